@@ -1,0 +1,31 @@
+"""The pinhole projection outside the splat op: lidar colouring, visibility of seeds, box masks, sky rays."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.types import Camera
+
+
+def project(
+    camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
+    """Pixel coordinates, depth along the optical axis (metres) and whether each world point is in the image."""
+    in_camera = transform_points(camera.camera_from_world.to(points.dtype), points)
+    depth = in_camera[:, 2]
+    safe = depth.clamp(min=near)
+    pixels = (in_camera @ camera.intrinsics.to(points.dtype).T)[:, :2] / safe[:, None]
+    inside = (depth > near) & (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    return pixels, depth, inside
+
+
+def ray_directions(camera: Camera) -> Float[Tensor, "h w 3"]:
+    """Unit directions in the world through the pixel centres."""
+    dtype = camera.intrinsics.dtype
+    x = (torch.arange(camera.width, dtype=dtype) + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
+    y = (torch.arange(camera.height, dtype=dtype) + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    in_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)
+    in_world = in_camera @ camera.camera_from_world[:3, :3]
+    return in_world / in_world.norm(dim=-1, keepdim=True)

@@ -1,0 +1,91 @@
+"""Unit quaternions, wxyz, Hamilton product; the only place where rotations change their form."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def normalized(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+    """Unit quaternions; a zero (or subnormal) one becomes the identity and gets no gradient."""
+    squared = quaternions.square().sum(-1, keepdim=True)
+    usable = squared > torch.finfo(quaternions.dtype).tiny
+    identity = torch.zeros_like(quaternions)
+    identity[..., 0] = 1
+    safe = torch.where(usable, quaternions, identity)
+    return safe / safe.norm(dim=-1, keepdim=True)
+
+
+def multiply(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
+    """The rotation b followed by the rotation a: matrix(multiply(a, b)) = matrix(a) @ matrix(b)."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        dim=-1,
+    )
+
+
+def to_matrix(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrices; the input need not be unit (a zero quaternion gives the identity)."""
+    w, x, y, z = normalized(quaternions).unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def from_matrix(rotations: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
+    """Unit quaternions with w >= 0, by the largest of the four squared components (Shepperd's method)."""
+    m = rotations
+    diagonal = torch.diagonal(m, dim1=-2, dim2=-1)
+    xx, yy, zz = diagonal.unbind(-1)
+    squares = torch.stack((1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz), dim=-1)
+    xw, yw, zw = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    # Row i holds 4 q_i q_j: any row divided by its norm is the quaternion; the one with the largest q_i is the safest.
+    outer = torch.stack(
+        (
+            torch.stack((squares[..., 0], xw, yw, zw), -1),
+            torch.stack((xw, squares[..., 1], xy, xz), -1),
+            torch.stack((yw, xy, squares[..., 2], yz), -1),
+            torch.stack((zw, xz, yz, squares[..., 3]), -1),
+        ),
+        dim=-2,
+    )
+    largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    quaternion = normalized(outer.gather(-2, largest).squeeze(-2))
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def from_rotation_vector(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Exponential map: a rotation by |v| radians about v; smooth at zero."""
+    half = 0.5 * vectors
+    squared = half.square().sum(-1, keepdim=True)
+    # sinc(|half|) with a Taylor branch: the gradient of norm is undefined at zero.
+    small = squared < 1e-6
+    angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    sinc = torch.where(small, 1 - squared / 6, torch.sin(angle) / angle)
+    cosine = torch.where(small, 1 - squared / 2 + squared.square() / 24, torch.cos(angle))
+    return torch.cat((cosine, sinc * half), dim=-1)
+
+
+def slerp(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"], fraction: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4"]:
+    """The rotation at ``fraction`` of the shorter arc from a to b (q and -q are the same rotation)."""
+    a, b = normalized(a), normalized(b)
+    dot = (a * b).sum(-1, keepdim=True)
+    b = torch.where(dot < 0, -b, b)
+    dot = dot.abs().clamp(max=1.0)
+    fraction = fraction[..., None]
+    near = dot > 0.9995  # below 1.8 degrees a normalised lerp differs from slerp by less than 1e-6
+    theta = torch.acos(torch.where(near, torch.zeros_like(dot), dot))
+    sine = torch.sin(theta)
+    weight_a = torch.where(near, 1 - fraction, torch.sin((1 - fraction) * theta) / sine)
+    weight_b = torch.where(near, fraction, torch.sin(fraction * theta) / sine)
+    return normalized(weight_a * a + weight_b * b)

@@ -1,0 +1,11 @@
+"""The binary mask with the gradient of its score (the paper's eq. for M_k; Bengio et al. 2013)."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+def straight_through(scores: Float[Tensor, " n"], threshold: float) -> Float[Tensor, " n"]:
+    """1[score > threshold] forward, d/dscore = 1 backward. Scores are sigmoids already: no second one here."""
+    # (hard - score) + score is not exactly 0 or 1 in float32; hard + (score - score.detach()) is.
+    hard = (scores > threshold).to(scores.dtype)
+    return hard + (scores - scores.detach())

@@ -1,0 +1,143 @@
+"""The frozen values that the wings of the package hand to each other.
+
+Conventions, everywhere: world frame metric and right-handed, re-centred at load; camera frame as in
+OpenCV (x right, y down, z forward); quaternions wxyz; ``a_from_b`` maps points of frame b to frame a;
+pixel centres at +0.5; time in [0, 1] beside the integer frame; images float32 in [0, 1] at the splat
+op and uint8 in storage.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64, Int, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Activated 3D Gaussians in the world frame (quaternions need not be unit)."""
+
+    means: Float[Tensor, "n 3"]
+    """Centres, metres."""
+    quaternions: Float[Tensor, "n 4"]
+    """Rotation world_from_gaussian, wxyz, any non-zero length."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the Gaussian's own axes, metres, >= 0."""
+    opacities: Float[Tensor, " n"]
+    """Peak alpha in [0, 1]; a row with opacity 0 is culled before projection."""
+    sh: Float[Tensor, "n k 3"]
+    """Spherical harmonics, k in {1, 4, 9, 16}; colour = max(0, 0.5 + sum_i basis_i(direction) sh_i)."""
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @staticmethod
+    def concatenate(parts: "list[Gaussians]") -> "Gaussians":
+        """Rows of all parts in order; parts of a lower SH degree are padded with zeros."""
+        terms = max(part.sh.shape[1] for part in parts)
+        padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, terms - part.sh.shape[1])) for part in parts]
+        return Gaussians(
+            torch.cat([part.means for part in parts]),
+            torch.cat([part.quaternions for part in parts]),
+            torch.cat([part.scales for part in parts]),
+            torch.cat([part.opacities for part in parts]),
+            torch.cat(padded),
+        )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    camera_from_world: Float[Tensor, "4 4"]
+    intrinsics: Float[Tensor, "3 3"]
+    """Pixels; the top left pixel's centre is at (0.5, 0.5)."""
+    width: int
+    height: int
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """Camera centre in the world, metres."""
+        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
+        return -rotation.T @ translation
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of one camera at one instant, with what is known about its pixels."""
+
+    index: int
+    """Integer frame of the log; all cameras of one instant share it."""
+    time: float
+    """Normalised time in [0, 1]."""
+    camera_index: int
+    camera: Camera
+    image: UInt8[Tensor, "h w 3"]
+    sky: Bool[Tensor, "h w"] | None = None
+    human: Bool[Tensor, "h w"] | None = None
+    vehicle: Bool[Tensor, "h w"] | None = None
+    depth: Float[Tensor, "h w"] | None = None
+    """Lidar depth along the optical axis, metres; 0 where no return fell into the pixel."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Lidar points of one instant in the world frame, coloured where a camera of that instant sees them."""
+
+    index: int
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    """RGB in [0, 1]; rows without ``colored`` are grey 0.5."""
+    colored: Bool[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One annotated object. Box frame: x along the length (heading), y left, z up, origin at the box centre."""
+
+    name: str
+    class_name: str
+    frames: Int[Tensor, " f"]
+    """Annotated integer frames, strictly increasing, not necessarily without gaps."""
+    world_from_object: Float64[Tensor, "f 4 4"]
+    size: Float[Tensor, "3"]
+    """Length, width, height, metres (mean over the annotated frames)."""
+
+    @property
+    def travel(self) -> float:
+        """Length of the path of the box centre over the annotated frames, metres."""
+        steps = self.world_from_object[1:, :3, 3] - self.world_from_object[:-1, :3, 3]
+        return float(steps.norm(dim=-1).sum())
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What the splat op returns. Row-wise fields have one entry per input Gaussian, drawn or not."""
+
+    rgb: Float[Tensor, "h w 3"]
+    """Blended colour over the background given to the op (premultiplied by alpha where none was given)."""
+    alpha: Float[Tensor, "h w"]
+    """1 - transmittance behind the last splat."""
+    depth: Float[Tensor, "h w"]
+    """Expected depth along the optical axis, metres: sum(w z) / max(alpha, 1e-6)."""
+    radii: Float[Tensor, " n"]
+    """Half the longer side of the splat's pixel box, pixels; 0 where the row was culled."""
+    screen_offsets: Float[Tensor, "n 2"]
+    """A leaf of zeros: after backward its .grad holds, per row, sum over pixels of |dLoss / d mean2d|, per pixel
+    unit (the absolute gradient of AbsGS, which density control thresholds)."""
+
+    @property
+    def visible(self) -> Bool[Tensor, " n"]:
+        return self.radii > 0
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What each row adds to one view (Mini-Splatting's counters, the paper's eq. for I_i)."""
+
+    weight: Float64[Tensor, " n"]
+    """Sum over pixels of the blend weight alpha * transmittance."""
+    pixels: Int[Tensor, " n"]
+    """Number of pixels the row was blended into."""
+    dominant: Int[Tensor, " n"]
+    """Number of pixels in which the row has the largest weight (ties: the nearer splat)."""
