@@ -1,0 +1,36 @@
+PY ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+# Caches stay inside the clone.
+export XDG_CACHE_HOME := $(CURDIR)/.cache
+export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
+
+.PHONY: test demo lint bench clean
+
+# Everything a fresh clone needs; rebuilt when the project's own files change.
+$(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt $(wildcard sparsestreet/ops/cpu/*pp)
+	test -x $(BIN)/python || $(PY) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev]'
+	@if $(BIN)/python -m pip list 2>/dev/null | grep -q '^torchvision '; then \
+	  echo 'torchvision must not be installed beside the CPU build of torch: it breaks torchmetrics and lightning'; exit 1; fi
+	touch $@
+
+test: $(VENV)/.ok
+	$(BIN)/python -m ruff check
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest
+
+demo: $(VENV)/.ok
+	$(BIN)/sparsestreet demo
+
+lint: $(VENV)/.ok
+	$(BIN)/python -m ruff check
+	$(BIN)/python -m ruff format --check
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.ok
+	$(BIN)/sparsestreet bench
+
+clean:
+	rm -rf $(VENV) build outputs/demo outputs/streets

@@ -1,0 +1,87 @@
+"""Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
+
+import difflib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import ConfigCompositionException
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+PACKAGE = Path(__file__).resolve().parents[1]
+# An installed wheel carries conf/ inside the package; a checkout has it beside the package.
+CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
+
+
+@dataclass
+class TrainSchema:
+    """Every root key of conf/train.yaml: any other is an error, with ``+`` as well."""
+
+    name: str = MISSING
+    seed: int = MISSING
+    split: Any = MISSING
+    resume: Any = None
+    data: Any = MISSING
+    scale: Any = MISSING
+    schedule: Any = MISSING
+    node: Any = MISSING
+    sky: Any = None
+    loss: Any = MISSING
+    callback: Any = MISSING
+    optimization: Any = MISSING
+    render: Any = MISSING
+    trainer: Any = MISSING
+    logger: Any = None
+
+
+ConfigStore.instance().store(name="train_schema", node=TrainSchema)
+
+
+def override_problem(overrides: list[str], config_name: str = "train") -> str | None:
+    """One line on what is wrong with the overrides, naming the nearest key; None if they compose."""
+    keyed = [text for text in overrides if not text.startswith("-")]
+    # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
+    single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        try:
+            compose(config_name, single)
+        except ConfigCompositionException as error:
+            reason = str(error.__cause__ or error).splitlines()[0]
+            return f"{reason.rstrip('.')}{_nearest(reason, config_name)}"
+    return None
+
+
+def _nearest(reason: str, config_name: str) -> str:
+    """'; did you mean ...?' for the unknown key or option that the message names."""
+    full_key = re.search(r"full_key: (\S+)|Could not override '([^']+)'|Key '([^']+)'", reason)
+    option = re.search(r"Could not find '([^']+)/([^/']+)'", reason)
+    if option:
+        choices = sorted(path.stem for path in (CONF / option[1]).glob("*.yaml"))
+        return f"; conf/{option[1]} has {', '.join(choices)}"
+    if not full_key:
+        return ""
+    wanted = next(group for group in full_key.groups() if group)
+    known = _keys(OmegaConf.to_container(compose(config_name), resolve=False))
+    close = difflib.get_close_matches(wanted, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _keys(tree: object, prefix: str = "") -> list[str]:
+    if not isinstance(tree, dict):
+        return []
+    keys = []
+    for name, value in tree.items():
+        keys.append(f"{prefix}{name}")
+        keys += _keys(value, f"{prefix}{name}.")
+    return keys
+
+
+def load_run_config(run: Path) -> DictConfig:
+    """The resolved configuration that a run wrote. Raises FileNotFoundError naming what a run folder holds."""
+    path = run / ".hydra" / "config.yaml"
+    if not path.is_file():
+        raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
+    return OmegaConf.load(path)

@@ -1,0 +1,81 @@
+"""``sparsestreet train``: compose, assemble, fit, evaluate, record."""
+
+import logging
+import sys
+import warnings
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from lightning import Callback, Trainer, seed_everything
+from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
+from omegaconf import DictConfig
+
+from sparsestreet.cli.assemble import Assembly, assemble, evaluate_assembly
+from sparsestreet.cli.compose import CONF, override_problem
+from sparsestreet.training.callbacks import Clock
+
+log = logging.getLogger(__name__)
+
+
+def train(arguments: list[str]) -> int:
+    """Run the Hydra app on these overrides; 2 if they name an unknown key."""
+    problem = override_problem(arguments) if "--help" not in arguments else None
+    if problem:
+        print(f"sparsestreet train: {problem}", file=sys.stderr)
+        return 2
+    sys.argv = ["sparsestreet train", *arguments]
+    app()
+    return 0
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
+def app(cfg: DictConfig) -> float:
+    """One training with its evaluation; returns the held-out full-image PSNR, for sweepers."""
+    out = Path(HydraConfig.get().runtime.output_dir)
+    seed_everything(cfg.seed, verbose=False)
+    silence_known_noise()
+    parts = assemble(cfg)
+    clock = Clock()
+    trainer = build_trainer(cfg, clock, out)
+    fit(trainer, parts, cfg.resume)
+    if trainer.fast_dev_run:
+        log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
+        return 0.0
+    summary = evaluate_assembly(parts, cfg, out, training_seconds=clock.seconds)
+    log.info("records and pictures in %s", out)
+    return summary
+
+
+def fit(trainer: Trainer, parts: Assembly, resume: str | None) -> None:
+    """Train; an interruption leaves checkpoints/interrupted.ckpt and ends with the way to go on."""
+    trainer.fit(parts.system, datamodule=parts.datamodule, ckpt_path=resume, weights_only=False if resume else None)
+    if trainer.interrupted:
+        path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
+        raise SystemExit(f"interrupted at step {trainer.global_step}; go on with resume={path}")
+
+
+def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:
+    callbacks: list[Callback] = list(instantiate(cfg.callback, _convert_="all").values())
+    checkpoints = [
+        ModelCheckpoint(dirpath=out / "checkpoints", filename="last", enable_version_counter=False),
+        OnExceptionCheckpoint(dirpath=out / "checkpoints", filename="interrupted"),
+    ]
+    logger = instantiate(cfg.logger) if cfg.logger else False
+    return instantiate(
+        cfg.trainer,
+        callbacks=[clock, *callbacks, *checkpoints],
+        logger=logger,
+        default_root_dir=str(out),
+        enable_model_summary=False,
+        log_every_n_steps=50,
+        max_epochs=-1,
+    )
+
+
+def silence_known_noise() -> None:
+    """Hints of Lightning that do not apply: frames are already in memory, a loader process would copy them."""
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)

@@ -1,0 +1,19 @@
+"""What every loss term is: a weighted number from a rendering and the frame it should look like."""
+
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.scene.rendering import SceneRendering
+from sparsestreet.types import Frame
+
+
+class Loss(Protocol):
+    def applies(self, frame: Frame) -> bool:
+        """Whether the frame carries what the term compares with."""
+        ...
+
+    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
+        """The weighted term."""
+        ...

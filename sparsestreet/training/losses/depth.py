@@ -1,0 +1,29 @@
+"""Rendered depth against lidar: L1 of the inverse depth over the pixels with a return."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.scene.rendering import SceneRendering
+from sparsestreet.types import Frame
+
+
+@dataclass(frozen=True)
+class InverseDepth:
+    """Inverse depth bounds the pull of far and wrong returns (DriveStudio's legacy presets)."""
+
+    weight: float = 0.1
+    nearest: float = 0.5
+    farthest: float = 80.0
+    """Returns outside [nearest, farthest] metres are left out."""
+
+    def applies(self, frame: Frame) -> bool:
+        return frame.depth is not None
+
+    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
+        measured, rendered = frame.depth, rendering.depth
+        valid = (measured > self.nearest) & (measured < self.farthest) & (rendered > self.nearest)
+        if not bool(valid.any()):
+            return rendered.sum() * 0.0
+        return self.weight * (1 / rendered[valid] - 1 / measured[valid]).abs().mean()

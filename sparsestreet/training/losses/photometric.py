@@ -1,0 +1,28 @@
+"""(1 - share) L1 + share (1 - SSIM) between the rendered and the recorded image (3DGS, eq. 7)."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.scene.rendering import SceneRendering
+from sparsestreet.training.losses.ssim import ssim
+from sparsestreet.types import Frame
+
+
+@dataclass(frozen=True)
+class Photometric:
+    """On unclamped colours: a clamp would stop the gradient of saturated pixels (lamps, white sky)."""
+
+    weight: float = 1.0
+    ssim_share: float = 0.2
+
+    def applies(self, frame: Frame) -> bool:
+        return True
+
+    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
+        truth = frame.image.to(rendering.rgb.dtype) / 255
+        error = (rendering.rgb - truth).abs().mean()
+        if self.ssim_share > 0:
+            error = (1 - self.ssim_share) * error + self.ssim_share * (1 - ssim(rendering.rgb, truth))
+        return self.weight * error

@@ -1,0 +1,43 @@
+"""When things happen: windows that keep their shape at any length of training."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Window:
+    """A recurring event between two fractions of the run.
+
+    Fractions rather than steps, so that a run of 2,000 steps has the shape of one of 30,000; only ``every`` counts
+    steps, since statistics need a number of images whatever the length of the run.
+    """
+
+    start: float
+    """Fraction of max_steps after which the event may happen first."""
+    stop: float
+    """Fraction of max_steps at which it happens last."""
+    every: int = 100
+    """Steps between two events."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.start <= self.stop <= 1:
+            raise ValueError(f"a window needs 0 <= start <= stop <= 1, got {self.start} and {self.stop}")
+        if self.every < 1:
+            raise ValueError(f"a window needs every >= 1 step, got {self.every}")
+
+    def due(self, step: int, max_steps: int) -> bool:
+        """Whether the event happens after ``step`` (1 is the first) of ``max_steps`` optimiser steps."""
+        return self.start * max_steps < step <= self.stop * max_steps and step % self.every == 0
+
+    def closes(self, step: int, max_steps: int) -> bool:
+        """Whether ``step`` is the last one inside the window."""
+        return step == self.last(max_steps)
+
+    def last(self, max_steps: int) -> int:
+        return int(self.stop * max_steps)
+
+
+def moment(fraction: float, max_steps: int) -> int:
+    """The step (at least 1) of a single event at a fraction of the run."""
+    if not 0 <= fraction <= 1:
+        raise ValueError(f"a moment of the run is a fraction in [0, 1], got {fraction}")
+    return max(1, int(fraction * max_steps))
