@@ -1,0 +1,48 @@
+"""Where the Gaussians are: a dot for every centre, coloured by node class."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry.cameras import project
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.types import Camera
+
+NODE_COLORS = ((0.30, 0.60, 0.90), (0.98, 0.60, 0.15), (0.35, 0.80, 0.40), (0.90, 0.35, 0.60), (0.80, 0.75, 0.25))
+"""RGB of the nodes in their order in the scene, repeated where there are more nodes."""
+
+BACKGROUND_COLOR = 0.05
+
+
+@torch.no_grad()
+def project_centres(
+    scene: SceneGraph, camera: Camera, time: float, *, minimum_opacity: float = 0.005
+) -> Float[Tensor, "h w 3"]:
+    """An image in [0, 1] with one pixel per centre in view, the nearest centre on top.
+
+    Rows below ``minimum_opacity`` are left out: those of absent instances, those masked, those about to be culled.
+    """
+    placed = scene.gaussians_at(time)
+    colors = placed.gaussians.means.new_zeros(len(placed.gaussians), 3)
+    for position, rows in enumerate(placed.rows.values()):
+        colors[rows] = colors.new_tensor(NODE_COLORS[position % len(NODE_COLORS)])
+    pixels, depth, inside = project(camera, placed.gaussians.means)
+    drawn = inside & (placed.gaussians.opacities >= minimum_opacity)
+    column, row = pixels[drawn].long().unbind(1)
+    image = colors.new_full((camera.height * camera.width, 3), BACKGROUND_COLOR)
+    target, nearest = _nearest_per_pixel(row * camera.width + column, depth[drawn], image.shape[0])
+    image[target] = colors[drawn][nearest]
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def _nearest_per_pixel(
+    pixels: Int[Tensor, " n"], depth: Float[Tensor, " n"], num_pixels: int
+) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
+    """The pixels hit, and for each the point with the smallest depth."""
+    order = depth.argsort(stable=True)
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(order.shape[0], device=order.device)
+    best = torch.full((num_pixels,), order.shape[0], device=order.device)
+    best.scatter_reduce_(0, pixels, rank, "amin")
+    hit = torch.nonzero(best < order.shape[0]).squeeze(1)
+    return hit, order[best[hit]]

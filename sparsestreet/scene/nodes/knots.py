@@ -1,0 +1,96 @@
+"""Annotated poses of many objects, padded to one table, and the pose between them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.types import Track
+
+TIME_TOLERANCE = 1e-5
+"""A tenth of a frame of a 10,000-frame log: equal instants may differ by the rounding of frame / (frames - 1)."""
+
+
+@dataclass(frozen=True)
+class Knots:
+    """World-from-box poses at annotated instants; row i is object i, its valid knots come first, in order of time."""
+
+    times: Float[Tensor, "i k"]
+    """Normalised time; 0 where not valid."""
+    quaternions: Float[Tensor, "i k 4"]
+    translations: Float[Tensor, "i k 3"]
+    """Box centre in the world, metres."""
+    valid: Bool[Tensor, "i k"]
+    spans: Float[Tensor, "i 2"]
+    """First and last annotated instant, held-out ones included."""
+
+    @staticmethod
+    def from_tracks(tracks: Sequence[Track], held_out: frozenset[int], num_frames: int) -> "Knots":
+        """The tracks' annotations without those of held-out frames, float32.
+
+        Raises ValueError if a track keeps no annotation.
+        """
+        counts = [sum(int(frame) not in held_out for frame in track.frames) for track in tracks]
+        for track, count in zip(tracks, counts, strict=True):
+            if count == 0:
+                raise ValueError(
+                    f"every track needs a pose in a training frame, but {track.name!r} is annotated only in "
+                    f"held-out frames {track.frames.tolist()}: leave the track out or hold out fewer frames"
+                )
+        shape = (len(tracks), max(counts, default=1))
+        times, valid = torch.zeros(shape), torch.zeros(shape, dtype=torch.bool)
+        rotations, translations = torch.zeros(*shape, 4), torch.zeros(*shape, 3)
+        rotations[..., 0] = 1
+        spans = torch.zeros(shape[0], 2)
+        last_frame = max(num_frames - 1, 1)
+        for i, (track, count) in enumerate(zip(tracks, counts, strict=True)):
+            kept = torch.tensor([int(frame) not in held_out for frame in track.frames], dtype=torch.bool)
+            poses = track.world_from_object[kept]
+            times[i, :count] = (track.frames[kept].double() / last_frame).float()
+            rotations[i, :count] = quat.from_matrix(poses[:, :3, :3]).float()
+            translations[i, :count] = poses[:, :3, 3].float()
+            valid[i, :count] = True
+            spans[i] = torch.stack((track.frames[0], track.frames[-1])).double() / last_frame
+        return Knots(times, rotations, translations, valid, spans)
+
+
+@dataclass(frozen=True)
+class Bracket:
+    """Which two knots a query lies between, per object."""
+
+    lower: Int[Tensor, " i"]
+    upper: Int[Tensor, " i"]
+    fraction: Float[Tensor, " i"]
+    """0 at the lower knot, 1 at the upper; outside [0, 1] where the pose is extrapolated."""
+    active: Bool[Tensor, " i"]
+
+
+def bracket(
+    times: Float[Tensor, "i k"],
+    valid: Bool[Tensor, "i k"],
+    spans: Float[Tensor, "i 2"],
+    time: float,
+    maximum_gap: float,
+) -> Bracket:
+    """The knots around ``time``. An object is active within its annotated span where a knot is near enough.
+
+    Args:
+        maximum_gap: farthest distance in time to the nearest knot at which an object counts as present.
+
+    A held-out end of a span lies beyond the last knot: there the first or last two knots are extrapolated at
+    constant velocity, up to the end of the span and no farther.
+    """
+    count = valid.sum(1)
+    num_before = (valid & (times <= time)).sum(1)
+    lower = torch.minimum((num_before - 1).clamp(min=0), (count - 2).clamp(min=0))
+    upper = torch.minimum(lower + 1, count - 1)
+    time_lower, time_upper = (times.gather(1, knot[:, None]).squeeze(1) for knot in (lower, upper))
+    inside = torch.full_like(time_lower, time).clamp(spans[:, 0], spans[:, 1])
+    step = torch.where(upper > lower, time_upper - time_lower, torch.ones_like(time_lower))
+    fraction = torch.where(upper > lower, (inside - time_lower) / step, torch.zeros_like(step))
+    nearest = torch.where(valid, (times - time).abs(), torch.inf).amin(1)
+    active = (nearest <= maximum_gap + TIME_TOLERANCE) & ((inside - time).abs() <= TIME_TOLERANCE)
+    return Bracket(lower, upper, fraction, active)

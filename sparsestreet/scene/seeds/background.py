@@ -1,0 +1,91 @@
+"""Seeds of the background."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.nodes.background import Background
+from sparsestreet.scene.seeds.boxes import moving_tracks, outside_boxes
+from sparsestreet.scene.seeds.points import Points, far_positions, near_positions, seen_points
+from sparsestreet.scene.seeds.rows import MINIMUM_SCALE, neighbour_scales, seed_rows
+from sparsestreet.types import Frame
+
+CANDIDATES_PER_POINT = 3
+"""Random positions drawn for each one wanted, since most lie in no view (DriveStudio)."""
+
+LARGEST_SCALE_RATIO = 0.05
+"""Of a seed's distance from the centre, or of the scene's radius if that is more: 3 degrees as seen from within."""
+
+
+@dataclass(frozen=True)
+class BackgroundSeeds:
+    """Lidar points outside moving boxes, random points around the drive and far away."""
+
+    lidar_points: int = 100_000
+    near_points: int = 20_000
+    far_points: int = 20_000
+    sh_degree: int = 3
+    mask: StaticMask | None = None
+    initial_opacity: float = 0.1
+    moving_travel: float = 1.0
+    """Metres; objects that travel farther leave no points in the background."""
+    moving_classes: Sequence[str] | None = None
+    """Classes that may move; None: all."""
+    box_enlargement: float = 1.1
+    """Of a moving object's box, for points that lie just outside an imprecise one."""
+
+    def build(
+        self, log: DrivingLog, train_frames: Sequence[Frame], held_out: frozenset[int], generator: torch.Generator
+    ) -> Background:
+        """Make the node from what training may see.
+
+        Raises ValueError if there is not a single point to start from.
+        """
+        center = torch.as_tensor(log.center, dtype=torch.float32)
+        near = near_positions(CANDIDATES_PER_POINT * self.near_points, center, log.radius, generator)
+        far = far_positions(CANDIDATES_PER_POINT * self.far_points, center, log.radius, generator)
+        points = Points.concatenate(
+            [
+                self._lidar(log, held_out).sampled(self.lidar_points, generator),
+                seen_points(near, train_frames).sampled(self.near_points, generator),
+                seen_points(far, train_frames).sampled(self.far_points, generator),
+            ]
+        )
+        if len(points) == 0:
+            raise ValueError(
+                f"the background of {log.name!r} has no seeds: no coloured lidar point and none of {len(near)} near "
+                f"and {len(far)} far random points is seen by a training view; raise near_points or check the poses"
+            )
+        scales = torch.minimum(
+            neighbour_scales(points.positions), _largest_scales(points.positions, center, log.radius)
+        )
+        rows = seed_rows(
+            points.positions,
+            points.colors,
+            scales,
+            sh_degree=self.sh_degree,
+            initial_opacity=self.initial_opacity,
+            mask=self.mask,
+            generator=generator,
+        )
+        return Background(rows, self.mask)
+
+    def _lidar(self, log: DrivingLog, held_out: frozenset[int]) -> Points:
+        """Coloured returns of the training sweeps that lie in no moving box of their instant."""
+        moving = moving_tracks(log.tracks, self.moving_travel, self.moving_classes)
+        parts = []
+        for sweep in log.sweeps:
+            if sweep.index not in held_out:
+                outside = outside_boxes(moving, sweep.index, sweep.points, self.box_enlargement)
+                parts.append(Points(sweep.points, sweep.colors).where(sweep.colored & outside))
+        return Points.concatenate(parts)
+
+
+def _largest_scales(positions: Float[Tensor, "n 3"], center: Float[Tensor, "3"], radius: float) -> Float[Tensor, " n"]:
+    distance = (positions - center).norm(dim=1).clamp(min=radius)
+    return (LARGEST_SCALE_RATIO * distance).clamp(min=MINIMUM_SCALE)

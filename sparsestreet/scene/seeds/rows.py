@@ -1,0 +1,67 @@
+"""From coloured points to rows of Gaussians."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sparsestreet.geometry.quaternions import normalized
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.masks import StaticMask
+
+SH_CONSTANT = 0.5 / math.sqrt(math.pi)
+"""The basis function of degree 0."""
+
+MINIMUM_SCALE = 1e-3
+"""Metres; coincident points are no distance apart, and a scale has to have a logarithm."""
+
+
+def neighbour_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Mean distance to the three nearest other points (fewer where there are no three), at least 1 mm.
+
+    A point without any neighbour gets 1 mm.
+    """
+    num_points = points.shape[0]
+    neighbours = min(3, num_points - 1)
+    if neighbours < 1:
+        return torch.full((num_points,), MINIMUM_SCALE)
+    # The nearest is the point itself, or a coincident one: both are 0 away, so dropping the first is right.
+    positions = points.double().numpy()
+    distances, _ = cKDTree(positions).query(positions, k=np.arange(2, neighbours + 2))
+    return torch.from_numpy(distances.mean(1)).float().clamp(min=MINIMUM_SCALE)
+
+
+def seed_rows(
+    points: Float[Tensor, "n 3"],
+    colors: Float[Tensor, "n 3"],
+    scales: Float[Tensor, " n"],
+    *,
+    sh_degree: int,
+    initial_opacity: float,
+    mask: StaticMask | None,
+    generator: torch.Generator,
+    buffers: dict[str, Tensor] | None = None,
+) -> Rows:
+    """Isotropic Gaussians with random rotations (as in 3DGS), one per point; colours RGB in [0, 1], scales metres.
+
+    Raises ValueError if the opacity is outside (0, 1) or the degree outside 0 to 3.
+    """
+    if not 0 < initial_opacity < 1:
+        raise ValueError(f"the initial opacity must lie between 0 and 1, got {initial_opacity}")
+    if sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"spherical harmonics are known up to degree 3, got sh_degree={sh_degree}")
+    num_rows = points.shape[0]
+    parameters = {
+        "means": points.float(),
+        "log_scales": scales.float().log()[:, None].expand(-1, 3),
+        "quaternions": normalized(torch.randn(num_rows, 4, generator=generator)),
+        "opacity_logits": torch.full((num_rows,), math.log(initial_opacity / (1 - initial_opacity))),
+        "sh_dc": ((colors.float() - 0.5) / SH_CONSTANT)[:, None, :],
+        "sh_rest": torch.zeros(num_rows, (sh_degree + 1) ** 2 - 1, 3),
+    }
+    if mask is not None:
+        parameters["mask_logits"] = mask.initial_logits(num_rows)
+    return Rows(parameters, buffers)
