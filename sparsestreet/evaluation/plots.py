@@ -1,0 +1,112 @@
+"""Curves over training and the scatter of runs (matplotlib without a display; no torch)."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from sparsestreet.evaluation.records import RunSummary
+
+# Okabe and Ito's palette: distinguishable with any colour vision.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+_MARKERS = "osD^vP*X"
+
+
+def plot_counts(
+    path: Path,
+    steps: Sequence[int],
+    counts: Mapping[str, Sequence[int]],
+    events: Sequence[tuple[int, str]] = (),
+    title: str = "Gaussians per node class",
+) -> None:
+    """Draw the number of Gaussians of each node class over training steps, with prune events marked.
+
+    Args:
+        path: PNG to write.
+        steps: training steps of the samples, increasing.
+        counts: node class -> number of rows at each step (logarithmic axis; zeros are not drawn).
+        events: (step, what happened), e.g. (2800, "background prune"); events of one name share a colour.
+    """
+    for name, values in counts.items():
+        if len(values) != len(steps):
+            raise ValueError(f"counts of {name!r} have {len(values)} samples, steps {len(steps)}: log them together")
+    figure, axes = _figure(title, "step", "Gaussians")
+    for index, (name, values) in enumerate(counts.items()):
+        drawn = [(step, value) for step, value in zip(steps, values, strict=True) if value > 0]
+        label = f"{name} ({values[-1]:,})" if len(values) else name
+        axes.plot(*zip(*drawn, strict=True) if drawn else ([], []), label=label, **_line(index))
+    names = list(dict.fromkeys(name for _, name in events))
+    for step, name in events:
+        axes.axvline(step, color="0.55", linewidth=0.8, linestyle=("--", ":", "-.")[names.index(name) % 3], zorder=0)
+    for index, name in enumerate(names):
+        axes.plot([], [], color="0.55", linewidth=0.8, linestyle=("--", ":", "-.")[index % 3], label=name)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    _finish(figure, axes, path)
+
+
+def plot_psnr(
+    path: Path, curves: Mapping[str, tuple[Sequence[int], Sequence[float]]], title: str = "PSNR over training"
+) -> None:
+    """Draw PSNR in dB against training steps, one curve per name -> (steps, PSNR)."""
+    figure, axes = _figure(title, "step", "PSNR (dB)")
+    for index, (name, (steps, values)) in enumerate(curves.items()):
+        axes.plot(steps, values, label=name, **_line(index))
+    _finish(figure, axes, path)
+
+
+def plot_runs(path: Path, summaries: Sequence[RunSummary], title: str = "Quality against size") -> None:
+    """Draw every run as a point: held-out full-image PSNR (dB) against its number of Gaussians (logarithmic)."""
+    figure, axes = _figure(title, "Gaussians", "held-out PSNR, full image (dB)")
+    for index, method in enumerate(dict.fromkeys(summary.run.method for summary in summaries)):
+        runs = [summary for summary in summaries if summary.run.method == method]
+        axes.scatter(
+            [summary.gaussians_total for summary in runs],
+            [summary.quality["psnr_full"].mean for summary in runs],
+            color=_COLOURS[index % len(_COLOURS)],
+            marker=_MARKERS[index % len(_MARKERS)],
+            s=46,
+            alpha=0.85,
+            label=f"{method} (n={len(runs)})",
+        )
+    axes.set_xscale("log")
+    for axis in (axes.xaxis,):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+        axis.set_minor_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axes.tick_params(axis="x", which="minor", labelsize=7)
+    _finish(figure, axes, path)
+
+
+def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_title(title)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _line(index: int) -> dict[str, str | float]:
+    colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+    return {"color": colour, "marker": marker, "markersize": 3.5, "linewidth": 1.4}
+
+
+def _short(value: float) -> str:
+    """12000 -> 12k, 1500000 -> 1.5M."""
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{value / size:g}{unit}"
+    return f"{value:g}"
+
+
+def _finish(figure: Figure, axes: Axes, path: Path) -> None:
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False, fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)

@@ -1,0 +1,75 @@
+"""How good images are: one value per frame and camera, and their summary over a split (no torch).
+
+The summary takes means over images, never over pixels; see ``metrics.definitions``.
+"""
+
+import statistics
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sparsestreet.evaluation.metrics.definitions import DEFINITIONS, PSNR_CAP, QUANTITIES, REGIONS, metric_id
+
+
+@dataclass(frozen=True)
+class RegionQuality:
+    """Errors within one region of one image; the metrics are None if and only if the region has no pixels."""
+
+    pixels: int
+    mse: float | None
+    psnr: float | None
+    """dB."""
+    ssim_uniform7: float | None
+
+
+@dataclass(frozen=True)
+class FrameQuality:
+    """One held-out image compared with its render."""
+
+    frame: int
+    camera: int
+    width: int
+    height: int
+    full: RegionQuality
+    human: RegionQuality | None = None
+    """None where the data has no such mask; a RegionQuality of 0 pixels where the mask is empty."""
+    vehicle: RegionQuality | None = None
+
+    def value(self, quantity: str, region: str) -> float | None:
+        """One metric, such as ("psnr", "vehicle"); None where the region is absent or empty."""
+        regions = {"full": self.full, "human": self.human, "vehicle": self.vehicle}
+        found = regions[region]
+        if found is None:
+            return None
+        return {"mse": found.mse, "psnr": found.psnr, "ssim_uniform7": found.ssim_uniform7}[quantity]
+
+
+@dataclass(frozen=True)
+class MetricSummary:
+    """One metric over the images of a split."""
+
+    mean: float | None
+    """None where no image has the region."""
+    sd: float | None
+    """Sample standard deviation over images (n - 1); None below two images. Not the spread over runs."""
+    images: int
+    """Number of images that entered the mean."""
+    capped: int
+    """Number of images whose PSNR was cut off at the cap (0 for other metrics)."""
+
+
+def summarise(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
+    """Id of each metric of ``DEFINITIONS`` -> its mean over the images that have the region."""
+    images = list(quality)
+    summaries = {}
+    for region in REGIONS:
+        for quantity in QUANTITIES:
+            values = [value for image in images if (value := image.value(quantity, region)) is not None]
+            capped = sum(value >= PSNR_CAP for value in values) if quantity == "psnr" else 0
+            summaries[metric_id(quantity, region)] = _summary(values, capped)
+    return {name: summaries[name] for name in DEFINITIONS}
+
+
+def _summary(values: list[float], capped: int) -> MetricSummary:
+    mean = statistics.fmean(values) if values else None
+    sd = statistics.stdev(values) if len(values) > 1 else None
+    return MetricSummary(mean, sd, len(values), capped)

@@ -1,0 +1,118 @@
+"""Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only (no torch)."""
+
+import json
+import math
+import os
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+Json = None | bool | int | float | str | list | dict
+Record = typing.TypeVar("Record")
+
+
+class RecordError(ValueError):
+    """A record that cannot be written or read as it stands; names the file and the entry."""
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a whole file or nothing: a reader never sees half of it, a crash leaves the old one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write a frozen dataclass as indented JSON, floats with 6 significant digits.
+
+    Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
+    """
+    text = json.dumps(_encoded(value, str(path)), indent=2, allow_nan=False, ensure_ascii=False)
+    write_atomically(path, text + "\n")
+
+
+def read_json(path: Path, kind: type[Record]) -> Record:
+    """Read a dataclass back, every type checked. Raises RecordError naming the file and the entry."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (FileNotFoundError, UnicodeDecodeError) as error:
+        raise RecordError(f"{path}: cannot be read ({error}); write the record again") from error
+    try:
+        value = json.loads(text, parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise RecordError(f"{path}: is not strict JSON ({error}); write the record again") from error
+    return _decoded(kind, value, str(path))
+
+
+def significant(value: float, where: str) -> float:
+    """Rounded to 6 significant digits: far below the noise of any measurement, readable in a diff.
+
+    Raises RecordError for a NaN or an infinity, naming the entry ``where`` it would stand.
+    """
+    if not math.isfinite(value):
+        raise RecordError(f"{where} is {value}, which a record has no number for: store None or find the cause")
+    return float(f"{value:.6g}")
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
+
+
+def _encoded(value: object, where: str) -> Json:
+    if is_dataclass(value):
+        return {field.name: _encoded(getattr(value, field.name), f"{where}: {field.name}") for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _encoded(entry, f"{where}: {key}") for key, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [_encoded(entry, f"{where}[{index}]") for index, entry in enumerate(value)]
+    if isinstance(value, float):
+        return significant(value, where)
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    raise RecordError(f"{where} is a {type(value).__name__}, which JSON cannot hold: convert it first")
+
+
+def _decoded(kind: object, value: Json, where: str) -> typing.Any:
+    """``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None or a plain type."""
+    if is_dataclass(kind):
+        return _decoded_dataclass(kind, value, where)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:
+        (inner,) = (argument for argument in arguments if argument is not types.NoneType)
+        return None if value is None else _decoded(inner, value, where)
+    if origin is dict:
+        return {key: _decoded(arguments[1], entry, f"{where}: {key}") for key, entry in _of(dict, value, where).items()}
+    if origin is tuple:
+        return tuple(
+            _decoded(arguments[0], entry, f"{where}[{index}]") for index, entry in enumerate(_of(list, value, where))
+        )
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return _of(kind, value, where)
+
+
+def _decoded_dataclass(kind: type, value: Json, where: str) -> typing.Any:
+    entries = _of(dict, value, where)
+    hints = typing.get_type_hints(kind)
+    names = {field.name for field in fields(kind)}
+    if names != set(entries):
+        missing, unknown = sorted(names - set(entries)), sorted(set(entries) - names)
+        raise RecordError(f"{where}: {kind.__name__} lacks the keys {missing} and has unknown keys {unknown}")
+    decoded = {name: _decoded(hints[name], entries[name], f"{where}: {name}") for name in names}
+    try:
+        return kind(**decoded)
+    except ValueError as error:
+        raise RecordError(f"{where}: {error}") from error
+
+
+def _of(kind: type, value: Json, where: str) -> typing.Any:
+    """``value`` if it is a ``kind`` (a bool is no int here)."""
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise RecordError(f"{where}: expected {kind.__name__}, got {type(value).__name__} {value!r}")
+    return value
