@@ -1,0 +1,59 @@
+"""What `sparsestreet data check` prints: every problem of a log, or what a sound one holds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from sparsestreet.data.drivestudio import Problem, check_drivestudio, read_drivestudio
+from sparsestreet.data.log import DrivingLog
+
+
+def report_problems(root: Path | str, *, ignore_distortion: bool = False, console: Console | None = None) -> int:
+    """Print all problems of a log in DriveStudio's layout, or a summary of it; 1 where there are problems, else 0."""
+    console = Console() if console is None else console
+    problems = check_drivestudio(root, ignore_distortion=ignore_distortion)
+    if problems:
+        console.print(_problem_table(Path(root), problems))
+        console.print(f"[bold red]{len(problems)} to repair[/] in {escape(str(root))}")
+        return 1
+    log = read_drivestudio(root, ignore_distortion=ignore_distortion)
+    console.print(_summary(log))
+    if log.tracks:
+        console.print(_track_table(log))
+    for note in log.notes:
+        console.print(f"[yellow]note[/] {escape(note)}")
+    console.print(f"[bold green]ready to train[/]: {escape(str(root))}")
+    return 0
+
+
+def _problem_table(root: Path, problems: Sequence[Problem]) -> Table:
+    table = Table("file", "problem", "remedy", title=f"Problems of {escape(str(root))}", show_lines=True)
+    for problem in problems:
+        path = problem.path.relative_to(root) if problem.path.is_relative_to(root) else problem.path
+        table.add_row(*map(escape, (str(path), problem.message, problem.remedy)))
+    return table
+
+
+def _summary(log: DrivingLog) -> Table:
+    table = Table("log", escape(log.name), title="What the log holds")
+    sizes = sorted({(frame.camera.width, frame.camera.height) for frame in log.frames}, reverse=True)
+    points = sum(len(sweep.points) for sweep in log.sweeps)
+    colored = sum(int(sweep.colored.sum()) for sweep in log.sweeps)
+    table.add_row("frames x cameras", f"{log.num_frames} x {log.num_cameras}")
+    table.add_row("image size", ", ".join(f"{width}x{height}" for width, height in sizes))
+    table.add_row("lidar points", f"{points:,} ({colored:,} seen by a camera)" if log.sweeps else "none")
+    table.add_row("objects", str(len(log.tracks)))
+    table.add_row("scene radius", f"{log.radius:.1f} m")
+    return table
+
+
+def _track_table(log: DrivingLog) -> Table:
+    table = Table("class", "objects", "boxes", "longest travel (m)", title="Objects")
+    for name in sorted({track.class_name for track in log.tracks}):
+        tracks = [track for track in log.tracks if track.class_name == name]
+        boxes = sum(len(track.frames) for track in tracks)
+        table.add_row(escape(name), str(len(tracks)), str(boxes), f"{max(track.travel for track in tracks):.1f}")
+    return table

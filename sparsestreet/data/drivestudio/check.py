@@ -1,0 +1,163 @@
+"""The schema check: everything that is wrong with a log, at once."""
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from sparsestreet.data.drivestudio.images import image_size, read_image, read_mask
+from sparsestreet.data.drivestudio.instances import read_instances
+from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout, find_layout
+from sparsestreet.data.drivestudio.lidar import check_sweep_size, read_sweep
+from sparsestreet.data.drivestudio.poses import read_intrinsics, read_pose
+from sparsestreet.data.drivestudio.problems import LogError, Problem, attempt, fault, missing_files
+
+LARGEST_SCENE = 20_000.0
+"""Metres. Re-centred coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""
+
+
+def check_drivestudio(
+    root: Path | str,
+    *,
+    cameras: Sequence[int] | None = None,
+    first_frame: int = 0,
+    last_frame: int = -1,
+    ignore_distortion: bool = False,
+    contents: bool = True,
+) -> list[Problem]:
+    """Every problem of the chosen cameras and frames; an empty list means that ``read_drivestudio`` will succeed.
+
+    ``contents=False`` trusts pixels and lidar points and looks at files' headers and sizes only, which is quick.
+    Raises ValueError where cameras or frames are asked for that the log lacks.
+    """
+    try:
+        layout = find_layout(Path(root), cameras=cameras, first_frame=first_frame, last_frame=last_frame)
+    except LogError as error:
+        return list(error.problems)
+    return check_layout(layout, ignore_distortion=ignore_distortion, contents=contents)
+
+
+def check_layout(layout: Layout, *, ignore_distortion: bool, contents: bool) -> list[Problem]:
+    """As ``check_drivestudio``, for a layout that is found already."""
+    return [
+        *missing_files(_required(layout)),
+        *_check_cameras(layout, ignore_distortion),
+        *_check_poses(layout),
+        *_check_images(layout, contents),
+        *_check_sweeps(layout, contents),
+    ]
+
+
+def _required(layout: Layout) -> list[Path]:
+    """Files that must be there, those of optional kinds only where the kind's folder is."""
+    poses = _pose_files(layout)
+    files = [layout.intrinsics(camera) for camera in layout.cameras] + poses
+    files += [layout.image(frame, camera) for frame, camera in layout.images]
+    for kind in MASK_KINDS:
+        paths = [layout.mask(kind, frame, camera) for frame, camera in layout.images]
+        files += [path for path in paths if path is not None]
+    if layout.has_lidar:
+        files += [layout.sweep(frame) for frame in layout.frames]
+    return files + ([layout.instances] if layout.has_instances else [])
+
+
+def _pose_files(layout: Layout) -> list[Path]:
+    """Every pose that is read, once, among them the front camera's that the world is re-centred on."""
+    cameras = sorted({*layout.cameras, layout.front})
+    poses = [layout.extrinsics(frame, camera) for frame in layout.frames for camera in cameras]
+    if layout.waymo or layout.has_lidar:
+        poses += [layout.sweep_pose(frame) for frame in layout.frames]
+    return list(dict.fromkeys(poses))
+
+
+def _check_cameras(layout: Layout, ignore_distortion: bool) -> list[Problem]:
+    problems: list[Problem] = []
+    for path in filter(Path.is_file, map(layout.intrinsics, layout.cameras)):
+        camera = attempt(problems, partial(read_intrinsics, path))
+        if camera is not None and camera[1].any() and not ignore_distortion:
+            message = (
+                f"the lens distortion k1 k2 p1 p2 k3 = {camera[1].tolist()} is not zero; images must be undistorted"
+            )
+            remedy = "undistort the images and write zeros, or accept the error with ignore_distortion=True"
+            problems.append(Problem(path, message, remedy))
+    return problems
+
+
+def _check_poses(layout: Layout) -> list[Problem]:
+    """Poses and boxes, and whether all of them are within one scene."""
+    problems: list[Problem] = []
+    placed: list[tuple[Path, torch.Tensor]] = []
+    for path in filter(Path.is_file, _pose_files(layout)):
+        pose = attempt(problems, partial(read_pose, path))
+        if pose is not None:
+            placed.append((path, pose[:3, 3]))
+    if layout.waymo:  # there the extrinsics are relative to the vehicle
+        placed = [(path, position) for path, position in placed if path.parent.name == "ego_pose"]
+    if layout.instances.is_file():
+        tracks = attempt(problems, partial(read_instances, layout)) or []
+        placed += [(layout.instances, position) for track in tracks for position in track.world_from_object[:, :3, 3]]
+    return problems + _check_extent(placed)
+
+
+def _check_extent(placed: list[tuple[Path, torch.Tensor]]) -> list[Problem]:
+    if not placed:
+        return []
+    positions = torch.stack([position for _, position in placed])
+    extent = float((positions.amax(0) - positions.amin(0)).max())
+    if extent <= LARGEST_SCENE:
+        return []
+    strayed = int((positions - positions.median(0).values).norm(dim=-1).argmax())
+    message = f"poses span {extent / 1000:.1f} km, more than the {LARGEST_SCENE / 1000:g} km that float32 can hold"
+    remedy = "repair this pose, the farthest from the others, or read fewer frames (first_frame, last_frame)"
+    return [Problem(placed[strayed][0], message, remedy)]
+
+
+def _check_images(layout: Layout, contents: bool) -> list[Problem]:
+    problems: list[Problem] = []
+    for camera in layout.cameras:
+        paths = [path for frame in layout.frames if (path := layout.image(frame, camera)).is_file()]
+        sizes = {path: attempt(problems, partial(image_size, path)) for path in paths}
+        counts = Counter(size for size in sizes.values() if size is not None)
+        if not counts:
+            continue
+        common = counts.most_common(1)[0][0]
+        for path, size in sizes.items():
+            if size is not None and size != common:
+                message = f"the image is {size[0]}x{size[1]}, the others of camera {camera} are {common[0]}x{common[1]}"
+                problems.append(Problem(path, message, "write all images of a camera at one size"))
+            elif size is not None and contents:
+                attempt(problems, partial(read_image, path, size))
+        problems += _check_masks(layout, camera, common, contents)
+    return problems
+
+
+def _check_masks(layout: Layout, camera: int, size: tuple[int, int], contents: bool) -> list[Problem]:
+    problems: list[Problem] = []
+    for kind in MASK_KINDS:
+        paths = [layout.mask(kind, frame, camera) for frame in layout.frames]
+        for path in (path for path in paths if path is not None and path.is_file()):
+            attempt(problems, partial(_check_mask, path, size, contents))
+    return problems
+
+
+def _check_mask(path: Path, size: tuple[int, int], contents: bool) -> None:
+    found = image_size(path)
+    if found != size:
+        message = f"the mask is {found[0]}x{found[1]}, the camera's images are {size[0]}x{size[1]}"
+        raise fault(path, message, "write masks at the size of the images")
+    if contents:
+        read_mask(path, size, sky=False)
+
+
+def _check_sweeps(layout: Layout, contents: bool) -> list[Problem]:
+    problems: list[Problem] = []
+    for frame in layout.frames:
+        if not layout.sweep(frame).is_file():
+            continue
+        # A broken pose is reported with the poses, once.
+        found: list[Problem] = []
+        attempt(found, partial(read_sweep if contents else check_sweep_size, layout, frame))
+        problems += [problem for problem in found if problem.path == layout.sweep(frame)]
+    return problems

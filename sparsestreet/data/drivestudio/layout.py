@@ -1,0 +1,141 @@
+"""Where DriveStudio's processed layout keeps what, in its Waymo and its nuScenes flavour."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.data.drivestudio.problems import fault
+
+_FRAME = re.compile(r"(\d+)")
+_CAMERA = re.compile(r"(\d+)")
+_FRAME_CAMERA = re.compile(r"(\d+)_(\d+)")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A log's folder and the part of it that is read: file names of every kind."""
+
+    root: Path
+    waymo: bool
+    """True: poses of the vehicle and static camera mounts; False (nuScenes): a pose for each image."""
+    frames: range
+    """Frames of the window, in the folder's own numbers."""
+    cameras: tuple[int, ...]
+    front: int
+    """Lowest camera number in the folder: the re-centred world starts there, whichever cameras are read."""
+    num_frames_on_disk: int
+
+    @property
+    def images(self) -> Iterator[tuple[int, int]]:
+        """(frame, camera) of every image that is read, in the order of the log's frames."""
+        return ((frame, camera) for frame in self.frames for camera in self.cameras)
+
+    def image(self, frame: int, camera: int) -> Path:
+        return self.root / "images" / f"{frame:03d}_{camera}.jpg"
+
+    def intrinsics(self, camera: int) -> Path:
+        return self.root / "intrinsics" / f"{camera}.txt"
+
+    def extrinsics(self, frame: int, camera: int) -> Path:
+        """Waymo: camera -> vehicle, the same at all frames. nuScenes: camera -> world."""
+        return self.root / "extrinsics" / (f"{camera}.txt" if self.waymo else f"{frame:03d}_{camera}.txt")
+
+    def sweep_pose(self, frame: int) -> Path:
+        """Frame of the lidar points -> world: the vehicle for Waymo, the sensor for nuScenes."""
+        return self.root / ("ego_pose" if self.waymo else "lidar_pose") / f"{frame:03d}.txt"
+
+    def sweep(self, frame: int) -> Path:
+        return self.root / "lidar" / f"{frame:03d}.bin"
+
+    @property
+    def sweep_columns(self) -> int:
+        """float32 columns of a lidar row."""
+        return 14 if self.waymo else 4
+
+    @property
+    def sweep_xyz(self) -> slice:
+        """Columns of a lidar row that hold the point (a Waymo row starts with the ray's origin)."""
+        return slice(3, 6) if self.waymo else slice(0, 3)
+
+    @property
+    def has_lidar(self) -> bool:
+        return (self.root / "lidar").is_dir()
+
+    @property
+    def instances(self) -> Path:
+        return self.root / "instances" / "instances_info.json"
+
+    @property
+    def frame_instances(self) -> Path:
+        return self.root / "instances" / "frame_instances.json"
+
+    @property
+    def has_instances(self) -> bool:
+        return self.instances.parent.is_dir()
+
+    def mask_folder(self, kind: str) -> Path | None:
+        """Folder of the masks of a kind (sky, human, vehicle), or None where the log has none.
+
+        Fine masks replace the coarse ones as soon as their folder exists, never a class at a time (DriveStudio).
+        """
+        if kind == "sky":
+            folder = self.root / "sky_masks"
+            return folder if folder.is_dir() else None
+        coarse, fine = self.root / "dynamic_masks" / kind, self.root / "fine_dynamic_masks"
+        if fine.is_dir():
+            # A class that has coarse masks only counts as missing: mixing the two would change what metrics mean.
+            return fine / kind if (fine / kind).is_dir() or coarse.is_dir() else None
+        return coarse if coarse.is_dir() else None
+
+    def mask(self, kind: str, frame: int, camera: int) -> Path | None:
+        folder = self.mask_folder(kind)
+        return None if folder is None else folder / f"{frame:03d}_{camera}.png"
+
+
+MASK_KINDS = ("sky", "human", "vehicle")
+
+
+def find_layout(
+    root: Path, *, cameras: Sequence[int] | None = None, first_frame: int = 0, last_frame: int = -1
+) -> Layout:
+    """Recognise the flavour by its files and choose cameras and frames (last_frame is included; -1: to the end).
+
+    Raises LogError where the folder is no such log, ValueError where cameras or frames are asked for that it lacks.
+    """
+    if not (root / "images").is_dir():
+        raise fault(root, "the folder has no images/", "name the folder of one scene in DriveStudio's processed layout")
+    waymo = (root / "ego_pose").is_dir()
+    if not waymo and not _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA):
+        remedy = "add ego_pose/TTT.txt (Waymo flavour) or extrinsics/TTT_C.txt (nuScenes flavour)"
+        raise fault(root / "extrinsics", "the folder holds no poses of either flavour", remedy)
+    images = _numbers(root / "images", ".jpg", _FRAME_CAMERA)
+    on_disk = sorted({camera for _, camera in images} | {n for (n,) in _numbers(root / "intrinsics", ".txt", _CAMERA)})
+    if not images or not on_disk:
+        raise fault(root / "images", "the folder holds no TTT_C.jpg", "write the images as frame_camera, as 000_0.jpg")
+    count = _count_frames(root, waymo)
+    last = count - 1 if last_frame == -1 else last_frame
+    if not 0 <= first_frame <= last < count:
+        raise ValueError(f"frames {first_frame} to {last_frame} are not within the log's 0 to {count - 1}: {root}")
+    chosen = tuple(on_disk) if cameras is None else tuple(cameras)
+    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(on_disk):
+        raise ValueError(f"cameras {list(chosen)} must be different ones of the log's {on_disk}: {root}")
+    return Layout(root, waymo, range(first_frame, last + 1), chosen, on_disk[0], count)
+
+
+def _count_frames(root: Path, waymo: bool) -> int:
+    """One more than the highest frame number of any kind of file: where one kind stops early, its files are missing."""
+    found = [(frame,) for frame, _ in _numbers(root / "images", ".jpg", _FRAME_CAMERA)]
+    found += _numbers(root / "lidar", ".bin", _FRAME)
+    found += _numbers(root / ("ego_pose" if waymo else "lidar_pose"), ".txt", _FRAME)
+    if not waymo:
+        found += [(frame,) for frame, _ in _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA)]
+    return 1 + max(frame for (frame,) in found)
+
+
+def _numbers(folder: Path, suffix: str, pattern: re.Pattern[str]) -> list[tuple[int, ...]]:
+    """The numbers in the names of the folder's files that look as they should; others are none of our business."""
+    if not folder.is_dir():
+        return []
+    matches = [pattern.fullmatch(path.stem) for path in folder.iterdir() if path.suffix == suffix]
+    return [tuple(int(number) for number in match.groups()) for match in matches if match]

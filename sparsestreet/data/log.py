@@ -1,0 +1,110 @@
+"""A driving log as the rest of the package sees it, whatever data set it came from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from sparsestreet.types import Frame, Sweep, Track
+
+_QUANTILES = (0.02, 0.98)
+_MARGIN = 1.1
+_SEEN_AHEAD = 50.0
+"""Metres a camera is taken to see where no lidar says so."""
+_QUANTILE_POINTS = 1_000_000
+"""Quantiles of this many points are as good as of all of them, and take a tenth of a second."""
+
+
+@dataclass(frozen=True)
+class DrivingLog:
+    """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centred near its start."""
+
+    name: str
+    frames: tuple[Frame, ...]
+    """Ordered by (index, camera_index)."""
+    sweeps: tuple[Sweep, ...]
+    """Ordered by index; empty where the log has no lidar."""
+    tracks: tuple[Track, ...]
+    """Objects annotated in at least one of the frames; poses are in the re-centred world."""
+    num_frames: int
+    """Instants, not images: frame indices run over 0 .. num_frames - 1."""
+    num_cameras: int
+    dataset_from_world: Float64[Tensor, "4 4"]
+    """Adds back what re-centring took away: maps the log's world to the data set's own."""
+    notes: tuple[str, ...] = ()
+    """What is absent, and what a run does without it, one sentence each."""
+
+    @cached_property
+    def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """Corners of the box around the camera centres and the 2 % to 98 % quantiles of the lidar points.
+
+        Points that some camera sees count (DriveStudio's rule); without lidar, what lies 50 m ahead of each camera.
+        """
+        centers = torch.stack([frame.camera.position for frame in self.frames]).double().numpy()
+        low, high = centers.min(axis=0), centers.max(axis=0)
+        points = _seen_points(self.sweeps)
+        if len(points):
+            around = np.quantile(points, _QUANTILES, axis=0)
+        else:
+            # The third row of camera_from_world is the optical axis in the world.
+            axes = torch.stack([frame.camera.camera_from_world[2, :3] for frame in self.frames]).double().numpy()
+            ahead = centers + _SEEN_AHEAD * axes
+            around = np.stack((ahead.min(axis=0), ahead.max(axis=0)))
+        return np.minimum(low, around[0]), np.maximum(high, around[1])
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """Middle of the scene's box in the world, metres."""
+        low, high = self._bounds
+        return torch.from_numpy((low + high) / 2).float()
+
+    @property
+    def radius(self) -> float:
+        """Size of the scene in metres: 1.1 times half the longest side of its box (DriveStudio's scene radius)."""
+        low, high = self._bounds
+        return _MARGIN * float((high - low).max()) / 2
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which images are trained on and which are only looked at; no instant is in both."""
+
+    train: tuple[Frame, ...]
+    held_out: tuple[Frame, ...]
+
+
+def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:
+    """Hold out every ``stride``-th instant with all its cameras: indices offset, offset + stride, ...
+
+    ``stride=0`` holds out nothing. Raises ValueError where no training frame, or no held-out one, would be left.
+    """
+    if stride == 0:
+        return Split(log.frames, ())
+    if not 0 <= offset < stride:
+        raise ValueError(
+            f"a split needs 0 <= offset < stride, got offset {offset} and stride {stride}: lower the offset"
+        )
+    held_out = tuple(frame for frame in log.frames if frame.index % stride == offset)
+    train = tuple(frame for frame in log.frames if frame.index % stride != offset)
+    if not train:
+        raise ValueError(f"stride {stride} holds out all {log.num_frames} frames of {log.name!r}: take a larger stride")
+    if not held_out:
+        raise ValueError(
+            f"offset {offset} lies behind the {log.num_frames} frames of {log.name!r}, so nothing would be held out: "
+            "lower the offset, or say stride=0 to train on every frame"
+        )
+    return Split(train, held_out)
+
+
+def _seen_points(sweeps: Sequence[Sweep]) -> Float[np.ndarray, "n 3"]:
+    """Lidar points that a camera sees, or all where none is seen; every k-th of very many."""
+    if not sweeps:
+        return np.zeros((0, 3), dtype=np.float32)
+    points = torch.cat([sweep.points[sweep.colored] for sweep in sweeps])
+    if not len(points):
+        points = torch.cat([sweep.points for sweep in sweeps])
+    return points[:: len(points) // _QUANTILE_POINTS + 1].numpy()
