@@ -1,0 +1,71 @@
+"""How much each Gaussian matters to the training views: the paper's global importance of background Gaussians."""
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from sparsestreet.types import Contribution
+
+
+class Importance:
+    """Accumulates the score of every row of the whole scene, one view at a time.
+
+    Score of row i over M views::
+
+        I_i = 1/M sum_m [dominant_i^(m) > 0] w_i^(m) / max(S_i^(m), 1)
+
+    w is the row's summed blend weight in the view and S the number of pixels it was blended into, so that w/S is its
+    mean blend weight. The indicator is the paper's delta(i in I_max): the row is the largest contributor of at least
+    one pixel of that view (Mini-Splatting, Fang & Wang 2024, whose score the paper takes over). The paper's background
+    formula leaves it out, but without it only rows that touch no training pixel at all score zero. Render the whole
+    scene, all nodes, for the contributions: what stands in front decides what is dominant; then select the background
+    rows of ``scores()``.
+    """
+
+    def __init__(self, gate: bool = True) -> None:
+        """``gate=False`` drops the indicator."""
+        self.gate = gate
+        self.views = 0
+        # float64: float32 sums of many views depend on their order, and thresholds sit at exactly zero.
+        self._total: Float64[Tensor, " n"] | None = None
+
+    def add(self, contribution: Contribution) -> None:
+        """Count one view in.
+
+        Raises ValueError if the view has another number of rows than the ones before, or a weight that is NaN,
+        infinite or negative.
+        """
+        weight = contribution.weight.double()
+        bad = ~(weight.isfinite() & (weight >= 0))
+        if bad.any():
+            row = int(bad.nonzero()[0])
+            raise ValueError(
+                f"blend weights must be finite and >= 0, but row {row} of view {self.views} has {float(weight[row])}: "
+                "look for NaN in the Gaussians before scoring them"
+            )
+        if self._total is not None and self._total.shape != weight.shape:
+            raise ValueError(
+                f"every view must score the same rows, but view {self.views} has {weight.shape[0]} and those before "
+                f"{self._total.shape[0]}: start a new Importance after rows were added or removed"
+            )
+        score = weight / contribution.pixels.clamp(min=1)
+        if self.gate:
+            score = torch.where(contribution.dominant > 0, score, 0.0)
+        self._total = score if self._total is None else self._total + score
+        self.views += 1
+
+    def scores(self) -> Float64[Tensor, " n"]:
+        """I_i in [0, 1]. Raises ValueError before the first view: zero for every row would remove the whole scene."""
+        if self._total is None:
+            raise ValueError("importance needs at least one view, got none: add the training views first")
+        return self._total / self.views
+
+
+def measure_importance(views: Iterable[Contribution], gate: bool = True) -> Float64[Tensor, " n"]:
+    """Scores of all rows over all views; see ``Importance`` for the formula and the errors raised."""
+    importance = Importance(gate)
+    for view in views:
+        importance.add(view)
+    return importance.scores()

@@ -1,0 +1,59 @@
+"""Which rows of a node class to keep: by learned mask or by importance, never fewer than K_min."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sparsestreet.scene.gaussians import RowPlan
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which rows stay."""
+
+    keep: Bool[Tensor, " n"]
+    floor_hit: bool
+    """True: the rule wanted to remove more, but K_min kept some of its candidates."""
+    removed: int
+
+    def plan(self) -> RowPlan:
+        """The kept rows, in order, with their optimiser moments."""
+        return RowPlan.keep(self.keep)
+
+
+def keep_by_mask(scores: Float[Tensor, " n"], threshold: float, minimum_rows: int) -> Selection:
+    """Drop the rows whose mask is closed, sigma(m_k) <= epsilon, lowest first, but never below ``minimum_rows``.
+
+    ``scores`` are the sigmoids that the rasteriser's mask compares too, of all instances of the node class. Among equal
+    scores at the floor the lower row stays. Raises ValueError for scores that are NaN or a negative floor.
+    """
+    # Compared in the scores' own dtype, as the mask does: both must agree on who is closed.
+    return _keep_best(scores, scores <= threshold, minimum_rows)
+
+
+def keep_by_importance(scores: Float[Tensor, " n"], minimum_rows: int) -> Selection:
+    """Drop the rows with importance 0, unless that leaves fewer than ``minimum_rows``.
+
+    At the floor the highest scores stay and, among rows of equal score (zero), the lower row. Raises ValueError for
+    scores that are NaN or negative, or a negative floor.
+    """
+    if (scores < 0).any():
+        raise ValueError(f"importance is a mean blend weight and >= 0, got {float(scores.min())}")
+    return _keep_best(scores, scores == 0, minimum_rows)
+
+
+def _keep_best(scores: Float[Tensor, " n"], unwanted: Bool[Tensor, " n"], minimum_rows: int) -> Selection:
+    """Keep all that is wanted, and of the unwanted (which score lowest) only what the floor calls for."""
+    if minimum_rows < 0:
+        raise ValueError(f"minimum_rows must be >= 0, got {minimum_rows}")
+    if scores.isnan().any():
+        row = int(scores.isnan().nonzero()[0])
+        raise ValueError(f"scores must be numbers, but row {row} of {scores.shape[0]} is NaN: repair it before pruning")
+    rows, wanted = scores.shape[0], int((~unwanted).sum())
+    kept = max(wanted, min(minimum_rows, rows))
+    best_first = torch.sort(scores, descending=True, stable=True).indices
+    keep = torch.zeros_like(unwanted)
+    keep[best_first[:kept]] = True
+    return Selection(keep, floor_hit=kept > wanted, removed=rows - kept)

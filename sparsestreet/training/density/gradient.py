@@ -1,0 +1,183 @@
+"""Gradient-based density control (3DGS, Kerbl et al. 2023; absolute gradients as in AbsGS, Ye et al. 2024).
+
+Pure functions: they read rows and statistics, and answer with a RowPlan. When to call them is a callback's matter.
+All tests see unmasked values: a closed mask would make the scale 0.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry.quaternions import to_matrix
+from sparsestreet.scene.gaussians import RowPlan, Rows
+from sparsestreet.training.density.statistics import DensityStatistics
+
+
+@dataclass(frozen=True)
+class GradientDensity:
+    """Thresholds of density control; the defaults are DriveStudio's for its background node."""
+
+    grad_threshold: float = 0.0003
+    """Mean screen gradient above which a row is cloned or split."""
+    split_scale: float = 0.003
+    """Fraction of the scene radius: larger rows are split, smaller ones cloned."""
+    split_screen: float = 0.05
+    """Fraction of the longer image side: rows that were larger on screen are split at any scale."""
+    cull_opacity: float = 0.005
+    """Fainter rows go."""
+    cull_scale: float = 0.5
+    """Fraction of the scene radius: larger rows go."""
+    cull_screen: float = 0.15
+    """Fraction of the longer image side: rows that were larger on screen go."""
+    split_children: int = 2
+    split_shrink: float = 1.6
+    """Children (and a parent that stays) have this much smaller scales."""
+    keep_parent: bool = True
+    """DriveStudio keeps the shrunk parent beside its children; the original 3DGS replaces it."""
+    maximum_rows: int | None = None
+    """The node never grows beyond this; the rows of highest gradient get the room that is left."""
+
+    def __post_init__(self) -> None:
+        if self.split_children < 2:
+            raise ValueError(f"a split needs at least 2 children, got split_children={self.split_children}")
+        if self.split_shrink < 1:
+            raise ValueError(f"children must not be larger than their parent, got split_shrink={self.split_shrink}")
+
+
+def densify(
+    rows: Rows,
+    statistics: DensityStatistics,
+    settings: GradientDensity,
+    radius: float,
+    generator: torch.Generator,
+    use_screen_size: bool,
+) -> RowPlan:
+    """Clone small rows and split large ones where the image asks for detail.
+
+    With g the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the scene
+    radius in metres: a row with g > grad_threshold is split if s_max > split_scale R (or, with ``use_screen_size``,
+    r > split_screen), else cloned. A clone is an exact copy. Children of a split are at mu + R(q) (s * z) with
+    z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies inherit all other columns (mask
+    logits, instances ...) and start with zero optimiser moments; parents keep theirs.
+
+    New order: the surviving rows in theirs, then clones, then children, siblings side by side. Raises ValueError if
+    the statistics do not belong to the rows or hold a gradient that is not finite.
+    """
+    _check_same_rows(rows, statistics)
+    gradients = statistics.mean_gradients()
+    wanted = gradients > settings.grad_threshold
+    large = _largest_scale(rows) > settings.split_scale * radius
+    if use_screen_size:
+        large = large | (statistics.largest_screen > settings.split_screen)
+    wanted = wanted & _within_cap(gradients, wanted, large, settings)
+    return _grow(rows, wanted & large, wanted & ~large, settings, generator)
+
+
+def cull(
+    rows: Rows,
+    statistics: DensityStatistics,
+    settings: GradientDensity,
+    radius: float,
+    use_scale: bool,
+    use_screen: bool,
+) -> RowPlan:
+    """Drop rows that are faint (opacity < cull_opacity), with ``use_scale`` those that are huge (largest scale >
+    cull_scale * ``radius``, metres) and with ``use_screen`` those that were huge on screen (> cull_screen).
+
+    Raises ValueError if the statistics do not belong to the rows.
+    """
+    _check_same_rows(rows, statistics)
+    drop = torch.sigmoid(rows.opacity_logits.detach()) < settings.cull_opacity
+    if use_scale:
+        drop = drop | (_largest_scale(rows) > settings.cull_scale * radius)
+    if use_screen:
+        drop = drop | (statistics.largest_screen > settings.cull_screen)
+    return RowPlan.keep(~drop)
+
+
+def outside_boxes(
+    means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], sizes: Float[Tensor, "i 3"], margin: float
+) -> Bool[Tensor, " n"]:
+    """Whether each row's centre (metres, in the frame of its instance's box) is more than ``margin`` metres outside.
+
+    ``sizes``: length, width, height of each instance's box, which is centred at the origin.
+    """
+    return (means.detach().abs() > sizes[instances] / 2 + margin).any(dim=-1)
+
+
+def reset_opacity(rows: Rows, value: float) -> RowPlan:
+    """Lower every opacity to at most ``value`` and forget the opacities' moments; rows that matter grow back.
+
+    Raises ValueError unless 0 < value < 1.
+    """
+    if not 0 < value < 1:
+        raise ValueError(f"opacities are reset to a value between 0 and 1, got {value}")
+    logits = rows.opacity_logits.detach()
+    source = torch.arange(len(rows), device=logits.device)
+    lowered = logits.clamp(max=math.log(value / (1 - value)))
+    return RowPlan(
+        source,
+        fresh=torch.zeros_like(source, dtype=torch.bool),
+        edits={"opacity_logits": lowered},
+        reset_moments=frozenset({"opacity_logits"}),
+    )
+
+
+def _check_same_rows(rows: Rows, statistics: DensityStatistics) -> None:
+    if len(rows) != len(statistics):
+        raise ValueError(
+            f"the node has {len(rows)} rows but its statistics {len(statistics)}: apply every RowPlan to both"
+        )
+
+
+def _largest_scale(rows: Rows) -> Float[Tensor, " n"]:
+    return rows.log_scales.detach().amax(dim=-1).exp()
+
+
+def _within_cap(
+    gradients: Float[Tensor, " n"], wanted: Bool[Tensor, " n"], large: Bool[Tensor, " n"], settings: GradientDensity
+) -> Bool[Tensor, " n"]:
+    """Which rows may grow under ``maximum_rows``: highest gradient first, ties by row, until one has no room."""
+    if settings.maximum_rows is None:
+        return torch.ones_like(wanted)
+    split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
+    growth = torch.where(large, split_growth, 1) * wanted
+    order = torch.sort(gradients, descending=True, stable=True).indices
+    room = max(settings.maximum_rows - wanted.shape[0], 0)
+    allowed = torch.zeros_like(wanted)
+    allowed[order] = growth[order].cumsum(0) <= room
+    return allowed
+
+
+def _grow(
+    rows: Rows,
+    split: Bool[Tensor, " n"],
+    clone: Bool[Tensor, " n"],
+    settings: GradientDensity,
+    generator: torch.Generator,
+) -> RowPlan:
+    """The plan that splits and clones the given rows."""
+    survivors = torch.nonzero(torch.ones_like(split) if settings.keep_parent else ~split).squeeze(-1)
+    clones = torch.nonzero(clone).squeeze(-1)
+    children = torch.nonzero(split).squeeze(-1).repeat_interleave(settings.split_children)
+    source = torch.cat((survivors, clones, children))
+    fresh = torch.arange(len(source), device=source.device) >= len(survivors)
+
+    means = rows.means.detach()[source]
+    first_child = len(survivors) + len(clones)
+    means[first_child:] += _offsets(rows, children, generator)
+    log_scales = rows.log_scales.detach()[source]
+    log_scales[split[source]] -= math.log(settings.split_shrink)
+    return RowPlan(source, fresh, edits={"means": means, "log_scales": log_scales})
+
+
+def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:
+    """One draw from each listed row's Gaussian, relative to its mean, metres."""
+    scales = rows.log_scales.detach()[children].exp()
+    # Drawn where the generator lives: a CPU generator gives the same children on every device.
+    normal = torch.randn(scales.shape, dtype=scales.dtype, generator=generator, device=generator.device)
+    rotations = to_matrix(rows.quaternions.detach()[children])
+    return (rotations @ (scales * normal.to(scales.device))[..., None]).squeeze(-1)
