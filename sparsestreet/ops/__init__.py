@@ -1,0 +1,7 @@
+"""The splat op: one signature, a dense reference and a fast CPU backend."""
+
+from sparsestreet.ops.backend import resolve_backend
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.splat import contribution, splat
+
+__all__ = ["SplatSettings", "contribution", "resolve_backend", "splat"]

@@ -1,0 +1,65 @@
+"""The knobs of the splat op: what is cut off, when a pixel stops, and how a splat is blurred."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+StopRule = Literal["inclusive", "exclusive"]
+
+
+@dataclass(frozen=True)
+class SplatSettings:
+    """Cut-offs and filters of one rendering; the defaults are those of 3DGS with an inclusive stop.
+
+    Raises ValueError for values outside the ranges given with each field.
+    """
+
+    alpha_min: float = 1 / 255
+    """A splat does not touch a pixel where its alpha would be smaller; in [0, alpha_max). 0: no cut-off."""
+    alpha_max: float = 0.99
+    """Alpha is clamped here (gradient 0 above), in (0, 1): 1 / (1 - alpha) must stay finite."""
+    transmittance_min: float = 1e-4
+    """A pixel is finished when less light than this gets through, in [0, 1). 0: never."""
+    stop: StopRule = "inclusive"
+    """``inclusive``: the splat that crosses transmittance_min is still blended (error <= transmittance_min);
+    ``exclusive``: it is dropped, as in 3DGS and gsplat."""
+    blur: float = 0.3
+    """Low-pass added to both diagonal entries of the screen covariance, px^2, >= 0 (3DGS, screen-space dilation)."""
+    near: float = 0.2
+    """Rows at this depth or nearer are culled, metres, > 0."""
+    antialias: bool = False
+    """Multiply opacity by sqrt(det / det_blurred), so that blur does not brighten small splats (Mip-Splatting)."""
+
+    def __post_init__(self) -> None:
+        _require(0 < self.alpha_max < 1, "alpha_max must lie in (0, 1)", self.alpha_max)
+        _require(0 <= self.alpha_min < self.alpha_max, "alpha_min must lie in [0, alpha_max)", self.alpha_min)
+        _require(0 <= self.transmittance_min < 1, "transmittance_min must lie in [0, 1)", self.transmittance_min)
+        _require(self.stop in ("inclusive", "exclusive"), "stop must be 'inclusive' or 'exclusive'", self.stop)
+        _require(0 <= self.blur < float("inf"), "blur must be finite and >= 0 px^2", self.blur)
+        _require(0 < self.near < float("inf"), "near must be finite and > 0 m", self.near)
+
+    @staticmethod
+    def preset(name: str) -> "SplatSettings":
+        """Settings by name; raises ValueError naming the presets there are.
+
+        ``gsplat15``, ``gsplat16`` and ``inria`` match those renderers as far as these fields can say.
+        """
+        if name not in _PRESETS:
+            raise ValueError(f"no settings preset {name!r}: choose one of {sorted(_PRESETS)}")
+        return _PRESETS[name]
+
+
+def _require(holds: bool, invariant: str, value: float | str) -> None:
+    if not holds:
+        raise ValueError(f"{invariant}, got {value!r}")
+
+
+_PRESETS = {
+    "default": SplatSettings(),
+    # The clamp of alpha is part of the model, not a cut-off: it stays.
+    "exact": SplatSettings(alpha_min=0.0, transmittance_min=0.0),
+    "gsplat15": SplatSettings(alpha_max=0.999, stop="exclusive", near=0.01),
+    "gsplat16": SplatSettings(stop="exclusive", near=0.01),
+    "inria": SplatSettings(stop="exclusive"),
+    # About 50 dB against "exact"; fewer pixels per splat and earlier stops.
+    "fast": SplatSettings(alpha_min=1 / 128, transmittance_min=1e-3),
+}

@@ -1,0 +1,88 @@
+"""The one public signature of the op: Gaussians and a camera in, a differentiable Rendering out."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.ops import reference
+from sparsestreet.ops.backend import resolve_backend
+from sparsestreet.ops.cpu import rasteriser as cpu
+from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.validate import check_structure, check_values
+from sparsestreet.types import Camera, Contribution, Gaussians, Rendering
+
+DEFAULT_SETTINGS = SplatSettings()
+_LEAST_ALPHA = 1e-6
+
+
+def splat(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None = None,
+    settings: SplatSettings = DEFAULT_SETTINGS,
+    backend: str = "auto",
+) -> Rendering:
+    """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
+
+    Differentiable in every field of ``gaussians`` (means also through the view direction of the colours) and in
+    ``background``; not in the camera. Autocast has no effect here: everything runs in the dtype of the Gaussians,
+    whatever the camera's.
+
+    Args:
+        gaussians: n rows in the world, metres; n = 0 gives the background.
+        camera: pinhole without skew.
+        background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha.
+        settings: cut-offs and filters.
+        backend: "reference", "cpu" or "auto".
+
+    Raises:
+        ValueError: wrong shapes, dtypes, devices or camera; a value that is not finite, an opacity outside [0, 1] or
+            a negative scale (named with field and row).
+        RuntimeError: the backend asked for is not built.
+        PairLimitError: the splats cover more tiles than can be held.
+    """
+    check_structure(gaussians, camera, background)
+    chosen = resolve_backend(backend, gaussians.means.device)
+    with torch.autocast(gaussians.means.device.type, enabled=False):
+        offsets = torch.zeros(
+            (len(gaussians), 2), dtype=gaussians.means.dtype, device=gaussians.means.device,
+            requires_grad=torch.is_grad_enabled(),
+        )  # fmt: skip
+        if chosen == "reference":
+            check_values(gaussians)
+            raster = reference.rasterise(gaussians, offsets, camera, settings)
+        else:
+            raster = cpu.rasterise(gaussians, offsets, camera, settings)
+        return _compose(raster, offsets, background)
+
+
+def contribution(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    settings: SplatSettings = DEFAULT_SETTINGS,
+    backend: str = "auto",
+) -> Contribution:
+    """What each row adds to one view: sum of blend weights, pixels touched, pixels dominated. No gradients.
+
+    Raises as :func:`splat`.
+    """
+    check_structure(gaussians, camera, None)
+    chosen = resolve_backend(backend, gaussians.means.device)
+    with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
+        if chosen == "reference":
+            check_values(gaussians)
+            return reference.contribution(gaussians, camera, settings)
+        return cpu.contribution(gaussians, camera, settings)
+
+
+def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rendering:
+    """Put the background behind the layers and turn the sum of depths into an expectation."""
+    alpha = 1 - raster.transmittance
+    rgb = raster.rgb
+    if background is not None:
+        rgb = rgb + raster.transmittance[..., None] * background
+    depth = raster.depth_sum / alpha.clamp(min=_LEAST_ALPHA)
+    return Rendering(rgb, alpha, depth, raster.radii, offsets)
