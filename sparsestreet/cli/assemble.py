@@ -1,15 +1,20 @@
 """From a config to the objects of a run; training and evaluation assemble the same."""
 
+import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.evaluation.records import RunDescription, RunSummary
 from sparsestreet.evaluation.run import evaluate_run
 from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.centres import project_centres
 from sparsestreet.training.system import StreetSystem
 
 
@@ -39,5 +44,31 @@ def assemble(cfg: DictConfig) -> Assembly:
         instantiate(cfg.optimization, _convert_="all"),
         radius=log.radius,
         options=instantiate(cfg.render),
+        sh_interval=cfg.schedule.sh_interval,
     )
     return Assembly(log, datamodule, system)
+
+
+@torch.no_grad()
+def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seconds: float | None) -> RunSummary | None:
+    """Records and pictures of the held-out frames under ``out``; None where the split holds out nothing."""
+    held_out = parts.datamodule.split.held_out
+    if not held_out:
+        return None
+    system, scene = parts.system.cpu().eval(), parts.system.scene
+    return evaluate_run(
+        held_out,
+        render=system.render,
+        centres=lambda frame: project_centres(scene, frame.camera, frame.time),
+        gaussians=scene.counts(),
+        bytes_by_part=scene.bytes_by_part(),
+        run=RunDescription(
+            method=cfg.name,
+            scene=parts.log.name,
+            seed=cfg.seed,
+            split=f"every {cfg.split.stride}th frame from {cfg.split.offset}",
+            training_seconds=training_seconds,
+            command=shlex.join(["sparsestreet", *sys.argv[0].split()[1:], *sys.argv[1:]]),
+        ),
+        out=out,
+    )

@@ -45,7 +45,7 @@ def app(cfg: DictConfig) -> float:
         return 0.0
     summary = evaluate_assembly(parts, cfg, out, training_seconds=clock.seconds)
     log.info("records and pictures in %s", out)
-    return summary
+    return summary.quality["psnr_full"].mean if summary else 0.0
 
 
 def fit(trainer: Trainer, parts: Assembly, resume: str | None) -> None:

@@ -14,6 +14,10 @@ from sparsestreet.training.schedule import Window
 from sparsestreet.training.system import StreetSystem
 
 
+BOX_MARGIN = 0.1
+"""Metres by which a rigid row's centre may lie outside its box: annotated boxes are about this tight."""
+
+
 class DensityControl(Callback):
     """Densifies and culls the nodes named in ``nodes`` and resets their opacities.
 
@@ -109,7 +113,7 @@ class DensityControl(Callback):
         sizes = getattr(node, "sizes", None)
         if sizes is None:
             return None
-        return outside_boxes(node.rows.means.detach(), node.rows.instances, sizes, margin=1.2)
+        return outside_boxes(node.rows.means.detach(), node.rows.instances, sizes, margin=BOX_MARGIN)
 
     def state_dict(self) -> dict[str, object]:
         return {
@@ -119,6 +123,8 @@ class DensityControl(Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, object]) -> None:
-        self.statistics = {name: DensityStatistics.from_state(s) for name, s in state_dict["statistics"].items()}
+        for name, saved in state_dict["statistics"].items():
+            self.statistics[name] = DensityStatistics(0)
+            self.statistics[name].load_state_dict(saved)
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]
