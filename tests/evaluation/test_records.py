@@ -1,0 +1,150 @@
+"""Records on disk: round trip, strictness, atomicity."""
+
+import csv
+import dataclasses
+import json
+import os
+
+import pytest
+
+from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
+from sparsestreet.evaluation.records import read_quality, read_summary, write_quality, write_summary
+from sparsestreet.evaluation.strict_json import RecordError, significant, write_atomically
+from tests.evaluation.frames import make_summary
+
+QUALITY = [
+    FrameQuality(0, 1, 12, 9, RegionQuality(108, 0.00123456, 29.0849, 0.912345)),
+    FrameQuality(
+        10,
+        0,
+        12,
+        9,
+        RegionQuality(108, 0.0, 100.0, 1.0),
+        RegionQuality(0, None, None, None),
+        RegionQuality(7, 0.5, 3.0103, -0.25),
+    ),
+]
+
+
+def test_summary_round_trip(tmp_path):
+    summary = make_summary(training_seconds=None, vehicle_psnr=None)
+    path = tmp_path / "records" / "summary.json"
+    write_summary(path, summary)
+    assert read_summary(path) == summary
+    assert json.loads(path.read_text())["latency"]["p90"] == 60.0
+
+
+def test_floats_are_written_with_six_digits(tmp_path):
+    summary = make_summary(psnr=25.123456789)
+    write_summary(tmp_path / "summary.json", summary)
+    assert '"mean": 25.1235,' in (tmp_path / "summary.json").read_text()
+    assert significant(1234567.0, "x") == 1234570.0
+    assert significant(1.23456789e-5, "x") == 1.23457e-5
+
+
+def test_quality_round_trip_and_plain_csv(tmp_path):
+    path = tmp_path / "quality.csv"
+    write_quality(path, QUALITY)
+    assert read_quality(path) == QUALITY
+    with path.open(newline="") as stream:
+        first, second = csv.DictReader(stream)
+    assert (first["frame"], first["camera"], first["psnr_full"]) == ("0", "1", "29.0849")
+    assert first["pixels_vehicle"] == first["psnr_vehicle"] == ""
+    assert (second["pixels_human"], second["psnr_human"], second["ssim_uniform7_vehicle"]) == ("0", "", "-0.25")
+    write_quality(path, [])
+    assert read_quality(path) == []
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_no_record_holds_a_number_that_is_none(tmp_path, value):
+    summary = make_summary()
+    broken = dataclasses.replace(summary, quality={"psnr_full": MetricSummary(value, None, 1, 0)})
+    with pytest.raises(RecordError, match=r"summary\.json: quality: psnr_full: mean is (nan|inf)"):
+        write_summary(tmp_path / "summary.json", broken)
+    with pytest.raises(RecordError, match=r"quality\.csv: frame 3 is (nan|inf)"):
+        write_quality(tmp_path / "quality.csv", [FrameQuality(3, 0, 8, 8, RegionQuality(64, value, 20.0, 0.5))])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_totals_must_be_the_sum_of_their_parts():
+    with pytest.raises(ValueError, match="gaussians_total is 5, its parts sum to 1200"):
+        dataclasses.replace(make_summary(), gaussians_total=5)
+
+
+def drop(entries, key):
+    del entries[key]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda entries: drop(entries, "images"), r"lacks the keys \['images'\]"),
+        (lambda entries: entries.update(extra=1), r"unknown keys \['extra'\]"),
+        (lambda entries: entries.update(images="six"), r"images: expected int, got str 'six'"),
+        (lambda entries: entries.update(images=True), r"images: expected int, got bool"),
+        (lambda entries: entries["latency"].update(p50=None), r"latency: p50: expected float, got NoneType"),
+        (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
+        (lambda entries: entries["quality"]["psnr_full"].update(images=1.5), r"psnr_full: images: expected int"),
+        (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
+        (lambda entries: entries.update(format=99), r"format 99, this version reads 1"),
+        (lambda entries: entries.update(machine=[]), r"machine: expected dict, got list"),
+        (lambda entries: entries["run"].update(seed=float("nan")), r"is not strict JSON \(NaN"),
+    ],
+)
+def test_a_malformed_summary_names_file_and_entry(tmp_path, damage, message):
+    path = tmp_path / "summary.json"
+    write_summary(path, make_summary())
+    entries = json.loads(path.read_text())
+    damage(entries)
+    path.write_text(json.dumps(entries))
+    with pytest.raises(RecordError, match=r"summary\.json.*" + message):
+        read_summary(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "\x00"])
+def test_a_broken_summary_names_the_file(tmp_path, text):
+    (tmp_path / "summary.json").write_text(text)
+    with pytest.raises(RecordError, match=r"summary\.json"):
+        read_summary(tmp_path / "summary.json")
+    with pytest.raises(RecordError, match=r"absent\.json: cannot be read"):
+        read_summary(tmp_path / "absent.json")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1,0,8,8,64,0.1", "line 3: 6 cells, expected 16"),
+        ("1,0,8,8,64,0.1,ten,0.5,,,,,,,,", "line 3: .*ten"),
+        ("1,0,8,8,64,0.1,nan,0.5,,,,,,,,", "line 3: a metric is not a finite number"),
+        ("1,0,8,8,,,,,,,,,,,,", "line 3: the metrics of the full image are missing"),
+    ],
+)
+def test_a_malformed_quality_names_file_and_line(tmp_path, line, message):
+    path = tmp_path / "quality.csv"
+    write_quality(path, QUALITY[:1])
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(RecordError, match=r"quality\.csv, " + message):
+        read_quality(path)
+
+
+def test_quality_with_another_header_is_refused(tmp_path):
+    (tmp_path / "quality.csv").write_text("frame,psnr\n0,20\n")
+    with pytest.raises(RecordError, match=r"quality\.csv: the header"):
+        read_quality(tmp_path / "quality.csv")
+    with pytest.raises(RecordError, match="does not exist"):
+        read_quality(tmp_path / "absent.csv")
+
+
+def test_a_crash_while_writing_leaves_the_old_file_alone(tmp_path, monkeypatch):
+    path = tmp_path / "summary.json"
+    write_atomically(path, "old")
+
+    def crash(source, target):
+        assert (source.read_text(), path.read_text()) == ("new", "old")  # whole before it takes the name
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", crash)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, "new")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["summary.json"]
+    assert path.read_text() == "old"
