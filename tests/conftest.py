@@ -1,0 +1,16 @@
+"""What all tests share: where recorded data may lie."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def kitti() -> Path:
+    """The KITTI drive in DriveStudio's layout; skips where it is absent."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    root = Path(os.environ.get("SPARSESTREET_DATA", default)) / "kitti_0001"
+    if not root.is_dir():
+        pytest.skip(f"no recorded drive at {root}: set SPARSESTREET_DATA to the folder that holds kitti_0001")
+    return root
