@@ -2,16 +2,17 @@
 
 from pathlib import Path
 
-from sparsestreet.evaluation.pictures import comparison_sheet, read_pictures, write_png
+from sparsestreet.evaluation.pictures import Legend, comparison_sheet, read_pictures, write_png
 from sparsestreet.evaluation.records import RunSummary, read_summary, summary_path
 
 
-def compare_runs(plain: Path, ours: Path, sheet: Path) -> None:
+def compare_runs(plain: Path, ours: Path, sheet: Path, *, legend: Legend | None = None) -> None:
     """Write the comparison sheet of two run folders: truth, renders, errors, centres before and after pruning.
 
     Args:
         plain, ours: run folders with records and pictures of the same held-out images.
         sheet: PNG to write.
+        legend: node class -> RGB of its centres, drawn on the sheet.
 
     Raises RecordError for malformed records, ValueError if the runs show other images or another scene.
     """
@@ -25,9 +26,14 @@ def compare_runs(plain: Path, ours: Path, sheet: Path) -> None:
         ours_label=_label(after),
         plain_count=before.gaussians_total,
         ours_count=after.gaussians_total,
-        title=f"{before.run.scene}, seed {before.run.seed} and {after.run.seed}: {_label(before)} and {_label(after)}",
+        title=f"{before.run.scene}: {_run(before)} and {_run(after)}; PSNR over {before.images} held-out images",
+        legend=legend,
     )
     write_png(sheet, image)
+
+
+def _run(summary: RunSummary) -> str:
+    return f"{summary.run.method} (seed {summary.run.seed})"
 
 
 def _label(summary: RunSummary) -> str:

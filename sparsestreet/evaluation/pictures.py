@@ -3,7 +3,7 @@
 All images are uint8 [h, w, 3]. Errors share one fixed scale, written on every sheet, so that two sheets compare.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,9 @@ ERROR_SCALE = 0.2
 """Mean absolute difference over RGB, in [0, 1], at which the error picture reaches its brightest colour."""
 
 KINDS = ("truth", "render", "error", "centres")
+
+Legend = Mapping[str, tuple[int, int, int]]
+"""Node class -> RGB in [0, 255] of its centres."""
 
 # Perceptually uniform dark-to-bright map: 17 equally spaced samples of "inferno" (van der Walt and Smith, CC0).
 _INFERNO = np.array(
@@ -47,6 +50,14 @@ class Picture:
         return error_picture(self.render, self.truth)
 
 
+@dataclass(frozen=True)
+class Tile:
+    """One image of a sheet and what is written above it."""
+
+    heading: str
+    image: UInt8[np.ndarray, "h w 3"]
+
+
 def colour_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
     """Values in [0, 1] (clipped) as colours from black through red to pale yellow."""
     position = np.clip(values, 0, 1) * (len(_INFERNO) - 1)
@@ -64,17 +75,25 @@ def error_picture(
 
 
 def picture_sheet(
-    pictures: Sequence[Picture], *, title: str, tile_width: int = 480
+    pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = 480
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """A sheet with one row per picture and the columns truth, render, error, centres.
+    """A sheet with one line per picture and the columns truth, render, error, centres.
 
     Args:
         pictures: at least one.
         title: printed on top, e.g. method, scene and PSNR.
+        legend: node class -> its colour in the centres, drawn at the foot.
         tile_width: pixels of each column; images are scaled to it.
     """
-    rows = [[picture.truth, picture.render, picture.error, picture.centres] for picture in pictures]
-    return _sheet(rows, _row_labels(pictures), ("truth", "render", "error", "Gaussian centres"), title, tile_width)
+    headings = ("render", "error", "Gaussian centres")
+    lines = [
+        [
+            Tile(f"truth: {_view(picture)}", picture.truth),
+            *(Tile(*pair) for pair in zip(headings, _outcome(picture), strict=True)),
+        ]
+        for picture in pictures
+    ]
+    return _sheet(lines, title, legend or {}, tile_width)
 
 
 def comparison_sheet(
@@ -86,29 +105,26 @@ def comparison_sheet(
     plain_count: int,
     ours_count: int,
     title: str,
+    legend: Legend | None = None,
     tile_width: int = 480,
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Two runs on the same images: truth, both renders, both errors, the centres before and after pruning.
+    """Two runs on the same images, one below the other: truth, renders, errors, centres before and after pruning.
 
+    Each picture takes two lines, so that the two renders (errors, centres) stand above each other at readable size.
     Raises ValueError if the two runs show different images.
     """
     views, other_views = ([(picture.frame, picture.camera) for picture in run] for run in (plain, ours))
     if views != other_views:
         raise ValueError(f"the runs show different images, (frame, camera) {views} and {other_views}: evaluate alike")
-    rows = [
-        [before.truth, before.render, after.render, before.error, after.error, before.centres, after.centres]
-        for before, after in zip(plain, ours, strict=True)
-    ]
-    headings = (
-        "truth",
-        f"render: {plain_label}",
-        f"render: {ours_label}",
-        f"error: {plain_label}",
-        f"error: {ours_label}",
-        f"centres before: {plain_count:,} Gaussians",
-        f"centres after: {ours_count:,} Gaussians ({100 * ours_count / max(plain_count, 1):.0f} %)",
-    )
-    return _sheet(rows, _row_labels(plain), headings, title, tile_width)
+    kept = f"{ours_count:,} Gaussians ({100 * ours_count / max(plain_count, 1):.0f} %)"
+    headings = (f"render: {plain_label}", f"error: {plain_label}", f"centres before: {plain_count:,} Gaussians")
+    our_headings = (f"render: {ours_label}", f"error: {ours_label}", f"centres after: {kept}")
+    lines = []
+    for before, after in zip(plain, ours, strict=True):
+        tiles = [Tile(*pair) for pair in zip(headings, _outcome(before), strict=True)]
+        lines.append([Tile(f"truth: {_view(before)}", before.truth), *tiles])
+        lines.append([None, *(Tile(*pair) for pair in zip(our_headings, _outcome(after), strict=True))])
+    return _sheet(lines, title, legend or {}, tile_width)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -153,43 +169,52 @@ def _read_png(path: Path) -> UInt8[np.ndarray, "h w 3"]:
         return np.asarray(image.convert("RGB"))
 
 
-def _row_labels(pictures: Sequence[Picture]) -> list[str]:
-    return [f"frame {picture.frame}, camera {picture.camera}" for picture in pictures]
+def _view(picture: Picture) -> str:
+    return f"frame {picture.frame}, camera {picture.camera}"
+
+
+def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return picture.render, picture.error, picture.centres
 
 
 def _sheet(
-    rows: list[list[np.ndarray]], labels: list[str], headings: tuple[str, ...], title: str, tile_width: int
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Lay tiles out on dark paper: title, column headings, rows under their labels, the error scale at the foot."""
-    if not rows:
+    lines: list[list[Tile | None]], title: str, legend: Legend, tile_width: int
+) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
+    """Lay tiles out on dark paper under their headings; the title on top, scale and legend at the foot."""
+    if not lines:
         raise ValueError("a sheet needs at least one picture")
-    tiles = [[_fitted(image, tile_width) for image in row] for row in rows]
-    width = len(headings) * (tile_width + _GAP) - _GAP + 2 * _MARGIN
-    height = 2 * _HEADING + sum(row[0].height + _HEADING for row in tiles) + 2 * _HEADING
-    paper = Image.new("RGB", (width, height), _PAPER)
+    heights = [max(_fitted(tile.image, tile_width).height for tile in line if tile) for line in lines]
+    width = max(len(line) for line in lines) * (tile_width + _GAP) - _GAP + 2 * _MARGIN
+    paper = Image.new("RGB", (width, 3 * _HEADING + sum(heights) + len(lines) * _HEADING), _PAPER)
     draw = ImageDraw.Draw(paper)
-    _write(draw, (_MARGIN, 5), title, _INK, 16)
-    left = [_MARGIN + column * (tile_width + _GAP) for column in range(len(headings))]
-    for x, heading in zip(left, headings, strict=True):
-        _write(draw, (x, _HEADING + 5), heading, _INK, 14, tile_width)
-    top = 2 * _HEADING
-    for label, row in zip(labels, tiles, strict=True):
-        for x, tile in zip(left, row, strict=True):
-            paper.paste(tile, (x, top))
-        _write(draw, (_MARGIN, top + row[0].height + 3), label, _QUIET, 13)
-        top += row[0].height + _HEADING
-    _draw_scale(paper, draw, _MARGIN, top + 8)
+    _write(draw, (_MARGIN, 5), title, _INK, 16, width - 2 * _MARGIN)
+    top = _HEADING
+    for line, height in zip(lines, heights, strict=True):
+        for column, tile in enumerate(line):
+            if tile is not None:
+                x = _MARGIN + column * (tile_width + _GAP)
+                _write(draw, (x, top + 6), tile.heading, _INK, 14, tile_width)
+                paper.paste(_fitted(tile.image, tile_width), (x, top + _HEADING))
+        top += _HEADING + height
+    x = _draw_scale(paper, draw, _MARGIN, top + 18)
+    _draw_legend(draw, legend, x + 40, top + 18)
     return np.asarray(paper)
 
 
-def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int) -> None:
-    """The error colours with their values."""
-    _write(draw, (x, y), "error |render - truth|, mean over RGB:   0", _QUIET, 13)
-    x += int(draw.textlength("error |render - truth|, mean over RGB:   0", font=_font(13))) + 8
+def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int) -> int:
+    """The error colours with their values; returns where the drawing ends."""
+    x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
     bar = colour_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
     paper.paste(Image.fromarray(bar), (x, y))
     draw.rectangle((x - 1, y - 1, x + 160, y + 16), outline=_QUIET)
-    _write(draw, (x + 168, y), f"{ERROR_SCALE:g} and above (of 1)", _QUIET, 13)
+    return _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13)
+
+
+def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:
+    """The node classes in the colours of their centres."""
+    for name, colour in legend.items():
+        draw.rectangle((x, y + 3, x + 10, y + 13), fill=colour)
+        x = _write(draw, (x + 16, y), name, _QUIET, 13) + 20
 
 
 def _fitted(image: UInt8[np.ndarray, "h w 3"], width: int) -> Image.Image:
@@ -206,11 +231,12 @@ def _write(
     colour: tuple[int, int, int],
     size: int,
     room: int | None = None,
-) -> None:
-    """Write a line; in narrow columns the type shrinks (not below 8) rather than run into the neighbour."""
+) -> int:
+    """Write a line and return where it ends; short of room the type shrinks (not below 8 pixels)."""
     while room is not None and size > 8 and draw.textlength(text, font=_font(size)) > room:
         size -= 1
     draw.text(position, text, fill=colour, font=_font(size))
+    return position[0] + round(draw.textlength(text, font=_font(size)))
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

@@ -37,7 +37,9 @@ def plot_counts(
     for index, (name, values) in enumerate(counts.items()):
         drawn = [(step, value) for step, value in zip(steps, values, strict=True) if value > 0]
         label = f"{name} ({values[-1]:,})" if len(values) else name
-        axes.plot(*zip(*drawn, strict=True) if drawn else ([], []), label=label, **_line(index))
+        # Counts jump at a step and stay: a slope between two samples would show Gaussians that never were.
+        samples = zip(*drawn, strict=True) if drawn else ([], [])
+        axes.plot(*samples, label=label, drawstyle="steps-post", **_line(index))
     names = list(dict.fromkeys(name for _, name in events))
     for step, name in events:
         axes.axvline(step, color="0.55", linewidth=0.8, linestyle=("--", ":", "-.")[names.index(name) % 3], zorder=0)
@@ -73,9 +75,8 @@ def plot_runs(path: Path, summaries: Sequence[RunSummary], title: str = "Quality
             label=f"{method} (n={len(runs)})",
         )
     axes.set_xscale("log")
-    for axis in (axes.xaxis,):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
-        axis.set_minor_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: _short(value)))
     axes.tick_params(axis="x", which="minor", labelsize=7)
     _finish(figure, axes, path)
 
@@ -93,8 +94,7 @@ def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 
 def _line(index: int) -> dict[str, str | float]:
-    colour, marker = _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
-    return {"color": colour, "marker": marker, "markersize": 3.5, "linewidth": 1.4}
+    return {"color": _COLOURS[index % len(_COLOURS)], "linewidth": 1.6}
 
 
 def _short(value: float) -> str:

@@ -11,6 +11,9 @@ from sparsestreet.evaluation.records import RunSummary, read_summary
 
 ABSENT = "-"
 
+_MOST_COLUMNS = 5
+"""Methods and differences beside each other in a terminal; beyond it they stand below each other."""
+
 
 @dataclass(frozen=True)
 class RunRecord:
@@ -97,18 +100,26 @@ def sections(records: Sequence[RunRecord], baseline: str | None = None) -> list[
 
 
 def tables(records: Sequence[RunRecord], baseline: str | None = None) -> list[Table]:
-    """The sections as rich tables for a terminal; print them with ``rich.console.Console``."""
-    drawn = []
-    for section in sections(records, baseline):
-        table = Table(title=section.title, caption="\n".join(section.notes), caption_justify="left", show_lines=False)
-        table.add_column("method", overflow="fold")
-        table.add_column("runs")
-        for column in section.columns:
-            table.add_column(column.heading, justify="right")
-        for row in section.rows:
-            table.add_row(*_texts(row, section.columns), style="dim" if row.difference else None)
-        drawn.append(table)
-    return drawn
+    """The sections as rich tables for a terminal; print them with ``rich.console.Console``.
+
+    A few methods stand as columns, which fits 80 characters; many (a sweep) stand as rows.
+    """
+    return [_drawn(section) for section in sections(records, baseline)]
+
+
+def _drawn(section: Section) -> Table:
+    lines = [
+        ["method", "runs", *(column.heading for column in section.columns)],
+        *(_texts(row, section.columns) for row in section.rows),
+    ]
+    if len(section.rows) <= _MOST_COLUMNS:
+        lines = [list(line) for line in zip(*lines, strict=True)]
+    table = Table(title=section.title, caption="\n".join(section.notes), caption_justify="left")
+    for index, heading in enumerate(lines[0]):
+        table.add_column(heading, justify="right" if index else "left")
+    for line in lines[1:]:
+        table.add_row(*line)
+    return table
 
 
 def markdown(records: Sequence[RunRecord], baseline: str | None = None) -> str:
@@ -156,8 +167,8 @@ def _columns(group: Sequence[RunSummary]) -> tuple[Column, ...]:
         Column("vehicle PSNR", _metric("psnr_vehicle"), "{:.2f}".format, False),
         Column("vehicle SSIM", _metric("ssim_uniform7_vehicle"), "{:.4f}".format, False),
         Column("human PSNR", _metric("psnr_human"), "{:.2f}".format, False),
-        Column("Gaussians", lambda summary: float(summary.gaussians_total), _count, True),
-        *(Column(name, _class_count(name), _count, True) for name in classes),
+        Column("Gaussians", lambda summary: float(summary.gaussians_total), "{:,.0f}".format, True),
+        *(Column(name, _class_count(name), "{:,.0f}".format, True) for name in classes),
         Column("MB", lambda summary: summary.bytes_total / 1e6, "{:.2f}".format, True),
         Column("ms/frame", lambda summary: summary.latency.p50, "{:.1f}".format, True),
         Column("train s", lambda summary: summary.run.training_seconds, "{:.0f}".format, True),
@@ -170,13 +181,6 @@ def _metric(name: str) -> Callable[[RunSummary], float | None]:
 
 def _class_count(name: str) -> Callable[[RunSummary], float | None]:
     return lambda summary: float(summary.gaussians[name]) if name in summary.gaussians else None
-
-
-def _count(value: float) -> str:
-    """1234567 -> 1.235M, 45678 -> 45.7k, 950 -> 950."""
-    if value >= 1e6:
-        return f"{value / 1e6:.3f}M"
-    return f"{value / 1e3:.1f}k" if value >= 1e4 else f"{value:.0f}"
 
 
 def _method_row(method: str, runs: Sequence[RunSummary], columns: tuple[Column, ...]) -> Row:
@@ -219,14 +223,13 @@ def _cell(cell: Spread | None, column: Column, row: Row) -> str:
     """mean ± sd; n is added where it is not the row's."""
     if cell is None:
         return ABSENT
-    if not row.difference:
-        mean, sd = column.text(cell.mean), None if cell.sd is None else column.text(cell.sd)
-    elif column.relative:
-        mean, sd = f"{cell.mean:.1f} %", None if cell.sd is None else f"{cell.sd:.1f}"
-    else:
-        sign = "+" if cell.mean >= 0 else "-"
-        mean, sd = sign + column.text(abs(cell.mean)), None if cell.sd is None else column.text(cell.sd)
-    text = mean if sd is None else f"{mean} ± {sd}"
+    percentage = row.difference and column.relative
+    number = "{:.1f}".format if percentage else column.text
+    sign = "" if not row.difference or percentage else "+" if cell.mean >= 0 else "-"
+    text = sign + number(abs(cell.mean) if sign else cell.mean)
+    if cell.sd is not None:
+        text += f" ± {number(cell.sd)}"
+    text += " %" if percentage else ""
     return text if cell.n == len(row.seeds) else f"{text} (n={cell.n})"
 
 
@@ -239,7 +242,9 @@ def _notes(group: Sequence[RunSummary]) -> list[str]:
         f"MB: 10^6 bytes of parameters; ms/frame: median, {group[0].latency.protocol}",
     ]
     clocks = sorted({f"{run.latency.device}, {run.latency.threads} threads" for run in group})
-    notes.append(("ms/frame are not comparable, measured on: " if len(clocks) > 1 else "on ") + "; ".join(clocks))
+    notes.append(
+        ("ms/frame are not comparable, measured on: " if len(clocks) > 1 else "measured on ") + "; ".join(clocks)
+    )
     if len({run.latency.protocol for run in group}) > 1:
         notes.append("ms/frame were taken with different numbers of renders; see each summary.json")
     if any(run.source.dirty for run in group):

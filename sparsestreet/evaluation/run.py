@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sparsestreet.evaluation.evaluate import RenderedImage, clamped_render, evaluate_frames
 from sparsestreet.evaluation.metrics.definitions import DEFINITIONS
-from sparsestreet.evaluation.pictures import KINDS, Picture, picture_sheet, write_picture, write_png
+from sparsestreet.evaluation.pictures import KINDS, Legend, Picture, picture_sheet, write_picture, write_png
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, summarise
 from sparsestreet.evaluation.records import (
@@ -37,6 +37,7 @@ def evaluate_run(
     bytes_by_part: dict[str, int],
     run: RunDescription,
     out: Path,
+    legend: Legend | None = None,
     pictures: int = 4,
     warmup: int = 20,
     repeats: int = 50,
@@ -51,6 +52,7 @@ def evaluate_run(
         bytes_by_part: part of the scene -> bytes of its parameters.
         run: what identifies the run.
         out: the run's folder.
+        legend: node class -> RGB in [0, 255] of its centres, for the picture sheet.
         pictures: how many held-out images become pictures.
         warmup, repeats: of the latency protocol.
 
@@ -76,7 +78,8 @@ def evaluate_run(
         machine=this_machine(),
         source=this_source(),
     )
-    _write_pictures(frames, quality, render, centres, summary, out / "pictures", pictures)
+    chosen = [_picture(frames[index], render, centres) for index in choose_pictures(quality, pictures)]
+    _write_pictures(chosen, summary, legend, out / "pictures")
     write_quality(quality_path(out), quality)
     write_summary(summary_path(out), summary)
     return summary
@@ -107,20 +110,11 @@ def _vehicle_pixels(image: FrameQuality) -> int:
     return 0 if image.vehicle is None else image.vehicle.pixels
 
 
-def _write_pictures(
-    frames: Sequence[Frame],
-    quality: Sequence[FrameQuality],
-    render: Render,
-    centres: Centres,
-    summary: RunSummary,
-    folder: Path,
-    count: int,
-) -> None:
-    """Single PNGs of a few chosen images and one sheet of all of them."""
+def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Legend | None, folder: Path) -> None:
+    """Single PNGs of the chosen images and one sheet of all of them."""
     for kind in KINDS:
         for stale in folder.glob(f"[0-9]*_[0-9]*_{kind}.png"):  # of an earlier evaluation, perhaps on another split
             stale.unlink()
-    chosen = [_picture(frames[index], render, centres) for index in choose_pictures(quality, count)]
     if not chosen:
         return
     for picture in chosen:
@@ -130,7 +124,7 @@ def _write_pictures(
         f"{summary.quality['psnr_full'].mean:.2f} dB over {summary.images} held-out images, "
         f"{summary.gaussians_total:,} Gaussians"
     )
-    write_png(folder / "sheet.png", picture_sheet(chosen, title=title))
+    write_png(folder / "sheet.png", picture_sheet(chosen, title=title, legend=legend))
 
 
 def _picture(frame: Frame, render: Render, centres: Centres) -> Picture:
