@@ -1,0 +1,47 @@
+"""A spinning lidar on the roof. The whole turn is taken at the instant of the images."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int16
+
+from sparsestreet.data.synthetic.noise import stream
+from sparsestreet.data.synthetic.parts import BACKGROUND, Pose, at
+from sparsestreet.data.synthetic.scene import Scene
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.tracer import Rays, first_hits
+
+_MOUNT = (0.9, 0.0, 1.9)
+_ELEVATIONS_DEGREES = (-24.0, 14.0)
+MAXIMUM_RANGE = 75.0
+
+
+@dataclass(frozen=True)
+class StreetSweep:
+    points: Float32[np.ndarray, "n 4"]
+    """x, y, z (metres, lidar frame: x forward, y left, z up) and intensity in [0, 1]; first returns with noise."""
+    object_indices: Int16[np.ndarray, " n"]
+    world_from_lidar: Pose
+
+
+def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: int) -> StreetSweep:
+    """One turn of the sensor in frame ``frame`` (which only seeds the noise)."""
+    world_from_lidar = world_from_ego @ at(*_MOUNT)
+    local = _directions(settings)
+    world = np.einsum("ij,jhw->ihw", world_from_lidar[:3, :3].astype(np.float32), local)
+    hits = first_hits(scene, Rays(world_from_lidar[:3, 3].astype(np.float32), np.ascontiguousarray(world)))
+    returned = hits.distances < MAXIMUM_RANGE
+    rng = stream(settings.seed, f"lidar {frame}")
+    ranges = hits.distances[returned] + settings.lidar_noise * rng.standard_normal(int(returned.sum()))
+    objects = scene.object_indices[hits.parts[returned]]
+    # Reflectance falls with range; paint of cars returns more than asphalt and brick.
+    intensity = np.clip(np.where(objects == BACKGROUND, 0.3, 0.6) * np.exp(-ranges / 60), 0, 1)
+    points = np.concatenate((local[:, returned] * ranges, intensity[None])).T
+    return StreetSweep(np.ascontiguousarray(points, np.float32), objects, world_from_lidar)
+
+
+def _directions(settings: StreetSettings) -> Float32[np.ndarray, "3 b a"]:
+    elevation = np.radians(np.linspace(*_ELEVATIONS_DEGREES, settings.lidar_beams))[:, None]
+    azimuth = (np.pi - 2 * np.pi * (np.arange(settings.lidar_azimuth_steps) + 0.5) / settings.lidar_azimuth_steps)[None]
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack((x, y, np.broadcast_to(np.sin(elevation), x.shape))).astype(np.float32)

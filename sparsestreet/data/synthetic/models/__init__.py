@@ -1,0 +1,1 @@
+"""Things that stand, drive and walk in the street, built from parts."""

@@ -1,0 +1,21 @@
+"""What the street asks of everything that moves."""
+
+from typing import Protocol
+
+from sparsestreet.data.synthetic.parts import Part
+
+
+class Model(Protocol):
+    """An object in its box frame: x along the heading, y left, z up, origin at the box centre."""
+
+    @property
+    def class_name(self) -> str: ...
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Length, width, height of the box, metres."""
+        ...
+
+    def parts(self, travelled: float) -> list[Part]:
+        """The parts after ``travelled`` metres: wheels turn and legs walk with the distance."""
+        ...

@@ -1,0 +1,64 @@
+"""Where things are at a time: straight along the street, with one smooth change of lane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparsestreet.data.synthetic.parts import Pose, at
+
+
+@dataclass(frozen=True)
+class Path:
+    """x = start + speed t; y moves by ``shift`` around ``shift_time`` (world frame, metres and seconds)."""
+
+    start: float
+    y: float
+    speed: float
+    """Signed, along x, metres per second; 0 stands still and takes its heading from ``rest_heading``."""
+    shift: float = 0.0
+    shift_time: float = 0.0
+    shift_duration: float = 2.5
+    rest_heading: float = 0.0
+
+    def position(self, time: float) -> tuple[float, float]:
+        return self.start + self.speed * time, self.y + self.shift * self._eased(time)
+
+    def heading(self, time: float) -> float:
+        """Angle of the path's tangent from +x, radians."""
+        if self.speed == 0:
+            return self.rest_heading
+        s = self._phase(time)
+        sideways = self.shift * 6 * s * (1 - s) / self.shift_duration
+        return float(np.arctan2(sideways, self.speed))
+
+    def travelled(self, time: float) -> float:
+        """Metres along x since time 0 (the sideways part is left out: it turns wheels by less than a percent)."""
+        return abs(self.speed) * time
+
+    def pose(self, time: float, height: float) -> Pose:
+        """World from object, the object's origin ``height`` metres above the road."""
+        x, y = self.position(time)
+        return at(x, y, height, self.heading(time))
+
+    def _phase(self, time: float) -> float:
+        return float(np.clip((time - self.shift_time) / self.shift_duration + 0.5, 0, 1))
+
+    def _eased(self, time: float) -> float:
+        s = self._phase(time)
+        return s * s * (3 - 2 * s)
+
+
+@dataclass(frozen=True)
+class EgoDrive:
+    """The recording car: at y = 0 on average, swaying a little, with a slowly changing speed."""
+
+    speed: float
+
+    def pose(self, time: float, offset: float = 0.0) -> Pose:
+        """World from ego: x forward, y left, z up, origin on the road under the rear axle; shifted left by ``offset``."""
+        x = self.speed * (time + 0.15 * np.sin(0.9 * time))
+        y = 0.12 * np.sin(0.8 * time)
+        slope = 0.12 * 0.8 * np.cos(0.8 * time) / (self.speed * (1 + 0.15 * 0.9 * np.cos(0.9 * time)))
+        heading = float(np.arctan(slope))
+        left = np.array([-np.sin(heading), np.cos(heading)])
+        return at(float(x + offset * left[0]), float(y + offset * left[1]), 0.0, heading)

@@ -1,0 +1,61 @@
+"""A part: a convex solid with a surface, somewhere in an object's (or the world's) frame."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from sparsestreet.data.synthetic.shapes import Capsule, Shape
+from sparsestreet.data.synthetic.textures.look import Surface
+
+BACKGROUND = -1
+"""Object index of what is no annotated object."""
+
+Pose = Float64[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class Part:
+    shape: Shape
+    surface: Surface
+    frame_from_part: Pose
+    """Frame: the object's while a model is built, the world once it stands in the street."""
+    object_index: int = BACKGROUND
+
+
+def placed(parts: list[Part], world_from_object: Pose, object_index: int = BACKGROUND) -> list[Part]:
+    """The parts of an object, moved to the world."""
+    return [
+        replace(part, frame_from_part=world_from_object @ part.frame_from_part, object_index=object_index)
+        for part in parts
+    ]
+
+
+def at(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
+    """A pose turned by ``yaw`` radians about z."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def axis_along_y(x: float, y: float, z: float) -> Pose:
+    """A pose whose z axis is the frame's y axis: axles of wheels."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def limb(start: tuple[float, float, float], end: tuple[float, float, float], radius: float, surface: Surface) -> Part:
+    """A capsule whose axis runs from one point to another, metres."""
+    a, b = np.array(start, np.float64), np.array(end, np.float64)
+    length = float(np.linalg.norm(b - a))
+    axis = (b - a) / length
+    helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
+    side = np.cross(helper, axis)
+    side /= np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack((np.cross(side, axis), side, axis), axis=1)
+    pose[:3, 3] = (a + b) / 2
+    return Part(Capsule(radius, length / 2), surface, pose)

@@ -1,0 +1,71 @@
+"""What a synthetic street is made from; two equal settings give the same bytes."""
+
+from dataclasses import dataclass
+
+CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
+"""Front, front left, front right; with 60 degrees of view each, neighbours overlap by 10."""
+
+
+@dataclass(frozen=True)
+class StreetSettings:
+    """A short drive along a straight street, seen by up to three cameras and a spinning lidar."""
+
+    seed: int = 0
+    """Decides the houses, colours, traffic, weather: everything but the sensors."""
+    num_frames: int = 40
+    width: int = 320
+    """Image width, pixels."""
+    height: int = 192
+    """Image height, pixels."""
+    num_cameras: int = 3
+    """1: front; 2: and front left; 3: and front right."""
+    field_of_view: float = 60.0
+    """Horizontal field of view of every camera, degrees."""
+    supersampling: int = 2
+    """Rays per pixel and axis: a pixel's colour is the mean of supersampling^2 rays."""
+    frame_rate: float = 10.0
+    """Frames per second."""
+    ego_speed: float = 8.0
+    """Mean speed of the recording car, metres per second."""
+    num_parked_cars: int = 14
+    num_moving_cars: int = 5
+    """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
+    num_pedestrians: int = 6
+    num_cyclists: int = 2
+    lidar_beams: int = 40
+    lidar_azimuth_steps: int = 600
+    """Rays of one beam in one full turn; about 40 percent of them look where the three cameras look."""
+    lidar_noise: float = 0.02
+    """Standard deviation of the measured range, metres."""
+    annotation_range: float = 60.0
+    """Objects farther from the ego car than this are not annotated, metres."""
+    novel_offsets: tuple[float, ...] = ()
+    """Sideways shifts (to the left, metres) of the ego car for which the front camera is rendered as well."""
+    novel_stride: int = 10
+    """Shifted views are rendered for every frame divisible by this."""
+
+    def __post_init__(self) -> None:
+        positive = (
+            "num_frames", "width", "height", "supersampling", "frame_rate", "ego_speed",
+            "lidar_beams", "lidar_azimuth_steps", "annotation_range", "novel_stride",
+        )  # fmt: skip
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
+        not_negative = (
+            "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "lidar_noise",
+        )  # fmt: skip
+        for name in not_negative:
+            if getattr(self, name) < 0:
+                raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
+        if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
+            raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
+        if not 10 <= self.field_of_view <= 120:
+            raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
+        # A list (as a config file gives it) becomes a tuple, so that equal settings compare equal.
+        object.__setattr__(self, "novel_offsets", tuple(float(offset) for offset in self.novel_offsets))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return (self.num_frames - 1) / self.frame_rate

@@ -1,0 +1,102 @@
+"""Colour of what the rays hit: sun with hard shadows, light of the sky and the ground, a mirrored sky, haze."""
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from sparsestreet.data.synthetic.scene import Scene, SunView
+from sparsestreet.data.synthetic.shapes import Scalars, Vectors
+from sparsestreet.data.synthetic.sky import SUNLIGHT, Weather
+from sparsestreet.data.synthetic.textures.look import column, mix
+from sparsestreet.data.synthetic.tracer import NOTHING, Hits, Rays, sunlit
+
+_HAZE_LENGTH = 900.0
+"""Metres in which haze takes all but 1/e of a surface's colour."""
+_HAZE = (0.62, 0.70, 0.80)
+_STREET_MIRROR = (0.22, 0.21, 0.20)
+"""What a mirror sees below the roofs: the other side of the street."""
+_EXPOSURE = 0.62
+
+
+def radiance(
+    scene: Scene, view: SunView, weather: Weather, rays: Rays, hits: Hits, pixel_angle: float
+) -> Float32[np.ndarray, "3 h w"]:
+    """Linear RGB of every ray. ``pixel_angle``: angle between neighbouring rays, radians."""
+    directions = rays.directions.reshape(3, -1)
+    parts, distances = hits.parts.ravel(), hits.distances.ravel()
+    colors = np.empty(directions.shape, np.float32)
+    order = np.argsort(parts, kind="stable")
+    bounds = np.flatnonzero(np.diff(parts[order])) + 1
+    for members in np.split(order, bounds):
+        index = parts[members[0]]
+        toward = directions[:, members]
+        if index == NOTHING:
+            colors[:, members] = weather.radiance(toward)
+            continue
+        distance = distances[members]
+        shaded = _shade(scene, view, weather, int(index), rays.origin, toward, distance, pixel_angle)
+        haze = np.float32(1) - np.exp(distance * np.float32(-1 / _HAZE_LENGTH))
+        colors[:, members] = mix(shaded, column(_HAZE), haze)
+    return colors.reshape(rays.directions.shape)
+
+
+def _shade(
+    scene: Scene,
+    view: SunView,
+    weather: Weather,
+    index: int,
+    origin: Float32[np.ndarray, "3"],
+    directions: Vectors,
+    distances: Scalars,
+    pixel_angle: float,
+) -> Vectors:
+    """Light from the points of one part towards the viewer."""
+    points = origin[:, None] + distances * directions
+    part = scene.parts[index]
+    local_directions, local_points = scene.turn_to_part(index, directions), scene.to_part(index, points)
+    local_normals = part.shape.normals(local_points)
+    footprints = _footprints(local_directions, local_normals, distances * np.float32(pixel_angle))
+    look = part.surface.look(local_points, local_normals, footprints)
+    normals = scene.turn_to_world(index, local_normals)
+    lit = sunlit(scene, view, points, normals, index)
+    slope = (normals * view.sun[:, None]).sum(0) * lit
+    light = weather.ambient(normals) + column(SUNLIGHT) * slope
+    return look.albedo * light + _mirrored(weather, directions, normals, look.gloss, lit)
+
+
+def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vectors:
+    """Extents along the axes of what a pixel covers of a plane.
+
+    A cone of width r around direction d meets the plane with normal n so that, along an axis a, it covers
+    r |a - n (d.a) / (d.n)|: the gradient of the hit point's coordinate with respect to the ray.
+    """
+    cosine = (directions * normals).sum(0)
+    cosine = np.where(np.abs(cosine) < 0.02, np.float32(-0.02), cosine)
+    ratio = directions / cosine
+    return radius * np.sqrt(np.maximum(1 - 2 * normals * ratio + ratio * ratio, 0))
+
+
+def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
+    """Sky and sun in glossy surfaces (Schlick's Fresnel term); the street's far side below the roofs."""
+    colors = np.zeros_like(directions)
+    shiny = np.flatnonzero(gloss > 0.01)
+    if len(shiny) == 0:
+        return colors
+    towards, normal = directions[:, shiny], normals[:, shiny]
+    cosine = (towards * normal).sum(0)
+    mirrored = towards - 2 * cosine * normal
+    sky = weather.radiance(mirrored)
+    street = np.clip((mirrored[2] - np.float32(0.25)) * 4, 0, 1)
+    seen = mix(column(_STREET_MIRROR), np.minimum(sky, 3), street)
+    fresnel = np.float32(0.12) + np.float32(0.88) * np.clip(1 + cosine, 0, 1) ** 5
+    sun = np.maximum((mirrored * weather.sun[:, None]).sum(0), 0) ** 200 * lit[shiny]
+    colors[:, shiny] = gloss[shiny] * (fresnel * seen + np.float32(2) * sun)
+    return colors
+
+
+def to_srgb(linear: Float32[np.ndarray, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Eight-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping."""
+    exposed = np.maximum(linear * np.float32(_EXPOSURE), 0)
+    exposed = exposed * (1 + exposed / 4) / (1 + exposed)
+    exposed = np.clip(exposed * np.float32(1.45), 0, 1)
+    encoded = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
+    return np.ascontiguousarray(np.round(encoded * 255).astype(np.uint8).transpose(1, 2, 0))

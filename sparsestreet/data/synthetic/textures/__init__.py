@@ -1,0 +1,1 @@
+"""Procedural textures, filtered over the pixel's footprint."""

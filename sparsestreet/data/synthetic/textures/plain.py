@@ -1,0 +1,43 @@
+"""One colour, with or without grain."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparsestreet.data.synthetic.noise import smooth_noise
+from sparsestreet.data.synthetic.textures.look import Color, Look, Vectors, column
+
+
+@dataclass(frozen=True)
+class Plain:
+    """Paint, metal, cloth seen from far."""
+
+    color: Color
+    gloss: float = 0.0
+
+    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+        albedo = np.repeat(column(self.color), points.shape[1], axis=1)
+        return Look(albedo, np.full(points.shape[1], self.gloss, np.float32))
+
+
+@dataclass(frozen=True)
+class Grainy:
+    """A colour modulated by noise of two sizes: cloth, bark, foliage, rough walls."""
+
+    color: Color
+    coarse: float
+    """Size of the large features, metres; the fine ones are a third of it."""
+    contrast: float
+    """Standard deviation of the relative brightness."""
+    offset: float = 0.0
+    """Shifts the pattern, so that copies differ, metres."""
+
+    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+        # Two skewed sections through the plane noise stand in for solid noise: no face shows stretched features.
+        x, y, z = points + np.float32(self.offset)
+        width = footprints.max(0)
+        u, v = x + np.float32(0.62) * z, y - np.float32(0.71) * z
+        grain = smooth_noise(u, v, self.coarse, width)
+        grain += np.float32(0.6) * smooth_noise(v * 1.3, u - y, self.coarse / 3, width)
+        albedo = column(self.color) * np.maximum(1 + np.float32(self.contrast) * grain, np.float32(0.15))
+        return Look(np.minimum(albedo, np.float32(0.95)), np.zeros(points.shape[1], np.float32))

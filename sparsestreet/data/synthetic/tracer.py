@@ -1,0 +1,118 @@
+"""First hits of ray bundles, and which points the sun reaches."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int16
+
+from sparsestreet.data.synthetic.scene import Scene, SunView
+from sparsestreet.data.synthetic.shapes import Vectors
+
+NOTHING = np.int16(-1)
+"""Part index of a ray that leaves the street."""
+
+_TILE = 48
+"""Side of the bundles that share one list of candidate parts, rays: small enough for the cache and for culling,
+large enough that NumPy's cost per call does not count."""
+_SHADOW_CHUNK = 4096
+_LIFT = np.float32(2e-3)
+"""Shadow rays start this far above the surface, metres: more than the rounding of a hit 250 m away."""
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A grid of rays from one point, as a camera's pixels or a lidar's beams and azimuth steps."""
+
+    origin: Float32[np.ndarray, "3"]
+    directions: Float32[np.ndarray, "3 h w"]
+    """Unit length, world frame."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    distances: Float32[np.ndarray, "h w"]
+    """Metres along the ray; infinity where nothing was hit."""
+    parts: Int16[np.ndarray, "h w"]
+    """Index of the part that was hit, or NOTHING."""
+
+
+def first_hits(scene: Scene, rays: Rays) -> Hits:
+    """The nearest part along every ray."""
+    _, height, width = rays.directions.shape
+    distances = np.empty((height, width), np.float32)
+    parts = np.empty((height, width), np.int16)
+    nearness = scene.distances(rays.origin)
+    for top in range(0, height, _TILE):
+        for left in range(0, width, _TILE):
+            window = (slice(top, top + _TILE), slice(left, left + _TILE))
+            tile = rays.directions[:, window[0], window[1]]
+            shape = tile.shape[1:]
+            nearest, hit = _trace_tile(scene, rays.origin, tile, nearness)
+            distances[window], parts[window] = nearest.reshape(shape), hit.reshape(shape)
+    return Hits(distances, parts)
+
+
+def _trace_tile(
+    scene: Scene,
+    origin: Float32[np.ndarray, "3"],
+    tile: Float32[np.ndarray, "3 a b"],
+    nearness: Float32[np.ndarray, " p"],
+) -> tuple[Float32[np.ndarray, " n"], Int16[np.ndarray, " n"]]:
+    directions = np.ascontiguousarray(tile.reshape(3, -1))
+    nearest = np.full(directions.shape[1], np.inf, np.float32)
+    hit = np.full(directions.shape[1], NOTHING, np.int16)
+    candidates = scene.in_bundle(origin, _bounding_planes(tile))
+    for index in candidates[np.argsort(nearness[candidates], kind="stable")]:
+        if nearness[index] > nearest.max():
+            break
+        local_origin = scene.to_part(index, origin[:, None])
+        distance = scene.parts[index].shape.enter(local_origin, scene.turn_to_part(index, directions))
+        closer = distance < nearest
+        nearest = np.where(closer, distance, nearest)
+        hit[closer] = index
+    return nearest, hit
+
+
+def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, "k 3"]:
+    """Inward normals of up to four planes through the origin with all rays of the tile on one side.
+
+    Sides of a lidar's tile are cones, not planes: a plane that would cut off rays is left out.
+    """
+    corners = tile[:, [0, 0, -1, -1], [0, -1, -1, 0]].T
+    normals = np.cross(corners, np.roll(corners, -1, axis=0))
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = normals[lengths > 1e-6] / lengths[lengths > 1e-6, None]
+    normals *= np.sign(normals @ tile.mean((1, 2)))[:, None]
+    lowest = (normals @ tile.reshape(3, -1)).min(1) if len(normals) else np.empty(0, np.float32)
+    return np.ascontiguousarray(normals[lowest >= -1e-6], np.float32)
+
+
+def sunlit(scene: Scene, view: SunView, points: Vectors, normals: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
+    """Whether one shadow ray from each point reaches the sun. All points lie on the convex part ``owner``.
+
+    ``normals`` are outward and in the world frame, as ``points`` are.
+    """
+    lit = (normals * view.sun[:, None]).sum(0) > 0
+    facing = np.flatnonzero(lit)
+    for start in range(0, len(facing), _SHADOW_CHUNK):
+        chosen = facing[start : start + _SHADOW_CHUNK]
+        lifted = points[:, chosen] + _LIFT * normals[:, chosen]
+        lit[chosen] = ~_blocked(scene, view, lifted, owner)
+    return lit
+
+
+def _blocked(scene: Scene, view: SunView, points: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
+    seen = view.axes @ points
+    blocked = np.zeros(points.shape[1], bool)
+    for index in view.blockers(seen):
+        if index == owner:  # a convex part does not shade its own lit side
+            continue
+        low, high = view.low[index], view.high[index]
+        near = (seen[0] > low[0]) & (seen[0] < high[0]) & (seen[1] > low[1]) & (seen[1] < high[1])
+        rays = np.flatnonzero(near & (seen[2] < high[2]) & ~blocked)
+        if len(rays) == 0:
+            continue
+        sun = np.repeat(scene.turn_to_part(index, view.sun[:, None]), len(rays), axis=1)
+        distance = scene.parts[index].shape.enter(scene.to_part(index, points[:, rays]), sun)
+        blocked[rays[np.isfinite(distance)]] = True
+    return blocked

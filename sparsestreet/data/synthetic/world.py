@@ -1,0 +1,209 @@
+"""The street itself: what stands where, who moves how, all decided by the seed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparsestreet.data.synthetic import layout
+from sparsestreet.data.synthetic.models.car import random_car
+from sparsestreet.data.synthetic.models.model import Model
+from sparsestreet.data.synthetic.models.people import random_cyclist, random_pedestrian
+from sparsestreet.data.synthetic.models.roadside import bin_box, house, lamp_post, tree
+from sparsestreet.data.synthetic.motion import EgoDrive, Path
+from sparsestreet.data.synthetic.noise import stream
+from sparsestreet.data.synthetic.parts import Part, Pose, at, placed
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.shapes import box
+from sparsestreet.data.synthetic.sky import Weather, random_weather
+from sparsestreet.data.synthetic.textures.ground import Asphalt, Footway, Lines
+
+
+@dataclass(frozen=True)
+class Actor:
+    """An annotated object and its path."""
+
+    name: str
+    model: Model
+    path: Path
+    ground: float
+    """Height of what it stands on, metres."""
+
+    def pose(self, time: float) -> Pose:
+        """World from object: the object's origin is the centre of its box."""
+        return self.path.pose(time, self.ground + self.model.size[2] / 2)
+
+
+@dataclass(frozen=True)
+class World:
+    ego: EgoDrive
+    scenery: tuple[Part, ...]
+    """Everything that is no annotated object, in the world frame."""
+    actors: tuple[Actor, ...]
+    """An actor's position in this tuple is the object index of its parts."""
+    weather: Weather
+
+    def parts_at(self, time: float) -> list[Part]:
+        """All parts in the world frame at a time in seconds."""
+        parts = list(self.scenery)
+        for index, actor in enumerate(self.actors):
+            parts += placed(actor.model.parts(actor.path.travelled(time)), actor.pose(time), index)
+        return parts
+
+
+def build_world(settings: StreetSettings) -> World:
+    ego = EgoDrive(settings.ego_speed)
+    end = settings.ego_speed * settings.duration
+    scenery = [*_ground(settings.seed, end), *_houses(settings.seed, end), *_footway_things(settings.seed, end)]
+    actors = [
+        *_parked_cars(settings, end),
+        *_moving_cars(settings, ego),
+        *_pedestrians(settings, end),
+        *_cyclists(settings),
+    ]
+    return World(ego, tuple(scenery), tuple(actors), random_weather(settings.seed))
+
+
+def _ground(seed: int, end: float) -> list[Part]:
+    rng = stream(seed, "ground")
+    start, stop = -layout.BEHIND, end + layout.AHEAD
+    crossing = float(rng.uniform(0.35, 0.6)) * end + 16
+    lines = Lines(
+        solid=layout.SOLID_LINES,
+        dashed=layout.DASHED_LINES,
+        crossings=(crossing, stop - 12),
+        kerb_right=layout.KERB_RIGHT,
+        kerb_left=layout.KERB_LEFT,
+    )
+    grey = float(rng.uniform(0.09, 0.15))
+    asphalt = Asphalt(lines, (grey, grey, grey * 1.03), float(rng.uniform(0, 30)))
+    parts = [Part(box(1600, 1600, 2), asphalt, at(0, 0, -1))]
+    half, half_length = layout.FOOTWAY_WIDTH / 2, (stop - start) / 2
+    tone = float(rng.uniform(0.24, 0.34))
+    for side, kerb in ((1, layout.KERB_RIGHT), (-1, layout.KERB_LEFT)):
+        footway = Footway((tone, tone * 0.97, tone * 0.91), half, side, float(rng.uniform(0, 30)))
+        # Sunk into the ground; wider at the back, so that set-back houses leave no gap to the road surface.
+        solid = box(2 * half_length, 2 * half, 2 * layout.KERB_HEIGHT)
+        parts.append(Part(solid, footway, at((start + stop) / 2, kerb - side * half, 0)))
+        back = Footway((tone * 0.9, tone * 0.88, tone * 0.8), 50, side, float(rng.uniform(0, 30)))
+        yard = box(2 * half_length, 30, 2 * layout.KERB_HEIGHT - 0.01)
+        parts.append(Part(yard, back, at((start + stop) / 2, kerb - side * (2 * half + 15), 0)))
+    return parts
+
+
+def _houses(seed: int, end: float) -> list[Part]:
+    """Two rows along the street, with a few gaps, and a row across its end."""
+    rng = stream(seed, "houses")
+    stop = end + layout.AHEAD
+    fronts = ((1, layout.KERB_RIGHT - layout.FOOTWAY_WIDTH), (-1, layout.KERB_LEFT + layout.FOOTWAY_WIDTH))
+    parts: list[Part] = []
+    for road_side, front in fronts:
+        x = -layout.BEHIND + float(rng.uniform(-6, 0))
+        while x < stop:
+            width = float(rng.uniform(8, 15))
+            setback = float(rng.uniform(0.0, 0.6))
+            pose = at(x + width / 2, front - road_side * setback, 0)
+            parts += placed(house(rng, width, float(rng.uniform(9, 13)), road_side), pose)
+            x += width
+            if rng.random() < 0.2:
+                gap = float(rng.uniform(3, 6))
+                behind = house(rng, gap + 10, 10, road_side)
+                parts += placed(behind, at(x + gap / 2, front - road_side * 15, 0))
+                x += gap
+    y = layout.KERB_RIGHT - 12.0
+    while y < layout.KERB_LEFT + 12:
+        width = float(rng.uniform(9, 14))
+        # Turned by a quarter: the front looks back along the street.
+        parts += placed(house(rng, width, 10, 1), at(stop + 14, y + width / 2, 0, np.pi / 2))
+        y += width
+    return parts
+
+
+def _footway_things(seed: int, end: float) -> list[Part]:
+    """Trees, lamp posts and bins by turns along both kerbs."""
+    rng = stream(seed, "footway")
+    parts: list[Part] = []
+    for side, y in ((1, layout.KERB_RIGHT - 0.75), (-1, layout.KERB_LEFT + 0.75)):
+        x, turn = -12.0 + float(rng.uniform(0, 6)), int(rng.integers(3))
+        while x < end + layout.AHEAD - 15:
+            is_lamp = turn % 3 == 2
+            thing = lamp_post(side) if is_lamp else tree(rng)
+            parts += placed(thing, at(x, y, layout.KERB_HEIGHT))
+            if rng.random() < 0.25:
+                parts += placed(bin_box(rng), at(x + 1.6, y, layout.KERB_HEIGHT))
+            x, turn = x + float(rng.uniform(6.5, 10)), turn + 1
+    return parts
+
+
+def _parked_cars(settings: StreetSettings, end: float) -> list[Actor]:
+    """Cars in randomly chosen places of both parking strips, most of them where the drive passes."""
+    rng = stream(settings.seed, "parked cars")
+    spacing = 6.4
+    places = [
+        (row * spacing + shift, y, heading)
+        for y, heading, shift in ((layout.PARKING_RIGHT, 0.0, -1.0), (layout.PARKING_LEFT, np.pi, 2.0))
+        for row in range(max(int((end + 45) / spacing), (settings.num_parked_cars + 1) // 2))
+    ]
+    chosen = sorted(rng.choice(len(places), size=settings.num_parked_cars, replace=False))
+    actors = []
+    for number, place in enumerate(chosen):
+        x, y, heading = places[place]
+        path = Path(
+            start=x + float(rng.uniform(-0.4, 0.4)),
+            y=y + float(rng.uniform(-0.12, 0.12)),
+            speed=0.0,
+            rest_heading=heading + float(rng.uniform(-0.03, 0.03)),
+        )
+        actors.append(Actor(f"parked_{number:02d}", random_car(rng), path, 0.0))
+    return actors
+
+
+def _moving_cars(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
+    """Oncoming and overtaking by turns. All of one kind share a speed and keep a distance, so none can collide."""
+    rng = stream(settings.seed, "moving cars")
+    oncoming, overtaking = -float(rng.uniform(8, 11)), settings.ego_speed + float(rng.uniform(3.5, 5))
+    spacing = 11.0
+    last = {oncoming: -np.inf, overtaking: np.inf}
+    actors = []
+    for number in range(settings.num_moving_cars):
+        # When the car is beside the ego car: spread evenly over the drive.
+        meeting = settings.duration * (number + 0.7) / max(settings.num_moving_cars, 1)
+        beside = float(ego.pose(meeting)[0, 3])
+        if number % 2 == 0:
+            speed, lane, wanted = oncoming, layout.ONCOMING_LANE, beside - oncoming * meeting
+            start = max(wanted + 6, last[speed] + spacing)
+            shift, shift_time = float(rng.uniform(-0.5, 0.5)), meeting
+        else:
+            speed, lane, wanted = overtaking, layout.OVERTAKING_LANE, beside - overtaking * meeting
+            start = min(wanted, last[speed] - spacing)
+            # Back into the ego lane once well ahead.
+            shift, shift_time = layout.EGO_LANE - layout.OVERTAKING_LANE, meeting + 14 / (speed - settings.ego_speed)
+        last[speed] = start
+        path = Path(start, lane + float(rng.uniform(-0.2, 0.2)), speed, shift, shift_time)
+        actors.append(Actor(f"moving_{number:02d}", random_car(rng), path, 0.0))
+    return actors
+
+
+def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
+    """People on both footways, each on a line of their own between the trees and the houses."""
+    rng = stream(settings.seed, "pedestrians")
+    actors = []
+    for number in range(settings.num_pedestrians):
+        on_right = number % 2 == 0
+        lane = float(rng.uniform(1.3, 2.9))
+        y = layout.KERB_RIGHT - lane if on_right else layout.KERB_LEFT + lane
+        speed = float(rng.uniform(0.9, 1.6)) * (1 if rng.random() < 0.5 else -1)
+        share = (number + float(rng.uniform(0.2, 0.8))) / settings.num_pedestrians
+        path = Path(start=6 + share * (end + 18), y=y, speed=speed)
+        actors.append(Actor(f"pedestrian_{number:02d}", random_pedestrian(rng), path, layout.KERB_HEIGHT))
+    return actors
+
+
+def _cyclists(settings: StreetSettings) -> list[Actor]:
+    """Cyclists in the lane to the right of the ego car, one after the other at one speed; the ego car passes them."""
+    rng = stream(settings.seed, "cyclists")
+    speed = settings.ego_speed * float(rng.uniform(0.5, 0.65))
+    actors = []
+    for number in range(settings.num_cyclists):
+        path = Path(9 + 8 * number + float(rng.uniform(0, 4)), layout.CYCLE_LANE + float(rng.uniform(-0.2, 0.2)), speed)
+        actors.append(Actor(f"cyclist_{number:02d}", random_cyclist(rng), path, 0.0))
+    return actors

@@ -1,0 +1,119 @@
+"""Frames of a street on disk: DriveStudio's processed layout in its nuScenes flavour, and the exact truth beside it."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int16
+from PIL import Image
+
+from sparsestreet.data.synthetic.parts import Pose
+from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.world import Actor, World
+
+MINIMUM_PIXELS = 6
+MINIMUM_RETURNS = 3
+"""An object is annotated where at least so many pixels (of all cameras) or lidar returns fall on it."""
+
+HUMAN_CLASSES = ("Pedestrian", "Cyclist")
+VEHICLE_CLASSES = ("Vehicle",)
+
+
+@dataclass
+class StreetWriter:
+    """Writes frames in order; ids of instances are given in order of first appearance."""
+
+    root: Path
+    settings: StreetSettings
+    world: World
+    _ids: dict[int, int] = field(default_factory=dict)
+    """Id of every actor annotated so far, by its position in the world."""
+    _instances: dict[str, dict] = field(default_factory=dict)
+    _frames: dict[str, list[int]] = field(default_factory=dict)
+
+    def write_frame(self, frame: StreetFrame) -> None:
+        annotated = self._annotate(frame)
+        for camera, image in enumerate(frame.images):
+            self._write_image(image, f"{frame.index:03d}_{camera}", annotated)
+            if frame.index == 0:
+                self._write_intrinsics(image, camera)
+        frame.sweep.points.tofile(self._file("lidar", f"{frame.index:03d}.bin"))
+        np.savetxt(self._file("lidar_pose", f"{frame.index:03d}.txt"), frame.sweep.world_from_lidar)
+        for offset, image in frame.novel.items():
+            folder, name = f"novel/{offset:g}m", f"{frame.index:03d}_0"
+            Image.fromarray(image.rgb).save(self._file(f"{folder}/images", f"{name}.png"))
+            np.savetxt(self._file(f"{folder}/extrinsics", f"{name}.txt"), image.camera.world_from_camera)
+
+    def finish(self) -> None:
+        """The files about the whole drive."""
+        self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
+        self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
+        times = np.arange(self.settings.num_frames) / self.settings.frame_rate
+        np.savetxt(self.root / "timestamps.txt", times, fmt="%.6f")
+
+    def _file(self, folder: str, name: str) -> Path:
+        (self.root / folder).mkdir(parents=True, exist_ok=True)
+        return self.root / folder / name
+
+    def _annotate(self, frame: StreetFrame) -> list[int]:
+        """Records the boxes of this frame; answers with the annotated actors."""
+        actors = self.world.actors
+        pixels, returns = np.zeros(len(actors), int), np.zeros(len(actors), int)
+        for image in frame.images:
+            pixels += _count(image.object_indices, len(actors))
+        returns += _count(frame.sweep.object_indices, len(actors))
+        seen = (pixels >= MINIMUM_PIXELS) | (returns >= MINIMUM_RETURNS)
+        ego = frame.world_from_ego[:2, 3]
+        annotated = [
+            index
+            for index, pose in enumerate(frame.actor_poses)
+            if seen[index] and np.linalg.norm(pose[:2, 3] - ego) <= self.settings.annotation_range
+        ]
+        for index in annotated:
+            self._record(index, actors[index], frame.index, frame.actor_poses[index])
+        self._frames[str(frame.index)] = [self._ids[index] for index in annotated]
+        return annotated
+
+    def _record(self, index: int, actor: Actor, frame: int, pose: Pose) -> None:
+        key = str(self._ids.setdefault(index, len(self._ids)))
+        empty = {"frame_idx": [], "obj_to_world": [], "box_size": []}
+        blank = {"id": actor.name, "class_name": actor.model.class_name, "frame_annotations": empty}
+        notes = self._instances.setdefault(key, blank)["frame_annotations"]
+        notes["frame_idx"].append(frame)
+        notes["obj_to_world"].append(pose.tolist())
+        notes["box_size"].append(list(actor.model.size))
+
+    def _write_image(self, image: StreetImage, name: str, annotated: list[int]) -> None:
+        picture = Image.fromarray(image.rgb)
+        # 4:4:4: halved colour would smear the edges that a 320-pixel image has few pixels for.
+        picture.save(self._file("images", f"{name}.jpg"), quality=97, subsampling=0)
+        np.savetxt(self._file("extrinsics", f"{name}.txt"), image.camera.world_from_camera)
+        _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)
+        classes = {index: self.world.actors[index].model.class_name for index in annotated}
+        for folder, members in (
+            ("all", HUMAN_CLASSES + VEHICLE_CLASSES), ("human", HUMAN_CLASSES), ("vehicle", VEHICLE_CLASSES),
+        ):  # fmt: skip
+            chosen = [index for index, class_name in classes.items() if class_name in members]
+            mask = np.isin(image.object_indices, np.array(chosen, np.int16))
+            _write_mask(self._file(f"dynamic_masks/{folder}", f"{name}.png"), mask)
+        ids = np.full(len(self.world.actors) + 1, -1, np.int16)  # the last entry answers for BACKGROUND = -1
+        for index in annotated:
+            ids[index] = self._ids[index]
+        truth = self._file("depth", f"{name}.npz")
+        np.savez_compressed(truth, depth=image.depth, instance=ids[image.object_indices])
+
+    def _write_intrinsics(self, image: StreetImage, camera: int) -> None:
+        k = image.camera.intrinsics
+        values = [k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0]
+        np.savetxt(self._file("intrinsics", f"{camera}.txt"), values)
+
+
+def _count(indices: Int16[np.ndarray, "..."], actors: int) -> np.ndarray:
+    """How often each actor's index occurs."""
+    return np.bincount(indices[indices >= 0], minlength=actors)
+
+
+def _write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
+    Image.fromarray(mask.astype(np.uint8) * 255).save(path)
