@@ -23,7 +23,7 @@ Legend = Mapping[str, tuple[int, int, int]]
 _INFERNO = np.array(
     [
         (0, 0, 4), (11, 7, 36), (33, 12, 74), (61, 9, 101), (87, 16, 110), (113, 25, 110), (138, 34, 106),
-        (163, 44, 97), (188, 55, 84), (209, 70, 68), (228, 90, 49), (241, 115, 29), (249, 142, 9), (252, 172, 17),
+        (163, 44, 97), (188, 55, 84), (210, 70, 68), (228, 90, 49), (241, 115, 29), (249, 142, 9), (252, 172, 17),
         (249, 203, 53), (242, 234, 105), (252, 255, 164),
     ],
     dtype=np.float64,
@@ -185,7 +185,7 @@ def _sheet(
         raise ValueError("a sheet needs at least one picture")
     heights = [max(_fitted(tile.image, tile_width).height for tile in line if tile) for line in lines]
     width = max(len(line) for line in lines) * (tile_width + _GAP) - _GAP + 2 * _MARGIN
-    paper = Image.new("RGB", (width, 3 * _HEADING + sum(heights) + len(lines) * _HEADING), _PAPER)
+    paper = Image.new("RGB", (width, _HEADING + sum(heights) + (len(lines) + (3 if legend else 2)) * _HEADING), _PAPER)
     draw = ImageDraw.Draw(paper)
     _write(draw, (_MARGIN, 5), title, _INK, 16, width - 2 * _MARGIN)
     top = _HEADING
@@ -196,22 +196,24 @@ def _sheet(
                 _write(draw, (x, top + 6), tile.heading, _INK, 14, tile_width)
                 paper.paste(_fitted(tile.image, tile_width), (x, top + _HEADING))
         top += _HEADING + height
-    x = _draw_scale(paper, draw, _MARGIN, top + 18)
-    _draw_legend(draw, legend, x + 40, top + 18)
+    _draw_scale(paper, draw, _MARGIN, top + 14)
+    _draw_legend(draw, legend, _MARGIN, top + 14 + _HEADING)
     return np.asarray(paper)
 
 
-def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int) -> int:
-    """The error colours with their values; returns where the drawing ends."""
+def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int) -> None:
+    """The error colours with their values."""
     x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
     bar = colour_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
     paper.paste(Image.fromarray(bar), (x, y))
     draw.rectangle((x - 1, y - 1, x + 160, y + 16), outline=_QUIET)
-    return _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13)
+    _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13)
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:
     """The node classes in the colours of their centres."""
+    if legend:
+        x = _write(draw, (x, y), "centres:", _QUIET, 13) + 12
     for name, colour in legend.items():
         draw.rectangle((x, y + 3, x + 10, y + 13), fill=colour)
         x = _write(draw, (x + 16, y), name, _QUIET, 13) + 20

@@ -102,8 +102,10 @@ def choose_pictures(quality: Sequence[FrameQuality], count: int) -> list[int]:
             chosen.append(index)
             instants.add(quality[index].frame)
     remaining = [index for index in range(len(quality)) if index not in chosen]
-    spaced = np.linspace(0, len(remaining) - 1, count - len(chosen) + 2)[1:-1].round().astype(int)
-    return sorted(chosen + [remaining[index] for index in spaced])
+    wanted = count - len(chosen)
+    # The middle of each of ``wanted`` equal stretches; there are at least as many images left, so none repeats.
+    spaced = [remaining[(2 * stretch + 1) * len(remaining) // (2 * wanted)] for stretch in range(wanted)]
+    return sorted(chosen + spaced)
 
 
 def _vehicle_pixels(image: FrameQuality) -> int:
