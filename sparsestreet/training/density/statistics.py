@@ -72,8 +72,11 @@ class DensityStatistics:
         """For a checkpoint: a run resumed between two refinements densifies as the uninterrupted one."""
         return {"gradient_sum": self.gradient_sum, "visits": self.visits, "largest_screen": self.largest_screen}
 
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+    @staticmethod
+    def from_state(state: dict[str, Tensor]) -> "DensityStatistics":
         """Continue from a checkpoint, with as many rows as it has."""
-        self.gradient_sum = state["gradient_sum"].clone()
-        self.visits = state["visits"].clone()
-        self.largest_screen = state["largest_screen"].clone()
+        statistics = DensityStatistics(state["visits"].shape[0])
+        statistics.gradient_sum = state["gradient_sum"].clone()
+        statistics.visits = state["visits"].clone()
+        statistics.largest_screen = state["largest_screen"].clone()
+        return statistics

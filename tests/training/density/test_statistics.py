@@ -61,8 +61,7 @@ def test_reset_keeps_the_rows():
 def test_a_checkpoint_continues_where_it_was_with_its_own_number_of_rows():
     statistics = DensityStatistics(3)
     statistics.add(torch.rand(3, 2), torch.tensor([1.0, 0.0, 2.0]), 7, 5)
-    resumed = DensityStatistics(1)
-    resumed.load_state_dict(statistics.state_dict())
+    resumed = DensityStatistics.from_state(statistics.state_dict())
     view = (torch.rand(3, 2), torch.ones(3), 7, 5)
     statistics.add(*view)
     resumed.add(*view)

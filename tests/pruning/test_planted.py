@@ -1,0 +1,116 @@
+"""Planted truth in a hand-made scene: an opaque wall of tiles before a slab, seen by several cameras."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
+from sparsestreet.pruning import keep_by_importance, measure_importance
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.types import Camera
+from tests.pruning.planted import NOTICEABLE, Views, activated, contributions_of, joint_change, judge, plant
+
+BACKEND = "reference"
+RECALL, VISIBLE_LOST = 0.95, 0.02
+
+
+def wall(generator: torch.Generator) -> Rows:
+    """8 x 6 tiles of 0.4 m before three layers of a dark opaque slab at 5 m (metres, z forward)."""
+    x, y = torch.meshgrid(torch.arange(8) * 0.4 - 1.4, torch.arange(6) * 0.4 - 1.0, indexing="ij")
+    tiles = torch.stack((x, y, torch.full_like(x, 5.0)), dim=-1).reshape(-1, 3)
+    slab = torch.tensor([[0.0, 0.0, 5.2], [0.0, 0.0, 5.3], [0.0, 0.0, 5.4]])
+    means = torch.cat((tiles, slab))
+    scales = torch.cat(
+        (torch.tensor([[0.16, 0.16, 0.02]]).expand(len(tiles), 3), torch.tensor([[30.0, 30.0, 0.01]]).expand(3, 3))
+    )
+    sh_dc = torch.cat((torch.rand(len(tiles), 1, 3, generator=generator) * 3 - 1.5, torch.full((3, 1, 3), -0.8)))
+    opacities = torch.cat((torch.full((len(tiles),), 0.95), torch.full((3,), 0.999)))
+    quaternions = torch.zeros(len(means), 4)
+    quaternions[:, 0] = 1
+    return Rows(
+        {
+            "means": means,
+            "log_scales": scales.log(),
+            "quaternions": quaternions,
+            "opacity_logits": opacities.logit(),
+            "sh_dc": sh_dc,
+            "sh_rest": torch.zeros(len(means), 0, 3),
+            "mask_logits": torch.ones(len(means)),
+        }
+    )
+
+
+def cameras() -> list[Camera]:
+    """Three cameras, turned a little, the last one nearer."""
+    intrinsics = torch.tensor([[40.0, 0.0, 23.5], [0.0, 40.0, 17.5], [0.0, 0.0, 1.0]])
+    views = []
+    for x, z, yaw in ((-1.0, 0.0, 0.15), (1.0, 0.0, -0.2), (0.3, 1.5, 0.05)):
+        camera_from_world = torch.eye(4)
+        rotation = to_matrix(from_rotation_vector(torch.tensor([0.0, yaw, 0.0]))).T
+        camera_from_world[:3, :3] = rotation
+        camera_from_world[:3, 3] = -rotation @ torch.tensor([x, 0.0, z])
+        views.append(Camera(camera_from_world, intrinsics, 47, 35))
+    return views
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Hundreds of tiny renderings: on a busy machine threads would mostly wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def planted_wall() -> tuple[Rows, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return plant(wall(generator), cameras(), generator, hidden=40, copies=10, backend=BACKEND)
+
+
+def test_planted_rows_are_useless_and_keep_the_others(planted_wall):
+    rows, planted = planted_wall
+    original = wall(torch.Generator().manual_seed(0))
+    assert int(planted.sum()) == 50
+    assert torch.equal(rows.means[~planted], original.means)
+    views = Views(activated(rows), cameras(), BACKEND)
+    assert not views.visible(torch.nonzero(planted).squeeze(-1)).any()
+    # All fifty at once: each alone moves less than one step, those before the same pixel add up.
+    assert joint_change(rows, planted, cameras(), BACKEND) < 3 * NOTICEABLE
+
+
+def test_zero_importance_removes_what_was_planted_and_nothing_visible(planted_wall):
+    rows, planted = planted_wall
+    visible = Views(activated(rows), cameras(), BACKEND).visible(torch.nonzero(~planted).squeeze(-1))
+    scores = measure_importance(contributions_of(rows, cameras(), BACKEND))
+    verdict = judge(keep_by_importance(scores, minimum_rows=0).keep, planted, visible)
+    assert verdict.num_visible == 49  # every tile and the front of the slab
+    assert verdict.recall >= RECALL
+    assert verdict.visible_lost <= VISIBLE_LOST
+
+
+def test_without_the_gate_most_of_them_stay(planted_wall):
+    """The test above can fail: touching one pixel faintly is enough to score."""
+    rows, planted = planted_wall
+    scores = measure_importance(contributions_of(rows, cameras(), BACKEND), gate=False)
+    keep = keep_by_importance(scores, minimum_rows=0).keep
+    assert float((planted & ~keep).sum()) / 50 < RECALL
+
+
+def test_a_judge_needs_a_truth():
+    some, none = torch.tensor([True, False]), torch.zeros(2, dtype=torch.bool)
+    assert judge(~some, some, ~some).recall == 1.0
+    assert judge(some, some, ~some).visible_lost == 1.0
+    with pytest.raises(ValueError, match="planted"):
+        judge(some, none, some)
+    with pytest.raises(ValueError, match="planted"):
+        judge(some, some, some)
+
+
+def test_a_transparent_scene_hides_nothing():
+    rows = wall(torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        rows.opacity_logits.fill_(-2.0)
+    with pytest.raises(ValueError, match="no opaque pixel"):
+        plant(rows, cameras(), torch.Generator().manual_seed(0), hidden=3, copies=0, backend=BACKEND)
