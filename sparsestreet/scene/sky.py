@@ -34,7 +34,7 @@ class Sky(nn.Module):
 
     texels: Float[Tensor, "6 r r 3"]
 
-    def __init__(self, settings: SkySettings = SkySettings()) -> None:  # noqa: B008 (frozen)
+    def __init__(self, settings: SkySettings = SkySettings()) -> None:
         super().__init__()
         if settings.resolution < 1:
             raise ValueError(f"a cube map needs at least one texel a side, got resolution {settings.resolution}")

@@ -11,12 +11,9 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes.background import Background
 from sparsestreet.scene.seeds.boxes import moving_tracks, outside_boxes
-from sparsestreet.scene.seeds.points import Points, far_positions, near_positions, seen_points
+from sparsestreet.scene.seeds.points import Points, far_positions, near_positions, random_points
 from sparsestreet.scene.seeds.rows import MINIMUM_SCALE, neighbour_scales, seed_rows
 from sparsestreet.types import Frame
-
-CANDIDATES_PER_POINT = 3
-"""Random positions drawn for each one wanted, since most lie in no view (DriveStudio)."""
 
 LARGEST_SCALE_RATIO = 0.05
 """Of a seed's distance from the centre, or of the scene's radius if that is more: 3 degrees as seen from within."""
@@ -32,7 +29,7 @@ class BackgroundSeeds:
     sh_degree: int = 3
     mask: StaticMask | None = None
     initial_opacity: float = 0.1
-    moving_travel: float = 1.0
+    minimum_travel: float = 1.0
     """Metres; objects that travel farther leave no points in the background."""
     moving_classes: Sequence[str] | None = None
     """Classes that may move; None: all."""
@@ -47,19 +44,18 @@ class BackgroundSeeds:
         Raises ValueError if there is not a single point to start from.
         """
         center = torch.as_tensor(log.center, dtype=torch.float32)
-        near = near_positions(CANDIDATES_PER_POINT * self.near_points, center, log.radius, generator)
-        far = far_positions(CANDIDATES_PER_POINT * self.far_points, center, log.radius, generator)
         points = Points.concatenate(
             [
                 self._lidar(log, held_out).sampled(self.lidar_points, generator),
-                seen_points(near, train_frames).sampled(self.near_points, generator),
-                seen_points(far, train_frames).sampled(self.far_points, generator),
+                random_points(near_positions, self.near_points, center, log.radius, train_frames, generator),
+                random_points(far_positions, self.far_points, center, log.radius, train_frames, generator),
             ]
         )
         if len(points) == 0:
             raise ValueError(
-                f"the background of {log.name!r} has no seeds: no coloured lidar point and none of {len(near)} near "
-                f"and {len(far)} far random points is seen by a training view; raise near_points or check the poses"
+                f"the background of {log.name!r} has no seeds: no coloured lidar point of a training sweep, and no "
+                f"random point (near_points={self.near_points}, far_points={self.far_points}) is seen by one of "
+                f"{len(train_frames)} training views; raise near_points, or check the poses of the cameras"
             )
         scales = torch.minimum(
             neighbour_scales(points.positions), _largest_scales(points.positions, center, log.radius)
@@ -77,7 +73,7 @@ class BackgroundSeeds:
 
     def _lidar(self, log: DrivingLog, held_out: frozenset[int]) -> Points:
         """Coloured returns of the training sweeps that lie in no moving box of their instant."""
-        moving = moving_tracks(log.tracks, self.moving_travel, self.moving_classes)
+        moving = moving_tracks(log.tracks, self.minimum_travel, self.moving_classes)
         parts = []
         for sweep in log.sweeps:
             if sweep.index not in held_out:

@@ -1,6 +1,6 @@
 """Coloured points in the world: what lidar saw, and random guesses where it saw nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +12,12 @@ from sparsestreet.types import Frame
 
 FARTHEST_RATIO = 0.02
 """Far points are drawn at radius / u with u from here to 1 (DriveStudio): out to 50 times the scene's radius."""
+
+CANDIDATES_PER_POINT = 3
+"""Random positions drawn at once for each one wanted, since most lie in no view (DriveStudio)."""
+
+ROUNDS = 10
+"""Draws before a scene whose cameras see a small part of the space makes do with fewer points."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,24 @@ def far_positions(
     """In uniform directions at distance radius / u, u uniform: density falls with the distance."""
     u = FARTHEST_RATIO + (1 - FARTHEST_RATIO) * torch.rand(count, 1, generator=generator)
     return center + radius / u * _directions(count, generator)
+
+
+def random_points(
+    draw: Callable[[int, Tensor, float, torch.Generator], Tensor],
+    count: int,
+    center: Float[Tensor, "3"],
+    radius: float,
+    frames: Sequence[Frame],
+    generator: torch.Generator,
+) -> Points:
+    """``count`` points of the distribution ``draw`` that the frames see; fewer if they see too little of it."""
+    found = Points.concatenate([])
+    for _ in range(ROUNDS):
+        if len(found) >= count:
+            break
+        candidates = draw(CANDIDATES_PER_POINT * count, center, radius, generator)
+        found = Points.concatenate([found, seen_points(candidates, frames)])
+    return found.sampled(count, generator)
 
 
 def seen_points(positions: Float[Tensor, "n 3"], frames: Sequence[Frame]) -> Points:

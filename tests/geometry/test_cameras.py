@@ -1,0 +1,51 @@
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparsestreet.geometry.cameras import project, ray_directions
+from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
+from sparsestreet.types import Camera
+
+
+def camera_of(seed: int, width: int = 13, height: int = 7) -> Camera:
+    generator = torch.Generator().manual_seed(seed)
+    camera_from_world = torch.eye(4, dtype=torch.float64)
+    camera_from_world[:3, :3] = to_matrix(from_rotation_vector(torch.randn(3, generator=generator).double()))
+    camera_from_world[:3, 3] = torch.randn(3, generator=generator).double()
+    intrinsics = torch.tensor([[11.0, 0.0, 6.1], [0.0, 12.0, 3.7], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return Camera(camera_from_world, intrinsics, width, height)
+
+
+def test_a_point_by_hand():
+    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 8.0], [0, 20.0, 6.0], [0, 0, 1]]), 16, 12)
+    pixels, depth, inside = project(camera, torch.tensor([[1.0, -0.5, 5.0], [0.0, 0.0, -1.0], [9.0, 0.0, 10.0]]))
+    torch.testing.assert_close(pixels[0], torch.tensor([10.0, 4.0]))
+    assert depth.tolist() == [5.0, -1.0, 10.0]
+    assert inside.tolist() == [True, False, False]  # behind; 17 pixels to the right of 16
+
+
+def test_the_image_ends_before_its_width():
+    camera = Camera(torch.eye(4), torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1]]), 4, 3)
+    points = torch.tensor([[0.0, 0.0, 1.0], [4.0, 1.0, 1.0], [3.999, 2.999, 1.0], [1.0, 3.0, 1.0], [-0.001, 1.0, 1.0]])
+    assert project(camera, points)[2].tolist() == [True, False, True, False, False]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.5, 100.0))
+def test_rays_project_onto_their_pixel_centres(seed: int, distance: float):
+    camera = camera_of(seed)
+    directions = ray_directions(camera)
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(7, 13, dtype=torch.float64))
+    points = camera.position + distance * directions.reshape(-1, 3)
+    pixels, depth, inside = project(camera, points)
+    row, column = torch.meshgrid(torch.arange(7).double() + 0.5, torch.arange(13).double() + 0.5, indexing="ij")
+    expected = torch.stack((column, row), dim=-1).reshape(-1, 2)
+    visible = depth > 0.2
+    assert torch.equal(inside, visible)
+    torch.testing.assert_close(pixels[visible], expected[visible], atol=1e-9, rtol=0)
+
+
+def test_no_points():
+    pixels, depth, inside = project(camera_of(0), torch.zeros(0, 3, dtype=torch.float64))
+    assert pixels.shape == (0, 2)
+    assert depth.shape == inside.shape == (0,)

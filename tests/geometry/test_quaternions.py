@@ -1,0 +1,135 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
+
+from sparsestreet.geometry import quaternions as quat
+
+# Rotation vectors up to two turns, and tiny ones, where sines and norms are delicate.
+components = st.one_of(st.floats(-12, 12), st.floats(-1e-6, 1e-6))
+vectors = st.tuples(components, components, components).map(lambda v: torch.tensor(v, dtype=torch.float64))
+examples = settings(max_examples=60, deadline=None)
+
+
+def scipy_of(quaternion: Tensor) -> Rotation:
+    return Rotation.from_quat(quaternion.roll(-1, -1).numpy())  # scipy is xyzw
+
+
+def assert_same_rotation(a: Tensor, b: Tensor, tolerance: float = 1e-9) -> None:
+    """Unit quaternions up to their sign."""
+    assert min(float((a - b).abs().max()), float((a + b).abs().max())) < tolerance
+
+
+@examples
+@given(vectors)
+def test_exponential_map_is_scipys(vector: Tensor):
+    quaternion = quat.from_rotation_vector(vector)
+    assert_same_rotation(quaternion, torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_quat()).roll(1))
+    assert abs(float(quaternion.norm()) - 1) < 1e-12
+
+
+@examples
+@given(vectors, st.floats(1e-3, 1e3))
+def test_matrix_is_scipys_for_any_length(vector: Tensor, length: float):
+    quaternion = quat.from_rotation_vector(vector)
+    expected = torch.from_numpy(scipy_of(quaternion).as_matrix())
+    torch.testing.assert_close(quat.to_matrix(length * quaternion), expected, atol=1e-12, rtol=0)
+
+
+@examples
+@given(vectors)
+def test_matrix_and_back(vector: Tensor):
+    quaternion = quat.from_rotation_vector(vector)
+    back = quat.from_matrix(quat.to_matrix(quaternion))
+    assert_same_rotation(back, quaternion)
+    assert back[0] >= 0
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (0, -1, 1), (1, 1, 1)])
+@pytest.mark.parametrize("offset", [0.0, 1e-9, -1e-9, 1e-4])
+def test_matrix_and_back_near_half_turns(axis: tuple[int, int, int], offset: float):
+    """The trace is -1 there and w nearly 0: the formula that divides by w fails."""
+    unit = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
+    quaternion = quat.from_rotation_vector((math.pi + offset) * unit)
+    assert_same_rotation(quat.from_matrix(quat.to_matrix(quaternion)), quaternion)
+
+
+@examples
+@given(vectors, vectors, vectors)
+def test_products_are_those_of_matrices_and_associate(u: Tensor, v: Tensor, w: Tensor):
+    a, b, c = (quat.from_rotation_vector(vector) for vector in (u, v, w))
+    product = quat.to_matrix(quat.multiply(a, b))
+    torch.testing.assert_close(product, quat.to_matrix(a) @ quat.to_matrix(b), atol=1e-12, rtol=0)
+    left, right = quat.multiply(quat.multiply(a, b), c), quat.multiply(a, quat.multiply(b, c))
+    torch.testing.assert_close(left, right, atol=1e-12, rtol=0)
+    inverse = a * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
+    assert_same_rotation(quat.multiply(a, inverse), torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+
+
+@examples
+@given(vectors, vectors, st.floats(0, 1), st.booleans())
+def test_slerp_is_scipys_whatever_the_sign(u: Tensor, v: Tensor, fraction: float, flip: bool):
+    a, b = quat.from_rotation_vector(u), quat.from_rotation_vector(v)
+    if abs(float((a * b).sum())) < 1e-6:  # half a turn apart: both ways are equally short
+        return
+    rotations = Rotation.concatenate([scipy_of(a), scipy_of(b)])
+    expected = torch.from_numpy(Slerp([0, 1], rotations)(fraction).as_quat()).roll(1)
+    result = quat.slerp(a, -b if flip else b, torch.tensor(fraction, dtype=torch.float64))
+    # Below 1.8 degrees (half angle) a normalised lerp stands in, which differs by less than 1e-6.
+    assert_same_rotation(result, expected, 1e-6)
+    assert abs(float(result.norm()) - 1) < 1e-12
+
+
+def test_slerp_meets_its_ends():
+    a = quat.from_rotation_vector(torch.tensor([[0.3, -1.0, 2.0]]).double())
+    b = quat.from_rotation_vector(torch.tensor([[-0.5, 0.2, 0.1]]).double())
+    assert_same_rotation(quat.slerp(a, b, torch.zeros(1).double()), a)
+    assert_same_rotation(quat.slerp(a, b, torch.ones(1).double()), b)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-4, 1e-3, 0.5, 3.0])
+def test_gradients_of_the_exponential_map(size: float):
+    vector = size * torch.tensor([[0.6, -0.64, 0.48]], dtype=torch.float64)
+    assert torch.autograd.gradcheck(quat.from_rotation_vector, [vector.requires_grad_()])
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.01, 0.1, 2.0, 3.1])
+def test_gradients_of_slerp(angle: float):
+    a = quat.from_rotation_vector(torch.tensor([[0.1, 0.2, 0.3]]).double())
+    b = quat.multiply(quat.from_rotation_vector(torch.tensor([[0.0, angle, 0.0]]).double()), a)
+    fraction = torch.tensor([0.3], dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda p, q: quat.slerp(p, q, fraction), [a.requires_grad_(), b.requires_grad_()])
+
+
+def test_gradients_of_matrix_and_product():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(3, 4, generator=generator, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    assert torch.autograd.gradcheck(quat.to_matrix, [a])
+    assert torch.autograd.gradcheck(quat.multiply, [a, b])
+
+
+def test_a_zero_quaternion_is_the_identity_without_gradient():
+    for dtype in (torch.float32, torch.float64):
+        quaternion = torch.zeros(2, 4, dtype=dtype, requires_grad=True)
+        matrix = quat.to_matrix(quaternion)
+        assert torch.equal(matrix, torch.eye(3, dtype=dtype).expand(2, 3, 3))
+        generator = torch.Generator().manual_seed(0)
+        (gradient,) = torch.autograd.grad(matrix, quaternion, torch.randn(2, 3, 3, generator=generator, dtype=dtype))
+        assert (gradient == 0).all()
+
+
+def test_tiny_and_huge_quaternions_normalise():
+    for length in (1e-15, 1e15):
+        quaternion = length * torch.tensor([[1.0, -1.0, 1.0, 1.0]])
+        torch.testing.assert_close(quat.normalized(quaternion), torch.tensor([[0.5, -0.5, 0.5, 0.5]]))
+
+
+def test_batches_and_empty_batches():
+    assert quat.to_matrix(torch.ones(2, 0, 4)).shape == (2, 0, 3, 3)
+    assert quat.from_matrix(torch.eye(3).expand(4, 5, 3, 3)).shape == (4, 5, 4)
+    np.testing.assert_array_equal(quat.from_matrix(torch.eye(3)[None]).numpy(), [[1, 0, 0, 0]])

@@ -1,0 +1,134 @@
+import pytest
+import torch
+
+from sparsestreet.scene.gaussians import RowPlan, Rows
+from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.nodes import Background
+from tests.scene.street import random_rows
+
+MASK = StaticMask(weight=1.0, minimum_rows=0)
+
+
+def trained(count: int = 6, steps: int = 3) -> tuple[Rows, torch.optim.Adam]:
+    """Rows after a few Adam steps with gradients that differ in every entry."""
+    rows = random_rows(count, 0, mask=MASK, instances=torch.arange(count) % 3)
+    groups = [{"params": [parameter], "name": name} for name, parameter in rows.named_parameters()]
+    optimizer = torch.optim.Adam(groups, lr=0.01, eps=1e-15)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(steps):
+        for parameter in rows.parameters():
+            parameter.grad = torch.randn(parameter.shape, generator=generator)
+        optimizer.step()
+    return rows, optimizer
+
+
+def snapshot(rows: Rows, optimizer: torch.optim.Adam) -> tuple[dict, dict, dict]:
+    values = {name: column.detach().clone() for name, column in rows.columns().items()}
+    first = {name: optimizer.state[p]["exp_avg"].clone() for name, p in rows.named_parameters()}
+    second = {name: optimizer.state[p]["exp_avg_sq"].clone() for name, p in rows.named_parameters()}
+    return values, first, second
+
+
+def test_values_moments_and_buffers_follow_their_rows():
+    rows, optimizer = trained()
+    values, first, second = snapshot(rows, optimizer)
+    source = torch.tensor([5, 0, 0, 3])
+    fresh = torch.tensor([False, False, True, False])
+    new_means = torch.full((4, 3), 7.0)
+    rows.resize(RowPlan(source, fresh, {"means": new_means}, frozenset({"opacity_logits"})), optimizer)
+    assert len(rows) == 4
+    for name, column in rows.columns().items():
+        for new, old in enumerate(source.tolist()):
+            expected = new_means[new] if name == "means" else values[name][old]
+            assert torch.equal(column[new], expected), name
+    for name, parameter in rows.named_parameters():
+        state = optimizer.state[parameter]
+        for new, old in enumerate(source.tolist()):
+            zeroed = fresh[new] or name == "opacity_logits"
+            for key, before in (("exp_avg", first), ("exp_avg_sq", second)):
+                expected = torch.zeros_like(before[name][old]) if zeroed else before[name][old]
+                assert torch.equal(state[key][new], expected), (name, key)
+        assert float(state["step"]) == 3
+    assert len(optimizer.state) == sum(1 for _ in rows.parameters())
+    held = {id(p) for group in optimizer.param_groups for p in group["params"]}
+    assert held == {id(p) for p in rows.parameters()}
+
+
+def test_training_goes_on_as_if_removed_rows_had_never_been():
+    """Adam works entry by entry: what is kept must take the same path with and without the others."""
+    rows, optimizer = trained()
+    alone, alone_optimizer = trained()
+    kept = torch.tensor([True, False, True, True, False, True])
+    rows.resize(RowPlan.keep(kept), optimizer)
+    generator = torch.Generator().manual_seed(9)
+    for (_, small), (_, large) in zip(rows.named_parameters(), alone.named_parameters(), strict=True):
+        large.grad = torch.randn(large.shape, generator=generator)
+        small.grad = large.grad[kept].clone()
+    optimizer.step()
+    alone_optimizer.step()
+    for name, column in rows.columns().items():
+        assert torch.equal(column, alone.columns()[name][kept]), name
+
+
+def test_resizing_before_the_first_step_and_without_optimizer():
+    rows = random_rows(3, 0)
+    optimizer = torch.optim.Adam(rows.parameters())
+    rows.resize(RowPlan.keep(torch.tensor([True, False, True])), optimizer)
+    rows.resize(RowPlan.keep(torch.tensor([True, False])))
+    assert len(rows) == 1
+
+
+def test_all_rows_may_go():
+    rows, optimizer = trained()
+    rows.resize(RowPlan.keep(torch.zeros(6, dtype=torch.bool)), optimizer)
+    assert len(rows) == 0
+    for parameter in rows.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+
+
+def test_the_children_inherit_mask_and_instance():
+    rows, _ = trained()
+    logits, instances = rows.mask_logits.detach().clone(), rows.instances.clone()
+    source = torch.tensor([0, 1, 2, 3, 4, 5, 4, 4])
+    rows.resize(RowPlan(source, source != torch.arange(8)))
+    assert torch.equal(rows.mask_logits[6:], logits[[4, 4]])
+    assert torch.equal(rows.instances[6:], instances[[4, 4]])
+
+
+def test_an_unknown_edit_changes_nothing():
+    rows, optimizer = trained()
+    before = snapshot(rows, optimizer)[0]
+    plan = RowPlan(torch.tensor([0]), torch.tensor([False]), {"mean": torch.zeros(1, 3)})
+    with pytest.raises(KeyError, match="mean"):
+        rows.resize(plan, optimizer)
+    assert all(torch.equal(column, before[name]) for name, column in rows.columns().items())
+
+
+def test_an_edit_of_the_wrong_length_is_an_error():
+    rows = random_rows(3, 0)
+    with pytest.raises(ValueError, match="edit of 'means' has 2 rows, the plan has 1"):
+        rows.resize(RowPlan(torch.tensor([0]), torch.tensor([False]), {"means": torch.zeros(2, 3)}))
+
+
+def test_columns_of_different_lengths_are_an_error():
+    with pytest.raises(ValueError, match="same number of rows"):
+        Rows({"means": torch.zeros(2, 3), "opacity_logits": torch.zeros(3)})
+
+
+def test_a_dropped_column_leaves_the_optimizer():
+    rows, optimizer = trained()
+    logits = rows.mask_logits
+    rows.drop_column("mask_logits", optimizer)
+    assert "mask_logits" not in rows.columns()
+    assert logits not in optimizer.state
+    assert all(logits is not parameter for group in optimizer.param_groups for parameter in group["params"])
+
+
+def test_a_checkpoint_brings_its_own_number_of_rows():
+    saved = Background(random_rows(9, 3, mask=MASK), MASK)
+    resumed = Background(random_rows(2, 4, mask=MASK), MASK)
+    resumed.load_state_dict(saved.state_dict())
+    for name, column in saved.rows.columns().items():
+        assert torch.equal(resumed.rows.columns()[name], column)
+    assert all(parameter.requires_grad for parameter in resumed.parameters())

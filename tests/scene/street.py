@@ -1,0 +1,137 @@
+"""Small hand-made scenes, rows, cameras and logs; nothing touches the disk."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.geometry.transforms import inverse
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.nodes.knots import Knots
+from sparsestreet.types import Camera, Frame, Sweep, Track
+
+
+def random_rows(
+    count: int,
+    seed: int,
+    *,
+    sh_degree: int = 1,
+    mask: StaticMask | None = None,
+    instances: Tensor | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Rows:
+    """Rows with different values in every entry, a few metres around the origin."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    parameters = {
+        "means": normal(count, 3),
+        "log_scales": normal(count, 3) * 0.3 - 1.5,
+        "quaternions": normal(count, 4),
+        "opacity_logits": normal(count),
+        "sh_dc": normal(count, 1, 3),
+        "sh_rest": normal(count, (sh_degree + 1) ** 2 - 1, 3) * 0.3,
+    }
+    if mask is not None:
+        parameters["mask_logits"] = mask.initial_logits(count)
+    return Rows(parameters, {} if instances is None else {"instances": instances})
+
+
+def pose(yaw: float, translation: tuple[float, float, float]) -> Float[Tensor, "4 4"]:
+    """World-from-box: a turn about z (radians), then a shift (metres); float64."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    matrix[:2, :2] = torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
+    matrix[:3, 3] = torch.tensor(translation, dtype=torch.float64)
+    return matrix
+
+
+def track(
+    name: str,
+    frames: list[int],
+    poses: list[Tensor],
+    size: tuple[float, float, float] = (4.0, 2.0, 1.5),
+    class_name: str = "Car",
+) -> Track:
+    return Track(name, class_name, torch.tensor(frames), torch.stack(poses), torch.tensor(size))
+
+
+def knots(
+    tracks: list[Track], num_frames: int, held_out: frozenset[int] = frozenset(), dtype: torch.dtype = torch.float32
+) -> Knots:
+    made = Knots.from_tracks(tracks, held_out, num_frames)
+    return Knots(
+        made.times.to(dtype),
+        made.quaternions.to(dtype),
+        made.translations.to(dtype),
+        made.valid,
+        made.spans.to(dtype),
+    )
+
+
+def camera_at(x: float, width: int = 33, height: int = 21) -> Camera:
+    """At (x, 0, 1.5) m in a world with z up, looking along +x with 90 degrees of horizontal view."""
+    world_from_camera = torch.tensor(
+        [[0.0, 0.0, 1.0, x], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
+    )
+    focal = width / 2
+    intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(inverse(world_from_camera), intrinsics, width, height)
+
+
+CAR_COLOR = (0.9, 0.1, 0.2)
+ROAD_COLOR = (0.3, 0.4, 0.5)
+NUM_FRAMES = 5
+
+
+def car_pose(frame: int) -> Float[Tensor, "4 4"]:
+    """A car that drives 2 m a frame and turns 0.1 rad a frame."""
+    return pose(0.1 * frame, (8.0 + 2.0 * frame, 1.0, 0.75))
+
+
+def frame_at(index: int) -> Frame:
+    """The left half of every image is green, the right half blue; the top five rows are sky."""
+    camera = camera_at(0.5 * index)
+    image = torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8)
+    image[:, : camera.width // 2, 1] = 255
+    image[:, camera.width // 2 :, 2] = 255
+    sky = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    sky[:5] = True
+    return Frame(index, index / (NUM_FRAMES - 1), 0, camera, image, sky=sky)
+
+
+def sweep_at(index: int, car_points: int) -> Sweep:
+    """Points on the road ahead and inside the moving car, in their colours; the last point has no colour."""
+    generator = torch.Generator().manual_seed(index)
+    road = torch.rand(50, 3, generator=generator) * torch.tensor([25.0, 8.0, 0.0]) + torch.tensor([3.0, -10.0, 0.0])
+    in_box = (torch.rand(car_points, 3, generator=generator) - 0.5) * torch.tensor([3.9, 1.9, 1.4])
+    car = (in_box.double() @ car_pose(index)[:3, :3].T + car_pose(index)[:3, 3]).float()
+    points = torch.cat((road, car, torch.tensor([[-5.0, 0.0, 0.0]])))
+    colors = torch.tensor([ROAD_COLOR] * 50 + [CAR_COLOR] * car_points + [(0.5, 0.5, 0.5)])
+    colored = torch.ones(points.shape[0], dtype=torch.bool)
+    colored[-1] = False
+    return Sweep(index, points, colors, colored)
+
+
+def street_log(car_points: int = 60) -> DrivingLog:
+    """Five frames of one camera: a car that drives away, one that is parked, a cyclist."""
+    frames = list(range(NUM_FRAMES))
+    tracks = (
+        track("parked", frames, [pose(0.0, (10.0, -5.0, 0.7))] * NUM_FRAMES),
+        track("driving", frames, [car_pose(frame) for frame in frames]),
+        track("bicycle", [1, 2], [pose(0.0, (6.0, -2.0, 0.8)), pose(0.0, (9.0, -2.0, 0.8))], class_name="Cyclist"),
+    )
+    return DrivingLog(
+        name="hand-made",
+        frames=tuple(frame_at(index) for index in frames),
+        sweeps=tuple(sweep_at(index, car_points) for index in frames),
+        tracks=tracks,
+        num_frames=NUM_FRAMES,
+        num_cameras=1,
+        dataset_from_world=torch.eye(4, dtype=torch.float64),
+    )

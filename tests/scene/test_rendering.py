@@ -1,0 +1,132 @@
+import torch
+
+from sparsestreet.geometry.cameras import ray_directions
+from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.nodes import Background, Rigid
+from sparsestreet.scene.rendering import SceneRendering, render
+from sparsestreet.scene.sky import Sky, SkySettings
+from tests.scene.street import camera_at, knots, pose, random_rows, track
+
+MASK = StaticMask(weight=0.1, minimum_rows=0)
+CAMERA = camera_at(-6.0, width=17, height=11)
+
+
+def scene_of(road_rows: int = 9, car_rows: int = 5, mask: StaticMask | None = MASK, dtype=torch.float32) -> SceneGraph:
+    """A road about the origin, 6 m before the camera, a car that moves across, a sky of many colours."""
+    instances = torch.zeros(car_rows, dtype=torch.int64)
+    car = track("car", [0, 1], [pose(0.0, (0.0, -1.0, 1.0)), pose(0.4, (0.0, 1.0, 1.0))])
+    rows = random_rows(car_rows, 1, instances=instances, mask=mask, dtype=dtype)
+    cars = Rigid(rows, knots([car], 2, dtype=dtype), torch.ones(1, 3, dtype=dtype), mask, maximum_gap=1.0)
+    sky = Sky(SkySettings(4)).to(dtype)
+    with torch.no_grad():
+        sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
+    return SceneGraph({"road": Background(random_rows(road_rows, 0, mask=mask, dtype=dtype), mask), "cars": cars}, sky)
+
+
+def rendered(scene: SceneGraph, time: float = 0.5) -> SceneRendering:
+    return render(scene, CAMERA, time, backend="reference")
+
+
+def test_fields_and_shapes():
+    result = rendered(scene_of())
+    assert result.rgb.shape == (11, 17, 3)
+    assert result.alpha.shape == result.depth.shape == (11, 17)
+    assert result.rows == {"road": slice(0, 9), "cars": slice(9, 14)}
+    assert result.splats.radii.shape == (14,)
+    assert result.splats.visible.any()
+    assert 0.1 < result.alpha.max() <= 1
+    assert {name: term.scores.shape for name, term in result.mask_terms.items()} == {"road": (9,), "cars": (5,)}
+
+
+def test_the_sky_shines_through_what_alpha_leaves():
+    scene = scene_of()
+    with_sky = rendered(scene)
+    sky = scene.sky.colors(ray_directions(CAMERA))
+    scene.sky = None
+    over_black = rendered(scene)
+    expected = over_black.rgb + (1 - over_black.alpha[..., None]) * sky
+    torch.testing.assert_close(with_sky.rgb, expected, atol=1e-6, rtol=0)  # one float32 rounding
+
+
+def test_an_empty_scene_is_the_sky():
+    scene = scene_of(0, 0)
+    result = rendered(scene)
+    assert torch.equal(result.rgb, scene.sky.colors(ray_directions(CAMERA)))
+    assert (result.alpha == 0).all()
+
+
+def test_masked_rows_change_no_bit_of_the_image_when_they_go():
+    scene = scene_of()
+    with torch.no_grad():
+        scene.nodes["road"].rows.mask_logits[::2] = -6.0
+        scene.nodes["cars"].rows.mask_logits[1:3] = -6.0
+    masked = rendered(scene)
+    for node in scene.nodes.values():
+        node.rows.resize(RowPlan.keep(node.mask_scores() > MASK.threshold))
+    removed = rendered(scene)
+    assert scene.counts() == {"road": 4, "cars": 3}
+    for name in ("rgb", "alpha", "depth"):
+        assert torch.equal(getattr(masked, name), getattr(removed, name)), name
+
+
+def test_absent_instances_change_no_bit_of_the_image():
+    scene = scene_of()
+    scene.nodes["cars"].spans.copy_(torch.tensor([[0.0, 0.2]]))
+    absent = rendered(scene, 0.8)
+    del scene.nodes["cars"]
+    assert torch.equal(absent.rgb, rendered(scene, 0.8).rgb)
+
+
+def test_the_image_moves_with_the_car():
+    scene = scene_of(road_rows=0)
+    middle = []
+    for time in (0.0, 1.0):
+        alpha = rendered(scene, time).alpha.detach().sum(0)
+        middle.append(float((alpha * torch.arange(17.0)).sum() / alpha.sum()))
+    assert middle[0] - middle[1] > 1  # y is to the left; 2 m at 6 m distance are 2.8 pixels
+
+
+def test_gradients_reach_every_parameter():
+    """Finite differences in float64 of a random projection of the image, one random direction per parameter."""
+    scene = scene_of(dtype=torch.float64, mask=None)
+    generator = torch.Generator().manual_seed(4)
+    cotangent = torch.randn(11, 17, 3, generator=generator, dtype=torch.float64)
+
+    def loss() -> torch.Tensor:
+        return (rendered(scene, 0.3).rgb * cotangent).sum()
+
+    loss().backward()
+    for name, parameter in scene.named_parameters():
+        direction = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        step = 1e-7
+        with torch.no_grad():
+            parameter += step * direction
+            above = loss()
+            parameter -= 2 * step * direction
+            below = loss()
+            parameter += step * direction
+        slope = (above - below) / (2 * step)
+        analytic = (parameter.grad * direction).sum()
+        assert analytic.abs() > 1e-6, name
+        # Second order in the step, and rounding 1e-16 / 1e-7; cut-offs at alpha 1/255 may jump by little.
+        torch.testing.assert_close(analytic, slope, rtol=1e-4, atol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def test_masks_get_the_gradient_of_opacity_and_scale():
+    scene = scene_of()
+    cotangent = torch.randn(11, 17, 3, generator=torch.Generator().manual_seed(4))
+    (rendered(scene).rgb * cotangent).sum().backward()
+    for node in scene.nodes.values():
+        assert torch.isfinite(node.rows.mask_logits.grad).all()
+        assert (node.rows.mask_logits.grad != 0).any()
+
+
+def test_bfloat16_autocast_changes_nothing():
+    scene = scene_of()
+    expected = rendered(scene)
+    with torch.autocast("cpu", torch.bfloat16):
+        result = rendered(scene)
+    assert torch.equal(result.rgb, expected.rgb)
+    assert result.mask_terms["road"].scores.dtype == torch.float32
