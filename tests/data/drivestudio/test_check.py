@@ -1,0 +1,221 @@
+"""Each way to break a log is found, names its file, and stops the reader; all are found at once."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparsestreet.data.drivestudio import LogError, check_drivestudio, read_drivestudio
+from tests.data.drivestudio.folders import (
+    HEIGHT,
+    WIDTH,
+    make_nuscenes,
+    make_waymo,
+    write_image,
+    write_json,
+    write_lines,
+    write_matrix,
+    write_rows,
+)
+
+INFO = "instances/instances_info.json"
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda root: (root / name).unlink()
+
+
+def edit_matrix(name: str, edit: Callable[[np.ndarray], None]) -> Callable[[Path], None]:
+    def corrupt(root: Path) -> None:
+        matrix = np.loadtxt(root / name)
+        edit(matrix)
+        write_matrix(root / name, matrix)
+
+    return corrupt
+
+
+def put(row: int, column: int, value: float) -> Callable[[np.ndarray], None]:
+    return lambda matrix: matrix.__setitem__((row, column), value)
+
+
+def mirror(matrix: np.ndarray) -> None:
+    matrix[:3, 0] *= -1
+
+
+def intrinsics(numbers: list[float]) -> Callable[[Path], None]:
+    return lambda root: write_lines(root / "intrinsics/1.txt", numbers)
+
+
+def text(name: str, content: str) -> Callable[[Path], None]:
+    return lambda root: (root / name).write_text(content) and None
+
+
+def truncate(name: str, size: int) -> Callable[[Path], None]:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size]) and None
+
+
+def image(name: str, height: int, width: int) -> Callable[[Path], None]:
+    shape = (height, width, 3) if name.endswith("jpg") else (height, width)
+    return lambda root: write_image(root / name, np.zeros(shape, np.uint8))
+
+
+def points(value: float) -> Callable[[Path], None]:
+    return lambda root: write_rows(root / "lidar/001.bin", np.array([[1.0, 2, 3, 0], [1, value, 3, 0]]))
+
+
+def boxes(**columns: object) -> Callable[[Path], None]:
+    """Replace columns of the one object's annotations."""
+
+    def corrupt(root: Path) -> None:
+        info = json.loads((root / INFO).read_text())
+        info["0"]["frame_annotations"].update(columns)
+        write_json(root / INFO, info)
+
+    return corrupt
+
+
+CORRUPTIONS = {
+    "missing image": (remove("images/001_1.jpg"), "images/001_1.jpg", "missing"),
+    "missing pose": (remove("extrinsics/002_0.txt"), "extrinsics/002_0.txt", "missing"),
+    "missing lidar pose": (remove("lidar_pose/001.txt"), "lidar_pose/001.txt", "missing"),
+    "missing sweep": (remove("lidar/001.bin"), "lidar/001.bin", "missing"),
+    "missing intrinsics": (remove("intrinsics/1.txt"), "intrinsics/1.txt", "missing"),
+    "missing boxes": (remove(INFO), INFO, "missing"),
+    "some sky masks": (remove("sky_masks/000_1.png"), "sky_masks/000_1.png", "missing"),
+    "some human masks": (remove("dynamic_masks/human/000_1.png"), "dynamic_masks/human/000_1.png", "missing"),
+    "more sweeps than images": (
+        lambda root: shutil.copy(root / "lidar/002.bin", root / "lidar/003.bin"),
+        "images/003_0.jpg",
+        "missing",
+    ),
+    "pose of 3x4": (text("lidar_pose/000.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n"), "lidar_pose/000.txt", "4x4"),
+    "ragged pose": (text("lidar_pose/000.txt", "1 0 0 0\n0 1\n"), "lidar_pose/000.txt", "no table"),
+    "empty pose": (text("lidar_pose/000.txt", ""), "lidar_pose/000.txt", "4x4"),
+    "words for a pose": (text("lidar_pose/000.txt", "a b\nc d\n"), "lidar_pose/000.txt", "no table"),
+    "scaled pose": (edit_matrix("extrinsics/001_0.txt", put(0, 2, 1.01)), "extrinsics/001_0.txt", "rigid"),
+    "mirrored pose": (edit_matrix("extrinsics/001_0.txt", mirror), "extrinsics/001_0.txt", "rigid"),
+    "last row": (edit_matrix("extrinsics/001_0.txt", put(3, 0, 0.5)), "extrinsics/001_0.txt", "rigid"),
+    "NaN pose": (edit_matrix("extrinsics/001_0.txt", put(1, 3, np.nan)), "extrinsics/001_0.txt", "NaN"),
+    "stray pose": (edit_matrix("extrinsics/001_1.txt", put(1, 3, 2.5e4)), "extrinsics/001_1.txt", "25.0 km"),
+    "other image size": (image("images/001_0.jpg", HEIGHT, WIDTH + 1), "images/001_0.jpg", f"{WIDTH + 1}x{HEIGHT}"),
+    "other mask size": (image("sky_masks/001_0.png", 12, 20), "sky_masks/001_0.png", "20x12"),
+    "cut image": (truncate("images/001_0.jpg", -20), "images/001_0.jpg", "decoded"),
+    "no image": (text("images/001_0.jpg", "hello"), "images/001_0.jpg", "decoded"),
+    "cut mask": (truncate("sky_masks/001_0.png", 60), "sky_masks/001_0.png", "decoded"),
+    "eight intrinsics": (intrinsics([40.0, 40, 20, 12, 0, 0, 0, 0]), "intrinsics/1.txt", "9 numbers"),
+    "negative focal length": (intrinsics([-40.0, 40, 20, 12, 0, 0, 0, 0, 0]), "intrinsics/1.txt", "positive"),
+    "NaN focal length": (intrinsics([np.nan, 40, 20, 12, 0, 0, 0, 0, 0]), "intrinsics/1.txt", "positive"),
+    "distortion": (intrinsics([40.0, 40, 20, 12, 0.1, 0, 0, 0, 0]), "intrinsics/1.txt", "undistort"),
+    "half a lidar row": (truncate("lidar/001.bin", 24), "lidar/001.bin", "24 bytes"),
+    "NaN lidar point": (points(np.nan), "lidar/001.bin", "1 of 2 points"),
+    "far lidar point": (points(2e3), "lidar/001.bin", "1 of 2 points"),
+    "broken JSON": (text(INFO, '{"0": '), INFO, "no JSON"),
+    "list for JSON": (text(INFO, "[]"), INFO, "list"),
+    "object without boxes": (text(INFO, '{"0": {"class_name": "Vehicle"}}'), INFO, "cannot be read"),
+    "object without frames": (boxes(frame_idx=[], obj_to_world=[], box_size=[]), INFO, "no frames"),
+    "fewer boxes than frames": (boxes(box_size=[[4, 2, 1.5]] * 2), INFO, "3 frames"),
+    "ragged boxes": (boxes(box_size=[[4, 2, 1.5], [4, 2], [4, 2, 1.5]]), INFO, "cannot be read"),
+    "negative box": (boxes(box_size=[[4, -2, 1.5]] * 3), INFO, "-2.0"),
+    "infinite box": (boxes(box_size=[[4, np.inf, 1.5]] * 3), INFO, "box of"),
+    "unsorted frames": (boxes(frame_idx=[0, 2, 1]), INFO, "increasing"),
+    "repeated frames": (boxes(frame_idx=[0, 1, 1]), INFO, "increasing"),
+    "frame behind the end": (boxes(frame_idx=[0, 1, 3]), INFO, "ends at 2"),
+    "NaN box pose": (boxes(obj_to_world=[np.full((4, 4), np.nan).tolist()] * 3), INFO, "NaN"),
+    "scaled box pose": (boxes(obj_to_world=[np.diag([2.0, 1, 1, 1]).tolist()] * 3), INFO, "rigid"),
+    "unknown object": (text("instances/frame_instances.json", '{"0": [7]}'), "instances/frame_instances.json", "7"),
+    "fine masks for one class": (
+        lambda root: shutil.copytree(root / "dynamic_masks/human", root / "fine_dynamic_masks/human"),
+        "fine_dynamic_masks/vehicle/000_0.png",
+        "6 files",
+    ),
+}
+
+
+@pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
+def test_a_sound_log_has_no_problems(make, tmp_path):
+    assert check_drivestudio(make(tmp_path)) == []
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_the_broken_file_is_named_and_the_reader_refuses_it(name, tmp_path):
+    corrupt, file, fragment = CORRUPTIONS[name]
+    corrupt(make_nuscenes(tmp_path))
+    problems = check_drivestudio(tmp_path)
+    assert file in [problem.path.relative_to(tmp_path).as_posix() for problem in problems]
+    assert fragment in " ".join(problem.message for problem in problems)
+    assert all(problem.remedy for problem in problems)
+    with pytest.raises(LogError, match=file) as caught:
+        read_drivestudio(tmp_path)
+    assert list(caught.value.problems) == problems
+
+
+@pytest.mark.parametrize("name", sorted(set(CORRUPTIONS) - {"more sweeps than images"}))
+def test_one_fault_is_one_problem(name, tmp_path):
+    CORRUPTIONS[name][0](make_nuscenes(tmp_path))
+    assert len(check_drivestudio(tmp_path)) == 1
+
+
+def test_all_problems_are_found_at_once(tmp_path):
+    make_nuscenes(tmp_path)
+    names = ["missing image", "mirrored pose", "cut mask", "NaN lidar point", "negative focal length", "negative box"]
+    for name in names:
+        CORRUPTIONS[name][0](tmp_path)
+    found = {problem.path.relative_to(tmp_path).as_posix() for problem in check_drivestudio(tmp_path)}
+    assert found == {CORRUPTIONS[name][1] for name in names}
+    with pytest.raises(LogError, match="4 problems"):  # pixels and points are only decoded once the rest is sound
+        read_drivestudio(tmp_path)
+
+
+def test_every_object_at_fault_is_reported(tmp_path):
+    make_nuscenes(tmp_path)
+    info = json.loads((tmp_path / INFO).read_text())
+    write_json(tmp_path / INFO, {key: {"class_name": "Vehicle"} for key in ("0", "1", "2")} | {"3": info["0"]})
+    messages = [problem.message for problem in check_drivestudio(tmp_path)]
+    assert [message.split(" cannot")[0] for message in messages] == ["object 0", "object 1", "object 2"]
+
+
+def test_the_waymo_flavour_is_checked_by_its_own_files(tmp_path):
+    make_waymo(tmp_path)
+    edit_matrix("ego_pose/001.txt", mirror)(tmp_path)
+    edit_matrix("extrinsics/1.txt", put(0, 0, 1.2))(tmp_path)
+    remove("ego_pose/002.txt")(tmp_path)
+    write_rows(tmp_path / "lidar/000.bin", np.ones((3, 4)))  # rows of the other flavour
+    found = {problem.path.relative_to(tmp_path).as_posix() for problem in check_drivestudio(tmp_path)}
+    assert found == {"ego_pose/001.txt", "extrinsics/1.txt", "ego_pose/002.txt", "lidar/000.bin"}
+
+
+def test_missing_files_of_one_folder_are_one_problem(tmp_path):
+    make_nuscenes(tmp_path, frames=8)
+    for frame in range(1, 8):
+        remove(f"lidar/{frame:03d}.bin")(tmp_path)
+    (problem,) = check_drivestudio(tmp_path)
+    assert problem.path == tmp_path / "lidar/001.bin"
+    assert problem.message == ("7 files of the folder are missing: 001.bin, 002.bin, 003.bin, 004.bin, 005.bin, ...")
+
+
+def test_what_is_not_read_is_not_checked(tmp_path):
+    make_nuscenes(tmp_path)
+    CORRUPTIONS["cut image"][0](tmp_path)
+    CORRUPTIONS["negative focal length"][0](tmp_path)
+    assert check_drivestudio(tmp_path, cameras=[0], first_frame=2) == []
+    assert len(check_drivestudio(tmp_path, contents=False)) == 1
+
+
+@pytest.mark.parametrize("build", [lambda root: None, lambda root: (root / "images").mkdir()])
+def test_a_folder_that_is_no_log_is_one_problem(build, tmp_path):
+    build(tmp_path)
+    assert len(check_drivestudio(tmp_path)) == 1
+    with pytest.raises(LogError):
+        read_drivestudio(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [{"cameras": [2]}, {"cameras": []}, {"cameras": [0, 0]}, {"first_frame": 3}, {"last_frame": 3}, {"last_frame": -2}],
+)
+def test_a_choice_the_log_cannot_give_is_an_error(choice, tmp_path):
+    with pytest.raises(ValueError, match="log's"):
+        read_drivestudio(make_nuscenes(tmp_path), **choice)

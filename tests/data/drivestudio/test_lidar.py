@@ -1,0 +1,48 @@
+"""Colouring and the z-buffer on hand-made cases."""
+
+import torch
+
+from sparsestreet.data.drivestudio.lidar import color_points, depth_image
+from sparsestreet.types import Camera
+
+# At the origin, looking along z; a point (x, y, z) falls on pixel (2 x/z + 1.5, 2 y/z + 1).
+CAMERA = Camera(torch.eye(4), torch.tensor([[2.0, 0, 1.5], [0, 2.0, 1.0], [0, 0, 1]]), width=3, height=2)
+TURNED = Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])), CAMERA.intrinsics, width=3, height=2)
+IMAGE = torch.arange(18, dtype=torch.uint8).reshape(2, 3, 3)
+
+
+def test_each_point_gets_the_pixel_it_falls_into():
+    points = torch.tensor([[0.0, 0.2, 1.0], [-0.7, -0.4, 1.0], [1.4, 0.8, 2.0], [0.0, 0.0, -1.0], [5.0, 0.0, 1.0]])
+    colors, colored = color_points(points, [(CAMERA, IMAGE)])
+    assert colored.tolist() == [True, True, True, False, False]
+    expected = torch.stack((IMAGE[1, 1], IMAGE[0, 0], IMAGE[1, 2])).float() / 255
+    assert torch.equal(colors[:3], expected)
+    assert torch.equal(colors[3:], torch.full((2, 3), 0.5))
+
+
+def test_the_first_camera_counts_and_others_fill_in():
+    points = torch.tensor([[0.0, 0.2, 1.0], [0.0, 0.2, -1.0]])
+    views = [(CAMERA, IMAGE), (CAMERA, IMAGE + 100), (TURNED, IMAGE + 50)]
+    colors, colored = color_points(points, views)
+    assert colored.all()
+    assert torch.equal(colors, torch.stack((IMAGE[1, 1], IMAGE[1, 1] + 50)).float() / 255)
+
+
+def test_the_nearest_point_wins_in_any_order():
+    points = torch.tensor([[0.0, 0.2, 4.0], [0.0, 0.2, 1.0], [0.0, 0.2, 2.0], [-0.7, -0.4, 1.0]])
+    expected = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
+        assert torch.equal(depth_image(points[order], CAMERA), expected)
+
+
+def test_no_points_give_no_colour_and_no_depth():
+    empty = torch.zeros(0, 3)
+    colors, colored = color_points(empty, [(CAMERA, IMAGE)])
+    assert colors.shape == (0, 3)
+    assert colored.shape == (0,)
+    assert not depth_image(empty, CAMERA).any()
+
+
+def test_without_cameras_nothing_is_coloured():
+    _, colored = color_points(torch.ones(3, 3), [])
+    assert not colored.any()

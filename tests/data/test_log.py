@@ -1,0 +1,82 @@
+"""Splits and the size of the scene."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparsestreet.data.log import split
+from sparsestreet.types import Sweep
+from tests.data.streets import make_log
+
+
+def sweep(points: torch.Tensor, colored: torch.Tensor) -> Sweep:
+    return Sweep(0, points, torch.full_like(points, 0.5), colored)
+
+
+@given(st.integers(2, 30), st.integers(1, 3), st.integers(2, 12), st.data())
+def test_a_split_takes_every_frame_once_and_all_cameras_of_an_instant_together(num_frames, num_cameras, stride, data):
+    offset = data.draw(st.integers(0, min(stride, num_frames) - 1))
+    log = make_log(num_frames, num_cameras)
+    parts = split(log, stride=stride, offset=offset)
+    held_out = [frame.index for frame in parts.held_out]
+    assert held_out == [index for index in range(offset, num_frames, stride) for _ in range(num_cameras)]
+    order = {id(frame): place for place, frame in enumerate(log.frames)}
+    places = [[order[id(frame)] for frame in part] for part in (parts.train, parts.held_out)]
+    assert sorted(places[0] + places[1]) == list(range(len(log.frames)))
+    assert all(place == sorted(place) for place in places)
+    assert not set(held_out) & {frame.index for frame in parts.train}
+
+
+def test_stride_zero_holds_out_nothing():
+    log = make_log(3)
+    assert split(log, stride=0) == split(log, stride=0, offset=7)
+    assert split(log, stride=0).train is log.frames
+    assert split(log, stride=0).held_out == ()
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ({"stride": 1, "offset": 0}, "all 12 frames"),
+        ({"stride": 5, "offset": 5}, "offset < stride"),
+        ({"stride": -2, "offset": 0}, "offset < stride"),
+        ({"stride": 20, "offset": 12}, "nothing would be held out"),
+    ],
+)
+def test_a_split_that_leaves_one_side_empty_is_an_error(choice, message):
+    with pytest.raises(ValueError, match=message):
+        split(make_log(12), **choice)
+
+
+def test_the_radius_follows_the_quantiles_of_what_cameras_see():
+    """1001 points evenly spaced over 0 .. 100 m in x: the quantiles are 2 and 98 m, a stray point moves neither."""
+    points = torch.zeros(1003, 3)
+    points[:1001, 0] = torch.linspace(0, 100, 1001)
+    points[1001:, 1] = 5e3  # no camera sees these
+    colored = torch.ones(1003, dtype=torch.bool)
+    colored[1001:] = False
+    log = make_log(num_frames=3, num_cameras=1, sweeps=(sweep(points, colored),))
+    assert log.radius == pytest.approx(1.1 * 98 / 2, rel=1e-6)  # from camera 0 at x = 0 to the upper quantile
+    assert torch.allclose(log.center, torch.tensor([49.0, 0, 0]), atol=1e-5)
+
+
+def test_the_box_reaches_around_the_cameras():
+    points = torch.zeros(10, 3)
+    log = make_log(num_frames=41, num_cameras=1, sweeps=(sweep(points, torch.zeros(10, dtype=torch.bool)),))
+    assert log.radius == pytest.approx(1.1 * 40 / 2)
+    assert torch.allclose(log.center, torch.tensor([20.0, 0, 0]))
+
+
+def test_without_lidar_cameras_see_fifty_metres_ahead():
+    log = make_log(num_frames=3, num_cameras=1)  # they look along z
+    assert log.radius == pytest.approx(1.1 * 50 / 2)
+    assert torch.allclose(log.center, torch.tensor([1.0, 0, 25]))
+
+
+def test_very_many_points_are_thinned_evenly():
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-50, 50, (2_500_000, 3)).astype(np.float32))
+    log = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(points, torch.ones(2_500_000, dtype=torch.bool)),))
+    # The 2 % quantile of 8e5 samples of a 100 m interval scatters by 100 * sqrt(0.02 * 0.98 / 8e5) = 0.016 m.
+    assert log.radius == pytest.approx(1.1 * 96 / 2, abs=0.1)
