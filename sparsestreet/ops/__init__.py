@@ -1,7 +1,8 @@
 """The splat op: one signature, a dense reference and a fast CPU backend."""
 
 from sparsestreet.ops.backend import resolve_backend
+from sparsestreet.ops.cpu.rasteriser import PairLimitError
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import contribution, splat
 
-__all__ = ["SplatSettings", "contribution", "resolve_backend", "splat"]
+__all__ = ["PairLimitError", "SplatSettings", "contribution", "resolve_backend", "splat"]

@@ -113,7 +113,7 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
     variances = factors.square().sum(-1) + settings.blur
     covariance, variance_y = (factors[:, 0] * factors[:, 1]).sum(-1), variances[:, 1]
     l11 = (variance_y / determinant).sqrt()
-    cholesky = torch.stack((l11, -covariance / (variance_y * determinant).sqrt(), variance_y.rsqrt()), -1)
+    cholesky = torch.stack((l11, -covariance / (variance_y.sqrt() * determinant.sqrt()), variance_y.rsqrt()), -1)
 
     opacities = gaussians.opacities[rows]
     if settings.antialias:

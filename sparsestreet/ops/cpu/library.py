@@ -1,7 +1,8 @@
-"""Finding and loading the C++ library, and its plain C interface."""
+"""Finding and loading the C++ library, and its plain C interface (src/interface.h)."""
 
 import ctypes
 import importlib.metadata
+from ctypes import c_double, c_int32, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
@@ -9,13 +10,63 @@ from pathlib import Path
 import torch  # noqa: F401
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
+_INTERFACE_VERSION = 1
+
+STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
+STAGES = ("project", "bin", "blend", "blend_backward", "project_backward", "count")
+
+
+class View(ctypes.Structure):
+    """A pinhole camera and the settings of one rendering."""
+
+    _fields_ = (
+        ("rotation", c_double * 9),
+        ("translation", c_double * 3),
+        *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
+        *((name, c_double) for name in ("alpha_min", "alpha_max", "transmittance_min", "blur", "near_plane")),
+        *((name, c_int64) for name in ("width", "height", "exclusive_stop", "antialias", "pair_limit", "threads")),
+    )
+
+
+class Rows(ctypes.Structure):
+    """Pointers to the Gaussians' fields."""
+
+    _fields_ = (
+        ("count", c_int64),
+        ("terms", c_int64),
+        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh")),
+    )
+
+
+class Layers(ctypes.Structure):
+    """Pointers to the layers of an image, or to their cotangents."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("rgb", "transmittance", "depth_sum"))
+
+
+class RowGradients(ctypes.Structure):
+    """Pointers to the gradients of the Gaussians' fields and of the screen offsets."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "screen"))
+
+
+class Counters(ctypes.Structure):
+    """Pointers to the contribution counters."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("weight", "pixels", "dominant"))
+
+
+class Report(ctypes.Structure):
+    """Number of (splat, tile) pairs and the rows with most of them."""
+
+    _fields_ = (("pairs", c_int64), ("worst_rows", c_int64 * 3), ("worst_pairs", c_int64 * 3))
 
 
 def remedy() -> str:
     """How to build the library."""
     return (
-        "install a C++17 compiler and reinstall the package (pip install --no-build-isolation -e . or pip install .), "
-        "then look for the line 'sparsestreet_splat' in its build log"
+        "install a C++17 compiler with OpenMP and reinstall the package from its checkout (pip install -e .); "
+        "the build log names 'sparsestreet_splat' when it was built"
     )
 
 
@@ -37,8 +88,31 @@ def find_library() -> Path | None:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """The loaded library."""
+    """The loaded library; raises RuntimeError with the remedy if it is absent or was built from other sources."""
     path = find_library()
     if path is None:
         raise RuntimeError(f"the splat library is not built: {remedy()}")
-    return ctypes.CDLL(str(path))
+    library = ctypes.CDLL(str(path))
+    library.splat_interface_version.restype = c_int32
+    version = library.splat_interface_version()
+    if version != _INTERFACE_VERSION:
+        raise RuntimeError(f"{path} has interface {version}, this package needs {_INTERFACE_VERSION}: {remedy()}")
+    _declare(library)
+    return library
+
+
+def _declare(library: ctypes.CDLL) -> None:
+    signatures = {
+        "splat_variant_name": (ctypes.c_char_p, (c_int32,)),
+        "splat_create": (c_void_p, (c_int32, c_int32)),
+        "splat_destroy": (None, (c_void_p,)),
+        "splat_poison": (None, (c_void_p,)),
+        "splat_stage_seconds": (ctypes.POINTER(c_double), (c_void_p,)),
+        "splat_pair_count": (c_int64, (c_void_p,)),
+        "splat_forward": (c_int32, (c_void_p,) * 6),
+        "splat_backward": (c_int32, (c_void_p,) * 6),
+        "splat_contribution": (c_int32, (c_void_p,) * 5),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments

@@ -1,0 +1,99 @@
+// Forward: each tile's splats, nearest first, into its 256 pixels.
+#pragma once
+#include <omp.h>
+
+#include "pixel.hpp"
+
+namespace SPLAT_VARIANT {
+
+template <class T>
+struct TileColors {
+  alignas(64) T transmittance[PIXELS], gate[PIXELS], red[PIXELS], green[PIXELS], blue[PIXELS], depth[PIXELS];
+};
+
+template <class T, bool EXCLUSIVE>
+inline void blend_row(const Splat<T>& s, const T* __restrict dx, T along, T base, const Cuts<T>& cuts,
+                      T* __restrict transmittance, T* __restrict gate, T* __restrict red, T* __restrict green,
+                      T* __restrict blue, T* __restrict depth) {
+  for (int i = 0; i < TILE; ++i) {
+    const T a = s.l11 * dx[i] + along;
+    const T exponent = base - a * a;
+    const T raw = exp2_nonpositive(exponent > T(-126) ? exponent : T(-126));
+    T alpha = raw < cuts.alpha_max ? raw : cuts.alpha_max;
+    alpha = exponent >= cuts.log2_alpha_min ? alpha : T(0);
+    if (EXCLUSIVE) {
+      gate[i] = gate[i] - alpha * gate[i];
+      alpha = gate[i] > cuts.transmittance_min ? alpha : T(0);
+    } else {
+      alpha = transmittance[i] > cuts.transmittance_min ? alpha : T(0);
+    }
+    const T weight = alpha * transmittance[i];
+    transmittance[i] = transmittance[i] - weight;
+    red[i] += weight * s.color[0];
+    green[i] += weight * s.color[1];
+    blue[i] += weight * s.color[2];
+    depth[i] += weight * s.depth;
+  }
+}
+
+// Answers the index after the last pair that was blended.
+template <class T, bool EXCLUSIVE>
+int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
+                   TileColors<T>& c) {
+  const int64_t end = ws.tile_begin[tile + 1];
+  for (int64_t k = ws.tile_begin[tile]; k < end; ++k) {
+    if ((k - ws.tile_begin[tile]) % LOOK == 0 &&
+        tile_finished(EXCLUSIVE ? c.gate : c.transmittance, cuts.transmittance_min))
+      return k;
+    if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
+    const Splat<T>& s = ws.splats[ws.pairs[k].row];
+    const TileSplat<T> here(s, x0, y0);
+    for (int y = here.first; y <= here.last; ++y) {
+      const T dy = T(y0 + y) + T(0.5) - s.y, b = s.l22 * dy;
+      const int at = y * TILE;
+      blend_row<T, EXCLUSIVE>(s, here.dx, s.l21 * dy, s.log2_opacity - b * b, cuts, c.transmittance + at, c.gate + at,
+                              c.red + at, c.green + at, c.blue + at, c.depth + at);
+    }
+  }
+  return end;
+}
+
+template <class T>
+void write_tile(const TileColors<T>& c, const View& view, int64_t x0, int64_t y0, const Layers& image) {
+  T *rgb = static_cast<T*>(image.rgb), *transmittance = static_cast<T*>(image.transmittance);
+  T* depth = static_cast<T*>(image.depth_sum);
+  for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
+    for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
+      const int64_t from = (y - y0) * TILE + x - x0, to = y * view.width + x;
+      rgb[3 * to] = c.red[from], rgb[3 * to + 1] = c.green[from], rgb[3 * to + 2] = c.blue[from];
+      transmittance[to] = c.transmittance[from], depth[to] = c.depth[from];
+    }
+  }
+}
+
+template <class T, bool EXCLUSIVE>
+void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
+  const Cuts<T> cuts(view);
+#pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
+  for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
+    const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
+    TileColors<T> c;
+    std::memset(static_cast<void*>(&c), 0, sizeof(c));
+    open_tile(c.transmittance, view, x0, y0);
+    if (EXCLUSIVE) open_tile(c.gate, view, x0, y0);
+    ws.tile_end[tile] = blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c);
+    write_tile(c, view, x0, y0, image);
+  }
+}
+
+template <class T>
+void blend(Workspace<T>& ws, const View& view, const Layers& image) {
+  const double start = omp_get_wtime();
+  if (view.exclusive_stop)
+    blend_tiles<T, true>(ws, view, image);
+  else
+    blend_tiles<T, false>(ws, view, image);
+  ws.seconds[BLEND] = omp_get_wtime() - start;
+}
+
+}  // namespace SPLAT_VARIANT

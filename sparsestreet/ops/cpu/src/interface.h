@@ -1,0 +1,52 @@
+// The plain C interface of the splat library; cpu/library.py mirrors these structs. All arrays are row-major.
+#pragma once
+#include <cstdint>
+
+namespace splat {
+
+constexpr int32_t INTERFACE_VERSION = 1;
+
+enum Status : int32_t { OK = 0, BAD_VALUE = 1, TOO_MANY_PAIRS = 2, OUT_OF_MEMORY = 3 };
+
+// A pinhole camera and the settings of one rendering.
+struct View {
+  double rotation[9];     // camera from world
+  double translation[3];  // metres
+  double fx, fy, cx, cy;  // pixels
+  double alpha_min, alpha_max, transmittance_min, blur, near_plane;
+  int64_t width, height;
+  int64_t exclusive_stop, antialias;
+  int64_t pair_limit;  // (splat, tile) pairs that may be held
+  int64_t threads;
+};
+
+// Activated Gaussians; pointers to float or double.
+struct Rows {
+  int64_t count, terms;  // terms: spherical harmonics per channel
+  const void *means, *quaternions, *scales, *opacities, *sh;
+};
+
+// Layers of an image: premultiplied colour [h,w,3], transmittance [h,w], sum of weighted depths [h,w].
+struct Layers {
+  void *rgb, *transmittance, *depth_sum;
+};
+
+// Gradients of the rows; screen: sum over pixels of |dLoss / d mean on the screen| [n,2].
+struct RowGradients {
+  void *means, *quaternions, *scales, *opacities, *sh, *screen;
+};
+
+struct Counters {
+  double* weight;
+  int64_t *pixels, *dominant;
+};
+
+// What went wrong, for the message: pair total and the three rows with most pairs (row -1: none).
+struct Report {
+  int64_t pairs;
+  int64_t worst_rows[3], worst_pairs[3];
+};
+
+enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };
+
+}  // namespace splat

@@ -1,0 +1,30 @@
+// What each instruction-set variant offers to the dispatcher. Rows are projected with strict IEEE rules (rows.cpp);
+// the pixel loops assume finite numbers (pixels.cpp): by then every NaN and infinity has been culled or refused.
+#pragma once
+#include "interface.h"
+
+namespace splat {
+
+struct RowKernels {
+  void* (*create)();
+  void (*destroy)(void*);
+  void (*poison)(void*);
+  const double* (*seconds)(void*);
+  int64_t (*pair_count)(void*);
+  Status (*prepare)(void*, const View&, const Rows&, void* radii, Report&);
+  void (*project_backward)(void*, const View&, const Rows&, const RowGradients&);
+};
+
+struct PixelKernels {
+  void (*blend)(void*, const View&, const Layers&);
+  void (*blend_backward)(void*, const View&, const Layers& image, const Layers& cotangents);
+  void (*count)(void*, const View&, int64_t rows, const Counters&);
+};
+
+struct Kernels {
+  const char* name;
+  RowKernels rows[2];      // float, double
+  PixelKernels pixels[2];
+};
+
+}  // namespace splat

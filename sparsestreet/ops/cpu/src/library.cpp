@@ -1,0 +1,136 @@
+// The exported C functions: pick the instruction set once, guard against exceptions, call the variant's kernels.
+#include <new>
+
+#include "kernels.h"
+
+#define SPLAT_DECLARE(variant)                   \
+  namespace variant {                            \
+  void fill_row_kernels(splat::Kernels&);        \
+  void fill_pixel_kernels(splat::Kernels&);      \
+  }
+SPLAT_DECLARE(baseline)
+#ifdef SPLAT_X86
+SPLAT_DECLARE(v3)
+SPLAT_DECLARE(v4)
+#endif
+
+namespace {
+
+using namespace splat;
+
+template <class FillRows, class FillPixels>
+Kernels make(const char* name, FillRows fill_rows, FillPixels fill_pixels) {
+  Kernels k{};
+  k.name = name;
+  fill_rows(k), fill_pixels(k);
+  return k;
+}
+
+bool runs(int variant) {
+#ifdef SPLAT_X86
+  __builtin_cpu_init();
+  const bool v3 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+                  __builtin_cpu_supports("bmi2") && __builtin_cpu_supports("f16c") && __builtin_cpu_supports("lzcnt");
+  const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+                  __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+                  __builtin_cpu_supports("avx512vl");
+  return variant == 0 || (variant == 1 && v3) || (variant == 2 && v4);
+#else
+  return variant == 0;
+#endif
+}
+
+const Kernels* variant(int index) {
+  static const Kernels all[] = {
+      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels),
+#ifdef SPLAT_X86
+      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels),
+      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels),
+#endif
+  };
+  return &all[index];
+}
+
+int fastest() {
+  int best = 0;
+  for (int index = 1; index < 3; ++index)
+    if (runs(index)) best = index;
+  return best;
+}
+
+struct Handle {
+  const Kernels* kernels;
+  int scalar;  // 0 float, 1 double
+  void* workspace;
+  const RowKernels& rows() const { return kernels->rows[scalar]; }
+  const PixelKernels& pixels() const { return kernels->pixels[scalar]; }
+};
+
+template <class Call>
+int32_t guarded(Call call) {
+  try {
+    return call();
+  } catch (const std::bad_alloc&) {
+    return OUT_OF_MEMORY;
+  }
+}
+
+}  // namespace
+
+#define SPLAT_API extern "C" __attribute__((visibility("default")))
+
+SPLAT_API int32_t splat_interface_version() { return INTERFACE_VERSION; }
+
+// Variants: 0 baseline, 1 x86-64-v3, 2 x86-64-v4; -1 the fastest that runs here. Null if it does not run here.
+SPLAT_API const char* splat_variant_name(int32_t index) {
+  if (index < 0) index = fastest();
+  return index < 3 && runs(index) ? variant(index)->name : nullptr;
+}
+
+SPLAT_API void* splat_create(int32_t is_double, int32_t index) {
+  if (index < 0) index = fastest();
+  if (index >= 3 || !runs(index)) return nullptr;
+  try {
+    const Kernels* kernels = variant(index);
+    return new Handle{kernels, is_double, kernels->rows[is_double].create()};
+  } catch (const std::bad_alloc&) {
+    return nullptr;
+  }
+}
+
+SPLAT_API void splat_destroy(Handle* h) {
+  h->rows().destroy(h->workspace);
+  delete h;
+}
+
+SPLAT_API void splat_poison(Handle* h) { h->rows().poison(h->workspace); }
+SPLAT_API const double* splat_stage_seconds(Handle* h) { return h->rows().seconds(h->workspace); }
+SPLAT_API int64_t splat_pair_count(Handle* h) { return h->rows().pair_count(h->workspace); }
+
+SPLAT_API int32_t splat_forward(Handle* h, const View* view, const Rows* rows, const Layers* image, void* radii,
+                                Report* report) {
+  return guarded([&]() -> int32_t {
+    const Status status = h->rows().prepare(h->workspace, *view, *rows, radii, *report);
+    if (status == OK) h->pixels().blend(h->workspace, *view, *image);
+    return status;
+  });
+}
+
+// Uses what splat_forward left in the workspace; null pointers in `cotangents` stand for zeros.
+SPLAT_API int32_t splat_backward(Handle* h, const View* view, const Rows* rows, const Layers* image,
+                                 const Layers* cotangents, const RowGradients* gradients) {
+  return guarded([&]() -> int32_t {
+    h->pixels().blend_backward(h->workspace, *view, *image, *cotangents);
+    h->rows().project_backward(h->workspace, *view, *rows, *gradients);
+    return OK;
+  });
+}
+
+SPLAT_API int32_t splat_contribution(Handle* h, const View* view, const Rows* rows, const Counters* counters,
+                                     Report* report) {
+  return guarded([&]() -> int32_t {
+    const Status status = h->rows().prepare(h->workspace, *view, *rows, nullptr, *report);
+    if (status == OK) h->pixels().count(h->workspace, *view, rows->count, *counters);
+    return status;
+  });
+}

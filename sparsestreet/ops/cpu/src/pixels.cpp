@@ -1,0 +1,28 @@
+// Compiled once per instruction set, with the rules of arithmetic loosened so that the loops vectorise.
+#include "blend.hpp"
+#include "blend_backward.hpp"
+#include "contribution.hpp"
+#include "kernels.h"
+
+namespace SPLAT_VARIANT {
+namespace {
+
+template <class T>
+Workspace<T>& as(void* workspace) { return *static_cast<Workspace<T>*>(workspace); }
+
+template <class T>
+PixelKernels kernels() {
+  return {[](void* w, const View& v, const Layers& image) { blend(as<T>(w), v, image); },
+          [](void* w, const View& v, const Layers& image, const Layers& cotangents) {
+            blend_backward(as<T>(w), v, image, cotangents);
+          },
+          [](void* w, const View& v, int64_t rows, const Counters& out) {
+            count_contributions(as<T>(w), v, rows, out);
+          }};
+}
+
+}  // namespace
+
+void fill_pixel_kernels(Kernels& k) { k.pixels[0] = kernels<float>(), k.pixels[1] = kernels<double>(); }
+
+}  // namespace SPLAT_VARIANT

@@ -1,0 +1,154 @@
+// Visible rows by depth, and their tiles' lists in that order: stable counting sorts over ranges of rows. Nothing
+// depends on how many ranges there are, so the order is the same for any number of threads.
+#pragma once
+#include "tiles.hpp"
+
+namespace SPLAT_VARIANT {
+
+struct Range {
+  int64_t begin, end;
+  Range(int64_t count, int64_t part, int64_t parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
+};
+
+// Bits of a positive float order as the float does.
+template <class T, class Key>
+inline Key depth_key(T depth) {
+  Key key;
+  static_assert(sizeof(key) == sizeof(depth), "the key takes all digits of the depth");
+  std::memcpy(&key, &depth, sizeof(key));
+  return key;
+}
+
+// Lists the rows with tiles, in row order, with their depth keys.
+template <class T>
+void list_visible(Workspace<T>& ws, int64_t rows, int64_t threads) {
+  using Key = typename Workspace<T>::Key;
+  int64_t* visible_before = ws.histogram.reserve(threads + 1);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t part = 0; part < threads; ++part) {
+    int64_t visible = 0;
+    const Range range(rows, part, threads);
+    for (int64_t i = range.begin; i < range.end; ++i) visible += ws.counts[i] > 0;
+    visible_before[part] = visible;
+  }
+  int64_t total = 0;
+  for (int64_t part = 0; part < threads; ++part) {
+    const int64_t here = visible_before[part];
+    visible_before[part] = total;
+    total += here;
+  }
+  ws.visible = total;
+  ws.keys.reserve(total), ws.other_keys.reserve(total), ws.order.reserve(total), ws.other_order.reserve(total);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t part = 0; part < threads; ++part) {
+    const Range range(rows, part, threads);
+    int64_t at = visible_before[part];
+    for (int64_t i = range.begin; i < range.end; ++i) {
+      if (ws.counts[i] == 0) continue;
+      ws.keys[at] = depth_key<T, Key>(ws.splats[i].depth);
+      ws.order[at++] = int32_t(i);
+    }
+  }
+}
+
+// One stable pass over `bits` bits of the key from `shift` on.
+template <class Key>
+void sort_by_digit(const Key* keys, const int32_t* values, Key* keys_out, int32_t* values_out, int64_t count, int shift,
+                   int bits, int64_t* histogram, int64_t threads) {
+  const int64_t digits = int64_t(1) << bits;
+  const Key mask = Key(digits - 1);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t part = 0; part < threads; ++part) {
+    int64_t* mine = histogram + part * digits;
+    std::memset(mine, 0, digits * sizeof(int64_t));
+    const Range range(count, part, threads);
+    for (int64_t i = range.begin; i < range.end; ++i) ++mine[(keys[i] >> shift) & mask];
+  }
+  int64_t total = 0;
+  for (int64_t digit = 0; digit < digits; ++digit) {
+    for (int64_t part = 0; part < threads; ++part) {
+      const int64_t here = histogram[part * digits + digit];
+      histogram[part * digits + digit] = total;
+      total += here;
+    }
+  }
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t part = 0; part < threads; ++part) {
+    int64_t* mine = histogram + part * digits;
+    const Range range(count, part, threads);
+    for (int64_t i = range.begin; i < range.end; ++i) {
+      const int64_t at = mine[(keys[i] >> shift) & mask]++;
+      keys_out[at] = keys[i];
+      values_out[at] = values[i];
+    }
+  }
+}
+
+// Radix sort by the whole key, from the lowest digit; leaves the result in ws.order. Ties keep the row order.
+template <class T>
+void sort_by_depth(Workspace<T>& ws, int64_t threads) {
+  constexpr int bits = 11, key_bits = 8 * sizeof(typename Workspace<T>::Key), passes = (key_bits + bits - 1) / bits;
+  int64_t* histogram = ws.histogram.reserve(threads << bits);
+  auto *keys = ws.keys.data(), *other_keys = ws.other_keys.data();
+  auto *order = ws.order.data(), *other_order = ws.other_order.data();
+  for (int pass = 0; pass < passes; ++pass) {
+    sort_by_digit(keys, order, other_keys, other_order, ws.visible, pass * bits, bits, histogram, threads);
+    auto* keys_before = keys;
+    keys = other_keys, other_keys = keys_before;
+    auto* order_before = order;
+    order = other_order, other_order = order_before;
+  }
+  if (order != ws.order.data()) std::memcpy(ws.order.data(), order, ws.visible * sizeof(int32_t));
+}
+
+// Slots of each row: contiguous, in row order. Answers the number of pairs (int64: it may pass 2^31).
+template <class T>
+int64_t assign_slots(Workspace<T>& ws, int64_t rows) {
+  int64_t total = 0;
+  ws.first_slot.reserve(rows);
+  for (int64_t i = 0; i < rows; ++i) {
+    ws.first_slot[i] = total;
+    total += ws.counts[i];
+  }
+  return total;
+}
+
+// Fills ws.pairs tile by tile, nearest first, and ws.tile_begin.
+template <class T>
+void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t threads) {
+  const int64_t tiles = grid.tiles_x * grid.tiles_y;
+  int64_t* histogram = ws.histogram.reserve(threads * tiles);
+  ws.pairs.reserve(ws.pair_count), ws.tile_begin.reserve(tiles + 1), ws.tile_end.reserve(tiles);
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t part = 0; part < threads; ++part) {
+    int64_t* mine = histogram + part * tiles;
+    std::memset(mine, 0, tiles * sizeof(int64_t));
+    const Range range(ws.visible, part, threads);
+    for (int64_t k = range.begin; k < range.end; ++k)
+      for_each_tile(ws.splats[ws.order[k]], grid, [&](int64_t tile) { ++mine[tile]; });
+  }
+  int64_t total = 0;
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    ws.tile_begin[tile] = total;
+    for (int64_t part = 0; part < threads; ++part) {
+      const int64_t here = histogram[part * tiles + tile];
+      histogram[part * tiles + tile] = total;
+      total += here;
+    }
+  }
+  ws.tile_begin[tiles] = total;
+#pragma omp parallel for num_threads(threads) schedule(static)
+  for (int64_t part = 0; part < threads; ++part) {
+    int64_t* mine = histogram + part * tiles;
+    const Range range(ws.visible, part, threads);
+    for (int64_t k = range.begin; k < range.end; ++k) {
+      const int32_t row = ws.order[k];
+      int64_t slot = ws.first_slot[row];
+      for_each_tile(ws.splats[row], grid, [&](int64_t tile) {
+        ws.pairs[mine[tile]++] = {row, int32_t(slot++)};
+      });
+    }
+  }
+}
+
+}  // namespace SPLAT_VARIANT

@@ -1,0 +1,70 @@
+// What one rendering keeps from forward to backward, and the records the stages hand to each other.
+#pragma once
+#include <type_traits>
+
+#include "buffer.hpp"
+#include "interface.h"
+
+namespace SPLAT_VARIANT {
+
+using namespace splat;
+
+// A tile row of 16 float pixels is one AVX-512 register, two AVX2 registers, four SSE registers.
+constexpr int TILE = 16;
+constexpr int PIXELS = TILE * TILE;
+
+// One splat on the screen; 64 bytes as float, one cache line.
+template <class T>
+struct alignas(16 * sizeof(T)) Splat {
+  T x, y;           // mean, pixels
+  T l11, l21, l22;  // Cholesky factor of the conic times sqrt(log2(e) / 2): alpha = 2^(log2_opacity - |L d|^2)
+  T log2_opacity;
+  T color[3];
+  T depth;
+  T half_x, half_y;            // half sides of the opacity-aware box, pixels
+  int32_t first_row, last_row;  // image rows the box reaches, inclusive
+};
+
+// One (splat, tile) pair in a tile's list, nearest first.
+struct Pair {
+  int32_t row;   // of the input
+  int32_t slot;  // where the pair's gradient goes: slots of a row are contiguous
+};
+
+// Sums over the pixels of one pair. s = dLoss/d(ln alpha), (a, b) = L d, w = blend weight, v = cotangents.
+template <class T>
+struct Slot {
+  T s, sa, sb, saa, sab, sbb;
+  T abs_x, abs_y;  // |s a|, |s (l21 a + l22 b)|
+  T color[3], depth;
+};
+
+template <class T>
+struct Workspace {
+  using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
+  Buffer<Splat<T>> splats;   // by input row; only visible rows are written
+  Buffer<int32_t> counts;    // tiles per input row, 0: culled
+  Buffer<int64_t> first_slot;  // by input row
+  Buffer<Key> keys, other_keys;
+  Buffer<int32_t> order, other_order;  // visible rows, nearest first
+  Buffer<int64_t> histogram;
+  Buffer<int64_t> tile_begin;  // tiles + 1
+  Buffer<int64_t> tile_end;    // after the last pair that still changed a pixel
+  Buffer<Pair> pairs;
+  Buffer<Slot<T>> slots;
+  struct Count {
+    double weight;
+    int64_t pixels, dominant;
+  };
+  Buffer<Count> count_slots;
+  int64_t visible = 0, pair_count = 0, tiles_x = 0, tiles_y = 0;
+  double seconds[STAGES] = {};
+
+  void poison() {
+    splats.poison(), counts.poison(), first_slot.poison(), keys.poison(), other_keys.poison(), order.poison();
+    other_order.poison(), histogram.poison(), tile_begin.poison(), tile_end.poison(), pairs.poison(), slots.poison();
+    count_slots.poison();
+  }
+};
+
+}  // namespace SPLAT_VARIANT
