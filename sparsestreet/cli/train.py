@@ -9,12 +9,12 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
-from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import Assembly, assemble, evaluate_assembly
 from sparsestreet.cli.compose import CONF, override_problem
-from sparsestreet.training.callbacks import Clock
+from sparsestreet.training.callbacks import Clock, SaveOnException, TrainingProgress
 
 log = logging.getLogger(__name__)
 
@@ -58,17 +58,19 @@ def fit(trainer: Trainer, parts: Assembly, resume: str | None) -> None:
 
 def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:
     callbacks: list[Callback] = list(instantiate(cfg.callback, _convert_="all").values())
-    checkpoints = [
+    standing = [
+        TrainingProgress(),
+        SaveOnException(out / "checkpoints" / "interrupted.ckpt"),
         ModelCheckpoint(dirpath=out / "checkpoints", filename="last", enable_version_counter=False),
-        OnExceptionCheckpoint(dirpath=out / "checkpoints", filename="interrupted"),
     ]
     logger = instantiate(cfg.logger) if cfg.logger else False
     return instantiate(
         cfg.trainer,
-        callbacks=[clock, *callbacks, *checkpoints],
+        callbacks=[clock, *callbacks, *standing],
         logger=logger,
         default_root_dir=str(out),
         enable_model_summary=False,
+        enable_progress_bar=False,
         log_every_n_steps=50,
         max_epochs=-1,
     )

@@ -1,7 +1,7 @@
 """The LightningModule: render, sum the losses, log. What changes the scene's rows lives in callbacks."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -22,7 +22,7 @@ from sparsestreet.types import Frame
 class RenderOptions:
     """How training renders; evaluation takes the same."""
 
-    settings: SplatSettings = SplatSettings()
+    settings: SplatSettings = field(default_factory=SplatSettings)
     backend: str = "auto"
 
 
@@ -73,7 +73,7 @@ class StreetSystem(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             image = self.render(frame).rgb.clamp(0, 1)
             value = psnr(image, frame.image.to(image.dtype) / 255)
-        self.log("val/psnr", value, prog_bar=True, batch_size=1)
+        self.log("val/psnr", value, batch_size=1)
 
     def configure_optimizers(self) -> dict[str, object]:
         optimizer, scheduler = self.optimization.build(self.scene, self.radius, self.trainer.max_steps)
@@ -85,6 +85,6 @@ class StreetSystem(LightningModule):
             image = self.rendering.rgb.detach().clamp(0, 1)
             self.train_psnr(psnr(image, frame.image.to(image.dtype) / 255))
         rows = float(sum(self.scene.counts().values()))
-        self.log("psnr", self.train_psnr.compute(), prog_bar=True, batch_size=1)
-        self.log("gaussians", rows, prog_bar=True, batch_size=1)
+        self.log("psnr", self.train_psnr.compute(), batch_size=1)
+        self.log("gaussians", rows, batch_size=1)
         self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()}, batch_size=1)

@@ -13,7 +13,6 @@ from sparsestreet.training.density.statistics import DensityStatistics
 from sparsestreet.training.schedule import Window
 from sparsestreet.training.system import StreetSystem
 
-
 BOX_MARGIN = 0.1
 """Metres by which a rigid row's centre may lie outside its box: annotated boxes are about this tight."""
 
