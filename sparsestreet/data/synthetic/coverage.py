@@ -19,7 +19,10 @@ def beyond(x: Scalars, edge: float, footprint: Scalars) -> Scalars:
 
 
 def stripes(x: Scalars, period: float, low: float, high: float, footprint: Scalars) -> Scalars:
-    """Share of the interval of length ``footprint`` around x in the strips [low, high] + k period; 0 <= low < high <= period."""
+    """Share of the interval of length ``footprint`` around x in the strips [low, high] + k period.
+
+    0 <= low < high <= period.
+    """
     width = np.maximum(footprint, np.float32(1e-6))
     half = width * np.float32(0.5)
     return (_painted(x + half, period, low, high) - _painted(x - half, period, low, high)) / width

@@ -55,7 +55,10 @@ class EgoDrive:
     speed: float
 
     def pose(self, time: float, offset: float = 0.0) -> Pose:
-        """World from ego: x forward, y left, z up, origin on the road under the rear axle; shifted left by ``offset``."""
+        """World from ego: x forward, y left, z up, origin on the road under the rear axle.
+
+        ``offset`` shifts the car to its left, metres.
+        """
         x = self.speed * (time + 0.15 * np.sin(0.9 * time))
         y = 0.12 * np.sin(0.8 * time)
         slope = 0.12 * 0.8 * np.cos(0.8 * time) / (self.speed * (1 + 0.15 * 0.9 * np.cos(0.9 * time)))

@@ -22,6 +22,8 @@ class Scene:
     half_extents: Float32[np.ndarray, "p 3"]
     corners: Float32[np.ndarray, "p 8 3"]
     """Corners of the bounding boxes, world frame."""
+    half_axes: Float32[np.ndarray, "p 3 3"]
+    """Columns: from the centre of each bounding box to the middle of its faces, world frame, metres."""
     object_indices: Int[np.ndarray, " p"]
 
     @staticmethod
@@ -32,7 +34,7 @@ class Scene:
         centres = np.ascontiguousarray(poses[:, :3, 3], np.float32)
         corners = centres[:, None] + (_SIGNS * half[:, None]) @ rotations.transpose(0, 2, 1)
         objects = np.array([part.object_index for part in parts], np.int16)
-        return Scene(tuple(parts), rotations, centres, half, corners, objects)
+        return Scene(tuple(parts), rotations, centres, half, corners, rotations * half[:, None], objects)
 
     def to_part(self, index: int, points: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "3 m"]:
         """World points in the frame of a part."""
@@ -49,11 +51,14 @@ class Scene:
         local = np.einsum("pji,pj->pi", self.rotations, origin - self.centres)
         return np.linalg.norm(np.maximum(np.abs(local) - self.half_extents, 0), axis=1)
 
-    def in_bundle(self, origin: Float32[np.ndarray, "3"], planes: Float32[np.ndarray, "k 3"]) -> Int[np.ndarray, " c"]:
-        """Parts that are not wholly outside one of the planes through ``origin`` (normals point inwards)."""
-        heights = (self.corners - origin).reshape(-1, 3) @ planes.T
-        outside = (heights.reshape(-1, 8, len(planes)).max(1) < -_MARGIN).any(1)
-        return np.flatnonzero(~outside)
+    def in_bundle(
+        self, among: Int[np.ndarray, " c"], origin: Float32[np.ndarray, "3"], planes: Float32[np.ndarray, "k 3"]
+    ) -> Int[np.ndarray, " d"]:
+        """Those parts that are not wholly outside one of the planes through ``origin`` (normals point inwards)."""
+        # The support function of a box: how far its farthest corner reaches along each normal.
+        reach = np.abs(planes @ self.half_axes[among]).sum(2)
+        heights = (self.centres[among] - origin) @ planes.T + reach
+        return among[(heights >= -_MARGIN).all(1)]
 
 
 @dataclass(frozen=True)

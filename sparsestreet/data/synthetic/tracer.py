@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int16
+from jaxtyping import Bool, Float32, Int, Int16
 
 from sparsestreet.data.synthetic.scene import Scene, SunView
 from sparsestreet.data.synthetic.shapes import Vectors
@@ -11,10 +11,9 @@ from sparsestreet.data.synthetic.shapes import Vectors
 NOTHING = np.int16(-1)
 """Part index of a ray that leaves the street."""
 
-_TILE = 48
+_TILE = 64
 """Side of the bundles that share one list of candidate parts, rays: small enough for the cache and for culling,
 large enough that NumPy's cost per call does not count."""
-_SHADOW_CHUNK = 4096
 _LIFT = np.float32(2e-3)
 """Shadow rays start this far above the surface, metres: more than the rounding of a hit 250 m away."""
 
@@ -42,12 +41,14 @@ def first_hits(scene: Scene, rays: Rays) -> Hits:
     distances = np.empty((height, width), np.float32)
     parts = np.empty((height, width), np.int16)
     nearness = scene.distances(rays.origin)
+    nearest_first = np.argsort(nearness, kind="stable")
+    in_view = scene.in_bundle(nearest_first, rays.origin, _bounding_planes(rays.directions))
     for top in range(0, height, _TILE):
         for left in range(0, width, _TILE):
             window = (slice(top, top + _TILE), slice(left, left + _TILE))
             tile = rays.directions[:, window[0], window[1]]
             shape = tile.shape[1:]
-            nearest, hit = _trace_tile(scene, rays.origin, tile, nearness)
+            nearest, hit = _trace_tile(scene, rays.origin, tile, in_view, nearness)
             distances[window], parts[window] = nearest.reshape(shape), hit.reshape(shape)
     return Hits(distances, parts)
 
@@ -56,20 +57,20 @@ def _trace_tile(
     scene: Scene,
     origin: Float32[np.ndarray, "3"],
     tile: Float32[np.ndarray, "3 a b"],
+    in_view: Int[np.ndarray, " c"],
     nearness: Float32[np.ndarray, " p"],
 ) -> tuple[Float32[np.ndarray, " n"], Int16[np.ndarray, " n"]]:
     directions = np.ascontiguousarray(tile.reshape(3, -1))
     nearest = np.full(directions.shape[1], np.inf, np.float32)
     hit = np.full(directions.shape[1], NOTHING, np.int16)
-    candidates = scene.in_bundle(origin, _bounding_planes(tile))
-    for index in candidates[np.argsort(nearness[candidates], kind="stable")]:
+    for index in scene.in_bundle(in_view, origin, _bounding_planes(tile)):
         if nearness[index] > nearest.max():
             break
         local_origin = scene.to_part(index, origin[:, None])
         distance = scene.parts[index].shape.enter(local_origin, scene.turn_to_part(index, directions))
         closer = distance < nearest
-        nearest = np.where(closer, distance, nearest)
-        hit[closer] = index
+        np.copyto(nearest, distance, where=closer)
+        np.copyto(hit, np.int16(index), where=closer)
     return nearest, hit
 
 
@@ -94,25 +95,31 @@ def sunlit(scene: Scene, view: SunView, points: Vectors, normals: Vectors, owner
     """
     lit = (normals * view.sun[:, None]).sum(0) > 0
     facing = np.flatnonzero(lit)
-    for start in range(0, len(facing), _SHADOW_CHUNK):
-        chosen = facing[start : start + _SHADOW_CHUNK]
-        lifted = points[:, chosen] + _LIFT * normals[:, chosen]
-        lit[chosen] = ~_blocked(scene, view, lifted, owner)
+    if len(facing) > 0:
+        lit[facing] = ~_blocked(scene, view, points[:, facing] + _LIFT * normals[:, facing], owner)
     return lit
 
 
 def _blocked(scene: Scene, view: SunView, points: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
     seen = view.axes @ points
-    blocked = np.zeros(points.shape[1], bool)
-    for index in view.blockers(seen):
-        if index == owner:  # a convex part does not shade its own lit side
+    # Sorted along one axis of the sun's view, the points that a part may shade are one short run.
+    order = np.argsort(seen[1])
+    points, seen = points[:, order], seen[:, order]
+    dark = np.zeros(points.shape[1], bool)
+    candidates = view.blockers(seen)
+    starts = np.searchsorted(seen[1], view.low[candidates, 1])
+    stops = np.searchsorted(seen[1], view.high[candidates, 1])
+    for index, start, stop in zip(candidates, starts, stops, strict=True):
+        if index == owner or start == stop:  # a convex part does not shade its own lit side
             continue
-        low, high = view.low[index], view.high[index]
-        near = (seen[0] > low[0]) & (seen[0] < high[0]) & (seen[1] > low[1]) & (seen[1] < high[1])
-        rays = np.flatnonzero(near & (seen[2] < high[2]) & ~blocked)
+        low, high, run = view.low[index], view.high[index], slice(start, stop)
+        across, along = seen[0, run], seen[2, run]
+        rays = start + np.flatnonzero((across > low[0]) & (across < high[0]) & (along < high[2]) & ~dark[run])
         if len(rays) == 0:
             continue
         sun = np.repeat(scene.turn_to_part(index, view.sun[:, None]), len(rays), axis=1)
         distance = scene.parts[index].shape.enter(scene.to_part(index, points[:, rays]), sun)
-        blocked[rays[np.isfinite(distance)]] = True
+        dark[rays[np.isfinite(distance)]] = True
+    blocked = np.empty_like(dark)
+    blocked[order] = dark
     return blocked

@@ -66,11 +66,10 @@ def build_world(settings: StreetSettings) -> World:
 def _ground(seed: int, end: float) -> list[Part]:
     rng = stream(seed, "ground")
     start, stop = -layout.BEHIND, end + layout.AHEAD
-    crossing = float(rng.uniform(0.35, 0.6)) * end + 16
     lines = Lines(
         solid=layout.SOLID_LINES,
         dashed=layout.DASHED_LINES,
-        crossings=(crossing, stop - 12),
+        crossings=(_crossing(seed, end), stop - 12),
         kerb_right=layout.KERB_RIGHT,
         kerb_left=layout.KERB_LEFT,
     )
@@ -88,6 +87,11 @@ def _ground(seed: int, end: float) -> list[Part]:
         yard = box(2 * half_length, 30, 2 * layout.KERB_HEIGHT - 0.01)
         parts.append(Part(yard, back, at((start + stop) / 2, kerb - side * (2 * half + 15), 0)))
     return parts
+
+
+def _crossing(seed: int, end: float) -> float:
+    """x of the near end of the zebra crossing."""
+    return float(stream(seed, "crossing").uniform(0.35, 0.6)) * end + 16
 
 
 def _houses(seed: int, end: float) -> list[Part]:
@@ -139,9 +143,10 @@ def _parked_cars(settings: StreetSettings, end: float) -> list[Actor]:
     rng = stream(settings.seed, "parked cars")
     spacing = 6.4
     places = [
-        (row * spacing + shift, y, heading)
+        # Nobody parks on the crossing: the places beyond it start one crossing later.
+        (x + 9.0 * (x > _crossing(settings.seed, end) - 4), y, heading)
         for y, heading, shift in ((layout.PARKING_RIGHT, 0.0, -1.0), (layout.PARKING_LEFT, np.pi, 2.0))
-        for row in range(max(int((end + 45) / spacing), (settings.num_parked_cars + 1) // 2))
+        for x in shift + spacing * np.arange(max(int((end + 36) / spacing), (settings.num_parked_cars + 1) // 2))
     ]
     chosen = sorted(rng.choice(len(places), size=settings.num_parked_cars, replace=False))
     actors = []

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
 
 from sparsestreet.data.synthetic.coverage import beyond, strip
 from sparsestreet.data.synthetic.shapes import Polytope
@@ -130,5 +129,5 @@ def metallic(rng: np.random.Generator) -> Color:
     )  # fmt: skip
     weights = np.array([4, 3, 2, 2, 2.5, 2.5, 1.5, 1, 1.5, 1])
     base = np.array(palette[rng.choice(len(palette), p=weights / weights.sum())])
-    shade: Float32[np.ndarray, "3"] = (base * rng.uniform(0.85, 1.15)).astype(np.float32)
-    return (float(shade[0]), float(shade[1]), float(shade[2]))
+    red, green, blue = base * rng.uniform(0.85, 1.15)
+    return (float(red), float(green), float(blue))

@@ -33,11 +33,12 @@ class Grainy:
     """Shifts the pattern, so that copies differ, metres."""
 
     def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
-        # Two skewed sections through the plane noise stand in for solid noise: no face shows stretched features.
+        # Each point takes the section of the noise that its surface faces most: no section is seen edge-on.
         x, y, z = points + np.float32(self.offset)
+        facing = np.abs(normals).argmax(0)
+        u, v = np.where(facing == 0, y, x), np.where(facing == 2, y, z)
         width = footprints.max(0)
-        u, v = x + np.float32(0.62) * z, y - np.float32(0.71) * z
         grain = smooth_noise(u, v, self.coarse, width)
-        grain += np.float32(0.6) * smooth_noise(v * 1.3, u - y, self.coarse / 3, width)
+        grain += np.float32(0.6) * smooth_noise(u + v, u - v, self.coarse / 3, width)
         albedo = column(self.color) * np.maximum(1 + np.float32(self.contrast) * grain, np.float32(0.15))
         return Look(np.minimum(albedo, np.float32(0.95)), np.zeros(points.shape[1], np.float32))
