@@ -5,7 +5,7 @@ metres; a ray that misses, starts inside or points away has distance infinity.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -17,6 +17,7 @@ Vector = Float32[np.ndarray, "3"]
 _TINY = np.float32(1e-12)
 
 
+@runtime_checkable
 class Shape(Protocol):
     """A convex solid around the origin of its frame."""
 

@@ -1,10 +1,11 @@
 """What the street asks of everything that moves."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from sparsestreet.data.synthetic.parts import Part
 
 
+@runtime_checkable
 class Model(Protocol):
     """An object in its box frame: x along the heading, y left, z up, origin at the box centre."""
 

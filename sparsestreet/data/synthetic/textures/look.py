@@ -1,7 +1,7 @@
 """What a surface tells the renderer about its points."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -22,6 +22,7 @@ class Look:
     """Weight of the mirrored sky in [0, 1]; 0 is matt."""
 
 
+@runtime_checkable
 class Surface(Protocol):
     def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
         """Appearance at points of the part's own frame; ``footprints`` are a pixel's extents along its axes, metres."""

@@ -1,0 +1,276 @@
+"""A tiny street on disk: complete, exact, repeatable; made whole or not at all."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.street import make_street
+from sparsestreet.data.synthetic.world import build_world
+
+TINY = StreetSettings(
+    seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, num_parked_cars=8, num_moving_cars=3,
+    num_pedestrians=3, num_cyclists=1, lidar_beams=16, lidar_azimuth_steps=200,
+    novel_offsets=(1.0, 2.5), novel_stride=2,
+)  # fmt: skip
+VIEWS = [(frame, camera) for frame in range(3) for camera in range(2)]
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory) -> Path:
+    return make_street(TINY, tmp_path_factory.mktemp("streets") / "tiny")
+
+
+def truth(street: Path, frame: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+    with np.load(street / f"depth/{frame:03d}_{camera}.npz") as stored:
+        return stored["depth"], stored["instance"]
+
+
+def mask(street: Path, folder: str, frame: int, camera: int) -> np.ndarray:
+    values = np.array(Image.open(street / folder / f"{frame:03d}_{camera}.png"))
+    assert set(np.unique(values)) <= {0, 255}
+    return values == 255
+
+
+def pinhole(street: Path, frame: int, camera: int) -> tuple[np.ndarray, np.ndarray]:
+    """Intrinsics and world_from_camera as a reader would take them."""
+    fx, fy, cx, cy, *distortion = np.loadtxt(street / f"intrinsics/{camera}.txt")
+    assert len(distortion) == 5
+    assert not any(distortion)
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.loadtxt(street / f"extrinsics/{frame:03d}_{camera}.txt")
+
+
+def unprojected(street: Path, frame: int, camera: int) -> np.ndarray:
+    """World points of all pixels, [h, w, 3]; meaningless in the sky."""
+    depth, _ = truth(street, frame, camera)
+    intrinsics, world_from_camera = pinhole(street, frame, camera)
+    v, u = np.meshgrid(np.arange(61) + 0.5, np.arange(97) + 0.5, indexing="ij")
+    rays = np.stack((u, v, np.ones_like(u)), -1) @ np.linalg.inv(intrinsics).T
+    return (rays * depth[..., None]) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+
+
+def instances(street: Path) -> dict[int, dict]:
+    return {
+        int(key): value for key, value in json.loads((street / "instances/instances_info.json").read_text()).items()
+    }
+
+
+def boxes(street: Path, frame: int) -> dict[int, tuple[np.ndarray, np.ndarray, str]]:
+    """Id -> (world_from_object, size, class) of the objects annotated in a frame."""
+    found = {}
+    for key, instance in instances(street).items():
+        notes = instance["frame_annotations"]
+        if frame in notes["frame_idx"]:
+            position = notes["frame_idx"].index(frame)
+            pose, size = np.array(notes["obj_to_world"][position]), np.array(notes["box_size"][position])
+            found[key] = (pose, size, instance["class_name"])
+    return found
+
+
+def test_all_files_are_there(street):
+    views = [f"{frame:03d}_{camera}" for frame, camera in VIEWS]
+    expected = {"street.json", "timestamps.txt", "instances/instances_info.json", "instances/frame_instances.json"}
+    expected |= {f"intrinsics/{camera}.txt" for camera in range(2)}
+    for folder, kind in (
+        ("images", "jpg"), ("extrinsics", "txt"), ("sky_masks", "png"), ("depth", "npz"),
+        *((f"dynamic_masks/{name}", "png") for name in ("all", "human", "vehicle")),
+    ):  # fmt: skip
+        expected |= {f"{folder}/{view}.{kind}" for view in views}
+    expected |= {f"lidar/{frame:03d}.bin" for frame in range(3)} | {f"lidar_pose/{frame:03d}.txt" for frame in range(3)}
+    for offset in ("1m", "2.5m"):
+        for frame in (0, 2):
+            expected |= {f"novel/{offset}/images/{frame:03d}_0.png", f"novel/{offset}/extrinsics/{frame:03d}_0.txt"}
+    found = {str(path.relative_to(street)) for path in street.rglob("*") if path.is_file()}
+    # A shifted camera inside a car is left out; nothing else may be missing, and nothing may be too much.
+    assert found <= expected
+    assert {path for path in expected - found if not path.startswith("novel")} == set()
+    assert any(path.startswith("novel/1m/images") for path in found)
+
+
+def test_images_are_pictures(street):
+    for frame, camera in VIEWS:
+        image = np.array(Image.open(street / f"images/{frame:03d}_{camera}.jpg"))
+        assert image.shape == (61, 97, 3)
+        assert 60 < image.mean() < 200
+        assert image.std() > 25
+
+
+def test_boxes_contain_the_points_of_their_pixels_and_enclose_them_in_the_image(street):
+    seen = 0
+    for frame, camera in VIEWS:
+        points, (_, ids) = unprojected(street, frame, camera), truth(street, frame, camera)
+        intrinsics, world_from_camera = pinhole(street, frame, camera)
+        for key, (pose, size, _) in boxes(street, frame).items():
+            mine = ids == key
+            if not mine.any():
+                continue
+            seen += 1
+            local = (points[mine] - pose[:3, 3]) @ pose[:3, :3]
+            # Float32 depth at 60 m is good to 4e-6 m; the rest is room for rounding of the poses.
+            assert (np.abs(local) <= size / 2 + 2e-3).all()
+            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size / 2
+            in_camera = (corners @ pose[:3, :3].T + pose[:3, 3] - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+            if (in_camera[:, 2] > 0.1).all():
+                pixels = in_camera @ intrinsics.T
+                pixels = pixels[:, :2] / pixels[:, 2:]
+                v, u = np.nonzero(mine)
+                centres = np.stack((u, v), 1) + 0.5
+                assert (centres >= pixels.min(0) - 1e-2).all()
+                assert (centres <= pixels.max(0) + 1e-2).all()
+    assert seen >= 15
+
+
+def test_depth_puts_the_road_on_the_ground(street):
+    """Pixels of the lower rows that are no object lie on the road, the footway or a wall above them."""
+    on_road = 0
+    for frame, camera in VIEWS:
+        points, (_, ids) = unprojected(street, frame, camera), truth(street, frame, camera)
+        free = points[(ids < 0) & ~mask(street, "sky_masks", frame, camera)]
+        assert free[:, 2].min() > -1e-3
+        lane = free[np.abs(free[:, 1]) < 1.5]
+        lane = lane[lane[:, 0] < 50]
+        np.testing.assert_allclose(lane[:, 2], 0, atol=1e-3)
+        on_road += len(lane)
+    assert on_road > 1000
+
+
+def test_masks_are_exactly_the_instances(street):
+    for frame, camera in VIEWS:
+        depth, ids = truth(street, frame, camera)
+        annotated = boxes(street, frame)
+        assert set(np.unique(ids)) - {-1} <= set(annotated)
+        human = [key for key, (_, _, class_name) in annotated.items() if class_name in ("Pedestrian", "Cyclist")]
+        vehicle = [key for key, (_, _, class_name) in annotated.items() if class_name == "Vehicle"]
+        np.testing.assert_array_equal(mask(street, "dynamic_masks/all", frame, camera), ids >= 0)
+        np.testing.assert_array_equal(mask(street, "dynamic_masks/human", frame, camera), np.isin(ids, human))
+        np.testing.assert_array_equal(mask(street, "dynamic_masks/vehicle", frame, camera), np.isin(ids, vehicle))
+        np.testing.assert_array_equal(mask(street, "sky_masks", frame, camera), depth == 0)
+
+
+def test_tracks_follow_the_world_and_every_frame_is_listed(street):
+    world = build_world(TINY)
+    actors = {actor.name: actor for actor in world.actors}
+    listed = json.loads((street / "instances/frame_instances.json").read_text())
+    assert list(listed) == ["0", "1", "2"]
+    info = instances(street)
+    assert list(info) == list(range(len(info)))
+    assert {instance["class_name"] for instance in info.values()} >= {"Vehicle", "Cyclist"}
+    for key, instance in info.items():
+        notes, actor = instance["frame_annotations"], actors[instance["id"]]
+        assert instance["class_name"] == actor.model.class_name
+        for frame, pose, size in zip(notes["frame_idx"], notes["obj_to_world"], notes["box_size"], strict=True):
+            assert key in listed[str(frame)]
+            np.testing.assert_array_equal(pose, actor.pose(frame / 2.0))
+            assert size == list(actor.model.size)
+            ego = world.ego.pose(frame / 2.0)[:2, 3]
+            assert np.linalg.norm(np.array(pose)[:2, 3] - ego) <= TINY.annotation_range
+    assert sum(map(len, listed.values())) == sum(len(i["frame_annotations"]["frame_idx"]) for i in info.values())
+
+
+def test_lidar_points_lie_on_what_the_cameras_see(street):
+    checked = 0
+    for frame, camera in VIEWS:
+        points = np.fromfile(street / f"lidar/{frame:03d}.bin", np.float32).reshape(-1, 4)
+        assert ((points[:, 3] >= 0) & (points[:, 3] <= 1)).all()
+        pose = np.loadtxt(street / f"lidar_pose/{frame:03d}.txt")
+        intrinsics, world_from_camera = pinhole(street, frame, camera)
+        world = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+        in_camera = (world - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
+        in_camera = in_camera[in_camera[:, 2] > 1]
+        pixels = in_camera @ intrinsics.T
+        u, v = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
+        inner = (u >= 1) & (u < 96) & (v >= 1) & (v < 60)
+        u, v, z = u[inner], v[inner], in_camera[inner, 2]
+        depth, _ = truth(street, frame, camera)
+        depth = np.where(depth == 0, np.inf, depth)
+        around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
+        # The surface passes through the 3x3 pixels around; range noise is 0.02 m, so 0.1 m is five of it.
+        fits = (z > around.min(0) - 0.1) & (z < around.max(0) + 0.1)
+        # The sensor stands 0.7 m behind the cameras and sees a little past what hides things from them.
+        assert fits.mean() > 0.95
+        checked += len(z)
+    assert checked > 1000
+
+
+def test_shifted_views_lie_to_the_left(street):
+    _, at_front = pinhole(street, 0, 0)
+    shifted = np.loadtxt(street / "novel/2.5m/extrinsics/000_0.txt")
+    np.testing.assert_allclose(shifted[:3, :3], at_front[:3, :3])
+    # Camera x points right, so 2.5 m to the left is -2.5 along it.
+    np.testing.assert_allclose(at_front[:3, :3].T @ (shifted[:3, 3] - at_front[:3, 3]), [-2.5, 0, 0], atol=1e-9)
+    image = np.array(Image.open(street / "novel/2.5m/images/000_0.png"), int)
+    assert image.shape == (61, 97, 3)
+    assert np.abs(image - np.array(Image.open(street / "images/000_0.jpg"), int)).mean() > 5
+
+
+def digest(root: Path) -> dict[str, str]:
+    """Hash of every file but the compressed archives, which hold the time of writing; those by their arrays."""
+    hashes = {}
+    for path in sorted(root.rglob("*")):
+        if path.suffix == ".npz":
+            with np.load(path) as stored:
+                content = b"".join(stored[name].tobytes() for name in sorted(stored))
+        elif path.is_file():
+            content = path.read_bytes()
+        else:
+            continue
+        hashes[str(path.relative_to(root))] = hashlib.sha256(content).hexdigest()
+    return hashes
+
+
+def test_equal_settings_give_equal_bytes_and_other_seeds_other_streets(street, tmp_path):
+    again = make_street(TINY, tmp_path / "again")
+    assert digest(again) == digest(street)
+    other = make_street(dataclasses.replace(TINY, seed=4, num_frames=1, novel_offsets=()), tmp_path / "other")
+    first, second = (np.array(Image.open(root / "images/000_0.jpg"), int) for root in (street, other))
+    assert np.abs(first - second).mean() > 15
+
+
+def test_a_finished_street_is_reused(street):
+    calls = []
+    before = (street / "street.json").stat().st_mtime_ns
+    assert make_street(TINY, street, lambda done, total: calls.append(done)) == street
+    assert calls == []
+    assert (street / "street.json").stat().st_mtime_ns == before
+
+
+def test_another_folder_is_not_touched(street, tmp_path):
+    with pytest.raises(FileExistsError, match="choose another folder"):
+        make_street(dataclasses.replace(TINY, seed=4), street)
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="exactly these settings"):
+        make_street(TINY, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_an_interruption_leaves_nothing(tmp_path):
+    small = dataclasses.replace(TINY, num_cameras=1, supersampling=1, width=16, height=9)
+
+    def interrupt(done: int, total: int) -> None:
+        assert total == 3
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_street(small, tmp_path / "street", interrupt)
+    assert list(tmp_path.iterdir()) == []
+    calls = []
+    make_street(small, tmp_path / "street", lambda done, total: calls.append((done, total)))
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert [path.name for path in tmp_path.iterdir()] == ["street"]
+
+
+def test_a_street_without_objects(tmp_path):
+    empty = StreetSettings(
+        num_frames=1, width=16, height=9, num_cameras=1, supersampling=1, lidar_beams=4, lidar_azimuth_steps=8,
+        num_parked_cars=0, num_moving_cars=0, num_pedestrians=0, num_cyclists=0,
+    )  # fmt: skip
+    root = make_street(empty, tmp_path / "empty")
+    assert json.loads((root / "instances/frame_instances.json").read_text()) == {"0": []}
+    assert json.loads((root / "instances/instances_info.json").read_text()) == {}
+    assert not np.array(Image.open(root / "dynamic_masks/all/000_0.png")).any()

@@ -1,0 +1,120 @@
+"""The street's objects: parts stay in their boxes, poses follow speeds, nobody collides, seeds differ."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from sparsestreet.data.synthetic import layout
+from sparsestreet.data.synthetic.models.car import STYLES, Car
+from sparsestreet.data.synthetic.models.people import Cyclist, Pedestrian, random_clothes
+from sparsestreet.data.synthetic.motion import EgoDrive, Path
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.world import build_world
+
+CLOTHES = random_clothes(np.random.default_rng(0))
+GREY = (0.5, 0.5, 0.5)
+MODELS = [
+    *(Car(style, GREY, GREY) for style in STYLES),
+    Pedestrian(1.58, CLOTHES),
+    Pedestrian(1.9, CLOTHES),
+    Cyclist(CLOTHES, GREY),
+]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.class_name} {model.size[0]:.2f}")
+def test_parts_stay_within_the_box_and_nearly_fill_it(model):
+    reach = np.zeros(3)
+    rng = np.random.default_rng(0)
+    for travelled in np.linspace(0, 6.3, 13):
+        for part in model.parts(float(travelled)):
+            directions = rng.standard_normal((3, 300))
+            directions /= np.linalg.norm(directions, axis=0)
+            # Rays towards a point within the part, from all around: their entries sample its surface.
+            origins = -4 * directions
+            hit = part.shape.enter(origins.astype(np.float32), directions.astype(np.float32))
+            points = (origins + np.where(np.isfinite(hit), hit, 4.0) * directions)[:, np.isfinite(hit)]
+            world = part.frame_from_part[:3, :3] @ points + part.frame_from_part[:3, 3:]
+            reach = np.maximum(reach, np.abs(world).max(1))
+    half = np.array(model.size) / 2
+    assert (reach <= half + 1e-3).all(), reach - half
+    assert (reach >= 0.75 * half).all(), reach / half
+
+
+def test_wheels_touch_the_road():
+    for style in STYLES:
+        car = Car(style, GREY, GREY)
+        lowest = min(part.frame_from_part[2, 3] - part.shape.half_extent[0] for part in car.parts(0.0)[2:])
+        assert lowest == pytest.approx(-style.height / 2, abs=1e-6)
+
+
+def test_path_heading_is_the_tangent():
+    path = Path(start=3.0, y=7.0, speed=-9.0, shift=2.0, shift_time=1.5)
+    for time in (0.0, 0.7, 1.5, 2.2, 4.0):
+        ahead, behind = np.array(path.position(time + 1e-5)), np.array(path.position(time - 1e-5))
+        tangent = (ahead - behind) / 2e-5
+        heading = path.heading(time)
+        expected = np.array([np.cos(heading), np.sin(heading)]) * np.linalg.norm(tangent)
+        np.testing.assert_allclose(expected, tangent, atol=1e-4)
+
+
+def test_ego_heading_is_the_tangent_and_offsets_go_left():
+    ego = EgoDrive(8.0)
+    for time in (0.0, 1.3, 3.9):
+        tangent = (ego.pose(time + 1e-5)[:2, 3] - ego.pose(time - 1e-5)[:2, 3]) / 2e-5
+        forward, left = ego.pose(time)[:2, 0], ego.pose(time)[:2, 1]
+        np.testing.assert_allclose(tangent / np.linalg.norm(tangent), forward, atol=1e-4)
+        assert 6 < np.linalg.norm(tangent) < 10
+        np.testing.assert_allclose(ego.pose(time, 2.0)[:2, 3], ego.pose(time)[:2, 3] + 2 * left)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_moving_actors_travel_at_their_speed_and_nobody_collides(seed):
+    settings = StreetSettings(seed=seed)
+    world = build_world(settings)
+    ego_half = np.array([2.4, 1.0])
+    for frame in range(settings.num_frames):
+        time = frame / settings.frame_rate
+        centres = [actor.pose(time)[:2, 3] for actor in world.actors]
+        halves = [np.array(actor.model.size[:2]) / 2 for actor in world.actors]
+        forward = world.ego.pose(time) @ [1.3, 0, 0, 1]
+        for centre, half in zip(centres, halves, strict=True):
+            # Headings stay within a few degrees of the street's, so boxes overlap only if both intervals do.
+            assert (np.abs(centre - forward[:2]) > half + ego_half).any()
+        for a, b in itertools.combinations(range(len(centres)), 2):
+            assert (np.abs(centres[a] - centres[b]) > halves[a] + halves[b]).any(), (frame, a, b)
+        for actor in world.actors:
+            moved = np.linalg.norm(actor.pose(time + 0.1)[:2, 3] - actor.pose(time)[:2, 3])
+            assert moved >= abs(actor.path.speed) * 0.1 - 1e-9
+            assert moved <= abs(actor.path.speed) * 0.1 * 1.15 + 1e-9
+    kinds = [actor.name.split("_")[0] for actor in world.actors]
+    assert [kinds.count(kind) for kind in ("parked", "moving", "pedestrian", "cyclist")] == [14, 5, 6, 2]
+
+
+def test_people_walk_on_footways_and_cars_on_the_road():
+    world = build_world(StreetSettings(seed=5))
+    for actor in world.actors:
+        y = actor.pose(1.0)[1, 3]
+        on_road = layout.KERB_RIGHT < y < layout.KERB_LEFT
+        assert on_road == (actor.model.class_name != "Pedestrian")
+        bottom = actor.pose(1.0)[2, 3] - actor.model.size[2] / 2
+        assert bottom == pytest.approx(0.0 if on_road else layout.KERB_HEIGHT, abs=1e-9)
+
+
+def test_seeds_give_other_streets_and_counts_can_be_zero():
+    first, again, other = (build_world(StreetSettings(seed=seed)) for seed in (0, 0, 1))
+    poses = [[actor.pose(0.0) for actor in world.actors] for world in (first, again, other)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert not np.allclose(poses[0], poses[2])
+    assert [part.surface for part in first.scenery] != [part.surface for part in other.scenery]
+    empty = StreetSettings(num_parked_cars=0, num_moving_cars=0, num_pedestrians=0, num_cyclists=0, num_frames=1)
+    assert build_world(empty).actors == ()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("num_frames", 0), ("width", -1), ("num_cameras", 4), ("field_of_view", 170.0), ("num_cyclists", -1)],
+)
+def test_settings_name_what_is_wrong(field, value):
+    with pytest.raises(ValueError, match=rf"StreetSettings\.{field} .*{value}"):
+        StreetSettings(**{field: value})
