@@ -34,8 +34,16 @@ class Gaussians:
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
         """Rows of all parts in order; parts of a lower SH degree are padded with zeros."""
+        if len(parts) == 1:
+            return parts[0]
         terms = max(part.sh.shape[1] for part in parts)
-        padded = [torch.nn.functional.pad(part.sh, (0, 0, 0, terms - part.sh.shape[1])) for part in parts]
+        # pad copies even where there is nothing to add, and the harmonics are most of a scene's memory traffic.
+        padded = [
+            part.sh
+            if part.sh.shape[1] == terms
+            else torch.nn.functional.pad(part.sh, (0, 0, 0, terms - part.sh.shape[1]))
+            for part in parts
+        ]
         return Gaussians(
             torch.cat([part.means for part in parts]),
             torch.cat([part.quaternions for part in parts]),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sparsestreet.data.log import DrivingLog
@@ -15,8 +16,9 @@ from sparsestreet.scene.seeds.points import Points, far_positions, near_position
 from sparsestreet.scene.seeds.rows import MINIMUM_SCALE, neighbour_scales, seed_rows
 from sparsestreet.types import Frame
 
-LARGEST_SCALE_RATIO = 0.05
-"""Of a seed's distance from the centre, or of the scene's radius if that is more: 3 degrees as seen from within."""
+LARGEST_RANDOM_RATIO = 0.02
+"""Of a random seed's distance from the nearest camera. Their neighbours are metres away, so without a limit (here 1.1
+degrees) they start as a fog that hides the lidar points and makes every early step slow."""
 
 
 @dataclass(frozen=True)
@@ -44,22 +46,19 @@ class BackgroundSeeds:
         Raises ValueError if there is not a single point to start from.
         """
         center = torch.as_tensor(log.center, dtype=torch.float32)
-        points = Points.concatenate(
-            [
-                self._lidar(log, held_out).sampled(self.lidar_points, generator),
-                random_points(near_positions, self.near_points, center, log.radius, train_frames, generator),
-                random_points(far_positions, self.far_points, center, log.radius, train_frames, generator),
-            ]
-        )
+        lidar = self._lidar(log, held_out).sampled(self.lidar_points, generator)
+        near = random_points(near_positions, self.near_points, center, log.radius, train_frames, generator)
+        far = random_points(far_positions, self.far_points, center, log.radius, train_frames, generator)
+        points = Points.concatenate([lidar, near, far])
         if len(points) == 0:
             raise ValueError(
                 f"the background of {log.name!r} has no seeds: no coloured lidar point of a training sweep, and no "
                 f"random point (near_points={self.near_points}, far_points={self.far_points}) is seen by one of "
                 f"{len(train_frames)} training views; raise near_points, or check the poses of the cameras"
             )
-        scales = torch.minimum(
-            neighbour_scales(points.positions), _largest_scales(points.positions, center, log.radius)
-        )
+        scales = neighbour_scales(points.positions)
+        limits = _largest_scales(points.positions[len(lidar) :], train_frames)
+        scales[len(lidar) :] = torch.minimum(scales[len(lidar) :], limits)
         rows = seed_rows(
             points.positions,
             points.colors,
@@ -82,6 +81,8 @@ class BackgroundSeeds:
         return Points.concatenate(parts)
 
 
-def _largest_scales(positions: Float[Tensor, "n 3"], center: Float[Tensor, "3"], radius: float) -> Float[Tensor, " n"]:
-    distance = (positions - center).norm(dim=1).clamp(min=radius)
-    return (LARGEST_SCALE_RATIO * distance).clamp(min=MINIMUM_SCALE)
+def _largest_scales(positions: Float[Tensor, "n 3"], frames: Sequence[Frame]) -> Float[Tensor, " n"]:
+    """Metres, by the distance from the nearest camera."""
+    cameras = torch.stack([frame.camera.position for frame in frames]).double().numpy()
+    distances, _ = cKDTree(cameras).query(positions.double().numpy())
+    return (LARGEST_RANDOM_RATIO * torch.from_numpy(distances).float()).clamp(min=MINIMUM_SCALE)

@@ -16,6 +16,9 @@ FARTHEST_RATIO = 0.02
 CANDIDATES_PER_POINT = 3
 """Random positions drawn at once for each one wanted, since most lie in no view (DriveStudio)."""
 
+VIEWS_PER_ROUND = 24
+"""Views that each draw is tested against, chosen anew: neighbouring views see nearly the same space."""
+
 ROUNDS = 10
 """Draws before a scene whose cameras see a small part of the space makes do with fewer points."""
 
@@ -79,7 +82,8 @@ def random_points(
         if len(found) >= count:
             break
         candidates = draw(CANDIDATES_PER_POINT * count, center, radius, generator)
-        found = Points.concatenate([found, seen_points(candidates, frames)])
+        views = torch.randperm(len(frames), generator=generator)[:VIEWS_PER_ROUND].tolist()
+        found = Points.concatenate([found, seen_points(candidates, [frames[view] for view in views])])
     return found.sampled(count, generator)
 
 
