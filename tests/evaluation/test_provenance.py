@@ -16,6 +16,7 @@ def test_source_is_the_checkout_that_tracks_the_package(tmp_path):
     package.mkdir()
     (package / "__init__.py").write_text("")
     git(tmp_path, "init", "-q")
+    git(tmp_path, "commit", "-q", "--allow-empty", "-m", "somebody else's repository")
     assert (this_source(package).commit, this_source(package).dirty) == (None, None)  # not tracked
     git(tmp_path, "add", "package")
     git(tmp_path, "commit", "-q", "-m", "first")

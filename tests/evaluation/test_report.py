@@ -149,7 +149,7 @@ def test_many_methods_stand_below_each_other():
 def test_collect_finds_each_run_once(tmp_path):
     for name in ("a/run", "b"):
         write_summary(summary_path(tmp_path / name), make_summary(name))
-    found = collect([tmp_path, tmp_path / "a"])
+    found = collect([tmp_path, tmp_path / "a", tmp_path / "a" / ".." / "b"])
     assert [record.summary.run.method for record in found] == ["a/run", "b"]
     assert found[1].folder == (tmp_path / "b").resolve()
     assert collect([tmp_path / "b"])[0].summary.run.method == "b"  # the run's folder itself
