@@ -72,14 +72,14 @@ Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii
   const double start = omp_get_wtime();
   if (!project_rows(ws, view, in, static_cast<T*>(radii))) return BAD_VALUE;
   const double projected = omp_get_wtime();
-  report.pairs = ws.pair_count = assign_slots(ws, in.count);
+  list_visible(ws, in.count);
+  report.pairs = ws.pair_count;
   if (ws.pair_count > view.pair_limit) {
     report_worst(ws, in.count, report);
     return TOO_MANY_PAIRS;
   }
   const Grid<T> grid(view);
   ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
-  list_visible(ws, in.count, view.threads);
   sort_by_depth(ws, view.threads);
   fill_tiles(ws, grid, view.threads);
   ws.seconds[PROJECT] = projected - start, ws.seconds[BIN] = omp_get_wtime() - projected;

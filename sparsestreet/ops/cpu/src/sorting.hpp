@@ -19,36 +19,24 @@ inline Key depth_key(T depth) {
   return key;
 }
 
-// Lists the rows with tiles, in row order, with their depth keys.
+// Below this many rows one thread sorts faster than several meet at a barrier.
+constexpr int64_t ROWS_WORTH_THREADS = 1 << 16;
+
+// Gives each row its slots, contiguous and in row order, and lists the rows that have any, with their depth keys. The
+// number of pairs is an int64: it may pass 2^31.
 template <class T>
-void list_visible(Workspace<T>& ws, int64_t rows, int64_t threads) {
+void list_visible(Workspace<T>& ws, int64_t rows) {
   using Key = typename Workspace<T>::Key;
-  int64_t* visible_before = ws.histogram.reserve(threads + 1);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t part = 0; part < threads; ++part) {
-    int64_t visible = 0;
-    const Range range(rows, part, threads);
-    for (int64_t i = range.begin; i < range.end; ++i) visible += ws.counts[i] > 0;
-    visible_before[part] = visible;
+  int64_t visible = 0, pairs = 0;
+  ws.first_slot.reserve(rows), ws.keys.reserve(rows), ws.order.reserve(rows);
+  for (int64_t i = 0; i < rows; ++i) {
+    ws.first_slot[i] = pairs;
+    if (ws.counts[i] == 0) continue;
+    pairs += ws.counts[i];
+    ws.keys[visible] = depth_key<T, Key>(ws.splats[i].depth);
+    ws.order[visible++] = int32_t(i);
   }
-  int64_t total = 0;
-  for (int64_t part = 0; part < threads; ++part) {
-    const int64_t here = visible_before[part];
-    visible_before[part] = total;
-    total += here;
-  }
-  ws.visible = total;
-  ws.keys.reserve(total), ws.other_keys.reserve(total), ws.order.reserve(total), ws.other_order.reserve(total);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t part = 0; part < threads; ++part) {
-    const Range range(rows, part, threads);
-    int64_t at = visible_before[part];
-    for (int64_t i = range.begin; i < range.end; ++i) {
-      if (ws.counts[i] == 0) continue;
-      ws.keys[at] = depth_key<T, Key>(ws.splats[i].depth);
-      ws.order[at++] = int32_t(i);
-    }
-  }
+  ws.visible = visible, ws.pair_count = pairs;
 }
 
 // One stable pass over `bits` bits of the key from `shift` on.
@@ -87,6 +75,8 @@ void sort_by_digit(const Key* keys, const int32_t* values, Key* keys_out, int32_
 // Radix sort by the whole key, from the lowest digit; leaves the result in ws.order. Ties keep the row order.
 template <class T>
 void sort_by_depth(Workspace<T>& ws, int64_t threads) {
+  if (ws.visible < ROWS_WORTH_THREADS) threads = 1;
+  ws.other_keys.reserve(ws.visible), ws.other_order.reserve(ws.visible);
   constexpr int bits = 11, key_bits = 8 * sizeof(typename Workspace<T>::Key), passes = (key_bits + bits - 1) / bits;
   int64_t* histogram = ws.histogram.reserve(threads << bits);
   auto *keys = ws.keys.data(), *other_keys = ws.other_keys.data();
@@ -99,18 +89,6 @@ void sort_by_depth(Workspace<T>& ws, int64_t threads) {
     order = other_order, other_order = order_before;
   }
   if (order != ws.order.data()) std::memcpy(ws.order.data(), order, ws.visible * sizeof(int32_t));
-}
-
-// Slots of each row: contiguous, in row order. Answers the number of pairs (int64: it may pass 2^31).
-template <class T>
-int64_t assign_slots(Workspace<T>& ws, int64_t rows) {
-  int64_t total = 0;
-  ws.first_slot.reserve(rows);
-  for (int64_t i = 0; i < rows; ++i) {
-    ws.first_slot[i] = total;
-    total += ws.counts[i];
-  }
-  return total;
 }
 
 // Fills ws.pairs tile by tile, nearest first, and ws.tile_begin.
