@@ -2,8 +2,10 @@ PY ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-# Caches stay inside the clone.
+# Caches and temporary files stay inside the clone.
+export TMPDIR := $(CURDIR)/.cache/tmp
 export XDG_CACHE_HOME := $(CURDIR)/.cache
+$(shell mkdir -p .cache/tmp)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
 .PHONY: test demo lint bench clean

@@ -11,10 +11,11 @@ from omegaconf import DictConfig
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import RunDescription, RunSummary
 from sparsestreet.evaluation.run import evaluate_run
 from sparsestreet.scene.build import build_scene
-from sparsestreet.scene.centres import project_centres
+from sparsestreet.scene.centres import node_legend, project_centres
 from sparsestreet.training.system import StreetSystem
 
 
@@ -56,7 +57,7 @@ def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seco
     if not held_out:
         return None
     system, scene = parts.system.cpu().eval(), parts.system.scene
-    return evaluate_run(
+    summary = evaluate_run(
         held_out,
         render=system.render,
         centres=lambda frame: project_centres(scene, frame.camera, frame.time),
@@ -71,4 +72,7 @@ def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seco
             command=shlex.join(["sparsestreet", *sys.argv[0].split()[1:], *sys.argv[1:]]),
         ),
         out=out,
+        legend=node_legend(scene.counts()),
     )
+    draw_history(out)
+    return summary

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from sparsestreet.cli.report import report
 from sparsestreet.evaluation.compare import compare_runs
+from sparsestreet.evaluation.records import read_summary, summary_path
+from sparsestreet.scene.centres import node_legend
 
 USAGE = "sparsestreet demo [key=value ...]    the overrides go to both trainings (schedule.max_steps=500, seed=1 ...)"
 EXPERIMENTS = ("streetgs", "streetgs_ours")
@@ -27,7 +29,8 @@ def demo(arguments: list[str]) -> int:
         if status:
             return status
     plain, ours = (out / experiment for experiment in EXPERIMENTS)
-    compare_runs(plain, ours, out / "comparison.png")
+    legend = node_legend(read_summary(summary_path(plain)).gaussians)
+    compare_runs(plain, ours, out / "comparison.png", legend=legend)
     status = report([str(out), f"baseline={EXPERIMENTS[0]}", f"markdown={out / 'table.md'}"])
     print(f"pictures: {out}/comparison.png, {ours}/pictures/sheet.png ({time.perf_counter() - started:.0f} s in all)")
     return status

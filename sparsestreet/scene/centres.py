@@ -1,5 +1,7 @@
 """Where the Gaussians are: a dot for every centre, coloured by node class."""
 
+from collections.abc import Iterable
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,6 +14,14 @@ NODE_COLORS = ((0.30, 0.60, 0.90), (0.98, 0.60, 0.15), (0.35, 0.80, 0.40), (0.90
 """RGB of the nodes in their order in the scene, repeated where there are more nodes."""
 
 BACKGROUND_COLOR = 0.05
+
+
+def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
+    """Name of a node, in the order of the scene -> 8-bit RGB of its dots."""
+    return {
+        name: tuple(round(255 * channel) for channel in NODE_COLORS[position % len(NODE_COLORS)])
+        for position, name in enumerate(nodes)
+    }
 
 
 @torch.no_grad()
