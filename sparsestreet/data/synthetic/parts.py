@@ -12,6 +12,7 @@ BACKGROUND = -1
 """Object index of what is no annotated object."""
 
 Pose = Float64[np.ndarray, "4 4"]
+Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def axis_along_y(x: float, y: float, z: float) -> Pose:
     return pose
 
 
-def limb(start: tuple[float, float, float], end: tuple[float, float, float], radius: float, surface: Surface) -> Part:
+def limb(start: Point, end: Point, radius: float, surface: Surface) -> Part:
     """A capsule whose axis runs from one point to another, metres."""
     a, b = np.array(start, np.float64), np.array(end, np.float64)
     length = float(np.linalg.norm(b - a))
@@ -58,4 +59,4 @@ def limb(start: tuple[float, float, float], end: tuple[float, float, float], rad
     pose = np.eye(4)
     pose[:3, :3] = np.stack((np.cross(side, axis), side, axis), axis=1)
     pose[:3, 3] = (a + b) / 2
-    return Part(Capsule(radius, length / 2), surface, pose)
+    return Part(Capsule(radius, length / 2.0), surface, pose)

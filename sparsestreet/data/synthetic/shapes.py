@@ -44,7 +44,7 @@ def _away_from_zero(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) < _TINY, _TINY, values)
 
 
-def _slab(origins: Scalars, directions: Scalars, half: float) -> tuple[Scalars, Scalars]:
+def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) -> tuple[Scalars, Scalars]:
     """Distances at which rays enter and leave |coordinate| <= half."""
     inverse = np.float32(1) / _away_from_zero(directions)
     centre = -origins * inverse

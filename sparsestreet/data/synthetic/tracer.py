@@ -63,7 +63,7 @@ def _trace_tile(
     directions = np.ascontiguousarray(tile.reshape(3, -1))
     nearest = np.full(directions.shape[1], np.inf, np.float32)
     hit = np.full(directions.shape[1], NOTHING, np.int16)
-    for index in scene.in_bundle(in_view, origin, _bounding_planes(tile)):
+    for index in scene.in_bundle(in_view, origin, _bounding_planes(tile)).tolist():
         if nearness[index] > nearest.max():
             break
         local_origin = scene.to_part(index, origin[:, None])
@@ -109,7 +109,7 @@ def _blocked(scene: Scene, view: SunView, points: Vectors, owner: int) -> Bool[n
     candidates = view.blockers(seen)
     starts = np.searchsorted(seen[1], view.low[candidates, 1])
     stops = np.searchsorted(seen[1], view.high[candidates, 1])
-    for index, start, stop in zip(candidates, starts, stops, strict=True):
+    for index, start, stop in zip(candidates.tolist(), starts.tolist(), stops.tolist(), strict=True):
         if index == owner or start == stop:  # a convex part does not shade its own lit side
             continue
         low, high, run = view.low[index], view.high[index], slice(start, stop)

@@ -75,17 +75,17 @@ def _ground(seed: int, end: float) -> list[Part]:
     )
     grey = float(rng.uniform(0.09, 0.15))
     asphalt = Asphalt(lines, (grey, grey, grey * 1.03), float(rng.uniform(0, 30)))
-    parts = [Part(box(1600, 1600, 2), asphalt, at(0, 0, -1))]
+    parts = [Part(box(1600.0, 1600.0, 2.0), asphalt, at(0.0, 0.0, -1.0))]
     half, half_length = layout.FOOTWAY_WIDTH / 2, (stop - start) / 2
     tone = float(rng.uniform(0.24, 0.34))
     for side, kerb in ((1, layout.KERB_RIGHT), (-1, layout.KERB_LEFT)):
         footway = Footway((tone, tone * 0.97, tone * 0.91), half, side, float(rng.uniform(0, 30)))
         # Sunk into the ground; wider at the back, so that set-back houses leave no gap to the road surface.
         solid = box(2 * half_length, 2 * half, 2 * layout.KERB_HEIGHT)
-        parts.append(Part(solid, footway, at((start + stop) / 2, kerb - side * half, 0)))
-        back = Footway((tone * 0.9, tone * 0.88, tone * 0.8), 50, side, float(rng.uniform(0, 30)))
-        yard = box(2 * half_length, 30, 2 * layout.KERB_HEIGHT - 0.01)
-        parts.append(Part(yard, back, at((start + stop) / 2, kerb - side * (2 * half + 15), 0)))
+        parts.append(Part(solid, footway, at((start + stop) / 2.0, kerb - side * half, 0.0)))
+        back = Footway((tone * 0.9, tone * 0.88, tone * 0.8), 50.0, side, float(rng.uniform(0, 30)))
+        yard = box(2 * half_length, 30.0, 2 * layout.KERB_HEIGHT - 0.01)
+        parts.append(Part(yard, back, at((start + stop) / 2.0, kerb - side * (2 * half + 15.0), 0.0)))
     return parts
 
 
@@ -105,19 +105,19 @@ def _houses(seed: int, end: float) -> list[Part]:
         while x < stop:
             width = float(rng.uniform(8, 15))
             setback = float(rng.uniform(0.0, 0.6))
-            pose = at(x + width / 2, front - road_side * setback, 0)
+            pose = at(x + width / 2.0, front - road_side * setback, 0.0)
             parts += placed(house(rng, width, float(rng.uniform(9, 13)), road_side), pose)
             x += width
             if rng.random() < 0.2:
                 gap = float(rng.uniform(3, 6))
-                behind = house(rng, gap + 10, 10, road_side)
-                parts += placed(behind, at(x + gap / 2, front - road_side * 15, 0))
+                behind = house(rng, gap + 10.0, 10.0, road_side)
+                parts += placed(behind, at(x + gap / 2.0, front - road_side * 15.0, 0.0))
                 x += gap
     y = layout.KERB_RIGHT - 12.0
     while y < layout.KERB_LEFT + 12:
         width = float(rng.uniform(9, 14))
         # Turned by a quarter: the front looks back along the street.
-        parts += placed(house(rng, width, 10, 1), at(stop + 14, y + width / 2, 0, np.pi / 2))
+        parts += placed(house(rng, width, 10.0, 1), at(stop + 14.0, y + width / 2.0, 0.0, np.pi / 2.0))
         y += width
     return parts
 
@@ -198,7 +198,7 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
         y = layout.KERB_RIGHT - lane if on_right else layout.KERB_LEFT + lane
         speed = float(rng.uniform(0.9, 1.6)) * (1 if rng.random() < 0.5 else -1)
         share = (number + float(rng.uniform(0.2, 0.8))) / settings.num_pedestrians
-        path = Path(start=6 + share * (end + 18), y=y, speed=speed)
+        path = Path(start=6 + share * (end + 18.0), y=y, speed=speed)
         actors.append(Actor(f"pedestrian_{number:02d}", random_pedestrian(rng), path, layout.KERB_HEIGHT))
     return actors
 
@@ -209,6 +209,8 @@ def _cyclists(settings: StreetSettings) -> list[Actor]:
     speed = settings.ego_speed * float(rng.uniform(0.5, 0.65))
     actors = []
     for number in range(settings.num_cyclists):
-        path = Path(9 + 8 * number + float(rng.uniform(0, 4)), layout.CYCLE_LANE + float(rng.uniform(-0.2, 0.2)), speed)
+        path = Path(
+            9 + 8 * number + float(rng.uniform(0.0, 4.0)), layout.CYCLE_LANE + float(rng.uniform(-0.2, 0.2)), speed
+        )
         actors.append(Actor(f"cyclist_{number:02d}", random_cyclist(rng), path, 0.0))
     return actors

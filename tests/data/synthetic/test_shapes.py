@@ -106,8 +106,8 @@ def test_no_rays(shape, inside):
 @pytest.mark.parametrize(
     ("shape", "origin", "direction", "expected"),
     [
-        (box(2, 2, 2), (-5, 0, 0), (1, 0, 0), 4.0),
-        (box(2, 2, 2), (-5, 1.5, 0), (1, 0, 0), np.inf),
+        (box(2.0, 2.0, 2.0), (-5, 0, 0), (1, 0, 0), 4.0),
+        (box(2.0, 2.0, 2.0), (-5, 1.5, 0), (1, 0, 0), np.inf),
         (Ellipsoid(np.array([2, 1, 1], np.float32)), (0, -5, 0), (0, 1, 0), 4.0),
         (Ellipsoid(np.array([2, 1, 1], np.float32)), (9, 0, 0), (-1, 0, 0), 7.0),
         (Cylinder(0.5, 1.0), (0, 0, 4), (0, 0, -1), 3.0),
@@ -118,7 +118,7 @@ def test_no_rays(shape, inside):
         # The half circle of the end: at z = 1.3 the cap's radius is 0.4.
         (Capsule(0.5, 1.0), (0, 3, 1.3), (0, -1, 0), 2.6),
         # A pyramid's side x + z <= 1 met from above at x = 0.25.
-        (extrusion([(-1, 0), (1, 0), (0, 1)], 2, 2), (0.25, 0, 3), (0, 0, -1), 2.25),
+        (extrusion([(-1.0, 0.0), (1.0, 0.0), (0.0, 1.0)], 2.0, 2.0), (0.25, 0, 3), (0, 0, -1), 2.25),
     ],
 )
 def test_hand_computed(shape, origin, direction, expected):

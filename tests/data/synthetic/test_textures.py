@@ -39,8 +39,8 @@ def test_noise_has_unit_variance_near_and_vanishes_far():
     assert abs(values.mean()) < 0.1
     assert 0.8 < values.std() < 1.2
     assert (smooth_noise(u, v, 0.5, far) == 0).all()
-    # Neighbours a hundredth of a cell apart differ by a hundredth of the amplitude or so: no steps.
-    assert np.abs(smooth_noise(u + 0.005, v, 0.5, near) - values).max() < 0.2
+    # One texel is 1/32 of a cell; the fade's slope is at most 1.875 and values span about 6: steps up to 0.35.
+    assert np.abs(smooth_noise(u + 0.005, v, 0.5, near) - values).max() < 0.4
 
 
 def test_cell_random_is_uniform_and_depends_on_all_inputs():
@@ -90,7 +90,8 @@ def test_looks_are_colours_and_flatten_with_distance(name):
         assert look.albedo.max() <= 1.2
         assert ((look.gloss >= 0) & (look.gloss <= 1)).all()
         top = normals[2] > 0.5
-        spread.append(look.albedo[:, ~top].std() if (~top).any() else look.albedo.std())
+        chosen = look.albedo[:, ~top] if (~top).any() else look.albedo
+        spread.append(chosen.std(1).max())
     assert spread[1] <= spread[0] + 1e-3
     nothing = part.surface.look(points[:, :0], normals[:, :0], points[:, :0])
     assert nothing.albedo.shape == (3, 0)

@@ -17,8 +17,13 @@ GREY = Plain((0.5, 0.5, 0.5))
 def random_scene(seed: int) -> Scene:
     """Forty solids around the origin, in all directions."""
     rng = np.random.default_rng(seed)
-    shapes = [box(2, 1, 3), Ellipsoid(np.array([1.5, 0.4, 0.8], np.float32)), Cylinder(0.5, 1.2), Capsule(0.3, 1.0)]
-    parts = [Part(box(400, 400, 2), GREY, at(0, 0, -3))]
+    shapes = [
+        box(2.0, 1.0, 3.0),
+        Ellipsoid(np.array([1.5, 0.4, 0.8], np.float32)),
+        Cylinder(0.5, 1.2),
+        Capsule(0.3, 1.0),
+    ]
+    parts = [Part(box(400.0, 400.0, 2.0), GREY, at(0.0, 0.0, -3.0))]
     for number in range(40):
         rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
         pose = np.eye(4)
@@ -84,15 +89,15 @@ def test_first_hits_equal_brute_force(rays, seed):
 def test_sunlit_equals_brute_force():
     scene = random_scene(3)
     view = SunView.of(scene, random_weather(2).sun)
-    rays = camera_rays(5)
+    rays = lidar_rays(400)
     hits = first_hits(scene, rays)
     directions, parts = rays.directions.reshape(3, -1), hits.parts.ravel()
     checked = 0
-    for index in np.unique(parts[parts != NOTHING]):
+    for index in np.unique(parts[parts != NOTHING]).tolist():
         chosen = np.flatnonzero(parts == index)
         points = rays.origin[:, None] + hits.distances.ravel()[chosen] * directions[:, chosen]
         normals = scene.turn_to_world(index, scene.parts[index].shape.normals(scene.to_part(index, points)))
-        lit = sunlit(scene, view, points, normals, int(index))
+        lit = sunlit(scene, view, points, normals, index)
         facing = (normals * view.sun[:, None]).sum(0) > 0
         lifted = (points + 2e-3 * normals).astype(np.float64)
         sun = np.repeat(view.sun[:, None].astype(np.float64), len(chosen), axis=1)
@@ -106,7 +111,9 @@ def test_sunlit_equals_brute_force():
 
 def test_shadow_of_a_box_on_the_ground():
     """A box of 2 m, sun from the south at 45 degrees: the shadow reaches 2 m to the north of the box."""
-    scene = Scene.of([Part(box(100, 100, 2), GREY, at(0, 0, -1)), Part(box(2, 2, 2), GREY, at(0, 0, 1))])
+    scene = Scene.of(
+        [Part(box(100.0, 100.0, 2.0), GREY, at(0.0, 0.0, -1.0)), Part(box(2.0, 2.0, 2.0), GREY, at(0.0, 0.0, 1.0))]
+    )
     sun = np.array([0, -1, 1], np.float32) / np.float32(np.sqrt(2))
     points = np.array([[0, 1.5, 0], [0, 2.9, 0], [0, 3.1, 0], [0, -1.5, 0], [0.9, 2, 0], [1.1, 2, 0]], np.float32).T
     up = np.zeros_like(points)
@@ -116,7 +123,10 @@ def test_shadow_of_a_box_on_the_ground():
 
 
 def test_a_point_behind_a_box_is_darker():
-    ground, wall = Part(box(100, 100, 2), GREY, at(0, 0, -1)), Part(box(2, 2, 6), GREY, at(0, 0, 3))
+    ground, wall = (
+        Part(box(100.0, 100.0, 2.0), GREY, at(0.0, 0.0, -1.0)),
+        Part(box(2.0, 2.0, 6.0), GREY, at(0.0, 0.0, 3.0)),
+    )
     weather = random_weather(0)
     behind = -4 * weather.sun / np.linalg.norm(weather.sun[:2])
     x, y = np.array([behind[0], 30.0]), np.array([behind[1], 30.0])  # the second point lies in the open

@@ -69,7 +69,7 @@ class Car:
     def _body(self) -> Part:
         style = self.style
         middle = (style.belt + _CLEARANCE) / 2
-        front, rear, low, high = self._x(0), self._x(1), _CLEARANCE - middle, style.belt - middle
+        front, rear, low, high = self._x(0.0), self._x(1.0), _CLEARANCE - middle, style.belt - middle
         nose, tail = style.nose - middle, (style.belt + style.nose) / 2 - middle
         profile = [
             (rear + 0.10, low), (front - 0.12, low), (front, nose - 0.22), (front - 0.06, nose),
@@ -87,7 +87,7 @@ class Car:
             arch=_WHEEL_RADIUS + 0.05,
             seams=(self._x(style.bonnet + 0.04), self._x(style.posts[0])),
         )
-        return Part(extrusion(profile, width, width - 0.06), paint, at(0, 0, middle - style.height / 2))
+        return Part(extrusion(profile, width, width - 0.06), paint, at(0.0, 0.0, middle - style.height / 2.0))
 
     def _cabin(self) -> Part:
         style = self.style
@@ -103,7 +103,7 @@ class Car:
         width = style.width - 2 * _BODY_INSET - 0.07
         shape = extrusion(profile, width, width - 0.34 * (style.height - style.belt) / 0.55)
         posts = tuple(self._x(post) for post in style.posts)
-        return Part(shape, Cabin(self.color, shape, 0.065, posts), at(0, 0, middle - style.height / 2))
+        return Part(shape, Cabin(self.color, shape, 0.065, posts), at(0.0, 0.0, middle - style.height / 2.0))
 
     def _wheels(self, travelled: float) -> list[Part]:
         half_width, angle = 0.11, travelled / _WHEEL_RADIUS

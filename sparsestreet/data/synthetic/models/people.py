@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparsestreet.data.synthetic.parts import Part, at, axis_along_y, limb
+from sparsestreet.data.synthetic.parts import Part, Point, at, axis_along_y, limb
 from sparsestreet.data.synthetic.shapes import Cylinder, Ellipsoid
 from sparsestreet.data.synthetic.textures.car import Wheel
 from sparsestreet.data.synthetic.textures.look import Color
@@ -25,11 +25,11 @@ def _head(x: float, z: float, scale: float, clothes: Clothes) -> list[Part]:
     face = Ellipsoid(np.array([0.095, 0.08, 0.125], np.float32) * np.float32(scale))
     hair = Ellipsoid(np.array([0.1, 0.09, 0.1], np.float32) * np.float32(scale))
     back, up = 0.02 * scale, 0.045 * scale
-    return [Part(face, Plain(clothes.skin), at(x, 0, z)), Part(hair, Plain(clothes.hair), at(x - back, 0, z + up))]
+    return [Part(face, Plain(clothes.skin), at(x, 0.0, z)), Part(hair, Plain(clothes.hair), at(x - back, 0.0, z + up))]
 
 
 def _leg(
-    hip: tuple[float, float, float], knee: tuple[float, float, float], foot: tuple[float, float, float],
+    hip: Point, knee: Point, foot: Point,
     scale: float, clothes: Clothes,
 ) -> list[Part]:  # fmt: skip
     trousers, shoe = Plain(clothes.trousers), Plain((0.04, 0.035, 0.03))
@@ -60,8 +60,8 @@ class Pedestrian:
         ground = -h / 2
         hip, shoulder = ground + 0.50 * h, ground + 0.80 * h
         cloth = Grainy(self.clothes.top, 0.25, 0.08)
-        torso = limb((0, 0, hip + 0.02 * h), (0.02, 0, shoulder - 0.03 * h), 0.135 * scale, cloth)
-        parts = [torso, *_head(0.02, ground + 0.92 * h, scale, self.clothes)]
+        torso = limb((0.0, 0.0, hip + 0.02 * h), (0.02, 0.0, shoulder - 0.03 * h), 0.135 * scale, cloth)
+        parts = [torso, *_head(0.02, ground + 0.915 * h, scale, self.clothes)]
         for side in (-1, 1):
             swing = float(np.sin(gait)) * side
             parts += self._leg(side * 0.085 * scale, hip, ground, swing, float(np.cos(gait)) * side)
@@ -73,7 +73,7 @@ class Pedestrian:
         raised = max(lift, 0.0) * 0.05 * h
         foot = (swing * 0.17 * h - 0.03, y, ground + 0.058 * scale + raised)
         knee = (swing * 0.10 * h + 0.03 + raised * 0.6, y, ground + 0.27 * h + raised * 0.5)
-        return _leg((0, y, hip), knee, foot, scale, self.clothes)
+        return _leg((0.0, y, hip), knee, foot, scale, self.clothes)
 
     def _arm(self, y: float, shoulder: float, swing: float, cloth: Grainy) -> list[Part]:
         h, scale = self.height, self.height / 1.75
@@ -81,7 +81,7 @@ class Pedestrian:
         hand = (swing * 0.17 * h + 0.03, y * 1.08, shoulder - 0.32 * h)
         skin = Plain(self.clothes.skin)
         return [
-            limb((0, y, shoulder - 0.03 * h), elbow, 0.05 * scale, cloth),
+            limb((0.0, y, shoulder - 0.03 * h), elbow, 0.05 * scale, cloth),
             limb(elbow, hand, 0.042 * scale, cloth),
             Part(Ellipsoid(np.full(3, 0.05 * scale, np.float32)), skin, at(*hand)),
         ]
@@ -93,7 +93,7 @@ class Cyclist:
     frame: Color
 
     class_name = "Cyclist"
-    size = (1.82, 0.62, 1.78)
+    size = (1.82, 0.62, 1.82)
 
     def parts(self, travelled: float) -> list[Part]:
         ground, radius = -self.size[2] / 2, 0.34
@@ -103,15 +103,13 @@ class Cyclist:
         metal = Plain(self.frame, 0.3)
         tyre = Cylinder(radius, 0.02)
         wheel = Wheel(radius, travelled / radius, (0.35, 0.35, 0.36))
-        parts = [Part(tyre, wheel, axis_along_y(x, 0, axle)) for x in (front[0], rear[0])]
+        parts = [Part(tyre, wheel, axis_along_y(x, 0.0, axle)) for x in (front[0], rear[0])]
         for start, end in ((rear, crank), (crank, seat), (crank, bar), (seat, rear), (bar, front), (seat, bar)):
             parts.append(limb(start, end, 0.022, metal))
         parts.append(limb((bar[0], -0.24, bar[2] + 0.04), (bar[0], 0.24, bar[2] + 0.04), 0.02, metal))
         return parts + self._rider(travelled, seat, bar, crank)
 
-    def _rider(
-        self, travelled: float, seat: tuple[float, ...], bar: tuple[float, ...], crank: tuple[float, ...]
-    ) -> list[Part]:
+    def _rider(self, travelled: float, seat: Point, bar: Point, crank: Point) -> list[Part]:
         cloth = Grainy(self.clothes.top, 0.25, 0.08)
         hip, shoulder = (seat[0], 0.0, seat[2] + 0.10), (0.08, 0.0, seat[2] + 0.50)
         parts = [limb(hip, shoulder, 0.14, cloth), *_head(0.17, shoulder[2] + 0.20, 1.0, self.clothes)]

@@ -12,8 +12,8 @@ def tree(rng: np.random.Generator) -> list[Part]:
     """A trunk with a crown of overlapping balls; origin at the foot."""
     height, reach = float(rng.uniform(5.0, 7.5)), float(rng.uniform(1.1, 1.6))
     stem = height - 1.6 * reach
-    bark = Grainy((0.16, 0.11, 0.07), 0.12, 0.25, float(rng.uniform(0, 20)))
-    parts = [Part(Cylinder(float(rng.uniform(0.11, 0.17)), stem / 2), bark, at(0, 0, stem / 2))]
+    bark = Grainy((0.16, 0.11, 0.07), 0.12, 0.25, float(rng.uniform(0.0, 20.0)))
+    parts = [Part(Cylinder(float(rng.uniform(0.11, 0.17)), stem / 2.0), bark, at(0.0, 0.0, stem / 2.0))]
     green = np.array([0.13, 0.24, 0.055]) * rng.uniform(0.75, 1.35) + rng.uniform(-0.015, 0.05) * np.array([1, 0.3, 0])
     for index in range(9):
         # The first ball is the core of the crown; the others sit around it.
@@ -23,7 +23,7 @@ def tree(rng: np.random.Generator) -> list[Part]:
         z = height - reach + away * np.sin(tilt) * 1.3
         size = reach * (0.8 if index == 0 else rng.uniform(0.45, 0.62))
         shade = green * rng.uniform(0.88, 1.12)
-        leaves = Grainy((float(shade[0]), float(shade[1]), float(shade[2])), 0.34, 0.32, float(rng.uniform(0, 20)))
+        leaves = Grainy((float(shade[0]), float(shade[1]), float(shade[2])), 0.34, 0.32, float(rng.uniform(0.0, 20.0)))
         ball = Ellipsoid(np.array([size, size, size * rng.uniform(0.8, 1.0)], np.float32))
         parts.append(Part(ball, leaves, at(float(x), float(y), float(z), float(turn))))
     return parts
@@ -33,10 +33,10 @@ def lamp_post(towards: int) -> list[Part]:
     """A post with an arm over the road; origin at the foot, ``towards`` +1 where the road lies at +y."""
     steel, head = Plain((0.13, 0.14, 0.15), 0.15), Plain((0.55, 0.55, 0.52))
     return [
-        Part(Cylinder(0.10, 0.4), steel, at(0, 0, 0.4)),
-        Part(Cylinder(0.06, 3.3), steel, at(0, 0, 3.3)),
-        limb((0, 0, 6.55), (0, towards * 1.3, 6.85), 0.045, steel),
-        Part(box(0.22, 0.7, 0.12), head, at(0, towards * 1.55, 6.86)),
+        Part(Cylinder(0.10, 0.4), steel, at(0.0, 0.0, 0.4)),
+        Part(Cylinder(0.06, 3.3), steel, at(0.0, 0.0, 3.3)),
+        limb((0.0, 0.0, 6.55), (0.0, towards * 1.3, 6.85), 0.045, steel),
+        Part(box(0.22, 0.7, 0.12), head, at(0.0, towards * 1.55, 6.86)),
     ]
 
 
@@ -44,8 +44,8 @@ def bin_box(rng: np.random.Generator) -> list[Part]:
     """A litter bin; origin at the foot."""
     color = ((0.05, 0.16, 0.08), (0.40, 0.10, 0.03), (0.10, 0.12, 0.16))[rng.integers(3)]
     return [
-        Part(box(0.45, 0.45, 0.9), Grainy(color, 0.3, 0.05), at(0, 0, 0.45)),
-        Part(box(0.52, 0.52, 0.1), Plain((0.05, 0.05, 0.05)), at(0, 0, 0.95)),
+        Part(box(0.45, 0.45, 0.9), Grainy(color, 0.3, 0.05), at(0.0, 0.0, 0.45)),
+        Part(box(0.52, 0.52, 0.1), Plain((0.05, 0.05, 0.05)), at(0.0, 0.0, 0.95)),
     ]
 
 
@@ -82,8 +82,8 @@ def house(rng: np.random.Generator, width: float, depth: float, road_side: int) 
     body = box(width, depth, height)
     front = -road_side * depth / 2
     facade = Facade((width / 2, depth / 2, height / 2), style)
-    parts = [Part(body, facade, at(0, front, height / 2))]
-    parts.append(Part(box(width + 0.02, depth + 0.5, 0.3), Plain(style.trim), at(0, front, height - 0.45)))
+    parts = [Part(body, facade, at(0.0, front, height / 2.0))]
+    parts.append(Part(box(width + 0.02, depth + 0.5, 0.3), Plain(style.trim), at(0.0, front, height - 0.45)))
     if rng.random() < 0.55:
         parts += _balconies(rng, style, width, height, road_side)
     return parts

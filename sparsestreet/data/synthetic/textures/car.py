@@ -113,7 +113,7 @@ class Wheel:
         width = footprints[:2].max(0)
         radius = np.hypot(x, y)
         turn = np.cos(5 * (np.arctan2(y, x) + np.float32(self.angle)))
-        spoke = beyond(turn * radius, 0.0, width * 3)
+        spoke = beyond(turn * radius, 0.0, width * 3.0)
         inside = 1 - beyond(radius, self.radius * 0.66, width)
         rim = np.maximum(strip(radius, self.radius * 0.56, self.radius * 0.66, width), spoke * inside)
         rim = np.maximum(rim, 1 - beyond(radius, self.radius * 0.18, width)) * (np.abs(normals[2]) > 0.5)
