@@ -41,7 +41,9 @@ class Optimization:
     def rate_of(self, name: str) -> Rate:
         keys = [key for key in self.rates if name == key or name.endswith(f".{key}")]
         if not keys:
-            raise ValueError(f"parameter {name!r} has no learning rate: add one to optimization.rates {list(self.rates)}")
+            raise ValueError(
+                f"parameter {name!r} has no learning rate: add one to optimization.rates {list(self.rates)}"
+            )
         return self.rates[max(keys, key=len)]
 
     def build(self, scene: nn.Module, radius: float, max_steps: int) -> tuple[torch.optim.Adam, LambdaLR]:

@@ -73,7 +73,7 @@ def test_sky_pushes_alpha_out_of_the_sky_and_up_elsewhere(generator):
     sky[:4] = True
     alpha = torch.full((HEIGHT, WIDTH), 0.5, requires_grad=True)
     loss = SkyMask(weight=0.3)(rendering(alpha=alpha), frame(generator, sky=sky))
-    assert float(loss) == pytest.approx(0.3 * 0.6931472, rel=1e-6)
+    assert loss.item() == pytest.approx(0.3 * 0.6931472, rel=1e-6)
     loss.backward()
     assert bool((alpha.grad[sky] > 0).all()) and bool((alpha.grad[~sky] < 0).all())
 
@@ -92,7 +92,7 @@ def test_depth_compares_only_measured_pixels(generator):
     measured[2, 3], measured[5, 5], measured[7, 7] = 4.0, 200.0, 0.1
     depth = torch.full((HEIGHT, WIDTH), 2.0, requires_grad=True)
     loss = InverseDepth(weight=0.5)(rendering(depth=depth), frame(generator, depth=measured))
-    assert float(loss) == pytest.approx(0.5 * abs(1 / 2 - 1 / 4))
+    assert loss.item() == pytest.approx(0.5 * abs(1 / 2 - 1 / 4))
     loss.backward()
     assert torch.nonzero(depth.grad).tolist() == [[2, 3]]
 
@@ -101,7 +101,7 @@ def test_depth_of_an_image_without_returns_is_zero(generator):
     depth = torch.ones(HEIGHT, WIDTH, requires_grad=True)
     loss = InverseDepth()(rendering(depth=depth), frame(generator, depth=torch.zeros(HEIGHT, WIDTH)))
     loss.backward()
-    assert float(loss) == 0.0 and bool((depth.grad == 0).all())
+    assert loss.item() == 0.0 and bool((depth.grad == 0).all())
 
 
 def test_terms_apply_only_where_the_data_has_them(generator):
@@ -113,7 +113,7 @@ def test_mask_sparsity_is_the_papers_formula(generator):
     terms = {"background": MaskTerm(scores["background"], 2.5e-3), "rigid": MaskTerm(scores["rigid"], 1e-4)}
     rows = {"background": slice(0, 2), "rigid": slice(2, 3), "unmasked": slice(3, 10)}
     loss = MaskSparsity(weight=2.0)(rendering(rows=rows, mask_terms=terms), frame(generator))
-    assert float(loss) == pytest.approx(2.0 * (2.5e-3 * 0.75 + 1e-4 * 1.0) / 10, rel=1e-6)
+    assert loss.item() == pytest.approx(2.0 * (2.5e-3 * 0.75 + 1e-4 * 1.0) / 10, rel=1e-6)
 
 
 def test_mask_sparsity_of_a_scene_without_rows_or_masks_is_zero(generator):

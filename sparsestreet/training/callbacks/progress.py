@@ -1,0 +1,62 @@
+"""One bar over the whole run: steps a second, Gaussians, PSNR. Where no terminal listens, a line per tenth."""
+
+import logging
+import time
+
+from lightning import Callback, LightningModule, Trainer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+log = logging.getLogger(__name__)
+
+REFRESH_EVERY = 10
+LINES = 10
+
+
+class TrainingProgress(Callback):
+    """Shows the step rate (of the last ``REFRESH_EVERY`` steps), counts per node and running PSNR."""
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+        self._task = None
+        self._since = (0, 0.0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._since = (trainer.global_step, time.perf_counter())
+        console = Console()
+        if console.is_terminal:
+            columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+            self._bar = Progress(*columns, console=console)
+            self._task = self._bar.add_task("", total=trainer.max_steps, completed=trainer.global_step)
+            self._bar.start()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        step = trainer.global_step
+        every = REFRESH_EVERY if self._bar is not None else max(trainer.max_steps // LINES, 1)
+        if step % every and step != trainer.max_steps:
+            return
+        text = self._status(trainer, pl_module)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=step, description=text)
+        else:
+            log.info("step %d of %d: %s", step, trainer.max_steps, text)
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _status(self, trainer: Trainer, system: LightningModule) -> str:
+        first, then = self._since
+        now = time.perf_counter()
+        self._since = (trainer.global_step, now)
+        parts = [f"{(trainer.global_step - first) / max(now - then, 1e-9):.1f} steps/s"]
+        metrics = trainer.callback_metrics
+        parts += [f"{label} {float(metrics[key]):.2f} dB" for key, label in LABELS.items() if key in metrics]
+        parts += [f"{name} {rows:,}" for name, rows in system.scene.counts().items()]
+        return ", ".join(parts)
+
+
+LABELS = {"psnr": "train", "val/psnr": "held out"}
