@@ -19,9 +19,11 @@ class Importance:
     w is the row's summed blend weight in the view and S the number of pixels it was blended into, so that w/S is its
     mean blend weight. The indicator is the paper's delta(i in I_max): the row is the largest contributor of at least
     one pixel of that view (Mini-Splatting, Fang & Wang 2024, whose score the paper takes over). The paper's background
-    formula leaves it out, but without it only rows that touch no training pixel at all score zero. Render the whole
-    scene, all nodes, for the contributions: what stands in front decides what is dominant; then select the background
-    rows of ``scores()``.
+    formula leaves it out, but without it only rows that touch no training pixel at all score zero.
+
+    Score zero does not mean invisible: where many soft rows overlap, those that lead nowhere still add light, and the
+    training steps after the removal make up for it. Render the whole scene, all nodes, for the contributions: what
+    stands in front decides what is dominant; then select the background rows of ``scores()``.
     """
 
     def __init__(self, gate: bool = True) -> None:

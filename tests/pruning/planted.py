@@ -1,8 +1,9 @@
 """Planted truth: put Gaussians into a scene that no view needs, prune, and see who went.
 
-``plant`` adds two kinds of useless rows. *Hidden* ones lie behind what some view sees, inside or behind opaque
-surfaces; *copies* are small, faint doubles just under an existing row. Each is checked to be useless in the sense of
-``moves`` before it is accepted, and lies in the image of at least one view (a row outside of all views would be no
+A row is *visible* if removing it alone moves a channel of a pixel of a view by more than one 8-bit step, or by more
+than a coarser step that the caller names. ``plant`` adds two kinds of useless rows, each checked to be invisible
+before it is accepted: *hidden* ones lie behind what some view sees, inside or behind opaque surfaces; *copies* are
+small, faint doubles just under an existing row. All lie in the image of a view (outside of all views would be no
 test). ``judge`` compares a selection with that truth.
 """
 
@@ -68,30 +69,30 @@ class Views:
             self.images = [splat(gaussians, camera, backend=backend).rgb for camera in cameras]
         self.contributions = [contribution(gaussians, camera, backend=backend) for camera in cameras]
 
-    def moves(self, row: int, more_than: float) -> bool:
-        """Whether removing this row alone moves a channel of a pixel of a view by more than ``more_than``.
+    def movement(self, row: int, enough: float = torch.inf) -> float:
+        """Largest change of a channel of a pixel of a view when this row alone is removed (exact up to ``enough``).
 
-        Exact: the view is rendered again without the row. Views with the largest weight come first, and those
-        into which the row was not blended cannot change.
+        Views are rendered again without the row, those with the largest weight first; the ones into which the
+        row was not blended cannot change.
         """
         weights = [float(view.weight[row]) for view in self.contributions]
         opacities = self.gaussians.opacities.clone()
         opacities[row] = 0
         without = replace(self.gaussians, opacities=opacities)
+        largest = 0.0
         for index in sorted(range(len(weights)), key=lambda index: -weights[index]):
-            if weights[index] == 0:
-                return False
+            if weights[index] == 0 or largest > enough:
+                break
             with torch.no_grad():
                 image = splat(without, self.cameras[index], backend=self.backend).rgb
-            if float((image - self.images[index]).abs().max()) > more_than:
-                return True
-        return False
+            largest = max(largest, float((image - self.images[index]).abs().max()))
+        return largest
 
     def visible(self, rows: Int[Tensor, " k"], more_than: float = NOTICEABLE) -> Bool[Tensor, " n"]:
-        """Marks those of the given rows whose removal moves a view."""
+        """Marks those of the given rows whose removal moves a view by more than ``more_than``."""
         marked = torch.zeros(len(self.gaussians), dtype=torch.bool)
         for row in rows.tolist():
-            marked[row] = self.moves(row, more_than)
+            marked[row] = self.movement(row, enough=more_than) > more_than
         return marked
 
 
