@@ -73,6 +73,17 @@ def test_halfway_between_knots():
     assert active.tolist() == [True]
 
 
+def test_every_instance_has_its_own_knots():
+    slow = track("slow", [0, 4], [pose(0.0, (0.0, 0.0, 0.0)), pose(0.0, (4.0, 0.0, 0.0))])
+    late = track(
+        "late", [1, 2, 3], [pose(0.0, (0.0, 0.0, 0.0)), pose(0.0, (0.0, 8.0, 0.0)), pose(0.0, (0.0, 9.0, 0.0))]
+    )
+    _, translations, active = rigid_of([slow, late]).pose_at(0.15)
+    expected = torch.tensor([[1.5, 0.0, 0.0], [0.0, 4.0, 0.0]]).double()
+    torch.testing.assert_close(translations, expected, atol=1e-5, rtol=0)
+    assert active.tolist() == [True, True]
+
+
 def test_yaw_across_180_degrees_takes_the_short_way():
     """from_matrix keeps w >= 0, so the quaternions of 170 and 190 degrees are nearly opposite in sign."""
     first, last = pose(math.radians(170), (0, 0, 0)), pose(math.radians(190), (0, 0, 0))
