@@ -1,5 +1,7 @@
 """Splits and the size of the scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -70,9 +72,12 @@ def test_the_box_reaches_around_the_cameras():
 
 
 def test_without_lidar_cameras_see_fifty_metres_ahead():
-    log = make_log(num_frames=3, num_cameras=1)  # they look along z
-    assert log.radius == pytest.approx(1.1 * 50 / 2)
+    log = make_log(num_frames=3, num_cameras=1)
+    assert log.radius == pytest.approx(1.1 * 50 / 2)  # they look along z
     assert torch.allclose(log.center, torch.tensor([1.0, 0, 25]))
+    along_x = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    frame = replace(log.frames[0], camera=replace(log.frames[0].camera, camera_from_world=along_x))
+    assert torch.allclose(replace(log, frames=(frame,)).center, torch.tensor([25.0, 0, 0]))
 
 
 def test_very_many_points_are_thinned_evenly():

@@ -18,7 +18,7 @@ CAR_SIZE = [4.0, 2.0, 1.5]
 # Columns: where the camera's x (right), y (down) and z (forward) point in a world with x forward, y left, z up.
 WORLD_FROM_OPENCV = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 TURN_LEFT = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-POINTS_IN_WORLD = np.array([[10.0, 0.0, 1.5], [20.0, 0.0, 1.5], [8.0, 0.5, 1.5], [-5.0, 0.0, 1.5], [10.0, 2.0, 0.75]])
+POINTS_IN_WORLD = np.array([[10.0, 0.0, 1.5], [20.0, 0.0, 1.5], [8.0, 0.3, 1.5], [-5.0, 0.0, 1.5], [10.0, 2.0, 0.75]])
 
 
 def pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:

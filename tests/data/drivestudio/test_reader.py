@@ -25,7 +25,7 @@ from tests.data.drivestudio.folders import (
     write_lines,
 )
 
-MAP = np.array([4.5e5, 5.4e6, 230.0])  # metres, as UTM coordinates of central Europe
+MAP = np.array([450123.377, 5400321.713, 230.19])  # metres, as UTM coordinates of central Europe
 FLAVOURS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 
 
@@ -53,12 +53,12 @@ def test_a_point_straight_ahead_lands_in_the_image_centre(make, tmp_path):
 
 @FLAVOURS
 def test_left_and_up_are_left_and_up_in_the_image(make, tmp_path):
-    """The point at (8, 0.5, 1.5) is left of camera 0 by 0.5 m at 8 m; the car's centre is left and below."""
+    """The point at (8, 0.3, 1.5) is left of camera 0 by 0.3 m at 8 m; the car's centre is left and below."""
     log = read_drivestudio(make(tmp_path))
     pixels, _, inside = project(log.frames[0].camera, log.sweeps[0].points[[2, 4]])
     expected = torch.tensor(
         [
-            [WIDTH / 2 - FOCAL * 0.5 / 8, HEIGHT / 2],
+            [WIDTH / 2 - FOCAL * 0.3 / 8, HEIGHT / 2],
             [WIDTH / 2 - FOCAL * CAR[1] / CAR[0], HEIGHT / 2 + FOCAL * (1.5 - CAR[2]) / CAR[0]],
         ]
     )
