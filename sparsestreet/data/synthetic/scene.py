@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from sparsestreet.data.synthetic.parts import Part
-from sparsestreet.data.synthetic.shapes import Vectors
+from sparsestreet.data.synthetic.shapes import Vectors, rotated
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 _MARGIN = np.float32(5e-3)
@@ -38,13 +38,13 @@ class Scene:
 
     def to_part(self, index: int, points: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "3 m"]:
         """World points in the frame of a part."""
-        return self.rotations[index].T @ (points - self.centres[index][:, None])
+        return rotated(self.rotations[index].T, points - self.centres[index][:, None])
 
     def turn_to_part(self, index: int, directions: Vectors) -> Vectors:
-        return self.rotations[index].T @ directions
+        return rotated(self.rotations[index].T, directions)
 
     def turn_to_world(self, index: int, directions: Vectors) -> Vectors:
-        return self.rotations[index] @ directions
+        return rotated(self.rotations[index], directions)
 
     def distances(self, origin: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, " p"]:
         """Lower bound of the distance from a point to each part, metres."""

@@ -17,6 +17,11 @@ Vector = Float32[np.ndarray, "3"]
 _TINY = np.float32(1e-12)
 
 
+def rotated(rows: Float32[np.ndarray, "k 3"], vectors: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "k m"]:
+    """rows @ vectors. Not by matmul: the BLAS behind it starts threads for products too small to gain from them."""
+    return np.einsum("kj,jm->km", rows, vectors)
+
+
 @runtime_checkable
 class Shape(Protocol):
     """A convex solid around the origin of its frame."""
@@ -82,8 +87,8 @@ class Polytope:
     half_extent: Vector
 
     def enter(self, origins: Float32[np.ndarray, "3 m"], directions: Vectors) -> Scalars:
-        slope = _away_from_zero(self.normals_out @ directions)
-        distance = (self.offsets[:, None] - self.normals_out @ origins) / slope
+        slope = _away_from_zero(rotated(self.normals_out, directions))
+        distance = (self.offsets[:, None] - rotated(self.normals_out, origins)) / slope
         entering = slope < 0
         near = np.where(entering, distance, np.float32(-np.inf)).max(0)
         far = np.where(entering, np.float32(np.inf), distance).min(0)
@@ -91,7 +96,7 @@ class Polytope:
 
     def depths(self, points: Vectors) -> Float32[np.ndarray, "k n"]:
         """Distance of each point inside each face plane, metres (negative outside)."""
-        return self.offsets[:, None] - self.normals_out @ points
+        return self.offsets[:, None] - rotated(self.normals_out, points)
 
     def normals(self, points: Vectors) -> Vectors:
         return np.ascontiguousarray(self.normals_out[self.depths(points).argmin(0)].T)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16
 
 from sparsestreet.data.synthetic.scene import Scene, SunView
-from sparsestreet.data.synthetic.shapes import Vectors
+from sparsestreet.data.synthetic.shapes import Vectors, rotated
 
 NOTHING = np.int16(-1)
 """Part index of a ray that leaves the street."""
@@ -84,7 +84,7 @@ def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, 
     lengths = np.linalg.norm(normals, axis=1)
     normals = normals[lengths > 1e-6] / lengths[lengths > 1e-6, None]
     normals *= np.sign(normals @ tile.mean((1, 2)))[:, None]
-    lowest = (normals @ tile.reshape(3, -1)).min(1) if len(normals) else np.empty(0, np.float32)
+    lowest = rotated(normals, tile.reshape(3, -1)).min(1) if len(normals) else np.empty(0, np.float32)
     return np.ascontiguousarray(normals[lowest >= -1e-6], np.float32)
 
 
@@ -101,7 +101,7 @@ def sunlit(scene: Scene, view: SunView, points: Vectors, normals: Vectors, owner
 
 
 def _blocked(scene: Scene, view: SunView, points: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
-    seen = view.axes @ points
+    seen = rotated(view.axes, points)
     # Sorted along one axis of the sun's view, the points that a part may shade are one short run.
     order = np.argsort(seen[1])
     points, seen = points[:, order], seen[:, order]
@@ -114,7 +114,11 @@ def _blocked(scene: Scene, view: SunView, points: Vectors, owner: int) -> Bool[n
             continue
         low, high, run = view.low[index], view.high[index], slice(start, stop)
         across, along = seen[0, run], seen[2, run]
-        rays = start + np.flatnonzero((across > low[0]) & (across < high[0]) & (along < high[2]) & ~dark[run])
+        near = across > low[0]
+        near &= across < high[0]
+        near &= along < high[2]
+        near &= ~dark[run]
+        rays = start + np.flatnonzero(near)
         if len(rays) == 0:
             continue
         sun = np.repeat(scene.turn_to_part(index, view.sun[:, None]), len(rays), axis=1)
