@@ -46,10 +46,7 @@ def splat(
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        offsets = torch.zeros(
-            (len(gaussians), 2), dtype=gaussians.means.dtype, device=gaussians.means.device,
-            requires_grad=torch.is_grad_enabled(),
-        )  # fmt: skip
+        offsets = _screen_offsets(gaussians)
         if chosen == "reference":
             check_values(gaussians)
             raster = reference.rasterise(gaussians, offsets, camera, settings)
@@ -76,6 +73,14 @@ def contribution(
             check_values(gaussians)
             return reference.contribution(gaussians, camera, settings)
         return cpu.contribution(gaussians, camera, settings)
+
+
+def _screen_offsets(gaussians: Gaussians) -> Float[Tensor, "n 2"]:
+    """A leaf of zeros; it takes part in the graph only where some field of the Gaussians does."""
+    fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.sh)
+    wanted = torch.is_grad_enabled() and any(field.requires_grad for field in fields)
+    offsets = gaussians.means.new_zeros(len(gaussians), 2)
+    return offsets.requires_grad_() if wanted else offsets
 
 
 def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rendering:

@@ -1,0 +1,125 @@
+"""Small scenes for the tests of the op, and ways to render and differentiate them."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.types import Camera, Gaussians
+
+FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
+DEFAULT = SplatSettings()
+
+
+def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:
+    """A turned and shifted camera, its principal point off the centre."""
+    focal = float(width) if focal is None else focal
+    intrinsics = torch.tensor([[focal, 0, 0.47 * width], [0, 1.1 * focal, 0.54 * height], [0, 0, 1]], dtype=dtype)
+    angle = torch.tensor(0.3, dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 0] = pose[2, 2] = angle.cos()
+    pose[0, 2], pose[2, 0] = angle.sin(), -angle.sin()
+    pose[:3, 3] = torch.tensor([0.5, -0.2, 0.3])
+    return Camera(pose.to(dtype), intrinsics, width, height)
+
+
+def front_camera(width: int, height: int, focal: float, dtype: torch.dtype = torch.float64) -> Camera:
+    """At the origin, looking along +z, principal point in the middle."""
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=dtype)
+    return Camera(torch.eye(4, dtype=dtype), intrinsics, width, height)
+
+
+def random_gaussians(rows: int, view: Camera, terms: int = 4, seed: int = 0) -> Gaussians:
+    """Float64 rows that hold float32 values (so both precisions see the same scene): some behind, some off screen."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    depth = 25 * uniform(rows) - 3
+    reach = 1.4 * depth.abs() / float(view.intrinsics[0, 0])
+    x = (uniform(rows) - 0.5) * reach * view.width
+    y = (uniform(rows) - 0.5) * reach * view.height
+    pose = view.camera_from_world.double()
+    means = (torch.stack((x, y, depth), -1) - pose[:3, 3]) @ pose[:3, :3]
+    sigma_pixels = 2.5 * torch.exp(0.6 * torch.randn(rows, 3, generator=generator, dtype=torch.float64))
+    parts = (
+        means,
+        torch.randn(rows, 4, generator=generator, dtype=torch.float64),
+        sigma_pixels * depth.abs()[:, None] / float(view.intrinsics[0, 0]),
+        0.02 + 0.98 * uniform(rows),
+        0.5 * torch.randn(rows, terms, 3, generator=generator, dtype=torch.float64),
+    )
+    return Gaussians(*(part.float().double() for part in parts))
+
+
+def one_gaussian(**fields: list) -> Gaussians:
+    """A grey ball of 0.1 m two metres ahead, with fields replaced; float64."""
+    values = {
+        "means": [[0.0, 0.0, 2.0]],
+        "quaternions": [[1.0, 0.0, 0.0, 0.0]],
+        "scales": [[0.1, 0.1, 0.1]],
+        "opacities": [0.8],
+        "sh": [[[0.0, 0.0, 0.0]]],
+    } | fields
+    return Gaussians(*(torch.tensor(values[name], dtype=torch.float64) for name in FIELDS))
+
+
+def cast(gaussians: Gaussians, dtype: torch.dtype, requires_grad: bool = False) -> Gaussians:
+    """Detached copy in another precision."""
+    return Gaussians(
+        *(getattr(gaussians, name).detach().clone().to(dtype).requires_grad_(requires_grad) for name in FIELDS)
+    )
+
+
+def cotangents(view: Camera, seed: int = 5) -> tuple[Tensor, Tensor, Tensor]:
+    """Random upstream gradients of rgb, alpha and depth; the depth's smaller, as metres are larger than colours."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (view.height, view.width)
+    rgb = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+    alpha = torch.randn(shape, generator=generator, dtype=torch.float64)
+    depth = 0.05 * torch.randn(shape, generator=generator, dtype=torch.float64)
+    return rgb, alpha, depth
+
+
+@dataclass(frozen=True)
+class Result:
+    """Images and gradients of one rendering, in float64."""
+
+    images: dict[str, Tensor]
+    gradients: dict[str, Tensor]
+    radii: Tensor
+
+    def is_finite(self) -> bool:
+        tensors = [*self.images.values(), *self.gradients.values()]
+        return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)
+
+
+def render(
+    gaussians: Gaussians,
+    view: Camera,
+    backend: str,
+    dtype: torch.dtype = torch.float64,
+    settings: SplatSettings = DEFAULT,
+    background: Tensor | None = None,
+) -> Result:
+    """Forward and backward with the same random cotangents for every backend."""
+    leaves = cast(gaussians, dtype, requires_grad=True)
+    behind = None if background is None else background.detach().clone().to(dtype).requires_grad_()
+    rendering = splat(leaves, view, background=behind, settings=settings, backend=backend)
+    images = {"rgb": rendering.rgb, "alpha": rendering.alpha, "depth": rendering.depth}
+    torch.autograd.backward(list(images.values()), [v.to(dtype) for v in cotangents(view)])
+    gradients = {name: getattr(leaves, name).grad for name in FIELDS} | {"screen": rendering.screen_offsets.grad}
+    if behind is not None:
+        gradients["background"] = behind.grad
+    return Result(
+        {name: image.detach().double() for name, image in images.items()},
+        {name: gradient.double() for name, gradient in gradients.items()},
+        rendering.radii.double(),
+    )
+
+
+def relative_error(value: Tensor, truth: Tensor) -> float:
+    """L2 of the difference over L2 of the truth."""
+    return float((value - truth).norm() / truth.norm().clamp(min=1e-30))

@@ -1,0 +1,171 @@
+"""The reference against hand-computed values, a naive NumPy renderer, scipy's harmonics and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import sph_harm_y
+
+from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops.spherical_harmonics import basis
+from sparsestreet.types import Camera, Gaussians
+from tests.ops.scenes import FIELDS, camera, cast, front_camera, one_gaussian, random_gaussians, render
+
+LOOSE = SplatSettings(alpha_min=1e-9)
+
+
+def test_one_ball_by_hand():
+    # 0.1 m at 2 m with focal 40: sigma = 2 px, variance 4 + 0.3 blur. A 5x5 image: the centre pixel is (2.5, 2.5).
+    rendering = splat(one_gaussian(), front_camera(5, 5, 40.0), backend="reference")
+    for (row, column), squared in {(2, 2): 0.0, (2, 3): 1.0, (1, 3): 2.0, (0, 4): 8.0}.items():
+        alpha = 0.8 * math.exp(-0.5 * squared / 4.3)
+        assert rendering.alpha[row, column].item() == pytest.approx(alpha, rel=1e-12)
+        assert rendering.rgb[row, column].tolist() == pytest.approx([0.5 * alpha] * 3, rel=1e-12)
+        assert rendering.depth[row, column].item() == pytest.approx(2.0, rel=1e-12)
+    # The box ends where 0.8 exp(-q/2) = 1/255.
+    assert rendering.radii.item() == pytest.approx(math.sqrt(2 * math.log(0.8 * 255) * 4.3), rel=1e-12)
+    assert rendering.visible.all()
+
+
+def test_antialias_by_hand():
+    rendering = splat(
+        one_gaussian(), front_camera(5, 5, 40.0), settings=SplatSettings(antialias=True), backend="reference"
+    )
+    assert rendering.alpha[2, 2].item() == pytest.approx(0.8 * 4.0 / 4.3, rel=1e-12)
+
+
+def test_two_layers_over_a_background_by_hand():
+    white, black = [[[0.5 / 0.28209479177387814] * 3]], [[[-0.5 / 0.28209479177387814] * 3]]
+    near, far = one_gaussian(sh=white), one_gaussian(sh=black, means=[[0.0, 0.0, 4.0]], opacities=[0.5])
+    rendering = splat(
+        Gaussians.concatenate([far, near]),
+        front_camera(5, 5, 40.0),
+        background=torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64),
+        backend="reference",
+    )
+    passed = (1 - 0.8) * (1 - 0.5)
+    assert rendering.rgb[2, 2].tolist() == pytest.approx([0.8 + passed, 0.8 + 0.5 * passed, 0.8], rel=1e-12)
+    assert rendering.depth[2, 2].item() == pytest.approx((0.8 * 2 + 0.2 * 0.5 * 4) / (1 - passed), rel=1e-12)
+
+
+@pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
+def test_stop_rule_by_hand(stop):
+    # Two splats of alpha 0.9 leave 0.01: the second one crosses the limit 0.05.
+    layers = [one_gaussian(opacities=[0.9], means=[[0.0, 0.0, 2.0 + k]], scales=[[9.0] * 3]) for k in range(3)]
+    settings = SplatSettings(transmittance_min=0.05, stop=stop)
+    rendering = splat(Gaussians.concatenate(layers), front_camera(1, 1, 40.0), settings=settings, backend="reference")
+    expected = 0.99 if stop == "inclusive" else 0.9
+    # 9 m at 2 m with focal 40 is 180 px: half a pixel off the centre changes nothing; the pixel is at the centre.
+    assert rendering.alpha.item() == pytest.approx(expected, rel=1e-12)
+
+
+def _naive_image(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> np.ndarray:
+    """Per pixel, from the textbook: matrix inverse of the covariance, no tricks; degree 0 colours."""
+    pose, intrinsics = view.camera_from_world.numpy(), view.intrinsics.numpy()
+    splats = []
+    for mean, q, scale, opacity, sh in zip(*(getattr(gaussians, name).numpy() for name in FIELDS), strict=True):
+        x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
+        if z <= settings.near:
+            continue
+        w, i, j, k = q / np.linalg.norm(q)
+        skew = np.array([[0, -k, j], [k, 0, -i], [-j, i, 0]])
+        rotation = np.eye(3) + 2 * w * skew + 2 * skew @ skew
+        fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+        margin_x, margin_y = 0.15 * view.width / fx, 0.15 * view.height / fy
+        u = np.clip(x / z, -cx / fx - margin_x, (view.width - cx) / fx + margin_x)
+        v = np.clip(y / z, -cy / fy - margin_y, (view.height - cy) / fy + margin_y)
+        jacobian = np.array([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
+        half = jacobian @ pose[:3, :3] @ rotation @ np.diag(scale)
+        conic = np.linalg.inv(half @ half.T + settings.blur * np.eye(2))
+        colour = np.maximum(0, 0.5 + sh[0] / (2 * np.sqrt(np.pi)))
+        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, colour))
+    image = np.zeros((view.height, view.width, 3))
+    for row, column in np.ndindex(view.height, view.width):
+        passed = 1.0
+        for _, mean, conic, opacity, colour in sorted(splats, key=lambda item: item[0]):
+            d = np.array([column + 0.5, row + 0.5]) - mean
+            alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
+            if alpha < settings.alpha_min or passed <= settings.transmittance_min:
+                continue
+            image[row, column] += passed * alpha * colour
+            passed *= 1 - alpha
+    return image
+
+
+def test_against_a_naive_renderer():
+    view = camera(13, 9)
+    gaussians = random_gaussians(40, view, terms=1)
+    image = splat(gaussians, view, backend="reference").rgb.numpy()
+    # float64 on both sides, different order of operations.
+    np.testing.assert_allclose(image, _naive_image(gaussians, view, SplatSettings()), atol=1e-12)
+
+
+def test_harmonics_against_scipy():
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    x, y, z = directions.numpy().T
+    theta, phi = np.arccos(z), np.arctan2(y, x)
+    columns = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), theta, phi)
+            if order < 0:
+                columns.append(math.sqrt(2) * value.imag)
+            else:
+                columns.append(value.real * (math.sqrt(2) if order else 1.0))
+    np.testing.assert_allclose(basis(directions, 16).numpy(), np.stack(columns, -1), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [LOOSE, SplatSettings(alpha_min=1e-9, stop="exclusive", antialias=True)],
+    ids=["default", "exclusive_antialias"],
+)
+@pytest.mark.parametrize("field", FIELDS)
+def test_gradient_of_each_field(field, settings):
+    view = camera(5, 4)
+    gaussians = random_gaussians(8, view, terms=16, seed=3)
+    values = {name: getattr(gaussians, name).clone() for name in FIELDS}
+
+    def images(value):
+        rendering = splat(Gaussians(**(values | {field: value})), view, settings=settings, backend="reference")
+        return rendering.rgb, rendering.alpha, rendering.depth
+
+    # Random projections of both Jacobians: a full one would take minutes.
+    assert torch.autograd.gradcheck(images, values[field].requires_grad_(), fast_mode=True)
+
+
+def test_screen_offsets_gather_absolute_gradients():
+    # Independent: differentiate each pixel on its own with respect to the mean, and add up absolute values.
+    view = front_camera(4, 3, 6.0)
+    gaussians = one_gaussian(means=[[0.1, -0.05, 2.0]], scales=[[0.4, 0.2, 0.3]])
+    cotangent = torch.randn(3, 4, 3, dtype=torch.float64)
+    expected = torch.zeros(2, dtype=torch.float64)
+    for row, column in np.ndindex(3, 4):
+        # Moving the principal point moves the mean on the screen, and the Jacobian's limits, which do not act here.
+        pixels = []
+        for axis in range(2):
+            values = []
+            for step in (1e-6, -1e-6):
+                moved = view.intrinsics.clone()
+                moved[axis, 2] += step
+                shifted = Camera(view.camera_from_world, moved, view.width, view.height)
+                image = splat(gaussians, shifted, backend="reference", settings=LOOSE).rgb
+                values.append(float((image[row, column] * cotangent[row, column]).sum()))
+            pixels.append((values[0] - values[1]) / 2e-6)
+        expected += torch.tensor(pixels, dtype=torch.float64).abs()
+    leaves = cast(gaussians, torch.float64, requires_grad=True)
+    rendering = splat(leaves, view, backend="reference", settings=LOOSE)
+    rendering.rgb.backward(cotangent)
+    # Central differences of step 1e-6: about 1e-9.
+    torch.testing.assert_close(rendering.screen_offsets.grad[0], expected, rtol=1e-7, atol=1e-8)
+
+
+def test_image_does_not_depend_on_the_chunks_of_pixels(monkeypatch):
+    view = camera(13, 9)
+    gaussians = random_gaussians(40, view)
+    whole = render(gaussians, view, "reference")
+    monkeypatch.setattr("sparsestreet.ops.reference._CHUNK_ELEMENTS", 700)
+    pieces = render(gaussians, view, "reference")
+    for name, gradient in whole.gradients.items():
+        torch.testing.assert_close(pieces.gradients[name], gradient, rtol=1e-10, atol=1e-12)
