@@ -1,5 +1,6 @@
 """What a synthetic street is made from; two equal settings give the same bytes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
@@ -39,8 +40,10 @@ class StreetSettings:
     """Standard deviation of the measured range, metres."""
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, metres."""
-    novel_offsets: tuple[float, ...] = ()
-    """Sideways shifts (to the left, metres) of the ego car for which the front camera is rendered as well."""
+    novel_offsets: Sequence[float] = ()
+    """Sideways shifts (to the left, metres) of the ego car for which the front camera is rendered as well.
+
+    A view from inside another car is left out."""
     novel_stride: int = 10
     """Shifted views are rendered for every frame divisible by this."""
 

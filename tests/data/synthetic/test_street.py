@@ -249,7 +249,16 @@ def test_another_folder_is_not_touched(street, tmp_path):
 
 
 def test_an_interruption_leaves_nothing(tmp_path):
-    small = dataclasses.replace(TINY, num_cameras=1, supersampling=1, width=16, height=9)
+    small = dataclasses.replace(
+        TINY,
+        num_cameras=1,
+        supersampling=1,
+        width=16,
+        height=9,
+        lidar_beams=2,
+        lidar_azimuth_steps=16,
+        novel_offsets=(),
+    )
 
     def interrupt(done: int, total: int) -> None:
         assert total == 3

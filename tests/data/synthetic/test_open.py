@@ -1,0 +1,54 @@
+"""A street read as a log: the reader's frames, tracks and points are the tracer's."""
+
+import numpy as np
+import torch
+
+from sparsestreet.data.synthetic import StreetSettings, open_street
+from sparsestreet.data.synthetic.world import Actor, build_world
+from sparsestreet.geometry.cameras import project
+
+SETTINGS = StreetSettings(
+    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1, lidar_beams=12, lidar_azimuth_steps=120,
+    novel_offsets=[],
+)  # fmt: skip
+
+
+def test_a_street_opens_as_a_log(tmp_path):
+    log = open_street(SETTINGS, tmp_path / "street")
+    assert (log.num_frames, log.num_cameras, len(log.sweeps)) == (2, 2, 2)
+    world = build_world(SETTINGS)
+    ego_from_world = torch.linalg.inv(torch.from_numpy(world.ego.pose(0.0)))
+    seen_from_camera = torch.stack([_in_camera(ego_from_world, actor) for actor in world.actors])
+    starting = [track for track in log.tracks if track.frames[0] == 0]
+    assert len(starting) > 5
+    for track in starting:
+        # The log's world is shifted: compare where the first frame's front camera has the box.
+        centre = (log.frames[0].camera.camera_from_world.double() @ track.world_from_object[0])[:3, 3]
+        distances = (seen_from_camera - centre).norm(dim=1)
+        # Camera matrices are float32: 1e-4 m at 60 m.
+        assert distances.min() < 1e-4
+        actor = world.actors[int(distances.argmin())]
+        assert track.class_name == actor.model.class_name
+        np.testing.assert_allclose(track.size.numpy(), actor.model.size, rtol=1e-6)
+
+
+def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:
+    """Centre of the actor's box in the front camera, which sits 1.6 m ahead of the ego origin and 1.65 m above it."""
+    ahead = (ego_from_world @ torch.from_numpy(actor.pose(0.0)))[:3, 3]
+    x, y, z = ahead - torch.tensor([1.6, 0.0, 1.65], dtype=torch.float64)
+    return torch.stack((-y, -z, x))
+
+
+def test_sweeps_fall_on_the_pixels_that_colour_them(tmp_path):
+    log = open_street(SETTINGS, tmp_path / "street")
+    sweep = log.sweeps[0]
+    assert sweep.colored.any()
+    frame = log.frames[0]
+    pixels, _, inside = project(frame.camera, sweep.points)
+    assert (sweep.colored[inside]).all()
+    u, v = pixels[inside].floor().long().T
+    seen_by_front_only = inside & ~project(log.frames[1].camera, sweep.points)[2]
+    expected = frame.image[v, u].float() / 255
+    chosen = seen_by_front_only[inside]
+    assert chosen.any()
+    torch.testing.assert_close(sweep.colors[inside][chosen], expected[chosen], atol=1e-6, rtol=0)
