@@ -15,7 +15,7 @@ from sparsestreet.data.synthetic.world import build_world
 
 TINY = StreetSettings(
     seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, num_parked_cars=8, num_moving_cars=3,
-    num_pedestrians=3, num_cyclists=1, lidar_beams=16, lidar_azimuth_steps=200,
+    num_pedestrians=3, num_cyclists=1, lidar_beams=16, lidar_azimuth_steps=200, annotation_range=25.0,
     novel_offsets=(1.0, 2.5), novel_stride=2,
 )  # fmt: skip
 VIEWS = [(frame, camera) for frame in range(3) for camera in range(2)]
