@@ -21,6 +21,8 @@ BOX_MARGIN = 0.01
 """Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""
 COMPENSATION_FLOOR = 0.005
 """Least antialias compensation (gsplat 1.6): below it the ratio of determinants has no correct digits."""
+DETERMINANT_MIN = 1e-12
+"""px^4. Reached only without blur, by splats so thin that they touch no pixel centre; their conic would overflow."""
 _CHUNK_ELEMENTS = 1 << 20
 
 
@@ -37,7 +39,7 @@ class Splats:
     half_boxes: Float[Tensor, "v 2"]
     """Half sides of the box in which alpha >= alpha_min, pixels; infinite for alpha_min = 0."""
     usable: Bool[Tensor, " v"]
-    """False where the determinant vanished or overflowed."""
+    """False where the determinant vanished or overflowed the dtype."""
 
 
 def rasterise(
@@ -121,7 +123,7 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
         opacities = opacities * torch.where(ratio > floor, ratio, floor).sqrt()
     colors = view_colors(gaussians.sh[rows], in_camera @ _rotation(camera, in_camera))
     half_boxes = _half_boxes(opacities.detach(), variances.detach(), settings.alpha_min)
-    usable = (determinant > 0) & torch.isfinite(determinant)
+    usable = (determinant >= DETERMINANT_MIN) & torch.isfinite(determinant)
     return Splats(means, cholesky, opacities, colors, in_camera[:, 2], half_boxes, usable)
 
 

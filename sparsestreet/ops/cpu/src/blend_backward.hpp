@@ -18,19 +18,19 @@ struct TileCotangents {
 // Sums over rows of a tile, per column.
 template <class T>
 struct Columns {
-  alignas(64) T s[TILE], sa[TILE], sb[TILE], saa[TILE], sab[TILE], sbb[TILE], abs_x[TILE], abs_y[TILE], red[TILE],
-      green[TILE], blue[TILE], depth[TILE];
+  alignas(64) T s[TILE], sa[TILE], sb[TILE], sa_dy[TILE], sb_dy[TILE], abs_x[TILE], abs_y[TILE], red[TILE], green[TILE],
+      blue[TILE], depth[TILE];
 };
 
 template <class T, bool EXCLUSIVE>
-inline void accumulate_row(const Splat<T>& p, const T* __restrict dx, T along, T b, const Cuts<T>& cuts,
-                           TileCotangents<T>& t, int at, Columns<T>& sums) {
+inline void accumulate_row(const Splat<T>& p, const T* __restrict dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
+                           int at, Columns<T>& sums) {
   T* __restrict transmittance = t.transmittance + at;
   T* __restrict gate = t.gate + at;
   T* __restrict behind = t.behind + at;
   const T *__restrict red = t.red + at, *__restrict green = t.green + at, *__restrict blue = t.blue + at;
   const T* __restrict depth = t.depth + at;
-  const T base = p.log2_opacity - b * b;
+  const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
   for (int i = 0; i < TILE; ++i) {
     const T a = p.l11 * dx[i] + along;
     const T exponent = base - a * a;
@@ -54,9 +54,8 @@ inline void accumulate_row(const Splat<T>& p, const T* __restrict dx, T along, T
     sums.s[i] += s;
     sums.sa[i] += sa;
     sums.sb[i] += sb;
-    sums.saa[i] += sa * a;
-    sums.sab[i] += sa * b;
-    sums.sbb[i] += sb * b;
+    sums.sa_dy[i] += sa * dy;
+    sums.sb_dy[i] += sb * dy;
     const T gy = p.l21 * sa + p.l22 * sb;
     sums.abs_x[i] += sa < 0 ? -sa : sa;
     sums.abs_y[i] += gy < 0 ? -gy : gy;
@@ -75,9 +74,11 @@ inline T total(const T* values) {
 }
 
 template <class T>
-inline void write_slot(const Columns<T>& c, Slot<T>& slot) {
-  slot = {total(c.s), total(c.sa), total(c.sb), total(c.saa), total(c.sab), total(c.sbb), total(c.abs_x),
-          total(c.abs_y), {total(c.red), total(c.green), total(c.blue)}, total(c.depth)};
+inline void write_slot(const Columns<T>& c, const T* dx, Slot<T>& slot) {
+  T sa_dx = 0;  // dx is the same in every row of a column
+  for (int i = 0; i < TILE; ++i) sa_dx += c.sa[i] * dx[i];
+  slot = {total(c.s), total(c.sa), total(c.sb), sa_dx, total(c.sa_dy), total(c.sb_dy), total(c.abs_x), total(c.abs_y),
+          {total(c.red), total(c.green), total(c.blue)}, total(c.depth)};
 }
 
 // Loads the cotangents and the light behind the camera: sum of what was blended plus what got past everything.
@@ -120,10 +121,9 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
     Columns<T> sums;
     std::memset(static_cast<void*>(&sums), 0, sizeof(sums));
     for (int y = here.first; y <= here.last; ++y) {
-      const T dy = T(y0 + y) + T(0.5) - s.y;
-      accumulate_row<T, EXCLUSIVE>(s, here.dx, s.l21 * dy, s.l22 * dy, cuts, t, y * TILE, sums);
+      accumulate_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE, sums);
     }
-    write_slot(sums, ws.slots[ws.pairs[k].slot]);
+    write_slot(sums, here.dx, ws.slots[ws.pairs[k].slot]);
   }
   for (int64_t k = end; k < ws.tile_begin[tile + 1]; ++k) ws.slots[ws.pairs[k].slot] = Slot<T>{};
 }

@@ -10,6 +10,7 @@ namespace SPLAT_VARIANT {
 
 constexpr double BOX_MARGIN = 0.01;               // pixels; rounding must never cull a touched pixel
 constexpr double COMPENSATION_FLOOR = 2.5e-5;     // least det / det_blurred of the antialias compensation
+constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: thinner splats touch no pixel centre
 constexpr double LOG2_SCALE = 0.84932180028801907;  // sqrt(log2(e) / 2)
 constexpr double TWO_LN2 = 1.3862943611198906;
 
@@ -130,7 +131,7 @@ inline bool project_row(const Camera<T>& camera, const T* mean, const T* quatern
   p.in_camera = camera.rotation * Vector<T>{mean[0], mean[1], mean[2]} + camera.translation;
   if (!(p.in_camera.z > camera.near_plane && opacity > 0)) return false;
   project_shape(camera, quaternion, scales, p);
-  if (!(p.determinant > 0 && p.determinant <= std::numeric_limits<T>::max())) return false;
+  if (!(p.determinant >= T(DETERMINANT_MIN) && p.determinant <= std::numeric_limits<T>::max())) return false;
   const T effective = opacity * compensation(camera, p);
   if (!(effective >= camera.alpha_min)) return false;
   out.x = camera.fx * p.in_camera.x * p.inverse_z + camera.cx;

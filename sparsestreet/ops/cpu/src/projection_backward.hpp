@@ -9,9 +9,9 @@ namespace SPLAT_VARIANT {
 // Gradients of one splat on the screen, in natural units (exponent -|L d|^2 / 2).
 template <class T>
 struct ScreenGradient {
-  T x, y, abs_x, abs_y;
+  T x, y, abs_x, abs_y, l11, l21, l22;
   T opacity;  // of the effective opacity
-  Vector<T> factor_x, factor_y, color;
+  Vector<T> color;
   T depth;
 };
 
@@ -21,46 +21,59 @@ inline Slot<T> sum_slots(const Workspace<T>& ws, int64_t row) {
   const Slot<T>* slots = ws.slots.data() + ws.first_slot[row];
   for (int32_t k = 0; k < ws.counts[row]; ++k) {
     const Slot<T>& o = slots[k];
-    sum.s += o.s, sum.sa += o.sa, sum.sb += o.sb, sum.saa += o.saa, sum.sab += o.sab, sum.sbb += o.sbb;
+    sum.s += o.s, sum.sa += o.sa, sum.sb += o.sb, sum.sa_dx += o.sa_dx;
+    sum.sa_dy += o.sa_dy, sum.sb_dy += o.sb_dy;
     sum.abs_x += o.abs_x, sum.abs_y += o.abs_y, sum.depth += o.depth;
     for (int c = 0; c < 3; ++c) sum.color[c] += o.color[c];
   }
   return sum;
 }
 
-// With w = L d: dLoss/d mean = sum s L^T w and dLoss/dV = L^T (sum s w w^T) (L V). In these whitened moments no
-// digits cancel, however thin the splat. The record's L is scaled by k = LOG2_SCALE; 1 / k^2 = 2 ln 2.
+// ln alpha = ln o - ln 2 |L d|^2 with the record's L, which is the Cholesky factor times k = LOG2_SCALE.
 template <class T>
-inline ScreenGradient<T> screen_gradient(const Slot<T>& sum, const Splat<T>& s, const Projection<T>& p) {
-  const T k2 = T(TWO_LN2), k4 = k2 * k2;
+inline ScreenGradient<T> screen_gradient(const Slot<T>& sum, const Splat<T>& s) {
+  const T two_ln2 = T(TWO_LN2);
   ScreenGradient<T> g;
-  g.x = k2 * s.l11 * sum.sa;
-  g.y = k2 * (s.l21 * sum.sa + s.l22 * sum.sb);
-  g.abs_x = k2 * s.l11 * sum.abs_x, g.abs_y = k2 * sum.abs_y;
+  g.x = two_ln2 * s.l11 * sum.sa;
+  g.y = two_ln2 * (s.l21 * sum.sa + s.l22 * sum.sb);
+  g.abs_x = two_ln2 * s.l11 * sum.abs_x, g.abs_y = two_ln2 * sum.abs_y;
+  g.l11 = -two_ln2 * T(LOG2_SCALE) * sum.sa_dx;
+  g.l21 = -two_ln2 * T(LOG2_SCALE) * sum.sa_dy;
+  g.l22 = -two_ln2 * T(LOG2_SCALE) * sum.sb_dy;
   g.opacity = sum.s * std::exp2(-s.log2_opacity);
-  const Vector<T> white_x = s.l11 * p.factor_x + s.l21 * p.factor_y, white_y = s.l22 * p.factor_y;
-  const Vector<T> moved_x = sum.saa * white_x + sum.sab * white_y, moved_y = sum.sab * white_x + sum.sbb * white_y;
-  g.factor_x = (k4 * s.l11) * moved_x;
-  g.factor_y = k4 * (s.l21 * moved_x + s.l22 * moved_y);
   g.color = {sum.color[0], sum.color[1], sum.color[2]};
   g.depth = sum.depth;
   return g;
 }
 
-// Moves the gradient of the effective opacity through the antialias compensation; answers that of the opacity.
+// Gradients of the rows of V.
 template <class T>
-inline T compensation_backward(const Camera<T>& camera, const Projection<T>& p, T opacity, ScreenGradient<T>& g) {
-  const T factor = compensation(camera, p);
+struct FactorGradient {
+  Vector<T> x, y;
+};
+
+// Through l11 = sqrt(C / det), l21 = -B / sqrt(C det), l22 = 1 / sqrt(C) with C = |Vy|^2 + blur, B = Vx . Vy and
+// det = |Vx x Vy|^2 + blur |V|^2 + blur^2, and through the antialias compensation sqrt(|Vx x Vy|^2 / det).
+template <class T>
+inline FactorGradient<T> factor_backward(const Camera<T>& camera, const Projection<T>& p, const ScreenGradient<T>& g,
+                                         T opacity) {
+  const T root = std::sqrt(p.variance_y) * std::sqrt(p.determinant);
+  const T l11 = std::sqrt(p.variance_y / p.determinant), l21 = -p.covariance / root;
+  const T l22 = 1 / std::sqrt(p.variance_y);
+  const T v_variance = (g.l11 * l11 - g.l21 * l21 - g.l22 * l22) / (2 * p.variance_y);
+  const T v_covariance = -g.l21 / root;
+  T v_cross = -(g.l11 * l11 + g.l21 * l21) / (2 * p.determinant);  // of |Vx x Vy|^2
+  T v_square = v_cross * camera.blur;                               // of |V|^2
   const T ratio = p.bare_determinant / p.determinant;
   if (camera.antialias && ratio > T(COMPENSATION_FLOOR)) {
-    const T v_ratio = g.opacity * opacity / (2 * factor);
-    const T v_bare = v_ratio * (1 - ratio) / p.determinant;                // d ratio = (1 - ratio) d bare / det
-    const T v_square = -v_ratio * ratio * camera.blur / p.determinant;     // - ratio blur d|V|^2 / det
-    const Vector<T> c = cross(p.factor_x, p.factor_y);
-    g.factor_x = g.factor_x + (2 * v_bare) * cross(p.factor_y, c) + (2 * v_square) * p.factor_x;
-    g.factor_y = g.factor_y + (2 * v_bare) * cross(c, p.factor_x) + (2 * v_square) * p.factor_y;
+    const T v_ratio = g.opacity * opacity / (2 * std::sqrt(ratio));
+    v_cross += v_ratio * (1 - ratio) / p.determinant;  // d ratio = ((1 - ratio) d|Vx x Vy|^2 - ratio blur d|V|^2) / det
+    v_square -= v_ratio * ratio * camera.blur / p.determinant;
   }
-  return g.opacity * factor;
+  const Vector<T> c = cross(p.factor_x, p.factor_y);
+  return {(2 * v_cross) * cross(p.factor_y, c) + (2 * v_square) * p.factor_x + v_covariance * p.factor_y,
+          (2 * v_cross) * cross(c, p.factor_x) + (2 * (v_square + v_variance)) * p.factor_y +
+              v_covariance * p.factor_x};
 }
 
 template <class T>
@@ -81,12 +94,12 @@ inline void quaternion_backward(const Projection<T>& p, const Matrix<T>& v, T* o
 
 // Gradients of the shape: writes quaternion and scales, answers that of the mean in the camera through J.
 template <class T>
-inline Vector<T> shape_backward(const Camera<T>& camera, const Projection<T>& p, const ScreenGradient<T>& g,
+inline Vector<T> shape_backward(const Camera<T>& camera, const Projection<T>& p, const FactorGradient<T>& g,
                                 const T* scales, T* quaternion_out, T* scales_out) {
   const Matrix<T>& m = p.camera_from_gaussian;
   const T jx = camera.fx * p.inverse_z, jy = camera.fy * p.inverse_z;
-  const Matrix<T> v_m{{jx * g.factor_x, jy * g.factor_y,
-                       (-jx * p.slope[0]) * g.factor_x + (-jy * p.slope[1]) * g.factor_y}};
+  const Matrix<T> v_m{{jx * g.x, jy * g.y,
+                       (-jx * p.slope[0]) * g.x + (-jy * p.slope[1]) * g.y}};
   Matrix<T> v_axes;  // R^T v_m
   v_axes.rows[0] = camera.rotation.rows[0].x * v_m.rows[0] + camera.rotation.rows[1].x * v_m.rows[1] +
                    camera.rotation.rows[2].x * v_m.rows[2];
@@ -104,8 +117,8 @@ inline Vector<T> shape_backward(const Camera<T>& camera, const Projection<T>& p,
   }
   quaternion_backward(p, v_axes, quaternion_out);
 
-  const T v_jxx = dot(g.factor_x, m.rows[0]), v_jxz = dot(g.factor_x, m.rows[2]);
-  const T v_jyy = dot(g.factor_y, m.rows[1]), v_jyz = dot(g.factor_y, m.rows[2]);
+  const T v_jxx = dot(g.x, m.rows[0]), v_jxz = dot(g.x, m.rows[2]);
+  const T v_jyy = dot(g.y, m.rows[1]), v_jyz = dot(g.y, m.rows[2]);
   const T iz = p.inverse_z;
   Vector<T> v{0, 0, 0};
   v.z = -iz * (jx * v_jxx + jy * v_jyy - jx * p.slope[0] * v_jxz - jy * p.slope[1] * v_jyz);
@@ -149,10 +162,10 @@ void row_backward(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<
   Projection<T> p;
   p.in_camera = camera.rotation * Vector<T>{mean[0], mean[1], mean[2]} + camera.translation;
   project_shape(camera, in.quaternions + 4 * i, in.scales + 3 * i, p);
-  ScreenGradient<T> g = screen_gradient(sum_slots(ws, i), ws.splats[i], p);
+  const ScreenGradient<T> g = screen_gradient(sum_slots(ws, i), ws.splats[i]);
   screen[0] = g.abs_x, screen[1] = g.abs_y;
-  *opacity = compensation_backward(camera, p, in.opacities[i], g);
-  Vector<T> v = shape_backward(camera, p, g, in.scales + 3 * i, quaternions, scales);
+  *opacity = g.opacity * compensation(camera, p);
+  Vector<T> v = shape_backward(camera, p, factor_backward(camera, p, g, in.opacities[i]), in.scales + 3 * i, quaternions, scales);
   const T jx = camera.fx * p.inverse_z, jy = camera.fy * p.inverse_z;
   v.x += g.x * jx, v.y += g.y * jy;
   v.z += g.depth - (g.x * jx * p.in_camera.x + g.y * jy * p.in_camera.y) * p.inverse_z;

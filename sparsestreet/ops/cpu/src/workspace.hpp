@@ -31,12 +31,13 @@ struct Pair {
   int32_t slot;  // where the pair's gradient goes: slots of a row are contiguous
 };
 
-// Sums over the pixels of one pair. s = dLoss/d(ln alpha), (a, b) = L d, w = blend weight, v = cotangents.
+// Sums over the pixels of one pair. s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d, w = blend weight.
 template <class T>
 struct Slot {
-  T s, sa, sb, saa, sab, sbb;
+  T s, sa, sb;
+  T sa_dx, sa_dy, sb_dy;  // towards l11, l21, l22
   T abs_x, abs_y;  // |s a|, |s (l21 a + l22 b)|
-  T color[3], depth;
+  T color[3], depth;      // w times the cotangents
 };
 
 template <class T>

@@ -1,0 +1,184 @@
+"""Bad input is one clear error that names the invariant, the value and the remedy; a missing library says so."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, resolve_backend, splat
+from sparsestreet.ops.cpu import library
+from sparsestreet.ops.validate import check_structure
+from sparsestreet.types import Camera
+from tests.ops.scenes import FIELDS, camera, cast, front_camera, one_gaussian, random_gaussians
+
+VIEW = camera(9, 7)
+BACKENDS = ["reference", "cpu"]
+CPU = torch.device("cpu")
+
+
+def unchecked(value, **changes):
+    """A copy with fields replaced that the shape annotations, checked in tests alone, would refuse."""
+    copy = object.__new__(type(value))
+    for field in dataclasses.fields(value):
+        object.__setattr__(copy, field.name, changes.get(field.name, getattr(value, field.name)))
+    return copy
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("field", FIELDS)
+def test_value_that_is_not_finite(field, poison, dtype, name):
+    gaussians = cast(random_gaussians(20, VIEW, terms=16), dtype)
+    getattr(gaussians, field)[13].view(-1)[-1] = poison
+    for call in (splat, contribution):
+        with pytest.raises(ValueError, match=f"{field} must be finite, but row 13 has {poison}"):
+            call(gaussians, VIEW, backend=name)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_values_out_of_range(name):
+    opaque, negative = random_gaussians(20, VIEW), random_gaussians(20, VIEW)
+    opaque.opacities[3] = 1.5
+    negative.scales[7, 1] = -0.5
+    with pytest.raises(ValueError, match=r"opacities must lie in \[0, 1\], but row 3 has 1.5"):
+        splat(opaque, VIEW, backend=name)
+    with pytest.raises(ValueError, match=r"scales must be >= 0 metres, but row 7 has -0.5"):
+        splat(negative, VIEW, backend=name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": torch.zeros(4, 3)}, r"quaternions must have shape \[4, 4\].*got \[5, 4\]"),
+        ({"opacities": torch.zeros(5, 1)}, r"opacities must have shape \[5\]"),
+        ({"sh": torch.zeros(5, 5, 3)}, "sh must hold 1, 4, 9 or 16 terms.*got 5"),
+        ({"scales": torch.zeros(5, 3, dtype=torch.float64)}, "share one dtype.*scales is torch.float64"),
+        ({"scales": torch.zeros(5, 3, device="meta")}, "share one dtype and device.*scales is torch.float32 on meta"),
+    ],
+)
+def test_structure(changes, message):
+    gaussians = unchecked(cast(random_gaussians(5, VIEW), torch.float32), **changes)
+    with pytest.raises(ValueError, match=message):
+        check_structure(gaussians, VIEW, None)
+
+
+def test_integer_fields():
+    whole = unchecked(one_gaussian(), **{name: getattr(one_gaussian(), name).long() for name in FIELDS})
+    with pytest.raises(ValueError, match="means must be floating point"):
+        check_structure(whole, VIEW, None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": 0}, "at least 1x1 pixels, got width 0"),
+        ({"camera_from_world": torch.eye(3)}, r"camera_from_world must have shape \[4, 4\]"),
+        ({"camera_from_world": torch.full((4, 4), float("nan"))}, "camera_from_world must be finite"),
+        ({"intrinsics": torch.tensor([[9.0, 0.5, 4], [0, 9, 3], [0, 0, 1]])}, "intrinsics must be.*skew"),
+        ({"intrinsics": torch.tensor([[0.0, 0, 4], [0, 9, 3], [0, 0, 1]])}, "positive focal lengths"),
+    ],
+)
+def test_camera(changes, message):
+    with pytest.raises(ValueError, match=message):
+        check_structure(one_gaussian(), unchecked(VIEW, **changes), None)
+
+
+@pytest.mark.parametrize(
+    ("background", "message"),
+    [
+        (torch.zeros(4, dtype=torch.float64), r"background must have shape \[3\] or \[7, 9, 3\], got \[4\]"),
+        (torch.zeros(3), "background must be torch.float64"),
+    ],
+)
+def test_background(background, message):
+    with pytest.raises(ValueError, match=message):
+        check_structure(one_gaussian(), VIEW, background)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("alpha_max", 1.0),
+        ("alpha_min", 0.995),
+        ("alpha_min", -0.1),
+        ("transmittance_min", 1.0),
+        ("stop", "sometimes"),
+        ("blur", float("nan")),
+        ("near", 0.0),
+    ],
+)
+def test_settings(field, value):
+    with pytest.raises(ValueError, match=f"{field} must .*got {value!r}"):
+        unchecked(SplatSettings(), **{field: value}).__post_init__()
+
+
+def test_presets():
+    assert SplatSettings.preset("default") == SplatSettings()
+    names = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast")
+    assert len({SplatSettings.preset(name) for name in names}) == len(names)
+    with pytest.raises(ValueError, match=r"no settings preset 'faster': choose one of .*'fast'"):
+        SplatSettings.preset("faster")
+
+
+def test_backends_that_cannot_run():
+    with pytest.raises(ValueError, match="no splat backend 'tritn': choose one of"):
+        resolve_backend("tritn", CPU)
+    with pytest.raises(ValueError, match="needs tensors on the cpu, got meta"):
+        resolve_backend("cpu", torch.device("meta"))
+    with pytest.raises(ValueError, match=r"float32 or float64, got torch.bfloat16"):
+        splat(cast(one_gaussian(), torch.bfloat16), VIEW, backend="cpu")
+
+
+@pytest.fixture
+def without_library(monkeypatch):
+    monkeypatch.setattr(backend, "find_library", lambda: None)
+    monkeypatch.setattr(backend, "_warned", set())
+
+
+@pytest.mark.usefixtures("without_library")
+def test_auto_without_the_library_warns_once_and_takes_the_reference():
+    with pytest.warns(RuntimeWarning, match="library is not built.*compiler.*pip install"):
+        assert resolve_backend("auto", CPU) == "reference"
+    # Warnings are errors in these tests: a second one would raise.
+    assert resolve_backend("auto", CPU) == "reference"
+
+
+@pytest.mark.usefixtures("without_library")
+def test_cpu_without_the_library_says_how_to_build_it():
+    with pytest.raises(RuntimeError, match="'cpu' is not built: install a C\\+\\+17 compiler"):
+        splat(one_gaussian(), VIEW, backend="cpu")
+
+
+def test_library_built_from_other_sources(monkeypatch):
+    monkeypatch.setattr(library, "_INTERFACE_VERSION", 999)
+    with pytest.raises(RuntimeError, match=r"has interface .*needs 999"):
+        library.load_library.__wrapped__()
+
+
+def test_more_pairs_than_may_be_held(monkeypatch):
+    view = front_camera(64, 48, 40.0)
+    giant = one_gaussian(scales=[[90.0] * 3])
+    gaussians = type(giant).concatenate([one_gaussian(means=[[0.0, 0.0, -2.0]]), giant, one_gaussian()])
+    # The ball of 0.1 m lies in the middle and reaches 7 px: tiles 1, 2 of rows 1; and the giant covers all 4 x 3.
+    for limit, fits in ((14, True), (13, False)):
+        monkeypatch.setattr("sparsestreet.ops.cpu.rasteriser.PAIR_LIMIT", limit)
+        if fits:
+            splat(gaussians, view, backend="cpu")
+            continue
+        with pytest.raises(
+            PairLimitError, match=r"cover 14 tiles, more than the 13.*row 1 \(12\), row 2 \(2\)\. Prune"
+        ):
+            splat(gaussians, view, backend="cpu")
+
+
+def test_pairs_beyond_32_bits_are_counted_not_allocated():
+    # 20,000 opaque giants over 512 x 512 tiles of a 8192 x 8192 image: 5.2e9 pairs, 42 GB of lists.
+    rows = 20_000
+    giant = one_gaussian(scales=[[900.0] * 3], opacities=[1.0])
+    gaussians = type(giant)(
+        *(getattr(giant, name).expand(rows, *getattr(giant, name).shape[1:]).float() for name in FIELDS)
+    )
+    view = front_camera(8192, 8192, 100.0, torch.float32)
+    with pytest.raises(PairLimitError, match=f"cover {rows * 512 * 512} tiles"):
+        contribution(gaussians, Camera(view.camera_from_world, view.intrinsics, 8192, 8192), backend="cpu")
