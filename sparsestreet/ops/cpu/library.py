@@ -109,6 +109,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_poison": (None, (c_void_p,)),
         "splat_stage_seconds": (ctypes.POINTER(c_double), (c_void_p,)),
         "splat_pair_count": (c_int64, (c_void_p,)),
+        "splat_sample_count": (c_int64, (c_void_p,)),
         "splat_forward": (c_int32, (c_void_p,) * 6),
         "splat_backward": (c_int32, (c_void_p,) * 6),
         "splat_contribution": (c_int32, (c_void_p,) * 5),

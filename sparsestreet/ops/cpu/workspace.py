@@ -33,6 +33,10 @@ class Workspace:
         """(splat, tile) pairs of the last forward pass."""
         return self._library.splat_pair_count(self.handle)
 
+    def sample_count(self) -> int:
+        """(splat, pixel) samples that the last forward pass evaluated."""
+        return self._library.splat_sample_count(self.handle)
+
     def poison(self) -> None:
         """Fill all buffers with NaN (tests: nothing may be read before it is written)."""
         self._library.splat_poison(self.handle)

@@ -39,7 +39,7 @@ inline void blend_row(const Splat<T>& s, const T* __restrict dx, T along, T base
 // Answers the index after the last pair that was blended.
 template <class T, bool EXCLUSIVE>
 int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
-                   TileColors<T>& c) {
+                   TileColors<T>& c, int64_t& samples) {
   const int64_t end = ws.tile_begin[tile + 1];
   for (int64_t k = ws.tile_begin[tile]; k < end; ++k) {
     if ((k - ws.tile_begin[tile]) % LOOK == 0 &&
@@ -48,6 +48,7 @@ int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
     if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
+    samples += (here.last - here.first + 1) * TILE;
     for (int y = here.first; y <= here.last; ++y) {
       const T dy = T(y0 + y) + T(0.5) - s.y, b = s.l22 * dy;
       const int at = y * TILE;
@@ -74,16 +75,18 @@ void write_tile(const TileColors<T>& c, const View& view, int64_t x0, int64_t y0
 template <class T, bool EXCLUSIVE>
 void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
   const Cuts<T> cuts(view);
-#pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
+  int64_t samples = 0;
+#pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1) reduction(+ : samples)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
     TileColors<T> c;
     std::memset(static_cast<void*>(&c), 0, sizeof(c));
     open_tile(c.transmittance, view, x0, y0);
     if (EXCLUSIVE) open_tile(c.gate, view, x0, y0);
-    ws.tile_end[tile] = blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c);
+    ws.tile_end[tile] = blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
     write_tile(c, view, x0, y0, image);
   }
+  ws.samples = samples;
 }
 
 template <class T>

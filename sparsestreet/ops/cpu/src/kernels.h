@@ -11,6 +11,7 @@ struct RowKernels {
   void (*poison)(void*);
   const double* (*seconds)(void*);
   int64_t (*pair_count)(void*);
+  int64_t (*sample_count)(void*);
   Status (*prepare)(void*, const View&, const Rows&, void* radii, Report&);
   void (*project_backward)(void*, const View&, const Rows&, const RowGradients&);
 };

@@ -107,6 +107,8 @@ SPLAT_API void splat_poison(Handle* h) { h->rows().poison(h->workspace); }
 SPLAT_API const double* splat_stage_seconds(Handle* h) { return h->rows().seconds(h->workspace); }
 SPLAT_API int64_t splat_pair_count(Handle* h) { return h->rows().pair_count(h->workspace); }
 
+SPLAT_API int64_t splat_sample_count(Handle* h) { return h->rows().sample_count(h->workspace); }
+
 SPLAT_API int32_t splat_forward(Handle* h, const View* view, const Rows* rows, const Layers* image, void* radii,
                                 Report* report) {
   return guarded([&]() -> int32_t {

@@ -15,6 +15,7 @@ RowKernels kernels() {
           [](void* w) { as<T>(w).poison(); },
           [](void* w) -> const double* { return as<T>(w).seconds; },
           [](void* w) { return as<T>(w).pair_count; },
+          [](void* w) { return as<T>(w).samples; },
           [](void* w, const View& v, const Rows& r, void* radii, Report& report) {
             return prepare(as<T>(w), v, r, radii, report);
           },

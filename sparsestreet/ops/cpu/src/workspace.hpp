@@ -59,6 +59,7 @@ struct Workspace {
   };
   Buffer<Count> count_slots;
   int64_t visible = 0, pair_count = 0, tiles_x = 0, tiles_y = 0;
+  int64_t samples = 0;  // (splat, pixel) pairs that the forward loops evaluated
   double seconds[STAGES] = {};
 
   void poison() {
