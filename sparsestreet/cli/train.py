@@ -71,7 +71,6 @@ def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:
         default_root_dir=str(out),
         enable_model_summary=False,
         enable_progress_bar=False,
-        log_every_n_steps=50,
         max_epochs=-1,
     )
 

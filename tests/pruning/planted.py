@@ -157,7 +157,7 @@ def _propose_hidden(rows: Rows, views: Views, number: int, generator: torch.Gene
     log_scales = rows.log_scales.detach()[parents]
     limit = (torch.cat(gaps) / 4).log()[:, None]  # four standard deviations fit into the gap
     edits = {"means": torch.cat(places), "log_scales": torch.minimum(log_scales, limit)}
-    return RowPlan(parents, torch.ones_like(parents, dtype=torch.bool), edits)
+    return RowPlan(len(rows), parents, torch.ones_like(parents, dtype=torch.bool), edits)
 
 
 def _propose_copies(rows: Rows, views: Views, number: int, generator: torch.Generator) -> RowPlan:
@@ -173,7 +173,7 @@ def _propose_copies(rows: Rows, views: Views, number: int, generator: torch.Gene
         "log_scales": (scales / 3).log(),
         "opacity_logits": opacities.logit(),
     }
-    return RowPlan(parents, torch.ones_like(parents, dtype=torch.bool), edits)
+    return RowPlan(len(rows), parents, torch.ones_like(parents, dtype=torch.bool), edits)
 
 
 def _append(rows: Rows, proposals: list[RowPlan]) -> RowPlan:
@@ -185,7 +185,7 @@ def _append(rows: Rows, proposals: list[RowPlan]) -> RowPlan:
         column = rows.columns()[name].detach()
         parts = [proposal.edits.get(name, column[proposal.source]) for proposal in proposals]
         edits[name] = torch.cat((column, *parts))
-    return RowPlan(source, torch.arange(len(source)) >= len(rows), edits)
+    return RowPlan(len(rows), source, torch.arange(len(source)) >= len(rows), edits)
 
 
 def _resized(rows: Rows, plan: RowPlan) -> Rows:

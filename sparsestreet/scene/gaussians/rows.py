@@ -6,11 +6,14 @@ from torch.optim import Optimizer
 
 from sparsestreet.scene.gaussians.plan import RowPlan
 
+TRANSIENT = frozenset({"mask_logits"})
+"""Columns that training may have dropped: a checkpoint without them loads into a table without them."""
+
 
 class Rows(nn.Module):
     """Named per-row parameters (means, log_scales, mask_logits ...) and buffers (instances ...).
 
-    Raises ValueError if the columns disagree in their number of rows.
+    Raises ValueError without any column, or if the columns disagree in their number of rows.
     """
 
     def __init__(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor] | None = None) -> None:
@@ -20,8 +23,8 @@ class Rows(nn.Module):
         for name, value in (buffers or {}).items():
             self.register_buffer(name, value.clone())
         lengths = {name: column.shape[0] for name, column in self.columns().items()}
-        if len(set(lengths.values())) > 1:
-            raise ValueError(f"every column needs the same number of rows, got {lengths}")
+        if len(set(lengths.values())) != 1:
+            raise ValueError(f"a table needs columns, all of the same number of rows, got {lengths}")
 
     def __len__(self) -> int:
         return next(iter(self.columns().values())).shape[0]
@@ -34,24 +37,21 @@ class Rows(nn.Module):
     def resize(self, plan: RowPlan, optimizer: Optimizer | None = None) -> None:
         """Apply a plan once, to values, optimiser moments and buffers; gradients are dropped.
 
-        Raises KeyError if the plan edits a column that does not exist (nothing is changed then).
+        Raises KeyError or ValueError, with nothing changed, if the plan was made for another number of rows, edits a
+        column that does not exist or in another shape, or if the optimiser does not hold a trainable column.
         """
         columns = self.columns()
-        unknown = (set(plan.edits) | plan.reset_moments) - set(columns)
-        if unknown:
-            raise KeyError(f"the plan edits {sorted(unknown)}, but the rows have only {sorted(columns)}")
+        self._check(plan, optimizer)
         for name, column in columns.items():
-            value = plan.edits.get(name, column[plan.source]).to(column.dtype)
-            if value.shape[0] != plan.source.shape[0]:
-                raise ValueError(f"edit of {name!r} has {value.shape[0]} rows, the plan has {plan.source.shape[0]}")
-            if isinstance(column, nn.Parameter):
-                fresh_parameter = nn.Parameter(value.contiguous().clone(), requires_grad=column.requires_grad)
-                setattr(self, name, fresh_parameter)
-                if optimizer is not None:
-                    zero = torch.ones_like(plan.fresh) if name in plan.reset_moments else plan.fresh
-                    _replace_in_optimizer(optimizer, column, fresh_parameter, plan.source, zero)
-            else:
-                setattr(self, name, value.clone())
+            value = plan.edits.get(name, column[plan.source]).to(column.dtype).clone()
+            if not isinstance(column, nn.Parameter):
+                setattr(self, name, value)
+                continue
+            parameter = nn.Parameter(value.contiguous(), requires_grad=column.requires_grad)
+            setattr(self, name, parameter)
+            if optimizer is not None and column.requires_grad:
+                zero = torch.ones_like(plan.fresh) if name in plan.reset_moments else plan.fresh
+                _replace_in_optimizer(optimizer, column, parameter, plan.source, zero)
 
     @torch.no_grad()
     def drop_column(self, name: str, optimizer: Optimizer | None = None) -> None:
@@ -64,13 +64,38 @@ class Rows(nn.Module):
         for group in optimizer.param_groups:
             group["params"] = [other for other in group["params"] if other is not parameter]
 
+    def _check(self, plan: RowPlan, optimizer: Optimizer | None) -> None:
+        columns = self.columns()
+        if plan.rows != len(self):
+            raise ValueError(f"the plan was made for {plan.rows} rows, the table has {len(self)}: plan again")
+        parameters = {name for name, column in columns.items() if isinstance(column, nn.Parameter)}
+        unknown = (set(plan.edits) - set(columns)) | (plan.reset_moments - parameters)
+        if unknown:
+            raise KeyError(f"the plan edits {sorted(unknown)}, but the rows have only {sorted(columns)}")
+        for name, value in plan.edits.items():
+            wanted = (len(plan.source), *columns[name].shape[1:])
+            if tuple(value.shape) != wanted:
+                raise ValueError(f"the edit of {name!r} has shape {tuple(value.shape)}, the plan needs {wanted}")
+        if optimizer is None:
+            return
+        held = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
+        missing = [name for name in sorted(parameters) if columns[name].requires_grad and id(columns[name]) not in held]
+        if missing:
+            raise ValueError(f"the optimiser does not hold the columns {missing}: build it after the scene was loaded")
+
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        """Take the number of rows from the checkpoint: a scene is saved with as many as training left it."""
+        """Take the number of rows, and whether there are still masks, from the checkpoint.
+
+        Load before building an optimiser: parameters of another length are replaced.
+        """
         for name, column in self.columns().items():
             saved = state_dict.get(prefix + name)
-            if saved is not None and saved.shape != column.shape:
+            if saved is None and name in TRANSIENT:
+                delattr(self, name)
+            elif saved is not None and saved.shape[1:] == column.shape[1:] and len(saved) != len(column):
                 value = torch.empty(saved.shape, dtype=column.dtype, device=column.device)
-                setattr(self, name, nn.Parameter(value) if isinstance(column, nn.Parameter) else value)
+                is_parameter = isinstance(column, nn.Parameter)
+                setattr(self, name, nn.Parameter(value, column.requires_grad) if is_parameter else value)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 

@@ -21,6 +21,16 @@ class StaticMask:
     """epsilon of the paper (value of Compact-3DGS, whose mask the paper repeats)."""
     initial_logit: float = 1.0
 
+    def __post_init__(self) -> None:
+        if not self.weight >= 0:
+            raise ValueError(f"a mask's weight must be >= 0, got {self.weight}")
+        if not self.minimum_rows >= 0:
+            raise ValueError(f"a mask's minimum_rows must be >= 0, got {self.minimum_rows}")
+        if not 0 <= self.threshold < 1:
+            raise ValueError(
+                f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}"
+            )
+
     def initial_logits(self, rows: int) -> Float[Tensor, " n"]:
         return torch.full((rows,), self.initial_logit, dtype=torch.float32)
 

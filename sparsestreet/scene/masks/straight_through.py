@@ -6,6 +6,6 @@ from torch import Tensor
 
 def straight_through(scores: Float[Tensor, " n"], threshold: float) -> Float[Tensor, " n"]:
     """1[score > threshold] forward, d/dscore = 1 backward. Scores are sigmoids already: no second one here."""
-    # (hard - score) + score is not exactly 0 or 1 in float32; hard + (score - score.detach()) is.
+    # score - score.detach() is exactly 0, so the product with a closed mask is exactly 0 in every dtype.
     hard = (scores > threshold).to(scores.dtype)
     return hard + (scores - scores.detach())

@@ -122,8 +122,6 @@ class DensityControl(Callback):
         }
 
     def load_state_dict(self, state_dict: dict[str, object]) -> None:
-        for name, saved in state_dict["statistics"].items():
-            self.statistics[name] = DensityStatistics(0)
-            self.statistics[name].load_state_dict(saved)
+        self.statistics = {name: DensityStatistics.from_state(s) for name, s in state_dict["statistics"].items()}
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]

@@ -119,6 +119,7 @@ def reset_opacity(rows: Rows, value: float) -> RowPlan:
     source = torch.arange(len(rows), device=logits.device)
     lowered = logits.clamp(max=math.log(value / (1 - value)))
     return RowPlan(
+        len(rows),
         source,
         fresh=torch.zeros_like(source, dtype=torch.bool),
         edits={"opacity_logits": lowered},
@@ -171,7 +172,7 @@ def _grow(
     means[first_child:] += _offsets(rows, children, generator)
     log_scales = rows.log_scales.detach()[source]
     log_scales[split[source]] -= math.log(settings.split_shrink)
-    return RowPlan(source, fresh, edits={"means": means, "log_scales": log_scales})
+    return RowPlan(len(rows), source, fresh, edits={"means": means, "log_scales": log_scales})
 
 
 def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:

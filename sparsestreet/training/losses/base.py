@@ -1,6 +1,6 @@
 """What every loss term is: a weighted number from a rendering and the frame it should look like."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -9,6 +9,7 @@ from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
 
+@runtime_checkable
 class Loss(Protocol):
     def applies(self, frame: Frame) -> bool:
         """Whether the frame carries what the term compares with."""

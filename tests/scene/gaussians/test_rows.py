@@ -35,7 +35,7 @@ def test_values_moments_and_buffers_follow_their_rows():
     source = torch.tensor([5, 0, 0, 3])
     fresh = torch.tensor([False, False, True, False])
     new_means = torch.full((4, 3), 7.0)
-    rows.resize(RowPlan(source, fresh, {"means": new_means}, frozenset({"opacity_logits"})), optimizer)
+    rows.resize(RowPlan(6, source, fresh, {"means": new_means}, frozenset({"opacity_logits"})), optimizer)
     assert len(rows) == 4
     for name, column in rows.columns().items():
         for new, old in enumerate(source.tolist()):
@@ -91,7 +91,7 @@ def test_the_children_inherit_mask_and_instance():
     rows, _ = trained()
     logits, instances = rows.mask_logits.detach().clone(), rows.instances.clone()
     source = torch.tensor([0, 1, 2, 3, 4, 5, 4, 4])
-    rows.resize(RowPlan(source, source != torch.arange(8)))
+    rows.resize(RowPlan(6, source, source != torch.arange(8)))
     assert torch.equal(rows.mask_logits[6:], logits[[4, 4]])
     assert torch.equal(rows.instances[6:], instances[[4, 4]])
 
@@ -99,7 +99,7 @@ def test_the_children_inherit_mask_and_instance():
 def test_an_unknown_edit_changes_nothing():
     rows, optimizer = trained()
     before = snapshot(rows, optimizer)[0]
-    plan = RowPlan(torch.tensor([0]), torch.tensor([False]), {"mean": torch.zeros(1, 3)})
+    plan = RowPlan(6, torch.tensor([0]), torch.tensor([False]), {"mean": torch.zeros(1, 3)})
     with pytest.raises(KeyError, match="mean"):
         rows.resize(plan, optimizer)
     assert all(torch.equal(column, before[name]) for name, column in rows.columns().items())
@@ -107,8 +107,42 @@ def test_an_unknown_edit_changes_nothing():
 
 def test_an_edit_of_the_wrong_length_is_an_error():
     rows = random_rows(3, 0)
-    with pytest.raises(ValueError, match="edit of 'means' has 2 rows, the plan has 1"):
-        rows.resize(RowPlan(torch.tensor([0]), torch.tensor([False]), {"means": torch.zeros(2, 3)}))
+    for shape in ((2, 3), (1, 4)):
+        with pytest.raises(ValueError, match="edit of 'means' has shape"):
+            rows.resize(RowPlan(3, torch.tensor([0]), torch.tensor([False]), {"means": torch.zeros(shape)}))
+    assert len(rows) == 3
+
+
+def test_a_stale_plan_is_refused():
+    with pytest.raises(ValueError, match="made for 2 rows, the table has 3"):
+        random_rows(3, 0).resize(RowPlan.keep(torch.tensor([True, False])))
+
+
+def test_a_plan_names_rows_that_exist():
+    with pytest.raises(ValueError, match="sources -1 to 2"):
+        RowPlan(3, torch.tensor([-1, 2]), torch.tensor([False, False]))
+
+
+def test_a_foreign_optimizer_is_refused():
+    rows, optimizer = trained()
+    with pytest.raises(ValueError, match="does not hold"):
+        random_rows(3, 0).resize(RowPlan.keep(torch.ones(3, dtype=torch.bool)), optimizer)
+
+
+def test_a_checkpoint_brings_its_rows_and_whether_masks_are_left():
+    finished = random_rows(5, 0, mask=MASK)
+    finished.drop_column("mask_logits")
+    fresh = random_rows(3, 1, mask=MASK)
+    fresh.load_state_dict(finished.state_dict())
+    assert len(fresh) == 5 and "mask_logits" not in fresh.columns()
+    assert torch.equal(fresh.means, finished.means)
+
+
+def test_a_checkpoint_of_another_column_shape_is_refused():
+    state = random_rows(3, 0).state_dict()
+    state["means"] = torch.zeros(3, 4)
+    with pytest.raises(RuntimeError, match="size mismatch for means"):
+        random_rows(3, 0).load_state_dict(state)
 
 
 def test_columns_of_different_lengths_are_an_error():

@@ -42,7 +42,7 @@ def test_nan_of_a_drawn_row_is_refused():
 def test_resize_follows_the_rows_and_starts_fresh_ones_at_zero():
     statistics = DensityStatistics(3)
     statistics.add(torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), torch.tensor([1.0, 2.0, 3.0]), 2, 2)
-    statistics.resize(RowPlan(torch.tensor([2, 0, 2]), torch.tensor([False, False, True])))
+    statistics.resize(RowPlan(3, torch.tensor([2, 0, 2]), torch.tensor([False, False, True])))
     assert statistics.mean_gradients().tolist() == [3.0, 1.0, 0.0]
     assert statistics.visits.tolist() == [1, 1, 0]
     assert statistics.largest_screen.tolist() == [1.5, 0.5, 0.0]
