@@ -12,27 +12,18 @@ struct TileColors {
 };
 
 template <class T, bool EXCLUSIVE>
-inline void blend_row(const Splat<T>& s, const T* __restrict dx, T along, T base, const Cuts<T>& cuts,
-                      T* __restrict transmittance, T* __restrict gate, T* __restrict red, T* __restrict green,
-                      T* __restrict blue, T* __restrict depth) {
-  for (int i = 0; i < TILE; ++i) {
-    const T a = s.l11 * dx[i] + along;
-    const T exponent = base - a * a;
-    const T raw = exp2_nonpositive(exponent > T(-126) ? exponent : T(-126));
-    T alpha = raw < cuts.alpha_max ? raw : cuts.alpha_max;
-    alpha = exponent >= cuts.log2_alpha_min ? alpha : T(0);
-    if (EXCLUSIVE) {
-      gate[i] = gate[i] - alpha * gate[i];
-      alpha = gate[i] > cuts.transmittance_min ? alpha : T(0);
-    } else {
-      alpha = transmittance[i] > cuts.transmittance_min ? alpha : T(0);
-    }
-    const T weight = alpha * transmittance[i];
-    transmittance[i] = transmittance[i] - weight;
-    red[i] += weight * s.color[0];
-    green[i] += weight * s.color[1];
-    blue[i] += weight * s.color[2];
-    depth[i] += weight * s.depth;
+inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c, int row) {
+  const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
+  for (int x = 0; x < TILE; x += LANES<T>) {
+    const int at = row * TILE + x;
+    const Lanes<T> transmittance = load(c.transmittance + at);
+    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
+    const Lanes<T> weight = p.alpha * transmittance;
+    store(c.transmittance + at, transmittance - weight);
+    store(c.red + at, load(c.red + at) + weight * s.color[0]);
+    store(c.green + at, load(c.green + at) + weight * s.color[1]);
+    store(c.blue + at, load(c.blue + at) + weight * s.color[2]);
+    store(c.depth + at, load(c.depth + at) + weight * s.depth);
   }
 }
 
@@ -49,12 +40,8 @@ int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
     samples += (here.last - here.first + 1) * TILE;
-    for (int y = here.first; y <= here.last; ++y) {
-      const T dy = T(y0 + y) + T(0.5) - s.y, b = s.l22 * dy;
-      const int at = y * TILE;
-      blend_row<T, EXCLUSIVE>(s, here.dx, s.l21 * dy, s.log2_opacity - b * b, cuts, c.transmittance + at, c.gate + at,
-                              c.red + at, c.green + at, c.blue + at, c.depth + at);
-    }
+    for (int y = here.first; y <= here.last; ++y)
+      blend_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y);
   }
   return end;
 }

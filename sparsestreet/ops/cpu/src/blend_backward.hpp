@@ -15,70 +15,56 @@ struct TileCotangents {
       depth[PIXELS];
 };
 
-// Sums over rows of a tile, per column.
+// Sums over the rows of a tile, per column, of some neighbouring columns.
 template <class T>
 struct Columns {
-  alignas(64) T s[TILE], sa[TILE], sb[TILE], sa_dy[TILE], sb_dy[TILE], abs_x[TILE], abs_y[TILE], red[TILE], green[TILE],
-      blue[TILE], depth[TILE];
+  Lanes<T> s{}, sa{}, sb{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{};
 };
 
 template <class T, bool EXCLUSIVE>
-inline void accumulate_row(const Splat<T>& p, const T* __restrict dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
+inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
                            int at, Columns<T>& sums) {
-  T* __restrict transmittance = t.transmittance + at;
-  T* __restrict gate = t.gate + at;
-  T* __restrict behind = t.behind + at;
-  const T *__restrict red = t.red + at, *__restrict green = t.green + at, *__restrict blue = t.blue + at;
-  const T* __restrict depth = t.depth + at;
   const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
-  for (int i = 0; i < TILE; ++i) {
-    const T a = p.l11 * dx[i] + along;
-    const T exponent = base - a * a;
-    const T raw = exp2_nonpositive(exponent > T(-126) ? exponent : T(-126));
-    T alpha = raw < cuts.alpha_max ? raw : cuts.alpha_max;
-    alpha = exponent >= cuts.log2_alpha_min ? alpha : T(0);
-    if (EXCLUSIVE) {
-      gate[i] = gate[i] - alpha * gate[i];
-      alpha = gate[i] > cuts.transmittance_min ? alpha : T(0);
-    } else {
-      alpha = transmittance[i] > cuts.transmittance_min ? alpha : T(0);
-    }
-    const T weight = alpha * transmittance[i];
-    transmittance[i] = transmittance[i] - weight;
-    const T blended = weight * (p.color[0] * red[i] + p.color[1] * green[i] + p.color[2] * blue[i] +
-                                p.depth * depth[i]);
-    behind[i] = behind[i] - blended;
-    T s = blended - alpha / (T(1) - alpha) * behind[i];
-    s = raw <= cuts.alpha_max ? s : T(0);  // a clamped alpha has no derivative
-    const T sa = s * a, sb = s * b;
-    sums.s[i] += s;
-    sums.sa[i] += sa;
-    sums.sb[i] += sb;
-    sums.sa_dy[i] += sa * dy;
-    sums.sb_dy[i] += sb * dy;
-    const T gy = p.l21 * sa + p.l22 * sb;
-    sums.abs_x[i] += sa < 0 ? -sa : sa;
-    sums.abs_y[i] += gy < 0 ? -gy : gy;
-    sums.red[i] += weight * red[i];
-    sums.green[i] += weight * green[i];
-    sums.blue[i] += weight * blue[i];
-    sums.depth[i] += weight * depth[i];
-  }
+  const Lanes<T> transmittance = load(t.transmittance + at);
+  const Sample<T> q = sample<T, EXCLUSIVE>(p, dx, along, base, cuts, transmittance, t.gate + at);
+  const Lanes<T> red = load(t.red + at), green = load(t.green + at), blue = load(t.blue + at);
+  const Lanes<T> depth = load(t.depth + at), weight = q.alpha * transmittance;
+  store(t.transmittance + at, transmittance - weight);
+  const Lanes<T> blended = weight * (p.color[0] * red + p.color[1] * green + p.color[2] * blue + p.depth * depth);
+  const Lanes<T> behind = load(t.behind + at) - blended;
+  store(t.behind + at, behind);
+  Lanes<T> s = blended - q.alpha / (T(1) - q.alpha) * behind;
+  s = q.raw <= cuts.alpha_max ? s : Lanes<T>{};  // a clamped alpha has no derivative
+  const Lanes<T> sa = s * q.a, sb = s * b;
+  sums.s += s;
+  sums.sa += sa;
+  sums.sb += sb;
+  sums.sa_dy += sa * dy;
+  sums.sb_dy += sb * dy;
+  sums.abs_x += magnitude(sa);
+  sums.abs_y += magnitude(p.l21 * sa + p.l22 * sb);
+  sums.red += weight * red;
+  sums.green += weight * green;
+  sums.blue += weight * blue;
+  sums.depth += weight * depth;
 }
 
 template <class T>
-inline T total(const T* values) {
-  T sum = 0;
-  for (int i = 0; i < TILE; ++i) sum += values[i];
+inline T total(const Lanes<T>& values) {
+  T each[LANES<T>], sum = 0;
+  store(each, values);
+  for (int i = 0; i < LANES<T>; ++i) sum += each[i];
   return sum;
 }
 
 template <class T>
-inline void write_slot(const Columns<T>& c, const T* dx, Slot<T>& slot) {
-  T sa_dx = 0;  // dx is the same in every row of a column
-  for (int i = 0; i < TILE; ++i) sa_dx += c.sa[i] * dx[i];
-  slot = {total(c.s), total(c.sa), total(c.sb), sa_dx, total(c.sa_dy), total(c.sb_dy), total(c.abs_x), total(c.abs_y),
-          {total(c.red), total(c.green), total(c.blue)}, total(c.depth)};
+inline void add_columns(const Columns<T>& c, const Lanes<T>& dx, Slot<T>& slot) {
+  slot.s += total<T>(c.s), slot.sa += total<T>(c.sa), slot.sb += total<T>(c.sb);
+  slot.sa_dx += total<T>(c.sa * dx);  // dx is the same in every row of a column
+  slot.sa_dy += total<T>(c.sa_dy), slot.sb_dy += total<T>(c.sb_dy);
+  slot.abs_x += total<T>(c.abs_x), slot.abs_y += total<T>(c.abs_y);
+  slot.color[0] += total<T>(c.red), slot.color[1] += total<T>(c.green), slot.color[2] += total<T>(c.blue);
+  slot.depth += total<T>(c.depth);
 }
 
 // Loads the cotangents and the light behind the camera: sum of what was blended plus what got past everything.
@@ -118,12 +104,15 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
     }
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
-    Columns<T> sums;
-    std::memset(static_cast<void*>(&sums), 0, sizeof(sums));
-    for (int y = here.first; y <= here.last; ++y) {
-      accumulate_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE, sums);
+    Slot<T> slot{};
+    for (int x = 0; x < TILE; x += LANES<T>) {
+      const Lanes<T> dx = load(here.dx + x);
+      Columns<T> sums;
+      for (int y = here.first; y <= here.last; ++y)
+        accumulate_row<T, EXCLUSIVE>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, sums);
+      add_columns(sums, dx, slot);
     }
-    write_slot(sums, here.dx, ws.slots[ws.pairs[k].slot]);
+    ws.slots[ws.pairs[k].slot] = slot;
   }
   for (int64_t k = end; k < ws.tile_begin[tile + 1]; ++k) ws.slots[ws.pairs[k].slot] = Slot<T>{};
 }

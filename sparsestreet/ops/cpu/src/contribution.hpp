@@ -13,22 +13,26 @@ struct TileCounters {
   int64_t best_pair[PIXELS];
 };
 
-// Weight of splat s in one pixel; moves the pixel's state on.
-template <class T>
-inline T pixel_weight(const Splat<T>& s, T dx, T dy, const Cuts<T>& cuts, bool exclusive, T& transmittance, T& gate) {
-  const T a = s.l11 * dx + s.l21 * dy, b = s.l22 * dy;
-  const T exponent = s.log2_opacity - b * b - a * a;
-  if (exponent < cuts.log2_alpha_min) return 0;
-  const T raw = exp2_nonpositive(exponent > T(-126) ? exponent : T(-126));
-  const T alpha = raw < cuts.alpha_max ? raw : cuts.alpha_max;
-  if (exclusive) gate -= alpha * gate;
-  if ((exclusive ? gate : transmittance) <= cuts.transmittance_min) return 0;
-  const T weight = alpha * transmittance;
-  transmittance -= weight;
-  return weight;
+// Blends one row of a tile and keeps, per pixel, the pair that weighed most so far.
+template <class T, bool EXCLUSIVE>
+inline void count_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileCounters<T>& c, int row,
+                      int64_t pair, typename Workspace<T>::Count& count) {
+  const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
+  for (int x = 0; x < TILE; x += LANES<T>) {
+    const int at = row * TILE + x;
+    const Lanes<T> transmittance = load(c.transmittance + at);
+    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
+    const Lanes<T> weight = p.alpha * transmittance;
+    store(c.transmittance + at, transmittance - weight);
+    for (int i = 0; i < LANES<T>; ++i) {
+      count.weight += double(weight[i]), count.pixels += weight[i] > 0;
+      // Strictly more: of equal weights the nearer splat keeps the pixel.
+      if (weight[i] > c.best[at + i]) c.best[at + i] = weight[i], c.best_pair[at + i] = pair;
+    }
+  }
 }
 
-template <class T>
+template <class T, bool EXCLUSIVE>
 void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   TileCounters<T> c;
@@ -38,16 +42,8 @@ void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
     typename Workspace<T>::Count count{0, 0, 0};
-    for (int y = here.first; y <= here.last; ++y) {
-      for (int x = 0; x < TILE; ++x) {
-        const int at = y * TILE + x;
-        const T weight = pixel_weight(s, here.dx[x], T(y0 + y) + T(0.5) - s.y, cuts, view.exclusive_stop,
-                                      c.transmittance[at], c.gate[at]);
-        count.weight += double(weight), count.pixels += weight > 0;
-        // Strictly more: of equal weights the nearer splat keeps the pixel.
-        if (weight > c.best[at]) c.best[at] = weight, c.best_pair[at] = k;
-      }
-    }
+    for (int y = here.first; y <= here.last; ++y)
+      count_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y, k, count);
     ws.count_slots[ws.pairs[k].slot] = count;
   }
   for (int i = 0; i < PIXELS; ++i)
@@ -60,11 +56,16 @@ void count_contributions(Workspace<T>& ws, const View& view, int64_t rows, const
   const Cuts<T> cuts(view);
   ws.count_slots.reserve(ws.pair_count);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
-  for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) count_tile(ws, view, cuts, tile);
+  for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
+    if (view.exclusive_stop)
+      count_tile<T, true>(ws, view, cuts, tile);
+    else
+      count_tile<T, false>(ws, view, cuts, tile);
+  }
 #pragma omp parallel for num_threads(view.threads) schedule(static)
   for (int64_t i = 0; i < rows; ++i) {
     typename Workspace<T>::Count sum{0, 0, 0};
-    for (int32_t k = 0; k < ws.counts[i]; ++k) {
+    for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
       const auto& slot = ws.count_slots[ws.first_slot[i] + k];
       sum.weight += slot.weight, sum.pixels += slot.pixels, sum.dominant += slot.dominant;
     }

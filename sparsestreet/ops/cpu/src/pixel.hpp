@@ -1,28 +1,9 @@
-// What the pixel loops share: 2^x, alpha, and the state of a tile.
+// What the pixel loops share: alpha, the stop rule, and where a splat meets a tile.
 #pragma once
-#include <cmath>
-
+#include "lanes.hpp"
 #include "workspace.hpp"
 
 namespace SPLAT_VARIANT {
-
-// 2^x for x in [-126, 0]: rounding and a minimax polynomial of degree 5 on [-1/2, 1/2] (relative error 1.2e-7).
-// A conversion and a shift, as these vectorise on every target.
-inline float exp2_nonpositive(float x) {
-  const int32_t n = int32_t(x - 0.5f);
-  const float f = x - float(n);
-  float p = 1.3276472454890609e-03f;
-  p = p * f + 9.6755409613251686e-03f;
-  p = p * f + 5.5507130920886993e-02f;
-  p = p * f + 2.4022120237350464e-01f;
-  p = p * f + 6.9314694404602051e-01f;
-  p = p * f + 1.0f;
-  const int32_t bits = (n + 127) << 23;
-  float scale;
-  std::memcpy(&scale, &bits, sizeof(scale));
-  return p * scale;
-}
-inline double exp2_nonpositive(double x) { return std::exp2(x); }
 
 // The cut-offs, ready for the pixel loops.
 template <class T>
@@ -39,11 +20,11 @@ constexpr int64_t PREFETCH = 8;
 // Pairs between two looks at whether the whole tile is finished.
 constexpr int64_t LOOK = 16;
 
-// The part of a splat in one tile: dx per column, and the image rows it reaches.
+// The part of a splat in one tile: dx per column, and the rows of the tile it reaches.
 template <class T>
 struct TileSplat {
-  T dx[TILE];
-  int first, last;  // rows within the tile, inclusive
+  alignas(64) T dx[TILE];
+  int first, last;  // inclusive
   TileSplat(const Splat<T>& s, int64_t x0, int64_t y0) {
     const T offset = T(x0) + T(0.5) - s.x;
     for (int i = 0; i < TILE; ++i) dx[i] = offset + T(i);
@@ -52,8 +33,35 @@ struct TileSplat {
   }
 };
 
-// `gate` decides whether a pixel is still open: the transmittance itself for the inclusive stop, the product that
-// includes dropped splats for the exclusive one.
+template <class T>
+struct Sample {
+  Lanes<T> a;      // first component of L d
+  Lanes<T> raw;    // alpha before the clamp
+  Lanes<T> alpha;  // what is blended: 0 below alpha_min and in finished pixels
+};
+
+// Evaluates a splat in neighbouring pixels of one row. `gate` decides whether a pixel is still open: the transmittance
+// itself for the inclusive stop, the product that includes dropped splats for the exclusive one.
+template <class T, bool EXCLUSIVE>
+inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, const Cuts<T>& cuts,
+                        const Lanes<T>& transmittance, T* gate) {
+  Sample<T> p;
+  p.a = s.l11 * dx + along;
+  const Lanes<T> exponent = base - p.a * p.a, none{};
+  p.raw = exp2_nonpositive(larger(exponent, same(T(-126))));
+  p.alpha = smaller(p.raw, same(cuts.alpha_max));
+  p.alpha = exponent >= cuts.log2_alpha_min ? p.alpha : none;
+  if (EXCLUSIVE) {
+    Lanes<T> passed = load(gate);
+    passed = passed - p.alpha * passed;
+    store(gate, passed);
+    p.alpha = passed > cuts.transmittance_min ? p.alpha : none;
+  } else {
+    p.alpha = transmittance > cuts.transmittance_min ? p.alpha : none;
+  }
+  return p;
+}
+
 template <class T>
 inline bool tile_finished(const T* gate, T least) {
   T most = 0;

@@ -17,12 +17,19 @@ struct Inputs {
         opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)) {}
 };
 
-// Whether all values are finite: x - x is 0 for those and NaN for the rest, and a sum keeps a NaN.
+// Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorises.
 template <class T>
 inline bool finite(const T* values, int64_t count) {
-  T sum = 0;
-  for (int64_t i = 0; i < count; ++i) sum += values[i] - values[i];
-  return sum == 0;
+  using Bits = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
+  constexpr Bits magnitude = ~Bits(0) >> 1, infinity = sizeof(T) == 4 ? Bits(0x7f800000) : Bits(0x7ff0000000000000);
+  Bits most = 0;
+  for (int64_t i = 0; i < count; ++i) {
+    Bits bits;
+    std::memcpy(&bits, values + i, sizeof(bits));
+    bits &= magnitude;
+    most = bits > most ? bits : most;
+  }
+  return most < infinity;
 }
 
 template <class T>
@@ -32,12 +39,12 @@ inline bool valid_row(const Inputs<T>& in, int64_t i) {
          s[2] >= 0 && opacity >= 0 && opacity <= 1 && finite(in.sh + 3 * in.terms * i, 3 * in.terms);
 }
 
-// Fills ws.splats, ws.counts and `radii`; false if a row holds a bad value.
+// Fills ws.splats, ws.tiles and `radii`; false if a row holds a bad value.
 template <class T>
 bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* radii) {
   const Camera<T> camera(view);
   const Grid<T> grid(view);
-  ws.splats.reserve(in.count), ws.counts.reserve(in.count);
+  ws.splats.reserve(in.count), ws.tiles.reserve(in.count);
   int bad = 0;
 #pragma omp parallel for num_threads(view.threads) schedule(static) reduction(| : bad)
   for (int64_t i = 0; i < in.count; ++i) {
@@ -45,7 +52,7 @@ bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* ra
     Splat<T>& splat = ws.splats[i];
     const bool seen = project_row(camera, in.means + 3 * i, in.quaternions + 4 * i, in.scales + 3 * i, in.opacities[i],
                                   in.sh + 3 * in.terms * i, in.terms, splat);
-    ws.counts[i] = seen ? count_tiles(splat, grid) : 0;
+    ws.tiles[i] = seen ? tile_set(splat, grid) : TileSet{0, 0, 0};
     if (radii) radii[i] = !seen ? T(0) : (splat.half_x > splat.half_y ? splat.half_x : splat.half_y);
   }
   return !bad;
@@ -56,7 +63,7 @@ template <class T>
 void report_worst(const Workspace<T>& ws, int64_t rows, Report& report) {
   for (int k = 0; k < 3; ++k) report.worst_rows[k] = -1, report.worst_pairs[k] = 0;
   for (int64_t i = 0; i < rows; ++i) {
-    int64_t row = i, pairs = ws.counts[i];
+    int64_t row = i, pairs = ws.tiles[i].count;
     for (int k = 0; k < 3; ++k) {
       if (pairs <= report.worst_pairs[k]) continue;
       const int64_t other_row = report.worst_rows[k], other_pairs = report.worst_pairs[k];

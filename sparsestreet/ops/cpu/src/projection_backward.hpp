@@ -19,7 +19,7 @@ template <class T>
 inline Slot<T> sum_slots(const Workspace<T>& ws, int64_t row) {
   Slot<T> sum{};
   const Slot<T>* slots = ws.slots.data() + ws.first_slot[row];
-  for (int32_t k = 0; k < ws.counts[row]; ++k) {
+  for (int32_t k = 0; k < ws.tiles[row].count; ++k) {
     const Slot<T>& o = slots[k];
     sum.s += o.s, sum.sa += o.sa, sum.sb += o.sb, sum.sa_dx += o.sa_dx;
     sum.sa_dy += o.sa_dy, sum.sb_dy += o.sb_dy;
@@ -154,7 +154,7 @@ void row_backward(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<
   T *means = static_cast<T*>(out.means) + 3 * i, *quaternions = static_cast<T*>(out.quaternions) + 4 * i;
   T *scales = static_cast<T*>(out.scales) + 3 * i, *opacity = static_cast<T*>(out.opacities) + i;
   T *sh = static_cast<T*>(out.sh) + 3 * in.terms * i, *screen = static_cast<T*>(out.screen) + 2 * i;
-  if (ws.counts[i] == 0) {
+  if (ws.tiles[i].count == 0) {
     zero(means, 3), zero(quaternions, 4), zero(scales, 3), zero(opacity, 1), zero(sh, 3 * in.terms), zero(screen, 2);
     return;
   }

@@ -31,8 +31,8 @@ void list_visible(Workspace<T>& ws, int64_t rows) {
   ws.first_slot.reserve(rows), ws.keys.reserve(rows), ws.order.reserve(rows);
   for (int64_t i = 0; i < rows; ++i) {
     ws.first_slot[i] = pairs;
-    if (ws.counts[i] == 0) continue;
-    pairs += ws.counts[i];
+    if (ws.tiles[i].count == 0) continue;
+    pairs += ws.tiles[i].count;
     ws.keys[visible] = depth_key<T, Key>(ws.splats[i].depth);
     ws.order[visible++] = int32_t(i);
   }
@@ -103,7 +103,7 @@ void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t threads) {
     std::memset(mine, 0, tiles * sizeof(int64_t));
     const Range range(ws.visible, part, threads);
     for (int64_t k = range.begin; k < range.end; ++k)
-      for_each_tile(ws.splats[ws.order[k]], grid, [&](int64_t tile) { ++mine[tile]; });
+      for_each_tile(ws.tiles[ws.order[k]], ws.splats[ws.order[k]], grid, [&](int64_t tile) { ++mine[tile]; });
   }
   int64_t total = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
@@ -122,7 +122,7 @@ void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t threads) {
     for (int64_t k = range.begin; k < range.end; ++k) {
       const int32_t row = ws.order[k];
       int64_t slot = ws.first_slot[row];
-      for_each_tile(ws.splats[row], grid, [&](int64_t tile) {
+      for_each_tile(ws.tiles[row], ws.splats[row], grid, [&](int64_t tile) {
         ws.pairs[mine[tile]++] = {row, int32_t(slot++)};
       });
     }

@@ -44,9 +44,9 @@ struct Ellipse {
   }
 };
 
-// Calls visit(tile) for each tile of a visible splat, row by row.
+// Calls visit(column, row) for each tile of a visible splat, row by row.
 template <class T, class Visit>
-inline void for_each_tile(const Splat<T>& s, const Grid<T>& grid, Visit visit) {
+inline void find_tiles(const Splat<T>& s, const Grid<T>& grid, Visit visit) {
   if (s.first_row > s.last_row) return;
   const Ellipse<T> ellipse(s, grid.log2_alpha_min);
   for (int64_t ty = s.first_row / TILE; ty <= s.last_row / TILE; ++ty) {
@@ -58,15 +58,40 @@ inline void for_each_tile(const Splat<T>& s, const Grid<T>& grid, Visit visit) {
       pixel_span(s.x + (left + right) / 2, (right - left) / 2, grid.width, first, last);
     }
     if (first > last) continue;
-    for (int64_t tx = first / TILE; tx <= last / TILE; ++tx) visit(ty * grid.tiles_x + tx);
+    for (int64_t tx = first / TILE; tx <= last / TILE; ++tx) visit(tx, ty);
   }
 }
 
 template <class T>
-inline int32_t count_tiles(const Splat<T>& s, const Grid<T>& grid) {
-  int32_t count = 0;
-  for_each_tile(s, grid, [&](int64_t) { ++count; });
-  return count;
+inline TileSet tile_set(const Splat<T>& s, const Grid<T>& grid) {
+  int32_t first, last;
+  pixel_span(s.x, s.half_x + T(BOX_MARGIN) * 2 + T(1e-4) * s.half_x, grid.width, first, last);
+  if (first > last || s.first_row > s.last_row) return {0, 0, 0};
+  const int64_t left = first / TILE, top = s.first_row / TILE;
+  const int64_t columns = last / TILE - left + 1, rows = s.last_row / TILE - top + 1;
+  TileSet set{0, int32_t(top * grid.tiles_x + left), 0};
+  if (columns == 1 && rows == 1) return {1, set.first, 1};
+  if (columns <= 8 && rows <= 8) {
+    find_tiles(s, grid, [&](int64_t x, int64_t y) {
+      ++set.count, set.mask |= uint64_t(1) << (8 * (y - top) + x - left);
+    });
+  } else {
+    find_tiles(s, grid, [&](int64_t, int64_t) { ++set.count; });
+  }
+  return set;
+}
+
+// Calls visit(tile) for each tile of a splat, always in the same order.
+template <class T, class Visit>
+inline void for_each_tile(const TileSet& set, const Splat<T>& s, const Grid<T>& grid, Visit visit) {
+  if (set.mask == 0) {
+    find_tiles(s, grid, [&](int64_t x, int64_t y) { visit(y * grid.tiles_x + x); });
+    return;
+  }
+  for (uint64_t mask = set.mask; mask != 0; mask &= mask - 1) {
+    const int bit = __builtin_ctzll(mask);
+    visit(set.first + (bit >> 3) * grid.tiles_x + (bit & 7));
+  }
 }
 
 }  // namespace SPLAT_VARIANT

@@ -25,6 +25,13 @@ struct alignas(16 * sizeof(T)) Splat {
   int32_t first_row, last_row;  // image rows the box reaches, inclusive
 };
 
+// The tiles of a splat, found once: bit 8 y + x stands for the tile x right of and y below the first one (of the box). A splat that
+// reaches further than 8x8 tiles has mask 0, and its tiles are found anew each time.
+struct TileSet {
+  uint64_t mask;
+  int32_t first, count;
+};
+
 // One (splat, tile) pair in a tile's list, nearest first.
 struct Pair {
   int32_t row;   // of the input
@@ -44,7 +51,7 @@ template <class T>
 struct Workspace {
   using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
   Buffer<Splat<T>> splats;   // by input row; only visible rows are written
-  Buffer<int32_t> counts;    // tiles per input row, 0: culled
+  Buffer<TileSet> tiles;     // by input row; count 0: culled
   Buffer<int64_t> first_slot;  // by input row
   Buffer<Key> keys, other_keys;
   Buffer<int32_t> order, other_order;  // visible rows, nearest first
@@ -63,7 +70,7 @@ struct Workspace {
   double seconds[STAGES] = {};
 
   void poison() {
-    splats.poison(), counts.poison(), first_slot.poison(), keys.poison(), other_keys.poison(), order.poison();
+    splats.poison(), tiles.poison(), first_slot.poison(), keys.poison(), other_keys.poison(), order.poison();
     other_order.poison(), histogram.poison(), tile_begin.poison(), tile_end.poison(), pairs.poison(), slots.poison();
     count_slots.poison();
   }

@@ -1,0 +1,70 @@
+// Registers of the instruction set at hand: pixels of a tile row are worked on a register at a time, so that the sums
+// over a splat's rows stay in registers. (Left to the compiler alone they go to memory in every row; vectors wider
+// than a register are split badly.)
+#pragma once
+#include <cmath>
+#include <cstdint>
+
+namespace SPLAT_VARIANT {
+
+#if defined(__AVX512F__)
+constexpr int REGISTER_BYTES = 64;
+#elif defined(__AVX2__)
+constexpr int REGISTER_BYTES = 32;
+#else
+constexpr int REGISTER_BYTES = 16;
+#endif
+
+template <class T>
+struct LanesOf;
+template <>
+struct LanesOf<float> {
+  typedef float Values __attribute__((vector_size(REGISTER_BYTES)));
+  typedef int32_t Integers __attribute__((vector_size(REGISTER_BYTES)));
+};
+template <>
+struct LanesOf<double> {
+  typedef double Values __attribute__((vector_size(REGISTER_BYTES)));
+  typedef int64_t Integers __attribute__((vector_size(REGISTER_BYTES)));
+};
+template <class T>
+using Lanes = typename LanesOf<T>::Values;
+template <class T>
+constexpr int LANES = REGISTER_BYTES / int(sizeof(T));
+
+template <class T>
+inline Lanes<T> load(const T* from) {
+  Lanes<T> v;
+  __builtin_memcpy(&v, from, sizeof(v));
+  return v;
+}
+template <class T>
+inline void store(T* to, const Lanes<T>& v) { __builtin_memcpy(to, &v, sizeof(v)); }
+template <class T>
+inline Lanes<T> same(T value) { return Lanes<T>{} + value; }
+template <class V>
+inline V larger(const V& a, const V& b) { return a > b ? a : b; }
+template <class V>
+inline V smaller(const V& a, const V& b) { return a < b ? a : b; }
+template <class V>
+inline V magnitude(const V& a) { return a < V{} ? -a : a; }
+
+// 2^x for x in [-126, 0]: rounding and a minimax polynomial of degree 5 on [-1/2, 1/2] (relative error 1.2e-7).
+inline Lanes<float> exp2_nonpositive(const Lanes<float>& x) {
+  using Integers = LanesOf<float>::Integers;
+  const Integers n = __builtin_convertvector(x - 0.5f, Integers);
+  const Lanes<float> f = x - __builtin_convertvector(n, Lanes<float>);
+  Lanes<float> p = 1.3276472454890609e-03f * f + 9.6755409613251686e-03f;
+  p = p * f + 5.5507130920886993e-02f;
+  p = p * f + 2.4022120237350464e-01f;
+  p = p * f + 6.9314694404602051e-01f;
+  p = p * f + 1.0f;
+  return p * reinterpret_cast<const Lanes<float>&>(static_cast<const Integers&>((n + 127) << 23));
+}
+inline Lanes<double> exp2_nonpositive(const Lanes<double>& x) {
+  Lanes<double> p;
+  for (int i = 0; i < LANES<double>; ++i) p[i] = std::exp2(x[i]);
+  return p;
+}
+
+}  // namespace SPLAT_VARIANT
