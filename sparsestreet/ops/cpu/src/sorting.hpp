@@ -19,8 +19,9 @@ inline Key depth_key(T depth) {
   return key;
 }
 
-// Below this many rows one thread sorts faster than several meet at a barrier.
-constexpr int64_t ROWS_WORTH_THREADS = 1 << 16;
+// Below this many rows sorting takes one thread a few milliseconds, and each meeting of threads at a barrier can cost
+// more than that on a machine that has other work as well.
+constexpr int64_t ROWS_WORTH_THREADS = 1 << 17;
 
 // Gives each row its slots, contiguous and in row order, and lists the rows that have any, with their depth keys. The
 // number of pairs is an int64: it may pass 2^31.
@@ -94,6 +95,7 @@ void sort_by_depth(Workspace<T>& ws, int64_t threads) {
 // Fills ws.pairs tile by tile, nearest first, and ws.tile_begin.
 template <class T>
 void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t threads) {
+  if (ws.visible < ROWS_WORTH_THREADS) threads = 1;
   const int64_t tiles = grid.tiles_x * grid.tiles_y;
   int64_t* histogram = ws.histogram.reserve(threads * tiles);
   ws.pairs.reserve(ws.pair_count), ws.tile_begin.reserve(tiles + 1), ws.tile_end.reserve(tiles);
