@@ -60,7 +60,8 @@ def test_benchmark_runs(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("sys.argv", arguments)
     threads = torch.get_num_threads()
     monkeypatch.setattr(blend, "measured_peak", lambda: 1e11)
+    monkeypatch.setattr(blend, "TRAINING_ROWS", (1000,))
     blend.main()
     torch.set_num_threads(threads)
     assert "torch over C++" in capsys.readouterr().out
-    assert len(path.read_text().splitlines()) == 12
+    assert len(path.read_text().splitlines()) == 12 + 7

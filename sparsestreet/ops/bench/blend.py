@@ -27,6 +27,8 @@ from sparsestreet.types import Camera, Gaussians
 FORWARD_FLOPS, BACKWARD_FLOPS = 30, 57
 """Per (splat, pixel) sample: the arithmetic of one colour blend and of its gradient."""
 SETTINGS = SplatSettings()
+TRAINING_ROWS = (20_000, 60_000)
+"""Rows of the small street; its images are 320x192. There the cost of a call counts as well as that of the loops."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ def main() -> None:
         print(timing.line())
     print(f"blend forward + backward, torch over C++: {ratio:.0f} times")
     print(image_difference(gaussians, camera))
+    for count in TRAINING_ROWS:
+        rows += _training_step(count, arguments.repeats)
     if arguments.csv is not None:
         _append(arguments.csv, rows, samples, pairs)
 
@@ -116,6 +120,18 @@ def time_torch(gaussians: Gaussians, camera: Camera, cotangent: torch.Tensor, re
         Timing("torch tiles forward", _repeat(forward, repeats)),
         Timing("torch tiles both", _repeat(both, repeats)),
     ]
+
+
+def _training_step(rows: int, repeats: int) -> list[Timing]:
+    """Times and prints the whole op, projection to image and back to the parameters, at a size of training."""
+    camera = frustum_camera(320, 192)
+    gaussians = frustum_gaussians(rows, camera, sigma_pixels=2.0, terms=16)
+    timings, samples, pairs = time_cpu(gaussians, camera, torch.randn(192, 320, 3), repeats)
+    print(f"{rows} splats, 320x192: {pairs} pairs, {samples / 1e6:.1f} M samples")
+    named = [Timing(f"{timing.name}, {rows // 1000}k 320x192", timing.seconds) for timing in timings.values()]
+    for timing in named:
+        print(timing.line())
+    return named
 
 
 def image_difference(gaussians: Gaussians, camera: Camera) -> str:
