@@ -43,30 +43,36 @@ ConfigStore.instance().store(name="train_schema", node=TrainSchema)
 def override_problem(overrides: list[str], config_name: str = "train") -> str | None:
     """One line on what is wrong with the overrides, naming the nearest key; None if they compose."""
     keyed = [text for text in overrides if not text.startswith("-")]
+    for text in keyed:
+        # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
+        if text.startswith("+") and not text.startswith(("++", "+hydra")):
+            with initialize_config_dir(str(CONF), version_base="1.3"):
+                return _explain(f"Key '{text.lstrip('+').partition('=')[0]}' not in the schema", [text], config_name)
     # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
     single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         try:
             compose(config_name, single)
         except ConfigCompositionException as error:
-            reason = str(error.__cause__ or error).splitlines()[0]
-            return f"{reason.rstrip('.')}{_nearest(reason, config_name)}"
+            return _explain(str(error.__cause__ or error).splitlines()[0], single, config_name)
     return None
 
 
-def _nearest(reason: str, config_name: str) -> str:
-    """'; did you mean ...?' for the unknown key or option that the message names."""
-    full_key = re.search(r"full_key: (\S+)|Could not override '([^']+)'|Key '([^']+)'", reason)
+def _explain(reason: str, overrides: list[str], config_name: str) -> str:
+    """Hydra's reason with the whole key and the key or option that was probably meant."""
     option = re.search(r"Could not find '([^']+)/([^/']+)'", reason)
     if option:
         choices = sorted(path.stem for path in (CONF / option[1]).glob("*.yaml"))
-        return f"; conf/{option[1]} has {', '.join(choices)}"
-    if not full_key:
-        return ""
-    wanted = next(group for group in full_key.groups() if group)
+        return f"no option {option[2]!r} in conf/{option[1]}: choose one of {', '.join(choices)}"
+    unknown = re.search(r"[Kk]ey '([^']+)' is not in struct|Key '([^']+)' not in|Could not override '([^']+)'", reason)
+    if not unknown:
+        return reason
+    part = next(group for group in unknown.groups() if group)
+    given = [text.partition("=")[0].lstrip("+~") for text in overrides]
+    key = next((name for name in given if part in name.split(".") or name == part), part)
     known = _keys(OmegaConf.to_container(compose(config_name), resolve=False))
-    close = difflib.get_close_matches(wanted, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else "")
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

@@ -9,12 +9,11 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
-from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import Assembly, assemble, evaluate_assembly
 from sparsestreet.cli.compose import CONF, override_problem
-from sparsestreet.training.callbacks import Clock, SaveOnException, TrainingProgress
+from sparsestreet.training.callbacks import Checkpoints, Clock, TrainingProgress
 
 log = logging.getLogger(__name__)
 
@@ -58,11 +57,7 @@ def fit(trainer: Trainer, parts: Assembly, resume: str | None) -> None:
 
 def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:
     callbacks: list[Callback] = list(instantiate(cfg.callback, _convert_="all").values())
-    standing = [
-        TrainingProgress(),
-        SaveOnException(out / "checkpoints" / "interrupted.ckpt"),
-        ModelCheckpoint(dirpath=out / "checkpoints", filename="last", enable_version_counter=False),
-    ]
+    standing = [TrainingProgress(), Checkpoints(out / "checkpoints")]
     logger = instantiate(cfg.logger) if cfg.logger else False
     return instantiate(
         cfg.trainer,
@@ -71,6 +66,7 @@ def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:
         default_root_dir=str(out),
         enable_model_summary=False,
         enable_progress_bar=False,
+        enable_checkpointing=False,
         max_epochs=-1,
     )
 

@@ -42,14 +42,13 @@ class Sky(nn.Module):
         self.texels = nn.Parameter(torch.full((6, side, side, 3), settings.initial_color))
         self.register_buffer("bordered", _bordered_texels(side), persistent=False)
 
-    def colors(self, directions: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    def colors(self, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Colour seen along world directions of any non-zero length; gradients go to the texels only."""
-        height, width, _ = directions.shape
         corners, weights = self._corners(directions.detach().reshape(-1, 3).to(self.texels.dtype))
         # gather, because of the ways to read rows its backward is the fast one on the CPU.
         index = corners.reshape(-1, 1).expand(-1, 3)
         values = self.texels.reshape(-1, 3).gather(0, index).reshape(-1, 4, 3)
-        return (values * weights[..., None]).sum(1).reshape(height, width, 3)
+        return (values * weights[..., None]).sum(1).reshape(directions.shape)
 
     def _corners(self, directions: Float[Tensor, "p 3"]) -> tuple[Int[Tensor, "p 4"], Float[Tensor, "p 4"]]:
         """The four texels around each direction (flat index) and their bilinear weights."""

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import nn
-from torch.optim.lr_scheduler import LambdaLR
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,7 @@ class Optimization:
     """Which rate each parameter of the scene takes.
 
     A key is the end of a parameter's dotted name (``means``, ``rigid.rows.means``, ``sky.texels``); the longest key
-    that matches wins. A parameter without a key, and a key without a parameter name to match in any scene, are errors
-    of configuration; the former is raised here.
+    that matches wins. A parameter without a key is an error.
     """
 
     rates: Mapping[str, Rate]
@@ -46,13 +44,20 @@ class Optimization:
             )
         return self.rates[max(keys, key=len)]
 
-    def build(self, scene: nn.Module, radius: float, max_steps: int) -> tuple[torch.optim.Adam, LambdaLR]:
-        """Adam with one group per parameter (name, rate) and the scheduler that decays them per step."""
-        groups, factors = [], []
+    def build(self, scene: nn.Module, radius: float) -> torch.optim.Adam:
+        """Adam with one group per parameter, named like it; ``radius`` is the scene's, metres."""
+        groups = []
         for name, parameter in scene.named_parameters():
             rate = self.rate_of(name)
-            scale = radius if rate.in_scene_units else 1.0
-            groups.append({"params": [parameter], "lr": rate.initial * scale, "name": name})
-            factors.append(lambda step, rate=rate: rate.factor(step / max(max_steps, 1)))
-        optimizer = torch.optim.Adam(groups, eps=self.eps, fused=True)
-        return optimizer, LambdaLR(optimizer, factors)
+            initial = rate.initial * (radius if rate.in_scene_units else 1.0)
+            groups.append({"params": [parameter], "lr": initial, "initial_lr": initial, "name": name})
+        return torch.optim.Adam(groups, eps=self.eps, fused=True)
+
+    def set_rates(self, optimizer: torch.optim.Optimizer, progress: float) -> None:
+        """Give every group its rate at a progress in [0, 1].
+
+        By name and without state, rather than by a scheduler: groups come and go with the masks, and a resumed run
+        needs nothing but its step.
+        """
+        for group in optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * self.rate_of(group["name"]).factor(progress)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
+from torch.optim import Optimizer
 from torchmetrics.aggregation import RunningMean
 
 from sparsestreet.evaluation.metrics.image import psnr
@@ -60,8 +61,7 @@ class StreetSystem(LightningModule):
         )
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
-        progress = self.global_step / max(self.trainer.max_steps, 1)
-        self.scene.active_sh_degree = int(progress / self.sh_interval)
+        self.scene.active_sh_degree = int(self._progress() / self.sh_interval)
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
             self.rendering = self.render(frame)
@@ -75,9 +75,14 @@ class StreetSystem(LightningModule):
             value = psnr(image, frame.image.to(image.dtype) / 255)
         self.log("val/psnr", value, batch_size=1)
 
-    def configure_optimizers(self) -> dict[str, object]:
-        optimizer, scheduler = self.optimization.build(self.scene, self.radius, self.trainer.max_steps)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+    def configure_optimizers(self) -> Optimizer:
+        return self.optimization.build(self.scene, self.radius)
+
+    def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
+        self.optimization.set_rates(self.trainer.optimizers[0], self._progress())
+
+    def _progress(self) -> float:
+        return self.global_step / max(self.trainer.max_steps, 1)
 
     def _log_training(self, terms: Mapping[str, Tensor], frame: Frame) -> None:
         """Running PSNR and the number of Gaussians in the progress bar, the terms in the log."""

@@ -103,6 +103,18 @@ def test_03_04_needles_in_float32(backend, ratio):
 
 
 @every_backend
+def test_04_exponent_far_along_a_needle(backend):
+    # 350 px from the centre the conic form subtracts terms of 1e5 to find a squared distance below 10.
+    view = front_camera(512, 512, 400.0)
+    needle = one_gaussian(quaternions=[[0.93, 0.05, -0.02, 0.36]], scales=[[10.0, 1e-4, 1e-4]])
+    truth = splat(needle, view, backend="reference")
+    alpha = splat(cast(needle, torch.float32), view, backend=backend).alpha
+    assert (truth.alpha[:64] > 0.5).any()
+    # The difference l11 dx + l21 dy keeps 300 * 6e-8 of a standard deviation; the profile changes by 1 in one.
+    assert (alpha - truth.alpha).abs().max() < 2e-4
+
+
+@every_backend
 @every_dtype
 def test_05_zero_quaternion_is_the_identity(backend, dtype):
     view = front_camera(21, 13, 20.0)

@@ -75,7 +75,8 @@ def test_sky_pushes_alpha_out_of_the_sky_and_up_elsewhere(generator):
     loss = SkyMask(weight=0.3)(rendering(alpha=alpha), frame(generator, sky=sky))
     assert loss.item() == pytest.approx(0.3 * 0.6931472, rel=1e-6)
     loss.backward()
-    assert bool((alpha.grad[sky] > 0).all()) and bool((alpha.grad[~sky] < 0).all())
+    assert bool((alpha.grad[sky] > 0).all())
+    assert bool((alpha.grad[~sky] < 0).all())
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
@@ -84,7 +85,8 @@ def test_sky_is_finite_at_alpha_zero_and_one(generator, value):
     sky = torch.rand(HEIGHT, WIDTH, generator=generator) > 0.5
     loss = SkyMask()(rendering(alpha=alpha), frame(generator, sky=sky))
     loss.backward()
-    assert bool(loss.isfinite()) and bool(alpha.grad.isfinite().all())
+    assert bool(loss.isfinite())
+    assert bool(alpha.grad.isfinite().all())
 
 
 def test_depth_compares_only_measured_pixels(generator):
@@ -101,11 +103,13 @@ def test_depth_of_an_image_without_returns_is_zero(generator):
     depth = torch.ones(HEIGHT, WIDTH, requires_grad=True)
     loss = InverseDepth()(rendering(depth=depth), frame(generator, depth=torch.zeros(HEIGHT, WIDTH)))
     loss.backward()
-    assert loss.item() == 0.0 and bool((depth.grad == 0).all())
+    assert loss.item() == 0.0
+    assert bool((depth.grad == 0).all())
 
 
 def test_terms_apply_only_where_the_data_has_them(generator):
-    assert not SkyMask().applies(frame(generator)) and not InverseDepth().applies(frame(generator))
+    assert not SkyMask().applies(frame(generator))
+    assert not InverseDepth().applies(frame(generator))
 
 
 def test_mask_sparsity_is_the_papers_formula(generator):

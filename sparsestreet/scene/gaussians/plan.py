@@ -26,9 +26,7 @@ class RowPlan:
 
     def __post_init__(self) -> None:
         if len(self.source) != len(self.fresh):
-            raise ValueError(
-                f"fresh must have one entry per new row: {len(self.fresh)} for {len(self.source)}"
-            )
+            raise ValueError(f"fresh must have one entry per new row: {len(self.fresh)} for {len(self.source)}")
         if len(self.source) and not 0 <= int(self.source.min()) <= int(self.source.max()) < self.rows:
             low, high = int(self.source.min()), int(self.source.max())
             raise ValueError(f"the plan's sources {low} to {high} must lie in the table of {self.rows} rows")

@@ -63,6 +63,7 @@ class Rows(nn.Module):
         optimizer.state.pop(parameter, None)
         for group in optimizer.param_groups:
             group["params"] = [other for other in group["params"] if other is not parameter]
+        optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
     def _check(self, plan: RowPlan, optimizer: Optimizer | None) -> None:
         columns = self.columns()

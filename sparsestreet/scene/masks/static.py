@@ -27,9 +27,7 @@ class StaticMask:
         if not self.minimum_rows >= 0:
             raise ValueError(f"a mask's minimum_rows must be >= 0, got {self.minimum_rows}")
         if not 0 <= self.threshold < 1:
-            raise ValueError(
-                f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}"
-            )
+            raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
 
     def initial_logits(self, rows: int) -> Float[Tensor, " n"]:
         return torch.full((rows,), self.initial_logit, dtype=torch.float32)
