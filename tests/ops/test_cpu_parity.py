@@ -179,3 +179,9 @@ def test_no_graph_without_grad():
         rendering = splat(leaves, view, backend="cpu")
     assert rendering.rgb.grad_fn is None
     assert not rendering.screen_offsets.requires_grad
+
+
+def test_the_library_does_not_switch_the_process_to_flush_to_zero():
+    # Linking with -ffast-math would: subnormal numbers would vanish in all of torch.
+    splat(random_gaussians(5, camera(5, 4)), camera(5, 4), backend="cpu")
+    assert torch.tensor(1e-40) * torch.tensor(0.5) > 0
