@@ -48,7 +48,9 @@ class SceneGraph(nn.Module):
         """Scores and weight of every node that is being masked."""
         scores = {name: node.mask_scores() for name, node in self.nodes.items()}
         return {
-            name: MaskTerm(value, self.nodes[name].mask.weight) for name, value in scores.items() if value is not None
+            name: MaskTerm(value, self.nodes[name].mask.weight, self.nodes[name].mask.visible_only)
+            for name, value in scores.items()
+            if value is not None
         }
 
     def bytes_by_part(self) -> dict[str, int]:

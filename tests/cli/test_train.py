@@ -94,3 +94,36 @@ def test_an_unknown_key_or_option_is_an_error_that_names_the_nearest(override, s
     message = capsys.readouterr().err
     assert said in message
     assert len(message.strip().splitlines()) == 1
+
+
+def test_bf16_mixed_changes_nothing_where_it_would_hurt(run_train, tmp_path):
+    """Masks, losses and the op stay float32: in bfloat16 a logit would stop at -4.0, above the threshold."""
+    few = ("experiment=streetgs_ours", "callback=[density_control,row_ledger]", "schedule.max_steps=12")
+    mixed = _weights(run_train(tmp_path / "mixed", *few, "trainer.precision=bf16-mixed"))
+    full = _weights(run_train(tmp_path / "full", *few))
+    logits = mixed["scene.nodes.background.rows.mask_logits"]
+    assert logits.dtype == torch.float32
+    assert not torch.equal(logits, torch.ones_like(logits))
+    for name, value in full.items():
+        assert torch.equal(value, mixed[name]), name
+
+
+def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path, caplog):
+    """A crushing lambda closes every mask; K_min rows stay open, are kept, and the firing is logged."""
+    out = run_train(
+        tmp_path,
+        "experiment=streetgs_masks",
+        "loss.mask_sparsity.weight=1e6",
+        "schedule.mask_rate=1.0",
+        "schedule.densify_in.stop=0.1",
+        "schedule.cull_in.stop=0.1",
+    )
+    summary = json.loads((out / "records" / "summary.json").read_text())
+    assert summary["gaussians"]["background"] == 200
+    assert summary["gaussians"]["rigid"] == 60
+    assert "K_min" in caplog.text
+
+
+def test_masks_end_with_their_stage(run_train, tmp_path):
+    names = _weights(run_train(tmp_path, "experiment=streetgs_ours")).keys()
+    assert not [name for name in names if "mask" in name]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import kornia
 import pytest
 import torch
@@ -118,6 +120,17 @@ def test_mask_sparsity_is_the_papers_formula(generator):
     rows = {"background": slice(0, 2), "rigid": slice(2, 3), "unmasked": slice(3, 10)}
     loss = MaskSparsity(weight=2.0)(rendering(rows=rows, mask_terms=terms), frame(generator))
     assert loss.item() == pytest.approx(2.0 * (2.5e-3 * 0.75 + 1e-4 * 1.0) / 10, rel=1e-6)
+
+
+def test_mask_sparsity_of_what_is_visible_only(generator):
+    """The same K, but rows that the view does not draw add nothing and get no gradient."""
+    scores = torch.tensor([0.5, 0.25, 0.75], requires_grad=True)
+    seen = rendering(rows={"rigid": slice(1, 4)}, mask_terms={"rigid": MaskTerm(scores, 2.0, visible_only=True)})
+    splats = replace(seen.splats, radii=torch.tensor([1.0, 0.0, 3.0, 2.0]), screen_offsets=torch.zeros(4, 2))
+    loss = MaskSparsity()(replace(seen, splats=splats), frame(generator))
+    assert loss.item() == pytest.approx(2.0 * (0.25 + 0.75) / 3)
+    loss.backward()
+    assert scores.grad.tolist() == pytest.approx([0.0, 2 / 3, 2 / 3])
 
 
 def test_mask_sparsity_of_a_scene_without_rows_or_masks_is_zero(generator):

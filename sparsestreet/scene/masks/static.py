@@ -20,6 +20,10 @@ class StaticMask:
     threshold: float = 0.01
     """epsilon of the paper (value of Compact-3DGS, whose mask the paper repeats)."""
     initial_logit: float = 1.0
+    visible_only: bool = False
+    """True: the loss pushes a row only in views that draw it. Adam forgets the size of a gradient, so that with the
+    paper's sum over all rows one that few images see is pushed out between two visits, at any lambda; with this one
+    lambda is weighed against the image error. Rows that no image sees are then left to background pruning."""
 
     def __post_init__(self) -> None:
         if not self.weight >= 0:

@@ -26,6 +26,8 @@ class MaskTerm:
     """sigma(m), float32."""
     weight: float
     """lambda_n of the paper."""
+    visible_only: bool = False
+    """Whether the loss sums over the rows drawn in the view only."""
 
 
 class Node(nn.Module, ABC):

@@ -18,25 +18,25 @@ log = logging.getLogger(__name__)
 
 
 class BackgroundPruning(Callback):
-    """At one moment of the run: score every row over all training views, remove the worthless rows of some nodes.
+    """At given moments of the run: score every row over all training views, remove the worthless rows of some nodes.
 
     The whole scene is rendered for the scores (cars hide the road behind them); only the rows of ``nodes`` may go.
 
     Args:
-        at: fraction of the run (the paper: 28,000 of 30,000 steps).
+        at: fractions of the run (the paper: once, at 28,000 of 30,000 steps).
         minimum_rows: node name -> K_min; the keys are the nodes to prune.
         gate: count a view only for rows that are the largest contributor of one of its pixels.
     """
 
-    def __init__(self, at: float, minimum_rows: dict[str, int], *, gate: bool = True) -> None:
-        self.at = at
+    def __init__(self, at: Sequence[float], minimum_rows: dict[str, int], *, gate: bool = True) -> None:
+        self.at = tuple(at)
         self.minimum_rows = dict(minimum_rows)
         self.gate = gate
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        if trainer.global_step != moment(self.at, trainer.max_steps):
+        if trainer.global_step not in {moment(fraction, trainer.max_steps) for fraction in self.at}:
             return
         frames = trainer.datamodule.split.train
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Training time without validation, and the rate of steps."""
+"""Wall time of training, validation left out."""
 
 import time
 
@@ -6,33 +6,35 @@ from lightning import Callback, LightningModule, Trainer
 
 
 class Clock(Callback):
-    """``seconds`` is wall time spent in training; it survives a resume."""
+    """``seconds`` grows while training runs; it survives a resume."""
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        self._finished = 0.0
         self._started: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        running = 0.0 if self._started is None else time.perf_counter() - self._started
+        return self._finished + running
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._started = time.perf_counter()
 
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._pause()
+
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._stop()
+        self._pause()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.training or trainer.fit_loop.epoch_loop.global_step > 0:
+        if not trainer.sanity_checking:
             self._started = time.perf_counter()
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._stop()
-
     def state_dict(self) -> dict[str, object]:
-        running = time.perf_counter() - self._started if self._started is not None else 0.0
-        return {"seconds": self.seconds + running}
+        return {"seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, object]) -> None:
-        self.seconds = state_dict["seconds"]
+        self._finished = state_dict["seconds"]
 
-    def _stop(self) -> None:
-        if self._started is not None:
-            self.seconds += time.perf_counter() - self._started
-            self._started = None
+    def _pause(self) -> None:
+        self._finished, self._started = self.seconds, None

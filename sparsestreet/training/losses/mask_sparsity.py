@@ -15,6 +15,7 @@ class MaskSparsity:
     """K counts all rows of all nodes, masked nodes or not; lambda_n is the node's own ``mask.weight``."""
 
     weight: float = 1.0
+    """lambda_m."""
 
     def applies(self, frame: Frame) -> bool:
         return True
@@ -22,6 +23,9 @@ class MaskSparsity:
     def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
         rows = max(sum(span.stop - span.start for span in rendering.rows.values()), 1)
         total = torch.zeros((), device=rendering.rgb.device)
-        for term in rendering.mask_terms.values():
-            total = total + term.weight * term.scores.sum()
+        for name, term in rendering.mask_terms.items():
+            scores = term.scores
+            if term.visible_only:
+                scores = scores * rendering.splats.visible[rendering.rows[name]]
+            total = total + term.weight * scores.sum()
         return self.weight * total / rows
