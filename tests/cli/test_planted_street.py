@@ -1,7 +1,7 @@
 """Useless Gaussians planted in a trained street.
 
-No setting yet finds nearly all of them and loses nearly nothing: masks alone spare what is visible and leave half of the
-planted, the gate of background pruning takes also rows that would be missed (docs/results.md).
+No setting yet finds nearly all of them and loses nearly nothing: masks alone spare what is visible and leave half of
+the planted, the gate of background pruning takes also rows that would be missed (docs/results.md).
 """
 
 import pytest

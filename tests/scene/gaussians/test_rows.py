@@ -124,7 +124,7 @@ def test_a_plan_names_rows_that_exist():
 
 
 def test_a_foreign_optimizer_is_refused():
-    rows, optimizer = trained()
+    _rows, optimizer = trained()
     with pytest.raises(ValueError, match="does not hold"):
         random_rows(3, 0).resize(RowPlan.keep(torch.ones(3, dtype=torch.bool)), optimizer)
 
@@ -134,7 +134,8 @@ def test_a_checkpoint_brings_its_rows_and_whether_masks_are_left():
     finished.drop_column("mask_logits")
     fresh = random_rows(3, 1, mask=MASK)
     fresh.load_state_dict(finished.state_dict())
-    assert len(fresh) == 5 and "mask_logits" not in fresh.columns()
+    assert len(fresh) == 5
+    assert "mask_logits" not in fresh.columns()
     assert torch.equal(fresh.means, finished.means)
 
 
