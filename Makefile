@@ -21,7 +21,8 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt $(wildcard sparsestre
 test: $(VENV)/.ok
 	$(BIN)/python -m ruff check
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest
+	# One thread a process: tests are small, and threads that wait for each other cost more than they bring.
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 demo: $(VENV)/.ok
 	$(BIN)/sparsestreet demo
