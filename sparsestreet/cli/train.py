@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
 from omegaconf import DictConfig
 
-from sparsestreet.cli.assemble import Assembly, assemble, evaluate_assembly
+from sparsestreet.cli.assemble import assemble, evaluate_assembly
 from sparsestreet.cli.compose import CONF, override_problem
 from sparsestreet.training.callbacks import Checkpoints, Clock, TrainingProgress
 
@@ -38,21 +38,15 @@ def app(cfg: DictConfig) -> float:
     parts = assemble(cfg)
     clock = Clock()
     trainer = build_trainer(cfg, clock, out)
-    fit(trainer, parts, cfg.resume)
+    # A checkpoint holds the state of callbacks and optimiser as well, so it is no file of weights only.
+    resume_options = {"ckpt_path": cfg.resume, "weights_only": False} if cfg.resume else {}
+    trainer.fit(parts.system, datamodule=parts.datamodule, **resume_options)
     if trainer.fast_dev_run:
         log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
         return 0.0
     summary = evaluate_assembly(parts, cfg, out, training_seconds=clock.seconds)
     log.info("records and pictures in %s", out)
     return summary.quality["psnr_full"].mean if summary else 0.0
-
-
-def fit(trainer: Trainer, parts: Assembly, resume: str | None) -> None:
-    """Train; an interruption leaves checkpoints/interrupted.ckpt and ends with the way to go on."""
-    trainer.fit(parts.system, datamodule=parts.datamodule, ckpt_path=resume, weights_only=False if resume else None)
-    if trainer.interrupted:
-        path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
-        raise SystemExit(f"interrupted at step {trainer.global_step}; go on with resume={path}")
 
 
 def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:

@@ -1,8 +1,11 @@
 """What training leaves to go on from: a checkpoint now and then, at the end, and when it is interrupted."""
 
+import logging
 from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
+
+log = logging.getLogger(__name__)
 
 
 class Checkpoints(Callback):
@@ -29,4 +32,6 @@ class Checkpoints(Callback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         if trainer.global_step > 0:
-            trainer.save_checkpoint(self.folder / "interrupted.ckpt", weights_only=False)
+            path = self.folder / "interrupted.ckpt"
+            trainer.save_checkpoint(path, weights_only=False)
+            log.warning("stopped at step %d; go on with resume=%s", trainer.global_step, path)
