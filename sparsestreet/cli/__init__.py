@@ -12,7 +12,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet train -m experiment=streetgs,streetgs_ours seed=0,1,2            a sweep
   sparsestreet train resume=RUN/checkpoints/last.ckpt ...                       go on after an interruption
   sparsestreet evaluate run=RUN                       measure a trained run again, without training
-  sparsestreet report DIR [DIR ...]                   one table and comparison sheet from the records of runs
+  sparsestreet report DIR [DIR ...]                   tables from the records of runs, one a scene
   sparsestreet data check data.root=DIR               everything that is wrong with a log, at once
   sparsestreet data make seed=1                       write a synthetic street to disk
   sparsestreet bench                                  time the splat op beside its peer

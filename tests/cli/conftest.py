@@ -26,7 +26,7 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "scale.background.maximum_rows=6000",
         "scale.background.minimum_rows=200",
         "scale.background.maximum_rows=6000",
-        "scale.rigid={points_per_instance: 150, minimum_rows: 60, maximum_rows: 3000}",
+        "scale.rigid={points_per_instance: 150, minimum_rows: 60, maximum_rows: 3000, mask_visible_only: true}",
         "scale.sky_resolution=8",
         "schedule.max_steps=60",
         "schedule.densify_in.every=10",
