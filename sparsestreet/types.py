@@ -27,6 +27,9 @@ class Gaussians:
     """Peak alpha in [0, 1]; a row with opacity 0 is culled before projection."""
     sh: Float[Tensor, "n k 3"]
     """Spherical harmonics, k in {1, 4, 9, 16}; colour = max(0, 0.5 + sum_i basis_i(direction) sh_i)."""
+    displacements: Float[Tensor, "n 3"] | None = None
+    """How far each row moves while an image is read out, metres in the world; None: nothing moves. Used only with
+    ``Camera.shutter``; it gets no gradient."""
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -50,18 +53,40 @@ class Gaussians:
             torch.cat([part.scales for part in parts]),
             torch.cat([part.opacities for part in parts]),
             torch.cat(padded),
+            Gaussians._displacements(parts),
         )
+
+    @staticmethod
+    def _displacements(parts: "list[Gaussians]") -> Tensor | None:
+        if all(part.displacements is None for part in parts):
+            return None
+        still = [torch.zeros_like(p.means) if p.displacements is None else p.displacements for p in parts]
+        return torch.cat(still)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """Motion of a camera while its rows are read from the first to the last; its pose is that of the middle row."""
+
+    translation: Float[Tensor, "3"]
+    """Displacement of the camera over the whole readout, metres, in the camera frame."""
+    rotation: Float[Tensor, "3"]
+    """Rotation vector of the camera over the whole readout, radians, in the camera frame."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion."""
+    """A pinhole camera; lens distortion and a rolling shutter only where they are given."""
 
     camera_from_world: Float[Tensor, "4 4"]
     intrinsics: Float[Tensor, "3 3"]
     """Pixels; the top left pixel's centre is at (0.5, 0.5)."""
     width: int
     height: int
+    distortion: Float[Tensor, "5"] | None = None
+    """Brown-Conrady k1, k2, p1, p2, k3 as OpenCV orders them; None: none, and none is paid for."""
+    shutter: Shutter | None = None
+    """None: all rows are exposed at once, and nothing is paid for."""
 
     @property
     def position(self) -> Float[Tensor, "3"]:

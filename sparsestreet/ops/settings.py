@@ -1,6 +1,7 @@
 """The knobs of the splat op: what is cut off, when a pixel stops, and how a splat is blurred."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Literal
 
 StopRule = Literal["inclusive", "exclusive"]
@@ -26,6 +27,13 @@ class SplatSettings:
     """Low-pass added to both diagonal entries of the screen covariance, px^2, >= 0 (3DGS, screen-space dilation)."""
     near: float = 0.2
     """Rows at this depth or nearer are culled, metres, > 0."""
+    box: float = inf
+    """A splat ends this many standard deviations from its mean, > 0, besides at ``alpha_min`` (gsplat: 3.33)."""
+    depth_bits: int = 32
+    """Upper bits of the float32 depth that are sorted, 9 to 32 (9: powers of two of the depth); fewer order near ties
+    by row."""
+    half_colors: bool = False
+    """Round colours to float16 before blending (gradient as if not rounded)."""
     antialias: bool = False
     """Multiply opacity by sqrt(det / det_blurred), so that blur does not brighten small splats (Mip-Splatting)."""
 
@@ -35,6 +43,8 @@ class SplatSettings:
         _require(0 <= self.transmittance_min < 1, "transmittance_min must lie in [0, 1)", self.transmittance_min)
         _require(self.stop in ("inclusive", "exclusive"), "stop must be 'inclusive' or 'exclusive'", self.stop)
         _require(0 <= self.blur < float("inf"), "blur must be finite and >= 0 px^2", self.blur)
+        _require(self.box > 0, "box must be > 0 standard deviations", self.box)
+        _require(9 <= self.depth_bits <= 32, "depth_bits must lie in [9, 32]", self.depth_bits)
         _require(0 < self.near < float("inf"), "near must be finite and > 0 m", self.near)
 
     @staticmethod
@@ -48,7 +58,7 @@ class SplatSettings:
         return _PRESETS[name]
 
 
-def _require(holds: bool, invariant: str, value: float | str) -> None:
+def _require(holds: bool, invariant: str, value: float | int | str) -> None:
     if not holds:
         raise ValueError(f"{invariant}, got {value!r}")
 

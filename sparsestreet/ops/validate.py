@@ -32,13 +32,19 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
     if gaussians.sh.shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"sh must hold 1, 4, 9 or 16 terms (degree 0 to 3), got {gaussians.sh.shape[1]}")
     _check_camera(camera)
+    moved = gaussians.displacements
+    if moved is not None and (moved.shape != means.shape or moved.dtype != means.dtype or moved.device != means.device):
+        raise ValueError(
+            f"displacements must be {list(means.shape)} {means.dtype} on {means.device} like the means, got "
+            f"{list(moved.shape)} {moved.dtype} on {moved.device}: give one row of metres per Gaussian"
+        )
     if background is not None:
         _check_background(background, camera, means)
 
 
 def check_values(gaussians: Gaussians) -> None:
     """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value."""
-    for name in _SHAPES:
+    for name in (*_SHAPES, *(() if gaussians.displacements is None else ("displacements",))):
         field = getattr(gaussians, name).detach()
         _raise_at(name, field, torch.isfinite(field), "must be finite", "find the step that made it")
     opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
@@ -68,6 +74,19 @@ def _check_camera(camera: Camera) -> None:
             f"intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths, got "
             f"{camera.intrinsics.tolist()}: remove skew by resampling the image"
         )
+    _check_effects(camera)
+
+
+def _check_effects(camera: Camera) -> None:
+    parts = {"distortion": (camera.distortion, (5,))}
+    if camera.shutter is not None:
+        parts["shutter.translation"] = (camera.shutter.translation, (3,))
+        parts["shutter.rotation"] = (camera.shutter.rotation, (3,))
+    for name, (values, shape) in parts.items():
+        if values is None:
+            continue
+        if tuple(values.shape) != shape or not all(math.isfinite(value) for value in values.tolist()):
+            raise ValueError(f"camera.{name} must be {shape[0]} finite numbers, got {values.tolist()}")
 
 
 def _check_background(background: Tensor, camera: Camera, means: Tensor) -> None:
