@@ -15,7 +15,7 @@ from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.spherical_harmonics import view_colors
-from sparsestreet.types import Camera, Contribution, Gaussians
+from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 
 BOX_MARGIN = 0.01
 """Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""
@@ -85,6 +85,35 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
         first = (weights == weights.amax(0)).to(torch.int8).cumsum(0).eq(0).sum(0)
         dominant[rows] += torch.bincount(first[touched.any(0)], minlength=len(rows))
     return Contribution(weight, pixels, dominant)
+
+
+@torch.no_grad()
+def removal(
+    gaussians: Gaussians, background: Float[Tensor, "h w 3"] | None, camera: Camera, settings: SplatSettings
+) -> Removal:
+    """Change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
+    rows = visible_rows(gaussians, camera, settings)
+    splats = on_screen(gaussians, rows, camera, settings)
+    largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
+    if not len(rows):
+        return Removal(largest, squared)
+    if background is None:
+        background = splats.colors.new_zeros(camera.height, camera.width, 3)
+    still, begin = torch.zeros_like(splats.means), 0
+    for chunk in _pixel_chunks(camera, splats):
+        weights, transmittance = _weights(_alphas(chunk, splats, still, settings), settings)
+        light = weights[..., None] * splats.colors[:, None]
+        behind = transmittance[:, None] * background.reshape(-1, 3)[begin : begin + len(chunk)]
+        # Summed from the back, so that little light keeps its digits; without row k itself.
+        rest = light.flip(0).cumsum(0).flip(0) - light + behind
+        # Never 0: alpha_max < 1, and a finished pixel's weights are 0.
+        before = (1 - weights.double().cumsum(0) + weights).to(weights)
+        alphas = weights / before
+        change = rest * (alphas / (1 - alphas))[..., None] - light
+        largest[rows] = torch.maximum(largest[rows], change.abs().amax((1, 2)).double())
+        squared[rows] += change.double().square().sum((1, 2))
+        begin += len(chunk)
+    return Removal(largest, squared)
 
 
 @torch.no_grad()

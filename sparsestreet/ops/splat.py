@@ -10,7 +10,7 @@ from sparsestreet.ops.cpu import rasteriser as cpu
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_structure, check_values
-from sparsestreet.types import Camera, Contribution, Gaussians, Rendering
+from sparsestreet.types import Camera, Contribution, Gaussians, Removal, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
 _LEAST_ALPHA = 1e-6
@@ -73,6 +73,32 @@ def contribution(
             check_values(gaussians)
             return reference.contribution(gaussians, camera, settings)
         return cpu.contribution(gaussians, camera, settings)
+
+
+def removal(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None = None,
+    settings: SplatSettings = DEFAULT_SETTINGS,
+    backend: str = "auto",
+) -> Removal:
+    """How far the view moves when each row alone is taken away, over a background (None: black). No gradients.
+
+    Exact for pixels that are not stopped: a pixel is linear in the alpha of each of its splats, so that the change is
+    -alpha dC/dalpha. Where the stop rule hid splats behind, up to ``transmittance_min / (1 - alpha_max)`` of their
+    light is missed.
+
+    Raises as :func:`splat`.
+    """
+    check_structure(gaussians, camera, background)
+    chosen = resolve_backend(backend, gaussians.means.device)
+    with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
+        behind = None if background is None else background.expand(camera.height, camera.width, 3)
+        if chosen == "reference":
+            check_values(gaussians)
+            return reference.removal(gaussians, behind, camera, settings)
+        return cpu.removal(gaussians, behind, camera, settings)
 
 
 def _screen_offsets(gaussians: Gaussians) -> Float[Tensor, "n 2"]:

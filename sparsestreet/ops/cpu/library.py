@@ -10,7 +10,7 @@ from pathlib import Path
 import torch  # noqa: F401
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
-_INTERFACE_VERSION = 1
+_INTERFACE_VERSION = 2
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
 STAGES = ("project", "bin", "blend", "blend_backward", "project_backward", "count")
@@ -54,6 +54,12 @@ class Counters(ctypes.Structure):
     """Pointers to the contribution counters."""
 
     _fields_ = tuple((name, c_void_p) for name in ("weight", "pixels", "dominant"))
+
+
+class Changes(ctypes.Structure):
+    """Pointers to what the removal of each row changes."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("largest", "squared"))
 
 
 class Report(ctypes.Structure):
@@ -113,6 +119,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_forward": (c_int32, (c_void_p,) * 6),
         "splat_backward": (c_int32, (c_void_p,) * 6),
         "splat_contribution": (c_int32, (c_void_p,) * 5),
+        "splat_removal": (c_int32, (c_void_p,) * 6),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)

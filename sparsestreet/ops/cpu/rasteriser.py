@@ -12,7 +12,7 @@ from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_values
-from sparsestreet.types import Camera, Contribution, Gaussians
+from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 
 DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
@@ -58,6 +58,32 @@ def contribution(
     )
     _raise_for(status, fields, report)
     return Contribution(weight, pixels, dominant)
+
+
+def removal(
+    gaussians: Gaussians,
+    background: Float[Tensor, "h w 3"] | None,
+    camera: Camera,
+    settings: SplatSettings,
+    variant: int = FASTEST_VARIANT,
+) -> Removal:
+    """How far the view moves when each row alone is taken away."""
+    _check_dtype(gaussians)
+    g = gaussians
+    fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
+    lease, report = Lease(g.means.dtype, variant), native.Report()
+    largest, squared = torch.empty(2, len(g), dtype=torch.float64)
+    behind = None if background is None else background.detach().contiguous()
+    status = native.load_library().splat_removal(
+        lease.workspace.handle,
+        byref(_view(camera, settings)),
+        byref(_rows(fields)),
+        None if behind is None else behind.data_ptr(),
+        byref(native.Changes(largest.data_ptr(), squared.data_ptr())),
+        byref(report),
+    )
+    _raise_for(status, fields, report)
+    return Removal(largest, squared)
 
 
 class _Blend(torch.autograd.Function):

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 1;
+constexpr int32_t INTERFACE_VERSION = 2;
 
 enum Status : int32_t { OK = 0, BAD_VALUE = 1, TOO_MANY_PAIRS = 2, OUT_OF_MEMORY = 3 };
 
@@ -39,6 +39,11 @@ struct RowGradients {
 struct Counters {
   double* weight;
   int64_t *pixels, *dominant;
+};
+
+// How far a view moves when a row alone is removed.
+struct Changes {
+  double *largest, *squared;
 };
 
 // What went wrong, for the message: pair total and the three rows with most pairs (row -1: none).

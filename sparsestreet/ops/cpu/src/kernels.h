@@ -20,6 +20,7 @@ struct PixelKernels {
   void (*blend)(void*, const View&, const Layers&);
   void (*blend_backward)(void*, const View&, const Layers& image, const Layers& cotangents);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
+  void (*remove)(void*, const View&, int64_t rows, const void* background, const Changes&);
 };
 
 struct Kernels {

@@ -136,3 +136,13 @@ SPLAT_API int32_t splat_contribution(Handle* h, const View* view, const Rows* ro
     return status;
   });
 }
+
+// background: [h,w,3] behind the splats, or null for black.
+SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, const void* background,
+                                const Changes* changes, Report* report) {
+  return guarded([&]() -> int32_t {
+    const Status status = h->rows().prepare(h->workspace, *view, *rows, nullptr, *report);
+    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, background, *changes);
+    return status;
+  });
+}

@@ -3,6 +3,7 @@
 #include "blend_backward.hpp"
 #include "contribution.hpp"
 #include "kernels.h"
+#include "removal.hpp"
 
 namespace SPLAT_VARIANT {
 namespace {
@@ -18,6 +19,9 @@ PixelKernels kernels() {
           },
           [](void* w, const View& v, int64_t rows, const Counters& out) {
             count_contributions(as<T>(w), v, rows, out);
+          },
+          [](void* w, const View& v, int64_t rows, const void* background, const Changes& out) {
+            remove_rows(as<T>(w), v, rows, background, out);
           }};
 }
 

@@ -65,6 +65,10 @@ struct Workspace {
     int64_t pixels, dominant;
   };
   Buffer<Count> count_slots;
+  struct Change {
+    double largest, squared;
+  };
+  Buffer<Change> change_slots;
   int64_t visible = 0, pair_count = 0, tiles_x = 0, tiles_y = 0;
   int64_t samples = 0;  // (splat, pixel) pairs that the forward loops evaluated
   double seconds[STAGES] = {};
@@ -72,7 +76,7 @@ struct Workspace {
   void poison() {
     splats.poison(), tiles.poison(), first_slot.poison(), keys.poison(), other_keys.poison(), order.poison();
     other_order.poison(), histogram.poison(), tile_begin.poison(), tile_end.poison(), pairs.poison(), slots.poison();
-    count_slots.poison();
+    count_slots.poison(), change_slots.poison();
   }
 };
 

@@ -1,0 +1,97 @@
+// How far a view moves when one row alone is taken away. A pixel is linear in the alpha of each of its splats, so the
+// change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha).
+#pragma once
+#include "blend.hpp"
+
+namespace SPLAT_VARIANT {
+
+// What is seen behind a splat: total (over the background) minus all up to it.
+template <class T>
+struct TileBehind {
+  alignas(64) T color[3][PIXELS];
+};
+
+template <class T>
+inline void behind_everything(const TileColors<T>& total, const View& view, const T* background, int64_t x0, int64_t y0,
+                              TileBehind<T>& behind) {
+  const T* blended[3] = {total.red, total.green, total.blue};
+  for (int channel = 0; channel < 3; ++channel)
+    for (int i = 0; i < PIXELS; ++i) {
+      const int64_t x = x0 + i % TILE, y = y0 + i / TILE;
+      const bool inside = x < view.width && y < view.height;
+      const T back = background && inside ? background[3 * (y * view.width + x) + channel] : T(0);
+      behind.color[channel][i] = blended[channel][i] + total.transmittance[i] * back;
+    }
+}
+
+template <class T, bool EXCLUSIVE>
+inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c,
+                       TileBehind<T>& behind, int row, Lanes<T>& largest, Lanes<T>& squared) {
+  const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
+  for (int x = 0; x < TILE; x += LANES<T>) {
+    const int at = row * TILE + x;
+    const Lanes<T> transmittance = load(c.transmittance + at);
+    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
+    const Lanes<T> weight = p.alpha * transmittance, through = p.alpha / (T(1) - p.alpha);
+    store(c.transmittance + at, transmittance - weight);
+    for (int channel = 0; channel < 3; ++channel) {
+      const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
+      store(behind.color[channel] + at, rest);
+      const Lanes<T> change = rest * through - own;
+      largest = larger(largest, magnitude(change));
+      squared += change * change;
+    }
+  }
+}
+
+template <class T, bool EXCLUSIVE>
+void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const T* background) {
+  const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
+  TileColors<T> c;
+  TileBehind<T> behind;
+  std::memset(static_cast<void*>(&c), 0, sizeof(c));
+  open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
+  int64_t samples = 0;
+  blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
+  behind_everything(c, view, background, x0, y0, behind);
+  open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
+  for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
+    const Splat<T>& s = ws.splats[ws.pairs[k].row];
+    const TileSplat<T> here(s, x0, y0);
+    Lanes<T> largest{}, squared{};
+    for (int y = here.first; y <= here.last; ++y)
+      remove_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, behind, y, largest, squared);
+    typename Workspace<T>::Change change{0, 0};
+    for (int i = 0; i < LANES<T>; ++i) {
+      change.largest = largest[i] > change.largest ? double(largest[i]) : change.largest;
+      change.squared += double(squared[i]);
+    }
+    ws.change_slots[ws.pairs[k].slot] = change;
+  }
+}
+
+template <class T>
+void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const void* background, const Changes& out) {
+  const double start = omp_get_wtime();
+  const Cuts<T> cuts(view);
+  ws.change_slots.reserve(ws.pair_count);
+#pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
+  for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
+    if (view.exclusive_stop)
+      remove_tile<T, true>(ws, view, cuts, tile, static_cast<const T*>(background));
+    else
+      remove_tile<T, false>(ws, view, cuts, tile, static_cast<const T*>(background));
+  }
+#pragma omp parallel for num_threads(view.threads) schedule(static)
+  for (int64_t i = 0; i < rows; ++i) {
+    typename Workspace<T>::Change sum{0, 0};
+    for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
+      const auto& slot = ws.change_slots[ws.first_slot[i] + k];
+      sum.largest = slot.largest > sum.largest ? slot.largest : sum.largest, sum.squared += slot.squared;
+    }
+    out.largest[i] = sum.largest, out.squared[i] = sum.squared;
+  }
+  ws.seconds[COUNT] = omp_get_wtime() - start;
+}
+
+}  // namespace SPLAT_VARIANT
