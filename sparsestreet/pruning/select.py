@@ -1,5 +1,6 @@
 """Which rows of a node class to keep: by learned mask or by importance, never fewer than K_min."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -42,6 +43,27 @@ def keep_by_importance(scores: Float[Tensor, " n"], minimum_rows: int) -> Select
     if (scores < 0).any():
         raise ValueError(f"importance is a mean blend weight and >= 0, got {float(scores.min())}")
     return _keep_best(scores, scores == 0, minimum_rows)
+
+
+def keep_by_cost(
+    costs: Mapping[str, Float[Tensor, " _"]], allowed: float, minimum_rows: Mapping[str, int]
+) -> dict[str, Selection]:
+    """Drop the cheapest rows of all nodes together, as long as their costs add up to ``allowed`` at most.
+
+    ``costs`` and ``minimum_rows``: by name of the node. At a node's floor its dearest rows stay and, among equals, the
+    lower row. Raises ValueError for costs that are NaN or negative, or a negative floor.
+    """
+    everything = torch.cat([cost.double() for cost in costs.values()])
+    if not (everything >= 0).all():
+        raise ValueError(f"costs of removal must be numbers >= 0, got {float(everything[~(everything >= 0)][0])}")
+    cheapest_first = torch.sort(everything, stable=True)
+    unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
+    unwanted[cheapest_first.indices] = cheapest_first.values.cumsum(0) <= allowed
+    parts = unwanted.split([len(cost) for cost in costs.values()])
+    return {
+        name: _keep_best(cost, part, minimum_rows[name])
+        for (name, cost), part in zip(costs.items(), parts, strict=True)
+    }
 
 
 def _keep_best(scores: Float[Tensor, " n"], unwanted: Bool[Tensor, " n"], minimum_rows: int) -> Selection:

@@ -48,6 +48,11 @@ def render(
         return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.rows, scene.mask_terms())
 
 
+def backdrop(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:
+    """The sky in every pixel of a camera, as it is seen where nothing stands before it; None: black, no sky."""
+    return None if scene.sky is None else scene.sky.colors(ray_directions(camera))
+
+
 def _over_sky(splats: Rendering, sky: Sky, camera: Camera, settings: SplatSettings) -> Float[Tensor, "h w 3"]:
     """Sky behind the splats, looked up only where more light gets through than at which the op stops a pixel.
 

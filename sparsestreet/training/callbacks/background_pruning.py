@@ -1,64 +1,48 @@
 """When the rows that no training view needs are removed from static nodes (the paper's second stage)."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
-import torch
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.ops import contribution
-from sparsestreet.pruning.importance import measure_importance
-from sparsestreet.pruning.select import keep_by_importance
+from sparsestreet.pruning import PruningRule, View
 from sparsestreet.training.callbacks.resizing import resize_rows
 from sparsestreet.training.schedule import moment
-from sparsestreet.training.system import StreetSystem
-from sparsestreet.types import Contribution, Frame
 
 log = logging.getLogger(__name__)
 
 
 class BackgroundPruning(Callback):
-    """At given moments of the run: score every row over all training views, remove the worthless rows of some nodes.
-
-    The whole scene is rendered for the scores (cars hide the road behind them); only the rows of ``nodes`` may go.
+    """At given moments of the run: let a rule look at all training views, and remove the rows it names from some nodes.
 
     Args:
         at: fractions of the run (the paper: once, at 28,000 of 30,000 steps).
+        rule: which rows go.
         minimum_rows: node name -> K_min; the keys are the nodes to prune.
-        gate: count a view only for rows that are the largest contributor of one of its pixels.
     """
 
-    def __init__(self, at: Sequence[float], minimum_rows: dict[str, int], *, gate: bool = True) -> None:
+    def __init__(self, at: Sequence[float], rule: PruningRule, minimum_rows: dict[str, int]) -> None:
         self.at = tuple(at)
+        self.rule = rule
         self.minimum_rows = dict(minimum_rows)
-        self.gate = gate
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         if trainer.global_step not in {moment(fraction, trainer.max_steps) for fraction in self.at}:
             return
+        unknown = self.minimum_rows.keys() - pl_module.scene.nodes.keys()
+        if unknown:
+            raise ValueError(
+                f"background pruning names nodes {sorted(unknown)}, the scene has {sorted(pl_module.scene.nodes.keys())}"
+            )
+        view = View(pl_module.options.settings, pl_module.options.backend)
         frames = trainer.datamodule.split.train
-        with torch.no_grad():
-            scores = measure_importance(self._views(pl_module, frames), gate=self.gate)
-            spans = pl_module.scene.gaussians_at(frames[0].time).rows
-        for name, floor in self.minimum_rows.items():
-            if name not in spans:
-                raise ValueError(f"background pruning names node {name!r}, the scene has {sorted(spans)}")
-            selection = keep_by_importance(scores[spans[name]], floor)
-            before = len(pl_module.scene.nodes[name].rows)
+        for name, selection in self.rule.select(pl_module.scene, frames, self.minimum_rows, view).items():
             log.info(
-                "step %d: %d of %d rows of %r matter in no training view%s",
-                trainer.global_step, selection.removed, before, name,
+                "step %d: background pruning takes %d of %d rows of %r%s",
+                trainer.global_step, selection.removed, len(selection.keep), name,
                 " (K_min holds)" if selection.floor_hit else "",
             )  # fmt: skip
             if selection.removed:
                 resize_rows(trainer, pl_module, name, selection.plan(), "background pruning")
-
-    @staticmethod
-    def _views(system: StreetSystem, frames: Sequence[Frame]) -> Iterator[Contribution]:
-        for frame in frames:
-            gaussians = system.scene.gaussians_at(frame.time).gaussians
-            yield contribution(
-                gaussians, frame.camera, settings=system.options.settings, backend=system.options.backend
-            )

@@ -1,0 +1,94 @@
+"""What decides which rows of some nodes go, given all training views: by the paper's importance or by removal."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+
+from sparsestreet.ops import SplatSettings, contribution, removal
+from sparsestreet.pruning.importance import measure_importance
+from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import backdrop, render
+from sparsestreet.types import Contribution, Frame
+
+
+@dataclass(frozen=True)
+class View:
+    """How a rule looks at the scene; the same as training does."""
+
+    settings: SplatSettings
+    backend: str
+
+
+class PruningRule(Protocol):
+    """Answers, for the nodes in ``minimum_rows`` (name -> K_min), which rows stay. Without gradients."""
+
+    def select(
+        self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
+    ) -> dict[str, Selection]: ...
+
+
+@dataclass(frozen=True)
+class ImportanceRule:
+    """The paper's: rows whose global importance is zero go (see ``Importance``).
+
+    The whole scene is rendered for the scores: cars hide the road behind them.
+    """
+
+    gate: bool = True
+    """Count a view only for rows that are the largest contributor of one of its pixels."""
+
+    @torch.no_grad()
+    def select(
+        self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
+    ) -> dict[str, Selection]:
+        scores = measure_importance(_contributions(scene, frames, view), gate=self.gate)
+        spans = scene.gaussians_at(frames[0].time).rows
+        return {name: keep_by_importance(scores[spans[name]], floor) for name, floor in minimum_rows.items()}
+
+
+@dataclass(frozen=True)
+class RemovalRule:
+    """Rows go that the training images miss least, as many as cost ``allowed_db`` of their PSNR.
+
+    The cost of a row is the sum over views, pixels and channels of the squared change when it alone is taken away. The
+    row of least cost goes first, as long as the sum of costs stays below the share of the present squared error that
+    ``allowed_db`` decibels stand for: 10^(dB / 10) - 1. That sum takes changes as independent of each other and of
+    the error; what overlapping rows lose together is more, and is made up for by the steps that follow. Unlike the
+    importance gate this asks whether a row would be missed, not whether it leads somewhere.
+    """
+
+    allowed_db: float
+    """Decibels a pass may cost before the scene is trained on, > 0."""
+
+    def __post_init__(self) -> None:
+        if not self.allowed_db > 0:
+            raise ValueError(f"allowed_db must be > 0 dB of training PSNR, got {self.allowed_db}")
+
+    @torch.no_grad()
+    def select(
+        self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
+    ) -> dict[str, Selection]:
+        cost, error = 0.0, 0.0
+        for frame in frames:
+            placed = scene.gaussians_at(frame.time)
+            behind = backdrop(scene, frame.camera)
+            changes = removal(
+                placed.gaussians, frame.camera, background=behind, settings=view.settings, backend=view.backend
+            )
+            cost = cost + changes.squared
+            image = render(scene, frame.camera, frame.time, settings=view.settings, backend=view.backend).rgb
+            truth = frame.image.to(image) / 255
+            error += float((image.clamp(0, 1) - truth).double().square().sum())
+        spans = scene.gaussians_at(frames[0].time).rows
+        nodes = {name: cost[spans[name]] for name in minimum_rows}
+        allowed = (10 ** (self.allowed_db / 10) - 1) * error
+        return keep_by_cost(nodes, allowed, minimum_rows)
+
+
+def _contributions(scene: SceneGraph, frames: Sequence[Frame], view: View) -> Iterator[Contribution]:
+    for frame in frames:
+        gaussians = scene.gaussians_at(frame.time).gaussians
+        yield contribution(gaussians, frame.camera, settings=view.settings, backend=view.backend)
