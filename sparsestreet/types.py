@@ -178,7 +178,7 @@ class Contribution:
 
 @dataclass(frozen=True)
 class Removal:
-    """How far one view moves when each row alone is taken away: what its loss is seen by, others staying as they are."""
+    """How far one view moves when each row alone is taken away, the others staying as they are."""
 
     largest: Float64[Tensor, " n"]
     """Largest absolute change of a channel of a pixel."""

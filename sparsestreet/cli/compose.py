@@ -8,7 +8,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from hydra.errors import ConfigCompositionException
+from hydra.errors import ConfigCompositionException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -42,7 +42,7 @@ ConfigStore.instance().store(name="train_schema", node=TrainSchema)
 
 def override_problem(overrides: list[str], config_name: str = "train") -> str | None:
     """One line on what is wrong with the overrides, naming the nearest key; None if they compose."""
-    keyed = [text for text in overrides if not text.startswith("-")]
+    keyed = [text for before, text in zip(["", *overrides], overrides, strict=False) if not _is_flag(before, text)]
     for text in keyed:
         # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
         if text.startswith("+") and not text.startswith(("++", "+hydra")):
@@ -53,9 +53,16 @@ def override_problem(overrides: list[str], config_name: str = "train") -> str | 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         try:
             compose(config_name, single)
+        except OverrideParseException as error:
+            return f"{error.override!r} is no override: write key=value"
         except ConfigCompositionException as error:
             return _explain(str(error.__cause__ or error).splitlines()[0], single, config_name)
     return None
+
+
+def _is_flag(before: str, text: str) -> bool:
+    """A flag of Hydra's, or the word after it (``--cfg job``)."""
+    return text.startswith("-") or (before.startswith("-") and "=" not in text)
 
 
 def _explain(reason: str, overrides: list[str], config_name: str) -> str:

@@ -60,10 +60,7 @@ def keep_by_cost(
     unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
     unwanted[cheapest_first.indices] = cheapest_first.values.cumsum(0) <= allowed
     parts = unwanted.split([len(cost) for cost in costs.values()])
-    return {
-        name: _keep_best(cost, part, minimum_rows[name])
-        for (name, cost), part in zip(costs.items(), parts, strict=True)
-    }
+    return {name: _keep_best(costs[name], part, minimum_rows[name]) for name, part in zip(costs, parts, strict=True)}
 
 
 def _keep_best(scores: Float[Tensor, " n"], unwanted: Bool[Tensor, " n"], minimum_rows: int) -> Selection:

@@ -33,9 +33,8 @@ class BackgroundPruning(Callback):
             return
         unknown = self.minimum_rows.keys() - pl_module.scene.nodes.keys()
         if unknown:
-            raise ValueError(
-                f"background pruning names nodes {sorted(unknown)}, the scene has {sorted(pl_module.scene.nodes.keys())}"
-            )
+            known = sorted(pl_module.scene.nodes.keys())
+            raise ValueError(f"background pruning names nodes {sorted(unknown)}, the scene has {known}")
         view = View(pl_module.options.settings, pl_module.options.backend)
         frames = trainer.datamodule.split.train
         for name, selection in self.rule.select(pl_module.scene, frames, self.minimum_rows, view).items():
