@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -11,7 +11,7 @@ from sparsestreet.pruning.importance import measure_importance
 from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import backdrop, render
-from sparsestreet.types import Contribution, Frame
+from sparsestreet.types import Contribution, Frame, Removal
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class View:
     backend: str
 
 
+@runtime_checkable
 class PruningRule(Protocol):
     """Answers, for the nodes in ``minimum_rows`` (name -> K_min), which rows stay. Without gradients."""
 
@@ -58,34 +59,48 @@ class RemovalRule:
     ``allowed_db`` decibels stand for: 10^(dB / 10) - 1. That sum takes changes as independent of each other and of
     the error; what overlapping rows lose together is more, and is made up for by the steps that follow. Unlike the
     importance gate this asks whether a row would be missed, not whether it leads somewhere.
+
+    A row that moves no channel of any pixel by more than ``noticeable`` costs nothing.
     """
 
     allowed_db: float
-    """Decibels a pass may cost before the scene is trained on, > 0."""
+    """Decibels a pass may cost before the scene is trained on, >= 0; 0: only rows that nobody sees go."""
+    noticeable: float = 1 / 255
+    """One step of an 8-bit image; 0: every change counts."""
 
     def __post_init__(self) -> None:
-        if not self.allowed_db > 0:
-            raise ValueError(f"allowed_db must be > 0 dB of training PSNR, got {self.allowed_db}")
+        if not self.allowed_db >= 0:
+            raise ValueError(f"allowed_db must be >= 0 dB of training PSNR, got {self.allowed_db}")
+        if not self.noticeable >= 0:
+            raise ValueError(f"noticeable must be >= 0 (images lie in [0, 1]), got {self.noticeable}")
 
     @torch.no_grad()
     def select(
         self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
     ) -> dict[str, Selection]:
-        cost, error = 0.0, 0.0
-        for frame in frames:
-            placed = scene.gaussians_at(frame.time)
-            behind = backdrop(scene, frame.camera)
-            changes = removal(
-                placed.gaussians, frame.camera, background=behind, settings=view.settings, backend=view.backend
-            )
-            cost = cost + changes.squared
-            image = render(scene, frame.camera, frame.time, settings=view.settings, backend=view.backend).rgb
-            truth = frame.image.to(image) / 255
-            error += float((image.clamp(0, 1) - truth).double().square().sum())
+        changes = [_removal(scene, frame, view) for frame in frames]
+        largest = torch.stack([change.largest for change in changes]).amax(0)
+        squared = torch.stack([change.squared for change in changes]).sum(0)
+        costs = torch.where(largest > self.noticeable, squared, 0.0)
         spans = scene.gaussians_at(frames[0].time).rows
-        nodes = {name: cost[spans[name]] for name in minimum_rows}
-        allowed = (10 ** (self.allowed_db / 10) - 1) * error
-        return keep_by_cost(nodes, allowed, minimum_rows)
+        allowed = (10 ** (self.allowed_db / 10) - 1) * sum(_squared_error(scene, frame, view) for frame in frames)
+        return keep_by_cost({name: costs[spans[name]] for name in minimum_rows}, allowed, minimum_rows)
+
+
+def _removal(scene: SceneGraph, frame: Frame, view: View) -> Removal:
+    """Over the sky, as the image is seen."""
+    return removal(
+        scene.gaussians_at(frame.time).gaussians,
+        frame.camera,
+        background=backdrop(scene, frame.camera),
+        settings=view.settings,
+        backend=view.backend,
+    )
+
+
+def _squared_error(scene: SceneGraph, frame: Frame, view: View) -> float:
+    image = render(scene, frame.camera, frame.time, settings=view.settings, backend=view.backend).rgb
+    return float((image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum())
 
 
 def _contributions(scene: SceneGraph, frames: Sequence[Frame], view: View) -> Iterator[Contribution]:

@@ -63,10 +63,17 @@ def activated(rows: Rows) -> Gaussians:
 class Views:
     """Images of a scene from all cameras, to be compared with images of the scene without one of its rows."""
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera], backend: str = "auto") -> None:
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        cameras: Sequence[Camera],
+        backend: str = "auto",
+        backdrops: Sequence[Tensor] | None = None,
+    ) -> None:
+        """``backdrops``: what stands behind the Gaussians in each view; None: black."""
         self.gaussians, self.cameras, self.backend = gaussians, cameras, backend
-        with torch.no_grad():
-            self.images = [splat(gaussians, camera, backend=backend).rgb for camera in cameras]
+        self.backdrops = [None] * len(cameras) if backdrops is None else backdrops
+        self.images = [self._image(gaussians, index) for index in range(len(cameras))]
         self.contributions = [contribution(gaussians, camera, backend=backend) for camera in cameras]
 
     def movement(self, row: int, enough: float = torch.inf) -> float:
@@ -83,10 +90,12 @@ class Views:
         for index in sorted(range(len(weights)), key=lambda index: -weights[index]):
             if weights[index] == 0 or largest > enough:
                 break
-            with torch.no_grad():
-                image = splat(without, self.cameras[index], backend=self.backend).rgb
-            largest = max(largest, float((image - self.images[index]).abs().max()))
+            largest = max(largest, float((self._image(without, index) - self.images[index]).abs().max()))
         return largest
+
+    @torch.no_grad()
+    def _image(self, gaussians: Gaussians, index: int) -> Tensor:
+        return splat(gaussians, self.cameras[index], background=self.backdrops[index], backend=self.backend).rgb
 
     def visible(self, rows: Int[Tensor, " k"], more_than: float = NOTICEABLE) -> Bool[Tensor, " n"]:
         """Marks those of the given rows whose removal moves a view by more than ``more_than``."""
@@ -103,12 +112,13 @@ def plant(
     hidden: int,
     copies: int,
     backend: str = "auto",
+    backdrops: Sequence[Tensor] | None = None,
 ) -> tuple[Rows, Bool[Tensor, " n"]]:
     """A table of the old rows followed by ``hidden`` + ``copies`` useless ones, and which these are.
 
     ``rows`` are in the world frame (a background node). Raises ValueError if the scene has too few opaque places.
     """
-    views = Views(activated(rows), cameras, backend)
+    views = Views(activated(rows), cameras, backend, backdrops)
     # Three proposals for each row wanted: some places turn out to be seen from elsewhere.
     proposals = [
         _propose_hidden(rows, views, 3 * hidden, generator),
@@ -122,7 +132,7 @@ def plant(
         chosen = _first(possible & is_hidden, hidden) | _first(possible & ~is_hidden, copies)
         keep = torch.cat((torch.ones(len(rows), dtype=torch.bool), chosen))
         planted = _resized(candidates, RowPlan.keep(keep))
-        moving = _moving(planted, len(rows), cameras, backend)
+        moving = _moving(Views(activated(planted), cameras, backend, backdrops), len(rows))
         if not moving.any():
             return planted, torch.arange(len(planted)) >= len(rows)
         possible[torch.nonzero(chosen).squeeze(-1)[moving]] = False
@@ -196,13 +206,12 @@ def _resized(rows: Rows, plan: RowPlan) -> Rows:
     return copy
 
 
-def _moving(rows: Rows, old: int, cameras: Sequence[Camera], backend: str) -> Bool[Tensor, " m"]:
+def _moving(views: Views, old: int) -> Bool[Tensor, " m"]:
     """Which of the rows from ``old`` on move some view."""
-    views = Views(activated(rows), cameras, backend)
     largest = torch.stack([view.weight for view in views.contributions]).amax(0)
     # A weight below NOTICEABLE in sum over all pixels moves no pixel by more (colours differ by at most about 1); the
     # others are tested one by one.
-    unclear = (largest > NOTICEABLE) & (torch.arange(len(rows)) >= old)
+    unclear = (largest > NOTICEABLE) & (torch.arange(len(views.gaussians)) >= old)
     return views.visible(torch.nonzero(unclear).squeeze(-1))[old:]
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from sparsestreet.pruning import keep_by_importance, keep_by_mask
+from sparsestreet.pruning import keep_by_cost, keep_by_importance, keep_by_mask
 from sparsestreet.scene.masks import StaticMask
 
 # A coarse grid, so that ties and hits of the threshold are common.
@@ -109,3 +109,23 @@ def test_impossible_inputs_are_refused():
         keep_by_mask(torch.zeros(2), 0.01, -1)
     with pytest.raises(ValueError, match=">= 0"):
         keep_by_importance(torch.tensor([-0.1, 0.2]), 0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(score_lists, score_lists, st.floats(0, 3), st.integers(0, 5))
+def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, second, allowed, floor):
+    costs = {name: torch.tensor(values, dtype=torch.float64) for name, values in (("a", first), ("b", second))}
+    chosen = keep_by_cost(costs, allowed, {"a": floor, "b": 0})
+    order = sorted(range(len(first) + len(second)), key=lambda row: ((first + second)[row], row))
+    spent, unwanted = 0.0, [False] * len(order)
+    for row in order:
+        spent += (first + second)[row]
+        unwanted[row] = spent <= allowed
+    assert chosen["a"].keep.tolist() == by_hand(first, unwanted[: len(first)], floor)
+    assert chosen["b"].keep.tolist() == by_hand(second, unwanted[len(first) :], 0)
+
+
+def test_costs_must_be_numbers():
+    for bad in (float("nan"), -1.0):
+        with pytest.raises(ValueError, match="costs of removal"):
+            keep_by_cost({"a": torch.tensor([1.0, bad])}, 1.0, {"a": 0})

@@ -1,0 +1,97 @@
+"""The removal rule on a scene whose answer is known, and both rules' errors."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.ops import SplatSettings
+from sparsestreet.pruning import ImportanceRule, RemovalRule, View
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes.background import Background
+from sparsestreet.scene.rendering import render
+from sparsestreet.types import Camera, Frame
+
+VIEW = View(SplatSettings(), "reference")
+
+
+def scene_of(opacities: list[float], depths: list[float]) -> SceneGraph:
+    """Large white discs across the view, one behind the other."""
+    n = len(opacities)
+    rows = Rows(
+        {
+            "means": torch.tensor([[0.0, 0.0, z] for z in depths]),
+            "log_scales": torch.full((n, 3), 3.0),
+            "quaternions": torch.tensor([[1.0, 0, 0, 0]] * n),
+            "opacity_logits": torch.tensor(opacities).logit(),
+            "sh_dc": torch.full((n, 1, 3), 1.7),
+            "sh_rest": torch.zeros(n, 0, 3),
+        }
+    )
+    return SceneGraph({"background": Background(rows, None)}, sky=None)
+
+
+def frame_of(scene: SceneGraph, offset: int) -> Frame:
+    """What the scene shows, off by ``offset`` 8-bit steps in every channel: so much is the present error."""
+    camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 4.5], [0, 40.0, 3.5], [0, 0, 1]]), 9, 7)
+    blank = Frame(0, 0.0, 0, camera, torch.zeros(7, 9, 3, dtype=torch.uint8))
+    with torch.no_grad():
+        rgb = render(scene, camera, 0.0, backend="reference").rgb.clamp(0, 1)
+    return replace(blank, image=((rgb * 255).round() - offset).clamp(0, 255).to(torch.uint8))
+
+
+def test_a_budget_buys_the_cheapest_rows_and_no_more():
+    # Front to back; white discs over black: removing row k changes a pixel by alpha_k times the light that gets
+    # past all others, T_all / (1 - alpha_k) * alpha_k.
+    opacities = [0.05, 0.3, 0.1]
+    scene = scene_of(opacities, [2.0, 3.0, 4.0])
+    frame = frame_of(scene, offset=20)
+    through = 0.95 * 0.7 * 0.9
+    value = 0.5 + 1.7 * 0.28209479177387814
+    costs = [3 * 63 * (value * through * o / (1 - o)) ** 2 for o in opacities]
+    with torch.no_grad():
+        image = render(scene, frame.camera, 0.0, backend="reference").rgb
+    error = float((image.clamp(0, 1) - frame.image / 255).square().sum())
+    for allowed, kept in (
+        (0.9 * costs[0], [True, True, True]),
+        (1.1 * costs[0], [False, True, True]),
+        (1.02 * (costs[0] + costs[2]), [False, True, False]),
+        (0.98 * (costs[0] + costs[2]), [False, True, True]),
+    ):
+        allowed_db = float(10 * torch.log10(torch.tensor(1 + allowed / error)))
+        rule = RemovalRule(allowed_db, noticeable=0.0)
+        assert rule.select(scene, [frame], {"background": 0}, VIEW)["background"].keep.tolist() == kept
+
+
+def test_without_a_budget_only_what_nobody_sees_goes():
+    # Two discs behind an opaque one: 0.01 of the light gets through, and of that 0.3 and 0.7 * 0.5: 0.9 steps of 255.
+    scene = scene_of([0.99, 0.3, 0.5], [2.0, 3.0, 4.0])
+    selection = RemovalRule(0.0).select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"]
+    assert selection.keep.tolist() == [True, False, False]
+    strict = RemovalRule(0.0, noticeable=0.0)
+    assert strict.select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"].removed == 0
+
+
+def test_a_row_seen_in_one_view_of_two_stays():
+    scene = scene_of([0.99, 0.3], [2.0, 3.0])
+    front = frame_of(scene, 5)
+    # From behind the first disc the second is seen.
+    pose = torch.eye(4)
+    pose[2, 3] = -2.5
+    behind = replace(front, camera=replace(front.camera, camera_from_world=pose))
+    rule = RemovalRule(0.0)
+    assert rule.select(scene, [front], {"background": 0}, VIEW)["background"].keep.tolist() == [True, False]
+    assert rule.select(scene, [front, behind], {"background": 0}, VIEW)["background"].removed == 0
+
+
+def test_the_floor_holds():
+    scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0])
+    for rule in (RemovalRule(50.0), ImportanceRule()):
+        assert int(rule.select(scene, [frame_of(scene, 5)], {"background": 2}, VIEW)["background"].keep.sum()) >= 2
+
+
+@pytest.mark.parametrize(("allowed_db", "noticeable"), [(-0.1, 0.0), (float("nan"), 0.0), (0.1, -1.0)])
+def test_bad_settings_are_refused(allowed_db, noticeable):
+    with pytest.raises(ValueError, match="must be >= 0"):
+        RemovalRule(allowed_db, noticeable)
