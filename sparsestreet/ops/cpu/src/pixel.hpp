@@ -1,6 +1,5 @@
 // What the pixel loops share: alpha, the stop rule, and where a splat meets a tile.
 #pragma once
-#include "lanes.hpp"
 #include "workspace.hpp"
 
 namespace SPLAT_VARIANT {
@@ -8,11 +7,8 @@ namespace SPLAT_VARIANT {
 // The cut-offs, ready for the pixel loops.
 template <class T>
 struct Cuts {
-  T log2_alpha_min, alpha_max, transmittance_min;
-  explicit Cuts(const View& v)
-      // Without a cut-off the exponent still ends where float does: 2^-126.
-      : log2_alpha_min(v.alpha_min > 0 ? T(std::log2(v.alpha_min)) : T(-126)), alpha_max(v.alpha_max),
-        transmittance_min(v.transmittance_min) {}
+  T alpha_max, transmittance_min;
+  explicit Cuts(const View& v) : alpha_max(v.alpha_max), transmittance_min(v.transmittance_min) {}
 };
 
 // Splats ahead whose record is fetched while one is blended.
@@ -50,7 +46,7 @@ inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, 
   const Lanes<T> exponent = base - p.a * p.a, none{};
   p.raw = exp2_nonpositive(larger(exponent, same(T(-126))));
   p.alpha = smaller(p.raw, same(cuts.alpha_max));
-  p.alpha = exponent >= cuts.log2_alpha_min ? p.alpha : none;
+  p.alpha = exponent >= s.least_exponent ? p.alpha : none;
   if (EXCLUSIVE) {
     Lanes<T> passed = load(gate);
     passed = passed - p.alpha * passed;

@@ -2,6 +2,7 @@
 #pragma once
 #include <omp.h>
 
+#include "columns.hpp"
 #include "sorting.hpp"
 
 namespace SPLAT_VARIANT {
@@ -33,10 +34,55 @@ inline bool finite(const T* values, int64_t count) {
 }
 
 template <class T>
-inline bool valid_row(const Inputs<T>& in, int64_t i) {
-  const T *s = in.scales + 3 * i, opacity = in.opacities[i];
-  return finite(in.means + 3 * i, 3) && finite(in.quaternions + 4 * i, 4) && finite(s, 3) && s[0] >= 0 && s[1] >= 0 &&
-         s[2] >= 0 && opacity >= 0 && opacity <= 1 && finite(in.sh + 3 * in.terms * i, 3 * in.terms);
+inline bool valid_rows(const Inputs<T>& in, int64_t first, int64_t count) {
+  bool inside = true;
+  for (int64_t i = first; i < first + count; ++i) inside &= in.opacities[i] >= 0 && in.opacities[i] <= 1;
+  for (int64_t i = 3 * first; i < 3 * (first + count); ++i) inside &= in.scales[i] >= 0;
+  return inside && finite(in.means + 3 * first, 3 * count) && finite(in.quaternions + 4 * first, 4 * count) &&
+         finite(in.scales + 3 * first, 3 * count) && finite(in.sh + 3 * in.terms * first, 3 * in.terms * count);
+}
+
+// Rows row(0), row(1), ... of the input, one per lane.
+template <class T, class RowAt>
+inline RowValues<Lanes<T>> load_rows(const Inputs<T>& in, RowAt row) {
+  RowValues<Lanes<T>> v;
+  load_columns<T>([&](int lane) { return in.means + 3 * row(lane); }, 3, &v.mean.x);
+  load_columns<T>([&](int lane) { return in.scales + 3 * row(lane); }, 3, &v.scales.x);
+  load_columns<T>([&](int lane) { return in.quaternions + 4 * row(lane); }, 4, v.quaternion);
+  load_columns<T>([&](int lane) { return in.opacities + row(lane); }, 1, &v.opacity);
+  return v;
+}
+
+// The colour of the rows of a register in the direction in which the camera sees them.
+template <class T, class RowAt>
+inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, const Vector<Lanes<T>>& in_camera,
+                       Splat<Lanes<T>>& s) {
+  Lanes<T> sh[3 * 16];
+  load_columns<T>([&](int lane) { return in.sh + 3 * in.terms * row(lane); }, int(3 * in.terms), sh);
+  const Vector<Lanes<T>> color = view_color(camera, in_camera, sh, in.terms).raw;
+  s.color[0] = positive_part(color.x), s.color[1] = positive_part(color.y), s.color[2] = positive_part(color.z);
+}
+
+// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii.
+template <class T>
+void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
+                   int count, T* radii) {
+  // The lanes of a last, partial block repeat its last row.
+  const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
+  Projection<Lanes<T>> p;
+  Splat<Lanes<T>> s{};
+  const Integers<T> seen = project(camera, load_rows(in, row), p, s);
+  const Lanes<T> radius = seen ? (s.half_x > s.half_y ? s.half_x : s.half_y) : Lanes<T>{};
+  if (radii)
+    for (int r = 0; r < count; ++r) radii[first + r] = radius[r];
+  if (!any<T>(seen)) {
+    for (int r = 0; r < count; ++r) ws.tiles[first + r] = {0, 0, 0};
+    return;
+  }
+  color_rows(camera, in, row, p.in_camera, s);
+  Splat<T>* splats = &ws.splats[first];
+  store_columns<T>(&s.x, SPLAT_COLUMNS<T>, count, [&](int r) { return reinterpret_cast<T*>(splats + r); });
+  tile_sets(s, grid, seen, splats, count, &ws.tiles[first]);
 }
 
 // Fills ws.splats, ws.tiles and `radii`; false if a row holds a bad value.
@@ -47,13 +93,10 @@ bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* ra
   ws.splats.reserve(in.count), ws.tiles.reserve(in.count);
   int bad = 0;
 #pragma omp parallel for num_threads(view.threads) schedule(static) reduction(| : bad)
-  for (int64_t i = 0; i < in.count; ++i) {
-    bad |= !valid_row(in, i);
-    Splat<T>& splat = ws.splats[i];
-    const bool seen = project_row(camera, in.means + 3 * i, in.quaternions + 4 * i, in.scales + 3 * i, in.opacities[i],
-                                  in.sh + 3 * in.terms * i, in.terms, splat);
-    ws.tiles[i] = seen ? tile_set(splat, grid) : TileSet{0, 0, 0};
-    if (radii) radii[i] = !seen ? T(0) : (splat.half_x > splat.half_y ? splat.half_x : splat.half_y);
+  for (int64_t first = 0; first < in.count; first += LANES<T>) {
+    const int count = int(in.count - first < LANES<T> ? in.count - first : LANES<T>);
+    bad |= !valid_rows(in, first, count);
+    project_block(ws, camera, grid, in, first, count, radii);
   }
   return !bad;
 }

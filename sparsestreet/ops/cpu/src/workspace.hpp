@@ -1,9 +1,8 @@
 // What one rendering keeps from forward to backward, and the records the stages hand to each other.
 #pragma once
-#include <type_traits>
-
 #include "buffer.hpp"
 #include "interface.h"
+#include "values.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -13,20 +12,24 @@ using namespace splat;
 constexpr int TILE = 16;
 constexpr int PIXELS = TILE * TILE;
 
-// One splat on the screen; 64 bytes as float, one cache line.
-template <class T>
-struct alignas(16 * sizeof(T)) Splat {
-  T x, y;           // mean, pixels
-  T l11, l21, l22;  // Cholesky factor of the conic times sqrt(log2(e) / 2): alpha = 2^(log2_opacity - |L d|^2)
-  T log2_opacity;
-  T color[3];
-  T depth;
-  T half_x, half_y;            // half sides of the opacity-aware box, pixels
-  int32_t first_row, last_row;  // image rows the box reaches, inclusive
+// One splat on the screen, 64 bytes as float, one cache line; or as many as a register has lanes.
+template <class V>
+struct alignas(16 * sizeof(Scalar<V>)) Splat {
+  V x, y;           // mean, pixels
+  V l11, l21, l22;  // Cholesky factor of the conic times sqrt(log2(e) / 2): alpha = 2^(log2_opacity - |L d|^2)
+  V log2_opacity;
+  V least_exponent;  // log2 of the least alpha that is drawn
+  V color[3];
+  V depth;
+  V half_x, half_y;              // half sides of the box, pixels
+  Index<V> first_row, last_row;  // image rows the box reaches, inclusive
+  V unused;
 };
+template <class V>
+constexpr int SPLAT_COLUMNS = sizeof(Splat<V>) / sizeof(V);
 
-// The tiles of a splat, found once: bit 8 y + x stands for the tile x right of and y below the first one (of the box). A splat that
-// reaches further than 8x8 tiles has mask 0, and its tiles are found anew each time.
+// The tiles of a splat, found once: bit 8 y + x stands for the tile x right of and y below the first one (of the box).
+// A splat that reaches further than 8x8 tiles has mask 0, and its tiles are found anew each time.
 struct TileSet {
   uint64_t mask;
   int32_t first, count;
@@ -39,13 +42,15 @@ struct Pair {
 };
 
 // Sums over the pixels of one pair. s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d, w = blend weight.
-template <class T>
+template <class V>
 struct Slot {
-  T s, sa, sb;
-  T sa_dx, sa_dy, sb_dy;  // towards l11, l21, l22
-  T abs_x, abs_y;  // |s a|, |s (l21 a + l22 b)|
-  T color[3], depth;      // w times the cotangents
+  V s, sa, sb;
+  V sa_dx, sa_dy, sb_dy;  // towards l11, l21, l22
+  V abs_x, abs_y;         // |s a|, |s (l21 a + l22 b)|
+  V color[3], depth;      // w times the cotangents
 };
+template <class V>
+constexpr int SLOT_COLUMNS = sizeof(Slot<V>) / sizeof(V);
 
 template <class T>
 struct Workspace {
