@@ -66,7 +66,7 @@ void count_contributions(Workspace<T>& ws, const View& view, int64_t rows, const
   for (int64_t i = 0; i < rows; ++i) {
     typename Workspace<T>::Count sum{0, 0, 0};
     for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
-      const auto& slot = ws.count_slots[ws.first_slot[i] + k];
+      const auto& slot = ws.count_slots[ws.tiles[i].first_slot + k];
       sum.weight += slot.weight, sum.pixels += slot.pixels, sum.dominant += slot.dominant;
     }
     out.weight[i] = sum.weight, out.pixels[i] = sum.pixels, out.dominant[i] = sum.dominant;

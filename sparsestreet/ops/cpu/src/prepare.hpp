@@ -63,10 +63,10 @@ inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, 
   s.color[0] = positive_part(color.x), s.color[1] = positive_part(color.y), s.color[2] = positive_part(color.z);
 }
 
-// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii.
+// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii, counts pairs per tile.
 template <class T>
 void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
-                   int count, T* radii) {
+                   int count, T* radii, int64_t* counts) {
   // The lanes of a last, partial block repeat its last row.
   const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
   Projection<Lanes<T>> p;
@@ -76,27 +76,36 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
   if (radii)
     for (int r = 0; r < count; ++r) radii[first + r] = radius[r];
   if (!any<T>(seen)) {
-    for (int r = 0; r < count; ++r) ws.tiles[first + r] = {0, 0, 0};
+    for (int r = 0; r < count; ++r) ws.tiles[first + r] = {0, 0, 0, 0};
     return;
   }
   color_rows(camera, in, row, p.in_camera, s);
   Splat<T>* splats = &ws.splats[first];
   store_columns<T>(&s.x, SPLAT_COLUMNS<T>, count, [&](int r) { return reinterpret_cast<T*>(splats + r); });
   tile_sets(s, grid, seen, splats, count, &ws.tiles[first]);
+  for (int r = 0; r < count; ++r)
+    for_each_tile(ws.tiles[first + r], splats[r], grid, [&](int64_t tile) { ++counts[tile]; });
 }
 
-// Fills ws.splats, ws.tiles and `radii`; false if a row holds a bad value.
+// Fills ws.splats, ws.tiles, `radii` and each thread's counts of pairs per tile; false if a row holds a bad value.
 template <class T>
 bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* radii) {
   const Camera<T> camera(view);
   const Grid<T> grid(view);
-  ws.splats.reserve(in.count), ws.tiles.reserve(in.count);
+  const int64_t tiles = grid.tiles_x * grid.tiles_y, blocks = (in.count + LANES<T> - 1) / LANES<T>;
+  ws.splats.reserve(in.count), ws.tiles.reserve(in.count), ws.histogram.reserve(view.threads * tiles);
   int bad = 0;
 #pragma omp parallel for num_threads(view.threads) schedule(static) reduction(| : bad)
-  for (int64_t first = 0; first < in.count; first += LANES<T>) {
-    const int count = int(in.count - first < LANES<T> ? in.count - first : LANES<T>);
-    bad |= !valid_rows(in, first, count);
-    project_block(ws, camera, grid, in, first, count, radii);
+  for (int64_t part = 0; part < view.threads; ++part) {
+    int64_t* counts = &ws.histogram[part * tiles];
+    std::memset(counts, 0, tiles * sizeof(int64_t));
+    const Range range(blocks, part, view.threads);
+    for (int64_t block = range.begin; block < range.end; ++block) {
+      const int64_t first = block * LANES<T>, rest = in.count - first;
+      const int count = int(rest < LANES<T> ? rest : LANES<T>);
+      bad |= !valid_rows(in, first, count);
+      project_block(ws, camera, grid, in, first, count, radii, counts);
+    }
   }
   return !bad;
 }
@@ -122,7 +131,7 @@ Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii
   const double start = omp_get_wtime();
   if (!project_rows(ws, view, in, static_cast<T*>(radii))) return BAD_VALUE;
   const double projected = omp_get_wtime();
-  list_visible(ws, in.count);
+  const int key_bits = list_visible(ws, in.count);
   report.pairs = ws.pair_count;
   if (ws.pair_count > view.pair_limit) {
     report_worst(ws, in.count, report);
@@ -130,7 +139,8 @@ Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii
   }
   const Grid<T> grid(view);
   ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
-  sort_by_depth(ws, view.threads);
+  begin_tiles(ws, grid.tiles_x * grid.tiles_y, view.threads);
+  sort_by_depth(ws, key_bits, view.threads);
   fill_tiles(ws, grid, view.threads);
   ws.seconds[PROJECT] = projected - start, ws.seconds[BIN] = omp_get_wtime() - projected;
   return OK;

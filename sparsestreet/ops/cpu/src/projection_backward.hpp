@@ -167,7 +167,7 @@ inline Slot<Lanes<T>> sum_slots(const Workspace<T>& ws, RowAt row) {
   constexpr int columns = SLOT_COLUMNS<T>;
   T sums[LANES<T>][columns];
   for (int lane = 0; lane < LANES<T>; ++lane) {
-    const T* slots = reinterpret_cast<const T*>(&ws.slots[ws.first_slot[row(lane)]]);
+    const T* slots = reinterpret_cast<const T*>(&ws.slots[ws.tiles[row(lane)].first_slot]);
     for (int c = 0; c < columns; ++c) sums[lane][c] = slots[c];
     for (int32_t k = 1; k < ws.tiles[row(lane)].count; ++k)
       for (int c = 0; c < columns; ++c) sums[lane][c] += slots[k * columns + c];

@@ -1,14 +1,9 @@
-// Visible rows by depth, and their tiles' lists in that order: stable counting sorts over ranges of rows. Nothing
-// depends on how many ranges there are, so the order is the same for any number of threads.
+// Visible rows by depth, and their tiles' lists in that order, by stable counting sorts. Nothing depends on the number
+// of threads.
 #pragma once
 #include "tiles.hpp"
 
 namespace SPLAT_VARIANT {
-
-struct Range {
-  int64_t begin, end;
-  Range(int64_t count, int64_t part, int64_t parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
-};
 
 // Bits of a positive float order as the float does.
 template <class T, class Key>
@@ -23,21 +18,24 @@ inline Key depth_key(T depth) {
 // more than that on a machine that has other work as well.
 constexpr int64_t ROWS_WORTH_THREADS = 1 << 17;
 
-// Gives each row its slots, contiguous and in row order, and lists the rows that have any, with their depth keys. The
-// number of pairs is an int64: it may pass 2^31.
+// Gives each row its slots, contiguous and in row order, and lists the rows that have any, with their depth keys;
+// answers how many bits of the keys differ. The number of pairs is an int64: it may pass 2^31.
 template <class T>
-void list_visible(Workspace<T>& ws, int64_t rows) {
+int list_visible(Workspace<T>& ws, int64_t rows) {
   using Key = typename Workspace<T>::Key;
   int64_t visible = 0, pairs = 0;
-  ws.first_slot.reserve(rows), ws.keys.reserve(rows), ws.order.reserve(rows);
+  Key different = 0;
+  ws.keys.reserve(rows), ws.order.reserve(rows);
   for (int64_t i = 0; i < rows; ++i) {
-    ws.first_slot[i] = pairs;
+    ws.tiles[i].first_slot = pairs;
     if (ws.tiles[i].count == 0) continue;
     pairs += ws.tiles[i].count;
     ws.keys[visible] = depth_key<T, Key>(ws.splats[i].depth);
+    different |= ws.keys[visible] ^ ws.keys[0];
     ws.order[visible++] = int32_t(i);
   }
   ws.visible = visible, ws.pair_count = pairs;
+  return different ? 64 - __builtin_clzll(different) : 0;
 }
 
 // One stable pass over `bits` bits of the key from `shift` on.
@@ -73,12 +71,13 @@ void sort_by_digit(const Key* keys, const int32_t* values, Key* keys_out, int32_
   }
 }
 
-// Radix sort by the whole key, from the lowest digit; leaves the result in ws.order. Ties keep the row order.
+// Radix sort by the lowest `key_bits` of the keys, from the lowest digit; leaves the result in ws.order. Ties keep the
+// row order.
 template <class T>
-void sort_by_depth(Workspace<T>& ws, int64_t threads) {
+void sort_by_depth(Workspace<T>& ws, int key_bits, int64_t threads) {
   if (ws.visible < ROWS_WORTH_THREADS) threads = 1;
   ws.other_keys.reserve(ws.visible), ws.other_order.reserve(ws.visible);
-  constexpr int bits = 11, key_bits = 8 * sizeof(typename Workspace<T>::Key), passes = (key_bits + bits - 1) / bits;
+  const int passes = (key_bits + 10) / 11, bits = passes > 0 ? (key_bits + passes - 1) / passes : 0;
   int64_t* histogram = ws.histogram.reserve(threads << bits);
   auto *keys = ws.keys.data(), *other_keys = ws.other_keys.data();
   auto *order = ws.order.data(), *other_order = ws.other_order.data();
@@ -92,40 +91,38 @@ void sort_by_depth(Workspace<T>& ws, int64_t threads) {
   if (order != ws.order.data()) std::memcpy(ws.order.data(), order, ws.visible * sizeof(int32_t));
 }
 
-// Fills ws.pairs tile by tile, nearest first, and ws.tile_begin.
+// Turns the counts of each part per tile, which projecting left in ws.histogram, into ws.tile_begin.
 template <class T>
-void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t threads) {
-  if (ws.visible < ROWS_WORTH_THREADS) threads = 1;
-  const int64_t tiles = grid.tiles_x * grid.tiles_y;
-  int64_t* histogram = ws.histogram.reserve(threads * tiles);
-  ws.pairs.reserve(ws.pair_count), ws.tile_begin.reserve(tiles + 1), ws.tile_end.reserve(tiles);
-#pragma omp parallel for num_threads(threads) schedule(static)
-  for (int64_t part = 0; part < threads; ++part) {
-    int64_t* mine = histogram + part * tiles;
-    std::memset(mine, 0, tiles * sizeof(int64_t));
-    const Range range(ws.visible, part, threads);
-    for (int64_t k = range.begin; k < range.end; ++k)
-      for_each_tile(ws.tiles[ws.order[k]], ws.splats[ws.order[k]], grid, [&](int64_t tile) { ++mine[tile]; });
-  }
+void begin_tiles(Workspace<T>& ws, int64_t tiles, int64_t parts) {
+  ws.tile_begin.reserve(tiles + 1), ws.tile_end.reserve(tiles);
   int64_t total = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
     ws.tile_begin[tile] = total;
-    for (int64_t part = 0; part < threads; ++part) {
-      const int64_t here = histogram[part * tiles + tile];
-      histogram[part * tiles + tile] = total;
-      total += here;
-    }
+    for (int64_t part = 0; part < parts; ++part) total += ws.histogram[part * tiles + tile];
   }
   ws.tile_begin[tiles] = total;
+}
+
+// Fills ws.pairs tile by tile, nearest first. Each thread walks all rows and lists the tiles of its own band. The rows
+// lie scattered in memory, so their tiles are fetched ahead.
+template <class T>
+void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t threads) {
+  if (ws.visible < ROWS_WORTH_THREADS) threads = 1;
+  constexpr int64_t ahead = 16;
+  const int64_t tiles = grid.tiles_x * grid.tiles_y;
+  int64_t* end = ws.tile_end.data();
+  ws.pairs.reserve(ws.pair_count);
+  std::memcpy(end, ws.tile_begin.data(), tiles * sizeof(int64_t));
 #pragma omp parallel for num_threads(threads) schedule(static)
   for (int64_t part = 0; part < threads; ++part) {
-    int64_t* mine = histogram + part * tiles;
-    const Range range(ws.visible, part, threads);
-    for (int64_t k = range.begin; k < range.end; ++k) {
+    const Range band(tiles, part, threads);
+    for (int64_t k = 0; k < ws.visible; ++k) {
+      if (k + ahead < ws.visible) __builtin_prefetch(&ws.tiles[ws.order[k + ahead]]);
       const int32_t row = ws.order[k];
-      int64_t slot = ws.first_slot[row];
+      int64_t slot = ws.tiles[row].first_slot;
       for_each_tile(ws.tiles[row], ws.splats[row], grid, [&](int64_t tile) {
-        ws.pairs[mine[tile]++] = {row, int32_t(slot++)};
+        if (band.begin <= tile && tile < band.end) ws.pairs[end[tile]++] = {row, int32_t(slot)};
+        ++slot;
       });
     }
   }

@@ -106,15 +106,16 @@ inline void tile_sets(const Splat<Lanes<T>>& s, const Grid<T>& grid, const Integ
   small_masks(s, box, grid, masks);
   for (int r = 0; r < rows; ++r) {
     const uint64_t mask = uint64_t(uint32_t(masks[1][r])) << 32 | uint32_t(masks[0][r]);
-    sets[r] = {mask, int32_t(box.top[r] * grid.tiles_x + box.left[r]), int32_t(__builtin_popcountll(mask))};
+    sets[r] = {mask, int32_t(box.top[r] * grid.tiles_x + box.left[r]), int32_t(__builtin_popcountll(mask)), 0};
     if (!box.small[r]) find_tiles(splats[r], grid, [&](int64_t, int64_t) { ++sets[r].count; });
   }
 }
 
-// Calls visit(tile) for each tile of a splat, always in the same order.
+// Calls visit(tile) for each tile of a row, always in the same order; for none if it is culled.
 template <class T, class Visit>
 inline void for_each_tile(const TileSet& set, const Splat<T>& s, const Grid<T>& grid, Visit visit) {
   if (set.mask == 0) {
+    if (set.count == 0) return;
     find_tiles(s, grid, [&](int64_t x, int64_t y) { visit(y * grid.tiles_x + x); });
     return;
   }

@@ -8,6 +8,12 @@ namespace SPLAT_VARIANT {
 
 using namespace splat;
 
+// A thread's share of `count` things.
+struct Range {
+  int64_t begin, end;
+  Range(int64_t count, int64_t part, int64_t parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
+};
+
 // A tile row of 16 float pixels is one AVX-512 register, two AVX2 registers, four SSE registers.
 constexpr int TILE = 16;
 constexpr int PIXELS = TILE * TILE;
@@ -33,6 +39,7 @@ constexpr int SPLAT_COLUMNS = sizeof(Splat<V>) / sizeof(V);
 struct TileSet {
   uint64_t mask;
   int32_t first, count;
+  int64_t first_slot;  // of the row's pairs, contiguous and in the order of its tiles
 };
 
 // One (splat, tile) pair in a tile's list, nearest first.
@@ -57,12 +64,11 @@ struct Workspace {
   using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
   Buffer<Splat<T>> splats;   // by input row; only visible rows are written
   Buffer<TileSet> tiles;     // by input row; count 0: culled
-  Buffer<int64_t> first_slot;  // by input row
   Buffer<Key> keys, other_keys;
   Buffer<int32_t> order, other_order;  // visible rows, nearest first
   Buffer<int64_t> histogram;
   Buffer<int64_t> tile_begin;  // tiles + 1
-  Buffer<int64_t> tile_end;    // after the last pair that still changed a pixel
+  Buffer<int64_t> tile_end;    // after its last pair; once blended, after the last that still changed a pixel
   Buffer<Pair> pairs;
   Buffer<Slot<T>> slots;
   struct Count {
@@ -75,7 +81,7 @@ struct Workspace {
   double seconds[STAGES] = {};
 
   void poison() {
-    splats.poison(), tiles.poison(), first_slot.poison(), keys.poison(), other_keys.poison(), order.poison();
+    splats.poison(), tiles.poison(), keys.poison(), other_keys.poison(), order.poison();
     other_order.poison(), histogram.poison(), tile_begin.poison(), tile_end.poison(), pairs.poison(), slots.poison();
     count_slots.poison();
   }
