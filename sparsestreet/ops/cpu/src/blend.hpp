@@ -3,6 +3,7 @@
 #include <omp.h>
 
 #include "pixel.hpp"
+#include "tile_order.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -70,6 +71,7 @@ void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
     std::memset(static_cast<void*>(&c), 0, sizeof(c));
     open_tile(c.transmittance, view, x0, y0);
     if (EXCLUSIVE) open_tile(c.gate, view, x0, y0);
+    sort_tile(ws, tile);
     ws.tile_end[tile] = blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
     write_tile(c, view, x0, y0, image);
   }

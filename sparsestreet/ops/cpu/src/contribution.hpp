@@ -4,6 +4,7 @@
 #include <omp.h>
 
 #include "pixel.hpp"
+#include "tile_order.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -36,6 +37,7 @@ template <class T, bool EXCLUSIVE>
 void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   TileCounters<T> c;
+  sort_tile(ws, tile);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
   for (int i = 0; i < PIXELS; ++i) c.best[i] = 0, c.best_pair[i] = -1;
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {

@@ -3,7 +3,7 @@
 #include <omp.h>
 
 #include "columns.hpp"
-#include "sorting.hpp"
+#include "pairs.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -76,7 +76,7 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
   if (radii)
     for (int r = 0; r < count; ++r) radii[first + r] = radius[r];
   if (!any<T>(seen)) {
-    for (int r = 0; r < count; ++r) ws.tiles[first + r] = {0, 0, 0, 0};
+    for (int r = 0; r < count; ++r) ws.tiles[first + r].count = 0, ws.tiles[first + r].mask = 0;
     return;
   }
   color_rows(camera, in, row, p.in_camera, s);
@@ -92,17 +92,16 @@ template <class T>
 bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* radii) {
   const Camera<T> camera(view);
   const Grid<T> grid(view);
-  const int64_t tiles = grid.tiles_x * grid.tiles_y, blocks = (in.count + LANES<T> - 1) / LANES<T>;
+  const int64_t tiles = grid.tiles_x * grid.tiles_y;
   ws.splats.reserve(in.count), ws.tiles.reserve(in.count), ws.histogram.reserve(view.threads * tiles);
   int bad = 0;
 #pragma omp parallel for num_threads(view.threads) schedule(static) reduction(| : bad)
   for (int64_t part = 0; part < view.threads; ++part) {
     int64_t* counts = &ws.histogram[part * tiles];
     std::memset(counts, 0, tiles * sizeof(int64_t));
-    const Range range(blocks, part, view.threads);
-    for (int64_t block = range.begin; block < range.end; ++block) {
-      const int64_t first = block * LANES<T>, rest = in.count - first;
-      const int count = int(rest < LANES<T> ? rest : LANES<T>);
+    const Range range = blocks_of_part<T>(in.count, part, view.threads);
+    for (int64_t first = range.begin; first < range.end; first += LANES<T>) {
+      const int count = int(range.end - first < LANES<T> ? range.end - first : LANES<T>);
       bad |= !valid_rows(in, first, count);
       project_block(ws, camera, grid, in, first, count, radii, counts);
     }
@@ -131,17 +130,15 @@ Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii
   const double start = omp_get_wtime();
   if (!project_rows(ws, view, in, static_cast<T*>(radii))) return BAD_VALUE;
   const double projected = omp_get_wtime();
-  const int key_bits = list_visible(ws, in.count);
+  const Grid<T> grid(view);
+  ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
+  begin_tiles(ws, grid.tiles_x * grid.tiles_y, view.threads);
   report.pairs = ws.pair_count;
   if (ws.pair_count > view.pair_limit) {
     report_worst(ws, in.count, report);
     return TOO_MANY_PAIRS;
   }
-  const Grid<T> grid(view);
-  ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
-  begin_tiles(ws, grid.tiles_x * grid.tiles_y, view.threads);
-  sort_by_depth(ws, key_bits, view.threads);
-  fill_tiles(ws, grid, view.threads);
+  fill_tiles(ws, grid, in.count, view.threads);
   ws.seconds[PROJECT] = projected - start, ws.seconds[BIN] = omp_get_wtime() - projected;
   return OK;
 }

@@ -100,20 +100,22 @@ inline void small_masks(const Splat<Lanes<T>>& s, const TileBoxes<T>& box, const
 // The tiles of each row of a register; count 0 where it was not seen.
 template <class T>
 inline void tile_sets(const Splat<Lanes<T>>& s, const Grid<T>& grid, const Integers<T>& seen, const Splat<T>* splats,
-                      int rows, TileSet* sets) {
+                      int rows, TileSet<T>* sets) {
   const TileBoxes<T> box(s, grid, seen);
   Integers<T> masks[2];
   small_masks(s, box, grid, masks);
+  const Integers<T> depth_bits = as_integers<T>(s.depth);
   for (int r = 0; r < rows; ++r) {
     const uint64_t mask = uint64_t(uint32_t(masks[1][r])) << 32 | uint32_t(masks[0][r]);
-    sets[r] = {mask, int32_t(box.top[r] * grid.tiles_x + box.left[r]), int32_t(__builtin_popcountll(mask)), 0};
+    sets[r] = {mask, 0, int32_t(box.top[r] * grid.tiles_x + box.left[r]), int32_t(__builtin_popcountll(mask)),
+               DepthKey<T>(depth_bits[r])};
     if (!box.small[r]) find_tiles(splats[r], grid, [&](int64_t, int64_t) { ++sets[r].count; });
   }
 }
 
 // Calls visit(tile) for each tile of a row, always in the same order; for none if it is culled.
 template <class T, class Visit>
-inline void for_each_tile(const TileSet& set, const Splat<T>& s, const Grid<T>& grid, Visit visit) {
+inline void for_each_tile(const TileSet<T>& set, const Splat<T>& s, const Grid<T>& grid, Visit visit) {
   if (set.mask == 0) {
     if (set.count == 0) return;
     find_tiles(s, grid, [&](int64_t x, int64_t y) { visit(y * grid.tiles_x + x); });

@@ -11,6 +11,7 @@ using namespace splat;
 // A thread's share of `count` things.
 struct Range {
   int64_t begin, end;
+  Range(int64_t begin, int64_t end) : begin(begin), end(end) {}
   Range(int64_t count, int64_t part, int64_t parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
 };
 
@@ -34,16 +35,24 @@ struct alignas(16 * sizeof(Scalar<V>)) Splat {
 template <class V>
 constexpr int SPLAT_COLUMNS = sizeof(Splat<V>) / sizeof(V);
 
-// The tiles of a splat, found once: bit 8 y + x stands for the tile x right of and y below the first one (of the box).
+// Bits of a positive depth order as the depth does.
+template <class T>
+using DepthKey = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
+
+// The tiles of a row, found once: bit 8 y + x stands for the tile x right of and y below the first one (of the box).
 // A splat that reaches further than 8x8 tiles has mask 0, and its tiles are found anew each time.
+template <class T>
 struct TileSet {
   uint64_t mask;
-  int32_t first, count;
   int64_t first_slot;  // of the row's pairs, contiguous and in the order of its tiles
+  int32_t first, count;
+  DepthKey<T> depth_key;
 };
 
-// One (splat, tile) pair in a tile's list, nearest first.
+// One (splat, tile) pair in a tile's list.
+template <class T>
 struct Pair {
+  DepthKey<T> depth_key;
   int32_t row;   // of the input
   int32_t slot;  // where the pair's gradient goes: slots of a row are contiguous
 };
@@ -61,28 +70,26 @@ constexpr int SLOT_COLUMNS = sizeof(Slot<V>) / sizeof(V);
 
 template <class T>
 struct Workspace {
-  using Key = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
   Buffer<Splat<T>> splats;   // by input row; only visible rows are written
-  Buffer<TileSet> tiles;     // by input row; count 0: culled
-  Buffer<Key> keys, other_keys;
-  Buffer<int32_t> order, other_order;  // visible rows, nearest first
-  Buffer<int64_t> histogram;
+  Buffer<TileSet<T>> tiles;     // by input row; count 0: culled
+  Buffer<int64_t> histogram;   // parts x tiles: pairs of a part of the rows in a tile, then where they begin
+  Buffer<int64_t> part_slots;  // by part: its first slot
   Buffer<int64_t> tile_begin;  // tiles + 1
-  Buffer<int64_t> tile_end;    // after its last pair; once blended, after the last that still changed a pixel
-  Buffer<Pair> pairs;
+  Buffer<int64_t> tile_end;    // after the last pair that still changed a pixel
+  Buffer<Pair<T>> pairs, other_pairs;  // by tile; other_pairs: room for sorting
   Buffer<Slot<T>> slots;
   struct Count {
     double weight;
     int64_t pixels, dominant;
   };
   Buffer<Count> count_slots;
-  int64_t visible = 0, pair_count = 0, tiles_x = 0, tiles_y = 0;
+  int64_t pair_count = 0, tiles_x = 0, tiles_y = 0;
   int64_t samples = 0;  // (splat, pixel) pairs that the forward loops evaluated
   double seconds[STAGES] = {};
 
   void poison() {
-    splats.poison(), tiles.poison(), keys.poison(), other_keys.poison(), order.poison();
-    other_order.poison(), histogram.poison(), tile_begin.poison(), tile_end.poison(), pairs.poison(), slots.poison();
+    splats.poison(), tiles.poison(), histogram.poison(), part_slots.poison(), tile_begin.poison(), tile_end.poison();
+    pairs.poison(), other_pairs.poison(), slots.poison();
     count_slots.poison();
   }
 };
