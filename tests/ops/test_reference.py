@@ -165,7 +165,7 @@ def test_image_does_not_depend_on_the_chunks_of_pixels(monkeypatch):
     view = camera(13, 9)
     gaussians = random_gaussians(40, view)
     whole = render(gaussians, view, "reference")
-    monkeypatch.setattr("sparsestreet.ops.reference._CHUNK_ELEMENTS", 700)
+    monkeypatch.setattr("sparsestreet.ops.reference.blend._CHUNK_ELEMENTS", 700)
     pieces = render(gaussians, view, "reference")
     for name, gradient in whole.gradients.items():
         torch.testing.assert_close(pieces.gradients[name], gradient, rtol=1e-10, atol=1e-12)
