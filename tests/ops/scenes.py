@@ -13,7 +13,7 @@ FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
 BACKENDS = ("reference", "cpu")
 """Every implementation of the op: what is tested for all of them takes the list from here."""
-EFFECT_BACKENDS = ("reference",)
+EFFECT_BACKENDS = ("reference", "cpu")
 """Those with lens, shutter, box, depth bits and half colours."""
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])

@@ -11,11 +11,12 @@ namespace SPLAT_VARIANT {
 template <class T>
 struct Inputs {
   int64_t count, terms;
-  const T *means, *quaternions, *scales, *opacities, *sh;
+  const T *means, *quaternions, *scales, *opacities, *sh, *displacements;
   explicit Inputs(const Rows& r)
       : count(r.count), terms(r.terms), means(static_cast<const T*>(r.means)),
         quaternions(static_cast<const T*>(r.quaternions)), scales(static_cast<const T*>(r.scales)),
-        opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)) {}
+        opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)),
+        displacements(static_cast<const T*>(r.displacements)) {}
 };
 
 // Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorises.
@@ -39,17 +40,23 @@ inline bool valid_rows(const Inputs<T>& in, int64_t first, int64_t count) {
   for (int64_t i = first; i < first + count; ++i) inside &= in.opacities[i] >= 0 && in.opacities[i] <= 1;
   for (int64_t i = 3 * first; i < 3 * (first + count); ++i) inside &= in.scales[i] >= 0;
   return inside && finite(in.means + 3 * first, 3 * count) && finite(in.quaternions + 4 * first, 4 * count) &&
-         finite(in.scales + 3 * first, 3 * count) && finite(in.sh + 3 * in.terms * first, 3 * in.terms * count);
+         finite(in.scales + 3 * first, 3 * count) && finite(in.sh + 3 * in.terms * first, 3 * in.terms * count) &&
+         (!in.displacements || finite(in.displacements + 3 * first, 3 * count));
 }
 
 // Rows row(0), row(1), ... of the input, one per lane.
-template <class T, class RowAt>
+template <class E, class T, class RowAt>
 inline RowValues<Lanes<T>> load_rows(const Inputs<T>& in, RowAt row) {
   RowValues<Lanes<T>> v;
   load_columns<T>([&](int lane) { return in.means + 3 * row(lane); }, 3, &v.mean.x);
   load_columns<T>([&](int lane) { return in.scales + 3 * row(lane); }, 3, &v.scales.x);
   load_columns<T>([&](int lane) { return in.quaternions + 4 * row(lane); }, 4, v.quaternion);
   load_columns<T>([&](int lane) { return in.opacities + row(lane); }, 1, &v.opacity);
+  if constexpr (E::SHUTTER) {
+    v.displacement = Vector<Lanes<T>>{};
+    if (in.displacements)
+      load_columns<T>([&](int lane) { return in.displacements + 3 * row(lane); }, 3, &v.displacement.x);
+  }
   return v;
 }
 
@@ -61,17 +68,20 @@ inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, 
   load_columns<T>([&](int lane) { return in.sh + 3 * in.terms * row(lane); }, int(3 * in.terms), sh);
   const Vector<Lanes<T>> color = view_color(camera, in_camera, sh, in.terms).raw;
   s.color[0] = positive_part(color.x), s.color[1] = positive_part(color.y), s.color[2] = positive_part(color.z);
+  if (camera.half_colors)
+    for (auto& channel : s.color) channel = rounded_to_half<T>(channel);
 }
 
 // Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii, counts pairs per tile.
-template <class T>
+template <class E, class T>
 void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
                    int count, T* radii, int64_t* counts) {
   // The lanes of a last, partial block repeat its last row.
   const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
-  Projection<Lanes<T>> p;
+  const RowValues<Lanes<T>> values = load_rows<E>(in, row);
+  const Projection<E, Lanes<T>> p(camera, values);
   Splat<Lanes<T>> s{};
-  const Integers<T> seen = project(camera, load_rows(in, row), p, s);
+  const Integers<T> seen = project(camera, values, p, s);
   const Lanes<T> radius = seen ? (s.half_x > s.half_y ? s.half_x : s.half_y) : Lanes<T>{};
   if (radii)
     for (int r = 0; r < count; ++r) radii[first + r] = radius[r];
@@ -79,19 +89,21 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
     for (int r = 0; r < count; ++r) ws.tiles[first + r].count = 0, ws.tiles[first + r].mask = 0;
     return;
   }
-  color_rows(camera, in, row, p.in_camera, s);
+  color_rows(camera, in, row, p.placement.mean, s);
   Splat<T>* splats = &ws.splats[first];
   store_columns<T>(&s.x, SPLAT_COLUMNS<T>, count, [&](int r) { return reinterpret_cast<T*>(splats + r); });
   tile_sets(s, grid, seen, splats, count, &ws.tiles[first]);
-  for (int r = 0; r < count; ++r)
+  for (int r = 0; r < count; ++r) {
+    ws.tiles[first + r].depth_key = depth_key(splats[r].depth, camera.depth_bits);
     for_each_tile(ws.tiles[first + r], splats[r], grid, [&](int64_t tile) { ++counts[tile]; });
+  }
 }
 
 // Fills ws.splats, ws.tiles, `radii` and each thread's counts of pairs per tile; false if a row holds a bad value.
-template <class T>
+template <class E, class T>
 bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* radii) {
   const Camera<T> camera(view);
-  const Grid<T> grid(view);
+  const Grid<T> grid(camera);
   const int64_t tiles = grid.tiles_x * grid.tiles_y;
   ws.splats.reserve(in.count), ws.tiles.reserve(in.count), ws.histogram.reserve(view.threads * tiles);
   int bad = 0;
@@ -103,7 +115,7 @@ bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* ra
     for (int64_t first = range.begin; first < range.end; first += LANES<T>) {
       const int count = int(range.end - first < LANES<T> ? range.end - first : LANES<T>);
       bad |= !valid_rows(in, first, count);
-      project_block(ws, camera, grid, in, first, count, radii, counts);
+      project_block<E>(ws, camera, grid, in, first, count, radii, counts);
     }
   }
   return !bad;
@@ -124,13 +136,23 @@ void report_worst(const Workspace<T>& ws, int64_t rows, Report& report) {
   }
 }
 
+// Calls call(Effects<...>{}) with those that the view has.
+template <class Call>
+inline auto with_effects(const View& view, Call call) {
+  if (view.has_lens) return view.has_shutter ? call(Effects<true, true>{}) : call(Effects<true, false>{});
+  return view.has_shutter ? call(Effects<false, true>{}) : call(Effects<false, false>{});
+}
+
 template <class T>
 Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii, Report& report) {
   const Inputs<T> in(rows);
   const double start = omp_get_wtime();
-  if (!project_rows(ws, view, in, static_cast<T*>(radii))) return BAD_VALUE;
+  const bool valid = with_effects(view, [&](auto effects) {
+    return project_rows<decltype(effects)>(ws, view, in, static_cast<T*>(radii));
+  });
+  if (!valid) return BAD_VALUE;
   const double projected = omp_get_wtime();
-  const Grid<T> grid(view);
+  const Grid<T> grid{Camera<T>(view)};
   ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
   begin_tiles(ws, grid.tiles_x * grid.tiles_y, view.threads);
   report.pairs = ws.pair_count;

@@ -34,88 +34,45 @@ inline ScreenGradient<V> screen_gradient(const Slot<V>& sum, const Splat<V>& s) 
   return g;
 }
 
-// Gradients of the rows of V.
-template <class V>
-struct FactorGradient {
-  Vector<V> x, y;
-};
-
-// Through l11 = sqrt(C / det), l21 = -B / sqrt(C det), l22 = 1 / sqrt(C) with C = |Vy|^2 + blur, B = Vx . Vy and
-// det = |Vx x Vy|^2 + blur |V|^2 + blur^2, and through the antialias compensation sqrt(|Vx x Vy|^2 / det).
-template <class T, class V>
-inline FactorGradient<V> factor_backward(const Camera<T>& camera, const Projection<V>& p, const ScreenGradient<V>& g) {
-  const V root_of_both = root(p.variance_y) * root(p.determinant);
-  const V l11 = root(p.variance_y / p.determinant), l21 = -p.covariance / root_of_both, l22 = 1 / root(p.variance_y);
-  const V v_variance = (g.l11 * l11 - g.l21 * l21 - g.l22 * l22) / (2 * p.variance_y);
-  const V v_covariance = -g.l21 / root_of_both;
-  V v_cross = -(g.l11 * l11 + g.l21 * l21) / (2 * p.determinant);  // of |Vx x Vy|^2
-  V v_square = v_cross * camera.blur;                              // of |V|^2
+// Through l11 = sqrt(C_yy / det), l21 = -C_xy / sqrt(C_yy det), l22 = 1 / sqrt(C_yy) and the antialias compensation
+// sqrt(bare / det) to the footprint, with det = bare + blur |F|^2 + blur^2 and bare the sum of squared minors.
+template <class T, class V, int K>
+inline Footprint<V, K> footprint_backward(const Camera<T>& camera, const Footprint<V, K>& f,
+                                          const ScreenGradient<V>& g) {
+  const Covariance<V, K> c(camera, f);
+  const V deviations = root(c.yy) * root(c.determinant);
+  const V l11 = root(c.yy / c.determinant), l21 = -c.xy / deviations, l22 = 1 / root(c.yy);
+  const V v_yy = (g.l11 * l11 - g.l21 * l21 - g.l22 * l22) / (2 * c.yy), v_xy = -g.l21 / deviations;
+  V v_bare = -(g.l11 * l11 + g.l21 * l21) / (2 * c.determinant);
+  V v_square = v_bare * camera.blur;  // of |F|^2
   if (camera.antialias) {
-    // d ratio = ((1 - ratio) d|Vx x Vy|^2 - ratio blur d|V|^2) / det, and the logarithm of the opacity holds ratio / 2.
-    const V ratio = p.bare_determinant / p.determinant;
+    // d ratio = ((1 - ratio) d bare - ratio blur d|F|^2) / det, and the logarithm of the opacity holds ln(ratio) / 2.
+    const V ratio = c.bare_determinant / c.determinant;
     const V v_ratio = ratio > T(COMPENSATION_FLOOR) ? g.log_opacity / (2 * ratio) : V{};
-    v_cross += v_ratio * (1 - ratio) / p.determinant;
-    v_square -= v_ratio * ratio * camera.blur / p.determinant;
+    v_bare += v_ratio * (1 - ratio) / c.determinant;
+    v_square -= v_ratio * ratio * camera.blur / c.determinant;
   }
-  const Vector<V> c = cross(p.factor_x, p.factor_y);
-  return {(2 * v_cross) * cross(p.factor_y, c) + (2 * v_square) * p.factor_x + v_covariance * p.factor_y,
-          (2 * v_cross) * cross(c, p.factor_x) + (2 * (v_square + v_variance)) * p.factor_y +
-              v_covariance * p.factor_x};
-}
-
-template <class V>
-inline void quaternion_backward(const Projection<V>& p, const Matrix<V>& v, V* out) {
-  const V w = p.quaternion[0], x = p.quaternion[1], y = p.quaternion[2], z = p.quaternion[3];
-  const Vector<V>&a = v.rows[0], &b = v.rows[1], &c = v.rows[2];
-  const V g[4] = {2 * (x * (c.y - b.z) + y * (a.z - c.x) + z * (b.x - a.y)),
-                  2 * (w * (c.y - b.z) + y * (a.y + b.x) + z * (a.z + c.x)) - 4 * x * (b.y + c.z),
-                  2 * (w * (a.z - c.x) + x * (a.y + b.x) + z * (b.z + c.y)) - 4 * y * (a.x + c.z),
-                  2 * (w * (b.x - a.y) + x * (a.z + c.x) + y * (b.z + c.y)) - 4 * z * (a.x + b.y)};
-  const V along = g[0] * w + g[1] * x + g[2] * y + g[3] * z;
-  for (int i = 0; i < 4; ++i) out[i] = p.length > V{} ? (g[i] - along * p.quaternion[i]) / p.length : V{};
-}
-
-// From the gradient of R_cam R S to those of the quaternion and the scales.
-template <class T, class V>
-inline void axes_backward(const Camera<T>& camera, const RowValues<V>& row, const Projection<V>& p, const Matrix<V>& v,
-                          RowValues<V>& out) {
-  const Vector<T>&x = camera.rotation.rows[0], &y = camera.rotation.rows[1], &z = camera.rotation.rows[2];
-  Matrix<V> v_axes{{x.x * v.rows[0] + y.x * v.rows[1] + z.x * v.rows[2],
-                    x.y * v.rows[0] + y.y * v.rows[1] + z.y * v.rows[2],
-                    x.z * v.rows[0] + y.z * v.rows[1] + z.z * v.rows[2]}};  // R_cam^T v
-  out.scales = Vector<V>{};
-  for (int i = 0; i < 3; ++i) {
-    const Vector<V>& r = p.world_from_gaussian.rows[i];
-    Vector<V>& a = v_axes.rows[i];
-    out.scales = out.scales + Vector<V>{a.x * r.x, a.y * r.y, a.z * r.z};
-    a = {a.x * row.scales.x, a.y * row.scales.y, a.z * row.scales.z};
+  Footprint<V, K> out;
+  out.x = g.x, out.y = g.y;
+  for (int i = 0; i < K; ++i) {
+    V along_x{}, along_y{};
+    for (int j = 0; j < K; ++j) {
+      const V minor = f.factor_x[i] * f.factor_y[j] - f.factor_x[j] * f.factor_y[i];
+      along_x += minor * f.factor_y[j], along_y -= minor * f.factor_x[j];
+    }
+    out.factor_x[i] = 2 * (v_bare * along_x + v_square * f.factor_x[i]) + v_xy * f.factor_y[i];
+    out.factor_y[i] = 2 * (v_bare * along_y + (v_square + v_yy) * f.factor_y[i]) + v_xy * f.factor_x[i];
   }
-  quaternion_backward(p, v_axes, out.quaternion);
-}
-
-// Gradients of the shape: fills those of quaternion and scales, answers that of the mean in the camera through J.
-template <class T, class V>
-inline Vector<V> shape_backward(const Camera<T>& camera, const RowValues<V>& row, const Projection<V>& p,
-                                const FactorGradient<V>& g, RowValues<V>& out) {
-  const Matrix<V>& m = p.camera_from_gaussian;
-  const V iz = p.inverse_z, jx = camera.fx * iz, jy = camera.fy * iz;
-  const Matrix<V> v_m{{jx * g.x, jy * g.y, (-jx * p.slope[0]) * g.x + (-jy * p.slope[1]) * g.y}};
-  axes_backward(camera, row, p, v_m, out);
-
-  const V v_jxx = dot(g.x, m.rows[0]), v_jxz = dot(g.x, m.rows[2]);
-  const V v_jyy = dot(g.y, m.rows[1]), v_jyz = dot(g.y, m.rows[2]);
-  const V x = p.inside[0] ? -jx * v_jxz * iz : V{}, y = p.inside[1] ? -jy * v_jyz * iz : V{};
-  const V z = -iz * (jx * v_jxx + jy * v_jyy - jx * p.slope[0] * v_jxz - jy * p.slope[1] * v_jyz);
-  return {x, y, z - x * p.slope[0] - y * p.slope[1]};
+  return out;
 }
 
 // Fills the gradient of the coefficients; answers that of the mean in the camera through the direction.
 template <class T, class V>
-inline Vector<V> color_backward(const Camera<T>& camera, const Vector<V>& in_camera, const Vector<V>& v_color,
+inline Vector<V> color_backward(const Camera<T>& camera, const Vector<V>& in_camera, const Vector<V>& v_colors,
                                 const V* sh, int64_t terms, V* sh_out) {
   const ViewColor<V> c = view_color(camera, in_camera, sh, terms);
-  const Vector<V> v = {c.raw.x > V{} ? v_color.x : V{}, c.raw.y > V{} ? v_color.y : V{},
-                       c.raw.z > V{} ? v_color.z : V{}};
+  const Vector<V> v = {c.raw.x > V{} ? v_colors.x : V{}, c.raw.y > V{} ? v_colors.y : V{},
+                       c.raw.z > V{} ? v_colors.z : V{}};
   V v_values[16];
   for (int64_t k = 0; k < terms; ++k) {
     v_values[k] = sh[3 * k] * v.x + sh[3 * k + 1] * v.y + sh[3 * k + 2] * v.z;
@@ -126,17 +83,23 @@ inline Vector<V> color_backward(const Camera<T>& camera, const Vector<V>& in_cam
   return camera.rotation * ((1 / c.distance) * (v_direction + -along * c.direction));
 }
 
-// All gradients of a register of rows but that of the harmonics' coefficients. `v_mean`: of the mean in the camera,
+// All gradients of a register of rows but that of the harmonics' coefficients. `v_color`: of the mean in the camera,
 // through the colour.
-template <class T, class V>
-inline RowValues<V> row_backward(const Camera<T>& camera, const RowValues<V>& row, const Projection<V>& p,
-                                 const ScreenGradient<V>& g, const Vector<V>& v_mean) {
+template <class T, class E, class V>
+inline RowValues<V> row_backward(const Camera<T>& camera, const RowValues<V>& row, const Projection<E, V>& p,
+                                 const ScreenGradient<V>& g, const Vector<V>& v_color) {
+  auto v_footprint = footprint_backward(camera, p.footprint, g);
+  Vector<V> v_mean = v_color;
+  v_mean.z += g.depth;
+  if constexpr (E::SHUTTER) {
+    V v_u_x, v_u_y;
+    read_out_backward(p.motion, camera.height, p.footprint, v_footprint, v_u_x, v_u_y);
+    v_mean = v_mean + p.motion.backward(camera, p.placement, v_u_x, v_u_y);
+  }
+  PlacementGradient<V> v = p.model.backward(camera, p.placement, v_footprint);
+  v.mean = v.mean + v_mean;
   RowValues<V> out;
-  const Vector<V> v_shape = shape_backward(camera, row, p, factor_backward(camera, p, g), out);
-  const V jx = camera.fx * p.inverse_z, jy = camera.fy * p.inverse_z;
-  const Vector<V> v_place{g.x * jx, g.y * jy,
-                          g.depth - (g.x * jx * p.in_camera.x + g.y * jy * p.in_camera.y) * p.inverse_z};
-  out.mean = transposed(camera.rotation, v_shape + v_place + v_mean);
+  place_backward(camera, row, p.placement, v, out);
   out.opacity = g.log_opacity / row.opacity;
   return out;
 }
@@ -178,7 +141,7 @@ inline Slot<Lanes<T>> sum_slots(const Workspace<T>& ws, RowAt row) {
 }
 
 // `count` visible rows, at most LANES.
-template <class T>
+template <class E, class T>
 void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
                     const int64_t* rows, int count) {
   using V = Lanes<T>;
@@ -186,15 +149,13 @@ void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Input
   const int coefficients = int(3 * in.terms);
   Splat<V> splat;
   load_columns<T>([&](int r) { return reinterpret_cast<const T*>(&ws.splats[row(r)]); }, SPLAT_COLUMNS<T>, &splat.x);
-  const RowValues<V> values = load_rows(in, row);
-  Projection<V> p;
-  place(camera, values, p);
-  project_shape(camera, p);
+  const RowValues<V> values = load_rows<E>(in, row);
+  const Projection<E, V> p(camera, values);
   const ScreenGradient<V> g = screen_gradient(sum_slots(ws, row), splat);
   V sh[3 * 16], v_sh[3 * 16];
   load_columns<T>([&](int r) { return in.sh + 3 * in.terms * row(r); }, coefficients, sh);
-  const Vector<V> v_mean = color_backward(camera, p.in_camera, g.color, sh, in.terms, v_sh);
-  const RowValues<V> v = row_backward(camera, values, p, g, v_mean);
+  const Vector<V> v_color = color_backward(camera, p.placement.mean, g.color, sh, in.terms, v_sh);
+  const RowValues<V> v = row_backward(camera, values, p, g, v_color);
   store_columns<T>(&v.mean.x, 3, count, [&](int r) { return out.means + 3 * row(r); });
   store_columns<T>(v.quaternion, 4, count, [&](int r) { return out.quaternions + 4 * row(r); });
   store_columns<T>(&v.scales.x, 3, count, [&](int r) { return out.scales + 3 * row(r); });
@@ -205,7 +166,7 @@ void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Input
 
 // Rows `range` of the input: culled ones get zeros, the others are gathered until they fill a register. In which lane
 // a row is computed does not change its bits.
-template <class T>
+template <class E, class T>
 void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
                     const Range& range) {
   int64_t rows[LANES<T>];
@@ -216,9 +177,9 @@ void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Input
       continue;
     }
     rows[count++] = i;
-    if (count == LANES<T>) backward_block(ws, camera, in, out, rows, count), count = 0;
+    if (count == LANES<T>) backward_block<E>(ws, camera, in, out, rows, count), count = 0;
   }
-  if (count > 0) backward_block(ws, camera, in, out, rows, count);
+  if (count > 0) backward_block<E>(ws, camera, in, out, rows, count);
 }
 
 template <class T>
@@ -227,9 +188,11 @@ void project_backward(Workspace<T>& ws, const View& view, const Rows& rows, cons
   const Inputs<T> in(rows);
   const Outputs<T> out(gradients, in.terms);
   const Camera<T> camera(view);
+  with_effects(view, [&](auto effects) {
 #pragma omp parallel for num_threads(view.threads) schedule(static)
-  for (int64_t part = 0; part < view.threads; ++part)
-    backward_range(ws, camera, in, out, Range(in.count, part, view.threads));
+    for (int64_t part = 0; part < view.threads; ++part)
+      backward_range<decltype(effects)>(ws, camera, in, out, Range(in.count, part, view.threads));
+  });
   ws.seconds[PROJECT_BACKWARD] = omp_get_wtime() - start;
 }
 

@@ -10,9 +10,9 @@ struct Grid {
   bool bounded;  // splats end somewhere
   int64_t tiles_x, tiles_y;
 
-  explicit Grid(const View& v)
-      : width(v.width), height(v.height), bounded(v.alpha_min > 0), tiles_x((v.width + TILE - 1) / TILE),
-        tiles_y((v.height + TILE - 1) / TILE) {}
+  explicit Grid(const Camera<T>& c)
+      : width(c.width), height(c.height), bounded(c.bounded()), tiles_x((int64_t(c.width) + TILE - 1) / TILE),
+        tiles_y((int64_t(c.height) + TILE - 1) / TILE) {}
 };
 
 // The ellipse |L d|^2 <= reach as x(dy) = slope dy -+ half_width sqrt(1 - (dy / half_y)^2); its right-most point lies
@@ -97,6 +97,20 @@ inline void small_masks(const Splat<Lanes<T>>& s, const TileBoxes<T>& box, const
   }
 }
 
+// What orders splats by depth: the upper `bits` of the depth as float32, or all digits of T.
+template <class T>
+inline DepthKey<T> depth_key(T depth, int bits) {
+  if (sizeof(T) == 4 || bits < 32) {
+    const float single = float(depth);
+    uint32_t key;
+    std::memcpy(&key, &single, sizeof(key));
+    return key & (~uint32_t(0) << (32 - bits));
+  }
+  DepthKey<T> key;
+  std::memcpy(&key, &depth, sizeof(key));
+  return key;
+}
+
 // The tiles of each row of a register; count 0 where it was not seen.
 template <class T>
 inline void tile_sets(const Splat<Lanes<T>>& s, const Grid<T>& grid, const Integers<T>& seen, const Splat<T>* splats,
@@ -104,11 +118,10 @@ inline void tile_sets(const Splat<Lanes<T>>& s, const Grid<T>& grid, const Integ
   const TileBoxes<T> box(s, grid, seen);
   Integers<T> masks[2];
   small_masks(s, box, grid, masks);
-  const Integers<T> depth_bits = as_integers<T>(s.depth);
   for (int r = 0; r < rows; ++r) {
     const uint64_t mask = uint64_t(uint32_t(masks[1][r])) << 32 | uint32_t(masks[0][r]);
-    sets[r] = {mask, 0, int32_t(box.top[r] * grid.tiles_x + box.left[r]), int32_t(__builtin_popcountll(mask)),
-               DepthKey<T>(depth_bits[r])};
+    sets[r].mask = mask, sets[r].count = __builtin_popcountll(mask);
+    sets[r].first = int32_t(box.top[r] * grid.tiles_x + box.left[r]);
     if (!box.small[r]) find_tiles(splats[r], grid, [&](int64_t, int64_t) { ++sets[r].count; });
   }
 }

@@ -94,6 +94,20 @@ inline Lanes<T> log2_positive(const Lanes<T>& v) {
   return T(2.8853900817779268) * s * series + as_value(exponent);  // 2 / ln 2
 }
 
+// The nearest float16 of numbers >= 0, at most its largest finite one. Through float32, as torch does.
+template <class T>
+inline Lanes<T> rounded_to_half(const Lanes<T>& given) {
+  constexpr int dropped = (sizeof(T) == 4 ? 23 : 52) - 10;
+  constexpr T largest = 65504, least_normal = T(6.103515625e-5), subnormal_sum = T(int64_t(1) << (dropped + 10)) / (1 << 24);
+  Lanes<T> v;
+  for (int i = 0; i < LANES<T>; ++i) v[i] = T(float(given[i]));
+  v = v < largest ? v : same(largest);
+  const Integers<T> one = Integers<T>{} + 1, bits = as_integers<T>(v);
+  const Integers<T> to_even = bits + ((one << (dropped - 1)) - 1) + ((bits >> dropped) & 1);
+  // Added, the last digit of the sum is that of the subnormals, 2^-24.
+  return v < least_normal ? (v + subnormal_sum) - subnormal_sum : as_lanes<T>((to_even >> dropped) << dropped);
+}
+
 template <class T>
 inline bool any(const Integers<T>& mask) {
   Index<T> together = 0;
