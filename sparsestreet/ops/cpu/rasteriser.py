@@ -85,14 +85,14 @@ class _Blend(torch.autograd.Function):
         )
         _raise_for(status, fields, displacements, report)
         ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*fields, displacements, rgb, transmittance, depth_sum)
+        ctx.save_for_backward(*fields, displacements, transmittance)
         ctx.view, ctx.lease = view, lease
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, displacements, rgb, transmittance, depth_sum = ctx.saved_tensors
+        *fields, displacements, transmittance = ctx.saved_tensors
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
@@ -100,7 +100,7 @@ class _Blend(torch.autograd.Function):
             ctx.lease.workspace.handle,
             byref(ctx.view),
             byref(_rows(fields, displacements)),
-            byref(_layers(rgb, transmittance, depth_sum)),
+            transmittance.data_ptr(),
             byref(_layers(*cotangents)),
             byref(native.RowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
         )

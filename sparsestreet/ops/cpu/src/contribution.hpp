@@ -22,8 +22,8 @@ inline void count_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts,
   for (int x = 0; x < TILE; x += LANES<T>) {
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
-    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
-    const Lanes<T> weight = p.alpha * transmittance;
+    const Lanes<T> weight = transmittance * still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha,
+                                                                     cuts, transmittance, c.gate + at);
     store(c.transmittance + at, transmittance - weight);
     for (int i = 0; i < LANES<T>; ++i) {
       count.weight += double(weight[i]), count.pixels += weight[i] > 0;

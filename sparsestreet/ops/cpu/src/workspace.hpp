@@ -75,7 +75,8 @@ struct Workspace {
   Buffer<int64_t> histogram;   // parts x tiles: pairs of a part of the rows in a tile, then where they begin
   Buffer<int64_t> part_slots;  // by part: its first slot
   Buffer<int64_t> tile_begin;  // tiles + 1
-  Buffer<int64_t> tile_end;    // after the last pair that still changed a pixel
+  Buffer<int64_t> tile_end;    // after the last pair that the forward loop looked at
+  Buffer<T> last_pairs;        // by tile and pixel: the last pair that was blended, counted from tile_begin; -1: none
   Buffer<Pair<T>> pairs, other_pairs;  // by tile; other_pairs: room for sorting
   Buffer<Slot<T>> slots;
   struct Count {
@@ -89,7 +90,7 @@ struct Workspace {
 
   void poison() {
     splats.poison(), tiles.poison(), histogram.poison(), part_slots.poison(), tile_begin.poison(), tile_end.poison();
-    pairs.poison(), other_pairs.poison(), slots.poison();
+    pairs.poison(), other_pairs.poison(), last_pairs.poison(), slots.poison();
     count_slots.poison();
   }
 };
