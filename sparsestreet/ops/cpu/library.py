@@ -2,15 +2,17 @@
 
 import ctypes
 import importlib.metadata
+import os
 from ctypes import c_double, c_int32, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
 # torch first: the library then shares torch's OpenMP runtime and its threads.
-import torch  # noqa: F401
+import torch
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
 _INTERFACE_VERSION = 2
+_LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
 STAGES = ("project", "bin", "blend", "blend_backward", "project_backward", "count")
@@ -106,6 +108,12 @@ def load_library() -> ctypes.CDLL:
         raise RuntimeError(f"{path} has interface {version}, this package needs {_INTERFACE_VERSION}: {remedy()}")
     _declare(library)
     return library
+
+
+def thread_count() -> int:
+    """Threads a call may use: torch's number, but one in a forked child, where the OpenMP runtime would wait for
+    threads that only its parent has."""
+    return torch.get_num_threads() if os.getpid() == _LOADED_IN else 1
 
 
 def _declare(library: ctypes.CDLL) -> None:

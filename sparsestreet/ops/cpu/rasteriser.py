@@ -145,7 +145,7 @@ def _view(camera: Camera, settings: SplatSettings) -> native.View:
         has_lens=camera.distortion is not None,
         has_shutter=camera.shutter is not None,
         pair_limit=PAIR_LIMIT,
-        threads=torch.get_num_threads(),
+        threads=native.thread_count(),
     )
     if camera.distortion is not None:
         view.distortion[:] = camera.distortion.tolist()
