@@ -2,29 +2,38 @@
 
 import ctypes
 import importlib.metadata
+import os
 from ctypes import c_double, c_int32, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
 # torch first: the library then shares torch's OpenMP runtime and its threads.
-import torch  # noqa: F401
+import torch
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
-_INTERFACE_VERSION = 2
+_INTERFACE_VERSION = 3
+_LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
 STAGES = ("project", "bin", "blend", "blend_backward", "project_backward", "count")
 
 
 class View(ctypes.Structure):
-    """A pinhole camera and the settings of one rendering."""
+    """A camera and the settings of one rendering."""
 
     _fields_ = (
         ("rotation", c_double * 9),
         ("translation", c_double * 3),
         *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
         *((name, c_double) for name in ("alpha_min", "alpha_max", "transmittance_min", "blur", "near_plane")),
-        *((name, c_int64) for name in ("width", "height", "exclusive_stop", "antialias", "pair_limit", "threads")),
+        ("box", c_double),
+        ("distortion", c_double * 5),
+        ("fold", c_double),
+        ("shutter_translation", c_double * 3),
+        ("shutter_rotation", c_double * 3),
+        *((name, c_int64) for name in ("width", "height")),
+        *((name, c_int64) for name in ("exclusive_stop", "antialias", "half_colors", "depth_bits")),
+        *((name, c_int64) for name in ("has_lens", "has_shutter", "pair_limit", "threads")),
     )
 
 
@@ -34,7 +43,7 @@ class Rows(ctypes.Structure):
     _fields_ = (
         ("count", c_int64),
         ("terms", c_int64),
-        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh")),
+        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "displacements")),
     )
 
 
@@ -105,6 +114,12 @@ def load_library() -> ctypes.CDLL:
         raise RuntimeError(f"{path} has interface {version}, this package needs {_INTERFACE_VERSION}: {remedy()}")
     _declare(library)
     return library
+
+
+def thread_count() -> int:
+    """Threads a call may use: torch's number, but one in a forked child, where the OpenMP runtime would wait for
+    threads that only its parent has."""
+    return torch.get_num_threads() if os.getpid() == _LOADED_IN else 1
 
 
 def _declare(library: ctypes.CDLL) -> None:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import Raster
@@ -16,7 +17,7 @@ from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 
 DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
-"""(splat, tile) pairs of one rendering; each takes 8 bytes forward and 48 (float32) more backward."""
+"""(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward in float32."""
 
 
 class PairLimitError(RuntimeError):
@@ -36,10 +37,8 @@ def rasterise(
     """
     _check_dtype(gaussians)
     g = gaussians
-    layers = _Blend.apply(
-        g.means, g.quaternions, g.scales, g.opacities, g.sh, screen_offsets, _view(camera, settings), variant
-    )
-    return Raster(*layers)
+    fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
+    return Raster(*_Blend.apply(*fields, screen_offsets, _moved(g), _view(camera, settings), variant))
 
 
 def contribution(
@@ -49,14 +48,19 @@ def contribution(
     _check_dtype(gaussians)
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
+    displacements = _moved(g)
     lease, report = Lease(g.means.dtype, variant), native.Report()
     weight = torch.empty(len(g), dtype=torch.float64)
     pixels, dominant = torch.empty(2, len(g), dtype=torch.int64)
     counters = native.Counters(weight.data_ptr(), pixels.data_ptr(), dominant.data_ptr())
     status = native.load_library().splat_contribution(
-        lease.workspace.handle, byref(_view(camera, settings)), byref(_rows(fields)), byref(counters), byref(report)
+        lease.workspace.handle,
+        byref(_view(camera, settings)),
+        byref(_rows(fields, displacements)),
+        byref(counters),
+        byref(report),
     )
-    _raise_for(status, fields, report)
+    _raise_for(status, fields, displacements, report)
     return Contribution(weight, pixels, dominant)
 
 
@@ -71,18 +75,19 @@ def removal(
     _check_dtype(gaussians)
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
+    displacements = _moved(g)
     lease, report = Lease(g.means.dtype, variant), native.Report()
     largest, squared = torch.empty(2, len(g), dtype=torch.float64)
     behind = None if background is None else background.detach().contiguous()
     status = native.load_library().splat_removal(
         lease.workspace.handle,
         byref(_view(camera, settings)),
-        byref(_rows(fields)),
+        byref(_rows(fields, displacements)),
         None if behind is None else behind.data_ptr(),
         byref(native.Changes(largest.data_ptr(), squared.data_ptr())),
         byref(report),
     )
-    _raise_for(status, fields, report)
+    _raise_for(status, fields, displacements, report)
     return Removal(largest, squared)
 
 
@@ -90,7 +95,7 @@ class _Blend(torch.autograd.Function):
     """Five fields and the screen offsets to the layers of a Raster."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, view, variant):
+    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, variant):
         ctx.set_materialize_grads(False)
         fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
         rgb = means.new_empty(view.height, view.width, 3)
@@ -100,34 +105,34 @@ class _Blend(torch.autograd.Function):
         status = native.load_library().splat_forward(
             lease.workspace.handle,
             byref(view),
-            byref(_rows(fields)),
+            byref(_rows(fields, displacements)),
             byref(_layers(rgb, transmittance, depth_sum)),
             radii.data_ptr(),
             byref(report),
         )
-        _raise_for(status, fields, report)
+        _raise_for(status, fields, displacements, report)
         ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*fields, rgb, transmittance, depth_sum)
+        ctx.save_for_backward(*fields, displacements, transmittance)
         ctx.view, ctx.lease = view, lease
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, rgb, transmittance, depth_sum = ctx.saved_tensors
+        *fields, displacements, transmittance = ctx.saved_tensors
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
         status = native.load_library().splat_backward(
             ctx.lease.workspace.handle,
             byref(ctx.view),
-            byref(_rows(fields)),
-            byref(_layers(rgb, transmittance, depth_sum)),
+            byref(_rows(fields, displacements)),
+            transmittance.data_ptr(),
             byref(_layers(*cotangents)),
             byref(native.RowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
         )
-        _raise_for(status, fields, native.Report())
-        return *gradients, screen, None, None
+        _raise_for(status, fields, displacements, native.Report())
+        return *gradients, screen, None, None, None
 
 
 def _check_dtype(gaussians: Gaussians) -> None:
@@ -138,42 +143,63 @@ def _check_dtype(gaussians: Gaussians) -> None:
         )
 
 
+def _moved(gaussians: Gaussians) -> Tensor | None:
+    moved = gaussians.displacements
+    return None if moved is None else moved.detach().contiguous()
+
+
 def _view(camera: Camera, settings: SplatSettings) -> native.View:
     pose, intrinsics = camera.camera_from_world.tolist(), camera.intrinsics.tolist()
-    return native.View(
-        (c_double * 9)(*(value for row in pose[:3] for value in row[:3])),
-        (c_double * 3)(*(row[3] for row in pose[:3])),
-        intrinsics[0][0],
-        intrinsics[1][1],
-        intrinsics[0][2],
-        intrinsics[1][2],
-        settings.alpha_min,
-        settings.alpha_max,
-        settings.transmittance_min,
-        settings.blur,
-        settings.near,
-        camera.width,
-        camera.height,
-        settings.stop == "exclusive",
-        settings.antialias,
-        PAIR_LIMIT,
-        torch.get_num_threads(),
+    view = native.View(
+        rotation=(c_double * 9)(*(value for row in pose[:3] for value in row[:3])),
+        translation=(c_double * 3)(*(row[3] for row in pose[:3])),
+        fx=intrinsics[0][0],
+        fy=intrinsics[1][1],
+        cx=intrinsics[0][2],
+        cy=intrinsics[1][2],
+        alpha_min=settings.alpha_min,
+        alpha_max=settings.alpha_max,
+        transmittance_min=settings.transmittance_min,
+        blur=settings.blur,
+        near_plane=settings.near,
+        box=settings.box,
+        width=camera.width,
+        height=camera.height,
+        exclusive_stop=settings.stop == "exclusive",
+        antialias=settings.antialias,
+        half_colors=settings.half_colors,
+        depth_bits=settings.depth_bits,
+        has_lens=camera.distortion is not None,
+        has_shutter=camera.shutter is not None,
+        pair_limit=PAIR_LIMIT,
+        threads=native.thread_count(),
     )
+    if camera.distortion is not None:
+        view.distortion[:] = camera.distortion.tolist()
+        view.fold = fold_radius_squared(camera.distortion)
+    if camera.shutter is not None:
+        view.shutter_translation[:] = camera.shutter.translation.tolist()
+        view.shutter_rotation[:] = camera.shutter.rotation.tolist()
+    return view
 
 
-def _rows(fields: tuple[Tensor, ...] | list[Tensor]) -> native.Rows:
-    return native.Rows(fields[0].shape[0], fields[4].shape[1], *(field.data_ptr() for field in fields))
+def _rows(fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None) -> native.Rows:
+    pointers = (field.data_ptr() for field in fields)
+    moved = None if displacements is None else displacements.data_ptr()
+    return native.Rows(fields[0].shape[0], fields[4].shape[1], *pointers, moved)
 
 
 def _layers(*layers: Tensor | None) -> native.Layers:
     return native.Layers(*(None if layer is None else layer.data_ptr() for layer in layers))
 
 
-def _raise_for(status: int, fields: tuple[Tensor, ...] | list[Tensor], report: native.Report) -> None:
+def _raise_for(
+    status: int, fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, report: native.Report
+) -> None:
     if status == native.STATUS_OK:
         return
     if status == native.STATUS_BAD_VALUE:
-        check_values(Gaussians(*fields))
+        check_values(Gaussians(*fields, displacements))
     if status == native.STATUS_TOO_MANY_PAIRS:
         worst = ", ".join(
             f"row {row} ({pairs})" for row, pairs in zip(report.worst_rows, report.worst_pairs, strict=True) if row >= 0

@@ -3,22 +3,26 @@
 #include <omp.h>
 
 #include "pixel.hpp"
+#include "tile_order.hpp"
 
 namespace SPLAT_VARIANT {
 
 template <class T>
 struct TileColors {
   alignas(64) T transmittance[PIXELS], gate[PIXELS], red[PIXELS], green[PIXELS], blue[PIXELS], depth[PIXELS];
+  alignas(64) T last[PIXELS];  // the last pair that was blended, counted in the tile
 };
 
 template <class T, bool EXCLUSIVE>
-inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c, int row) {
+inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c, int row, T pair) {
   const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
   for (int x = 0; x < TILE; x += LANES<T>) {
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
-    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
-    const Lanes<T> weight = p.alpha * transmittance;
+    const Lanes<T> alpha = still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha, cuts,
+                                                    transmittance, c.gate + at);
+    const Lanes<T> weight = alpha * transmittance;
+    store(c.last + at, alpha > Lanes<T>{} ? same(pair) : load(c.last + at));
     store(c.transmittance + at, transmittance - weight);
     store(c.red + at, load(c.red + at) + weight * s.color[0]);
     store(c.green + at, load(c.green + at) + weight * s.color[1]);
@@ -27,13 +31,13 @@ inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts,
   }
 }
 
-// Answers the index after the last pair that was blended.
+// Answers the index after the last pair that was looked at.
 template <class T, bool EXCLUSIVE>
 int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
                    TileColors<T>& c, int64_t& samples) {
-  const int64_t end = ws.tile_begin[tile + 1];
-  for (int64_t k = ws.tile_begin[tile]; k < end; ++k) {
-    if ((k - ws.tile_begin[tile]) % LOOK == 0 &&
+  const int64_t begin = ws.tile_begin[tile], end = ws.tile_begin[tile + 1];
+  for (int64_t k = begin; k < end; ++k) {
+    if ((k - begin) % LOOK == 0 &&
         tile_finished(EXCLUSIVE ? c.gate : c.transmittance, cuts.transmittance_min))
       return k;
     if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
@@ -41,7 +45,7 @@ int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
     const TileSplat<T> here(s, x0, y0);
     samples += (here.last - here.first + 1) * TILE;
     for (int y = here.first; y <= here.last; ++y)
-      blend_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y);
+      blend_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y, T(k - begin));
   }
   return end;
 }
@@ -63,15 +67,19 @@ template <class T, bool EXCLUSIVE>
 void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
   const Cuts<T> cuts(view);
   int64_t samples = 0;
+  ws.last_pairs.reserve(ws.tiles_x * ws.tiles_y * PIXELS);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1) reduction(+ : samples)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
     TileColors<T> c;
     std::memset(static_cast<void*>(&c), 0, sizeof(c));
+    for (T& pair : c.last) pair = -1;
     open_tile(c.transmittance, view, x0, y0);
     if (EXCLUSIVE) open_tile(c.gate, view, x0, y0);
+    sort_tile(ws, tile);
     ws.tile_end[tile] = blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
     write_tile(c, view, x0, y0, image);
+    std::memcpy(&ws.last_pairs[tile * PIXELS], c.last, sizeof(c.last));
   }
   ws.samples = samples;
 }

@@ -1,6 +1,8 @@
-// Backward, front to back again: dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light still behind k), where
-// f = colour and depth against the cotangents and the light behind is the pixel's total minus the prefix. Nothing is
-// divided out of the transmittance, so saturated pixels keep their digits. Each pair writes its own slot: no atomics.
+// Backward, from the last splat of a pixel to the first: dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light
+// from behind k), where f = colour and depth against the cotangents. The light from behind is summed from the back, its
+// small terms first, and the transmittance before a splat is that after it / (1 - alpha): both keep their relative
+// digits however deep the stack. (Total minus prefix, from the front, would carry the rounding of the total to the
+// faintest splat.) Each pair writes its own slot: no atomics.
 #pragma once
 #include <omp.h>
 
@@ -11,7 +13,7 @@ namespace SPLAT_VARIANT {
 // Cotangents of a tile's pixels and the running state.
 template <class T>
 struct TileCotangents {
-  alignas(64) T transmittance[PIXELS], gate[PIXELS], behind[PIXELS], red[PIXELS], green[PIXELS], blue[PIXELS],
+  alignas(64) T transmittance[PIXELS], last[PIXELS], behind[PIXELS], red[PIXELS], green[PIXELS], blue[PIXELS],
       depth[PIXELS];
 };
 
@@ -21,19 +23,19 @@ struct Columns {
   Lanes<T> s{}, sa{}, sb{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{};
 };
 
-template <class T, bool EXCLUSIVE>
+template <class T>
 inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
-                           int at, Columns<T>& sums) {
+                           int at, T pair, Columns<T>& sums) {
   const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
-  const Lanes<T> transmittance = load(t.transmittance + at);
-  const Sample<T> q = sample<T, EXCLUSIVE>(p, dx, along, base, cuts, transmittance, t.gate + at);
+  const Sample<T> q = sample(p, dx, along, base, cuts);
+  const Lanes<T> alpha = load(t.last + at) >= pair ? q.alpha : Lanes<T>{};
+  const Lanes<T> inverse = T(1) / (T(1) - alpha), transmittance = load(t.transmittance + at) * inverse;
+  store(t.transmittance + at, transmittance);
   const Lanes<T> red = load(t.red + at), green = load(t.green + at), blue = load(t.blue + at);
-  const Lanes<T> depth = load(t.depth + at), weight = q.alpha * transmittance;
-  store(t.transmittance + at, transmittance - weight);
+  const Lanes<T> depth = load(t.depth + at), weight = alpha * transmittance, behind = load(t.behind + at);
   const Lanes<T> blended = weight * (p.color[0] * red + p.color[1] * green + p.color[2] * blue + p.depth * depth);
-  const Lanes<T> behind = load(t.behind + at) - blended;
-  store(t.behind + at, behind);
-  Lanes<T> s = blended - q.alpha / (T(1) - q.alpha) * behind;
+  store(t.behind + at, behind + blended);
+  Lanes<T> s = blended - alpha * inverse * behind;
   s = q.raw <= cuts.alpha_max ? s : Lanes<T>{};  // a clamped alpha has no derivative
   const Lanes<T> sa = s * q.a, sb = s * b;
   sums.s += s;
@@ -67,40 +69,33 @@ inline void add_columns(const Columns<T>& c, const Lanes<T>& dx, Slot<T>& slot) 
   slot.depth += total<T>(c.depth);
 }
 
-// Loads the cotangents and the light behind the camera: sum of what was blended plus what got past everything.
+// Loads the cotangents, and the light that got past everything.
 template <class T>
-void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, const Layers& image,
+void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, const T* passed,
                const Layers& cotangents) {
   std::memset(static_cast<void*>(&t), 0, sizeof(t));
-  open_tile(t.transmittance, view, x0, y0);
-  open_tile(t.gate, view, x0, y0);
-  const T *rgb = static_cast<const T*>(image.rgb), *passed = static_cast<const T*>(image.transmittance);
-  const T *depth = static_cast<const T*>(image.depth_sum), *v_rgb = static_cast<const T*>(cotangents.rgb);
-  const T *v_passed = static_cast<const T*>(cotangents.transmittance);
-  const T* v_depth = static_cast<const T*>(cotangents.depth_sum);
+  const T *v_rgb = static_cast<const T*>(cotangents.rgb), *v_depth = static_cast<const T*>(cotangents.depth_sum);
+  const T* v_passed = static_cast<const T*>(cotangents.transmittance);
   for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
     for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
       const int64_t to = (y - y0) * TILE + x - x0, from = y * view.width + x;
-      T behind = 0;
-      if (v_rgb) {
-        t.red[to] = v_rgb[3 * from], t.green[to] = v_rgb[3 * from + 1], t.blue[to] = v_rgb[3 * from + 2];
-        behind += rgb[3 * from] * t.red[to] + rgb[3 * from + 1] * t.green[to] + rgb[3 * from + 2] * t.blue[to];
-      }
-      if (v_depth) t.depth[to] = v_depth[from], behind += depth[from] * t.depth[to];
-      if (v_passed) behind += passed[from] * v_passed[from];
-      t.behind[to] = behind;
+      t.transmittance[to] = passed[from];
+      if (v_passed) t.behind[to] = passed[from] * v_passed[from];
+      if (v_depth) t.depth[to] = v_depth[from];
+      if (v_rgb) t.red[to] = v_rgb[3 * from], t.green[to] = v_rgb[3 * from + 1], t.blue[to] = v_rgb[3 * from + 2];
     }
   }
 }
 
-template <class T, bool EXCLUSIVE>
+template <class T>
 void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
                          TileCotangents<T>& t) {
-  const int64_t end = ws.tile_end[tile];
-  for (int64_t k = ws.tile_begin[tile]; k < end; ++k) {
-    if (k + PREFETCH < end) {
-      __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
-      __builtin_prefetch(&ws.slots[ws.pairs[k + PREFETCH].slot], 1);
+  const int64_t begin = ws.tile_begin[tile], end = ws.tile_end[tile];
+  for (int64_t k = ws.tile_begin[tile + 1] - 1; k >= end; --k) ws.slots[ws.pairs[k].slot] = Slot<T>{};
+  for (int64_t k = end - 1; k >= begin; --k) {
+    if (k - PREFETCH >= begin) {
+      __builtin_prefetch(&ws.splats[ws.pairs[k - PREFETCH].row]);
+      __builtin_prefetch(&ws.slots[ws.pairs[k - PREFETCH].slot], 1);
     }
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
@@ -109,34 +104,26 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
       const Lanes<T> dx = load(here.dx + x);
       Columns<T> sums;
       for (int y = here.first; y <= here.last; ++y)
-        accumulate_row<T, EXCLUSIVE>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, sums);
+        accumulate_row(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums);
       add_columns(sums, dx, slot);
     }
     ws.slots[ws.pairs[k].slot] = slot;
   }
-  for (int64_t k = end; k < ws.tile_begin[tile + 1]; ++k) ws.slots[ws.pairs[k].slot] = Slot<T>{};
 }
 
-template <class T, bool EXCLUSIVE>
-void blend_tiles_backward(Workspace<T>& ws, const View& view, const Layers& image, const Layers& cotangents) {
+template <class T>
+void blend_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents) {
+  const double start = omp_get_wtime();
   const Cuts<T> cuts(view);
+  ws.slots.reserve(ws.pair_count);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
     TileCotangents<T> t;
-    load_tile(t, view, x0, y0, image, cotangents);
-    blend_tile_backward<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, t);
+    load_tile(t, view, x0, y0, transmittance, cotangents);
+    std::memcpy(t.last, &ws.last_pairs[tile * PIXELS], sizeof(t.last));
+    blend_tile_backward(ws, cuts, tile, x0, y0, t);
   }
-}
-
-template <class T>
-void blend_backward(Workspace<T>& ws, const View& view, const Layers& image, const Layers& cotangents) {
-  const double start = omp_get_wtime();
-  ws.slots.reserve(ws.pair_count);
-  if (view.exclusive_stop)
-    blend_tiles_backward<T, true>(ws, view, image, cotangents);
-  else
-    blend_tiles_backward<T, false>(ws, view, image, cotangents);
   ws.seconds[BLEND_BACKWARD] = omp_get_wtime() - start;
 }
 

@@ -4,6 +4,7 @@
 #include <omp.h>
 
 #include "pixel.hpp"
+#include "tile_order.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -21,8 +22,8 @@ inline void count_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts,
   for (int x = 0; x < TILE; x += LANES<T>) {
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
-    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
-    const Lanes<T> weight = p.alpha * transmittance;
+    const Lanes<T> weight = transmittance * still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha,
+                                                                     cuts, transmittance, c.gate + at);
     store(c.transmittance + at, transmittance - weight);
     for (int i = 0; i < LANES<T>; ++i) {
       count.weight += double(weight[i]), count.pixels += weight[i] > 0;
@@ -36,6 +37,7 @@ template <class T, bool EXCLUSIVE>
 void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   TileCounters<T> c;
+  sort_tile(ws, tile);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
   for (int i = 0; i < PIXELS; ++i) c.best[i] = 0, c.best_pair[i] = -1;
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
@@ -66,7 +68,7 @@ void count_contributions(Workspace<T>& ws, const View& view, int64_t rows, const
   for (int64_t i = 0; i < rows; ++i) {
     typename Workspace<T>::Count sum{0, 0, 0};
     for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
-      const auto& slot = ws.count_slots[ws.first_slot[i] + k];
+      const auto& slot = ws.count_slots[ws.tiles[i].first_slot + k];
       sum.weight += slot.weight, sum.pixels += slot.pixels, sum.dominant += slot.dominant;
     }
     out.weight[i] = sum.weight, out.pixels[i] = sum.pixels, out.dominant[i] = sum.dominant;

@@ -1,6 +1,7 @@
 // Real spherical harmonics to degree 3 (ops/spherical_harmonics.py has the same in torch) and their derivative.
 #pragma once
 #include "small_matrix.hpp"
+#include "values.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -13,10 +14,11 @@ constexpr double Y3_OUTER = 0.59004358992664352, Y3_CORNER = 2.8906114426405538,
 constexpr double Y3_ZONAL = 0.37317633259011546, Y3_PLANAR = 1.4453057213202769;
 
 // The first `terms` functions at the unit direction d.
-template <class T>
-inline void basis(Vector<T> d, int64_t terms, T* out) {
-  const T x = d.x, y = d.y, z = d.z;
-  out[0] = T(Y0);
+template <class V>
+inline void basis(const Vector<V>& d, int64_t terms, V* out) {
+  using T = Scalar<V>;
+  const V x = d.x, y = d.y, z = d.z;
+  out[0] = V{} + T(Y0);
   if (terms > 1) {
     out[1] = -T(Y1) * y, out[2] = T(Y1) * z, out[3] = -T(Y1) * x;
   }
@@ -39,25 +41,26 @@ inline void basis(Vector<T> d, int64_t terms, T* out) {
 }
 
 // sum_i v[i] d(basis_i)/d(direction).
-template <class T>
-inline Vector<T> basis_backward(Vector<T> d, int64_t terms, const T* v) {
-  const T x = d.x, y = d.y, z = d.z;
-  Vector<T> g{0, 0, 0};
+template <class V>
+inline Vector<V> basis_backward(const Vector<V>& d, int64_t terms, const V* v) {
+  using T = Scalar<V>;
+  const V x = d.x, y = d.y, z = d.z;
+  Vector<V> g{};
   if (terms > 1) {
     g.x -= T(Y1) * v[3], g.y -= T(Y1) * v[1], g.z += T(Y1) * v[2];
   }
   if (terms > 4) {
-    const T xy = T(Y2_MIXED) * v[4], yz = T(Y2_MIXED) * v[5], xz = T(Y2_MIXED) * v[7];
-    const T zonal = 2 * T(Y2_ZONAL) * v[6], planar = 2 * T(Y2_PLANAR) * v[8];
+    const V xy = T(Y2_MIXED) * v[4], yz = T(Y2_MIXED) * v[5], xz = T(Y2_MIXED) * v[7];
+    const V zonal = 2 * T(Y2_ZONAL) * v[6], planar = 2 * T(Y2_PLANAR) * v[8];
     g.x += xy * y - xz * z + (planar - zonal) * x;
     g.y += xy * x - yz * z - (planar + zonal) * y;
     g.z += 2 * zonal * z - yz * y - xz * x;
   }
   if (terms > 9) {
-    const T o1 = T(Y3_OUTER) * v[9], corner = T(Y3_CORNER) * v[10], m1 = T(Y3_MIDDLE) * v[11];
-    const T zonal = T(Y3_ZONAL) * v[12], m2 = T(Y3_MIDDLE) * v[13], planar = T(Y3_PLANAR) * v[14];
-    const T o2 = T(Y3_OUTER) * v[15];
-    const T xx = x * x, yy = y * y, zz = z * z;
+    const V o1 = T(Y3_OUTER) * v[9], corner = T(Y3_CORNER) * v[10], m1 = T(Y3_MIDDLE) * v[11];
+    const V zonal = T(Y3_ZONAL) * v[12], m2 = T(Y3_MIDDLE) * v[13], planar = T(Y3_PLANAR) * v[14];
+    const V o2 = T(Y3_OUTER) * v[15];
+    const V xx = x * x, yy = y * y, zz = z * z;
     g.x += -6 * o1 * x * y + corner * y * z + 2 * m1 * x * y - 6 * zonal * x * z - m2 * (4 * zz - 3 * xx - yy) +
            2 * planar * x * z - 3 * o2 * (xx - yy);
     g.y += -3 * o1 * (xx - yy) + corner * x * z - m1 * (4 * zz - xx - 3 * yy) - 6 * zonal * y * z + 2 * m2 * x * y -

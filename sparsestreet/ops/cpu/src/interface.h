@@ -4,18 +4,23 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 2;
+constexpr int32_t INTERFACE_VERSION = 3;
 
 enum Status : int32_t { OK = 0, BAD_VALUE = 1, TOO_MANY_PAIRS = 2, OUT_OF_MEMORY = 3 };
 
-// A pinhole camera and the settings of one rendering.
+// A camera and the settings of one rendering.
 struct View {
   double rotation[9];     // camera from world
   double translation[3];  // metres
   double fx, fy, cx, cy;  // pixels
   double alpha_min, alpha_max, transmittance_min, blur, near_plane;
+  double box;             // standard deviations
+  double distortion[5];   // k1, k2, p1, p2, k3
+  double fold;            // r^2 past which the lens does not see
+  double shutter_translation[3], shutter_rotation[3];  // over the readout, camera frame
   int64_t width, height;
-  int64_t exclusive_stop, antialias;
+  int64_t exclusive_stop, antialias, half_colors, depth_bits;
+  int64_t has_lens, has_shutter;
   int64_t pair_limit;  // (splat, tile) pairs that may be held
   int64_t threads;
 };
@@ -24,6 +29,7 @@ struct View {
 struct Rows {
   int64_t count, terms;  // terms: spherical harmonics per channel
   const void *means, *quaternions, *scales, *opacities, *sh;
+  const void* displacements;  // null: none
 };
 
 // Layers of an image: premultiplied colour [h,w,3], transmittance [h,w], sum of weighted depths [h,w].

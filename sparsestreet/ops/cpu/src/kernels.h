@@ -18,7 +18,7 @@ struct RowKernels {
 
 struct PixelKernels {
   void (*blend)(void*, const View&, const Layers&);
-  void (*blend_backward)(void*, const View&, const Layers& image, const Layers& cotangents);
+  void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
   void (*remove)(void*, const View&, int64_t rows, const void* background, const Changes&);
 };

@@ -1,6 +1,6 @@
-// Registers of the instruction set at hand: pixels of a tile row are worked on a register at a time, so that the sums
-// over a splat's rows stay in registers. (Left to the compiler alone they go to memory in every row; vectors wider
-// than a register are split badly.)
+// Registers of the instruction set at hand: pixels of a tile row, and rows of Gaussians, are worked on a register at a
+// time, so that the sums over a splat's rows stay in registers. (Left to the compiler alone they go to memory in every
+// row; vectors wider than a register are split badly.)
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -29,6 +29,9 @@ struct LanesOf<double> {
 };
 template <class T>
 using Lanes = typename LanesOf<T>::Values;
+// An integer per lane, as wide as T; comparisons of lanes have this type, -1 for true.
+template <class T>
+using Integers = typename LanesOf<T>::Integers;
 template <class T>
 constexpr int LANES = REGISTER_BYTES / int(sizeof(T));
 
@@ -49,17 +52,30 @@ inline V smaller(const V& a, const V& b) { return a < b ? a : b; }
 template <class V>
 inline V magnitude(const V& a) { return a < V{} ? -a : a; }
 
+// The same bits as another type.
+template <class T>
+inline Lanes<T> as_lanes(const Integers<T>& bits) {
+  Lanes<T> v;
+  __builtin_memcpy(&v, &bits, sizeof(v));
+  return v;
+}
+template <class T>
+inline Integers<T> as_integers(const Lanes<T>& v) {
+  Integers<T> bits;
+  __builtin_memcpy(&bits, &v, sizeof(v));
+  return bits;
+}
+
 // 2^x for x in [-126, 0]: rounding and a minimax polynomial of degree 5 on [-1/2, 1/2] (relative error 1.2e-7).
 inline Lanes<float> exp2_nonpositive(const Lanes<float>& x) {
-  using Integers = LanesOf<float>::Integers;
-  const Integers n = __builtin_convertvector(x - 0.5f, Integers);
+  const Integers<float> n = __builtin_convertvector(x - 0.5f, Integers<float>);
   const Lanes<float> f = x - __builtin_convertvector(n, Lanes<float>);
   Lanes<float> p = 1.3276472454890609e-03f * f + 9.6755409613251686e-03f;
   p = p * f + 5.5507130920886993e-02f;
   p = p * f + 2.4022120237350464e-01f;
   p = p * f + 6.9314694404602051e-01f;
   p = p * f + 1.0f;
-  return p * reinterpret_cast<const Lanes<float>&>(static_cast<const Integers&>((n + 127) << 23));
+  return p * as_lanes<float>((n + 127) << 23);
 }
 inline Lanes<double> exp2_nonpositive(const Lanes<double>& x) {
   Lanes<double> p;

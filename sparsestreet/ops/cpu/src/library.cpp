@@ -119,10 +119,10 @@ SPLAT_API int32_t splat_forward(Handle* h, const View* view, const Rows* rows, c
 }
 
 // Uses what splat_forward left in the workspace; null pointers in `cotangents` stand for zeros.
-SPLAT_API int32_t splat_backward(Handle* h, const View* view, const Rows* rows, const Layers* image,
+SPLAT_API int32_t splat_backward(Handle* h, const View* view, const Rows* rows, const void* transmittance,
                                  const Layers* cotangents, const RowGradients* gradients) {
   return guarded([&]() -> int32_t {
-    h->pixels().blend_backward(h->workspace, *view, *image, *cotangents);
+    h->pixels().blend_backward(h->workspace, *view, transmittance, *cotangents);
     h->rows().project_backward(h->workspace, *view, *rows, *gradients);
     return OK;
   });

@@ -1,6 +1,5 @@
 // What the pixel loops share: alpha, the stop rule, and where a splat meets a tile.
 #pragma once
-#include "lanes.hpp"
 #include "workspace.hpp"
 
 namespace SPLAT_VARIANT {
@@ -8,11 +7,11 @@ namespace SPLAT_VARIANT {
 // The cut-offs, ready for the pixel loops.
 template <class T>
 struct Cuts {
-  T log2_alpha_min, alpha_max, transmittance_min;
+  T alpha_max, transmittance_min;
+  // Even without a stop a pixel ends before its transmittance underflows: backward divides by what got past.
   explicit Cuts(const View& v)
-      // Without a cut-off the exponent still ends where float does: 2^-126.
-      : log2_alpha_min(v.alpha_min > 0 ? T(std::log2(v.alpha_min)) : T(-126)), alpha_max(v.alpha_max),
-        transmittance_min(v.transmittance_min) {}
+      : alpha_max(v.alpha_max),
+        transmittance_min(std::fmax(T(v.transmittance_min), sizeof(T) == 4 ? T(1e-30) : T(1e-280))) {}
 };
 
 // Splats ahead whose record is fetched while one is blended.
@@ -37,29 +36,29 @@ template <class T>
 struct Sample {
   Lanes<T> a;      // first component of L d
   Lanes<T> raw;    // alpha before the clamp
-  Lanes<T> alpha;  // what is blended: 0 below alpha_min and in finished pixels
+  Lanes<T> alpha;  // 0 past the splat's end
 };
 
-// Evaluates a splat in neighbouring pixels of one row. `gate` decides whether a pixel is still open: the transmittance
-// itself for the inclusive stop, the product that includes dropped splats for the exclusive one.
-template <class T, bool EXCLUSIVE>
-inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, const Cuts<T>& cuts,
-                        const Lanes<T>& transmittance, T* gate) {
+// Evaluates a splat in neighbouring pixels of one row.
+template <class T>
+inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, const Cuts<T>& cuts) {
   Sample<T> p;
   p.a = s.l11 * dx + along;
-  const Lanes<T> exponent = base - p.a * p.a, none{};
+  const Lanes<T> exponent = base - p.a * p.a;
   p.raw = exp2_nonpositive(larger(exponent, same(T(-126))));
-  p.alpha = smaller(p.raw, same(cuts.alpha_max));
-  p.alpha = exponent >= cuts.log2_alpha_min ? p.alpha : none;
-  if (EXCLUSIVE) {
-    Lanes<T> passed = load(gate);
-    passed = passed - p.alpha * passed;
-    store(gate, passed);
-    p.alpha = passed > cuts.transmittance_min ? p.alpha : none;
-  } else {
-    p.alpha = transmittance > cuts.transmittance_min ? p.alpha : none;
-  }
+  p.alpha = exponent >= s.least_exponent ? smaller(p.raw, same(cuts.alpha_max)) : Lanes<T>{};
   return p;
+}
+
+// What of alpha is blended: nothing in finished pixels. `gate` decides whether a pixel is still open: the
+// transmittance itself for the inclusive stop, the product that includes dropped splats for the exclusive one.
+template <class T, bool EXCLUSIVE>
+inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lanes<T>& transmittance, T* gate) {
+  if (!EXCLUSIVE) return transmittance > cuts.transmittance_min ? alpha : Lanes<T>{};
+  Lanes<T> passed = load(gate);
+  passed = passed - alpha * passed;
+  store(gate, passed);
+  return passed > cuts.transmittance_min ? alpha : Lanes<T>{};
 }
 
 template <class T>

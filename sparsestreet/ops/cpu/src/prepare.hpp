@@ -2,7 +2,8 @@
 #pragma once
 #include <omp.h>
 
-#include "sorting.hpp"
+#include "columns.hpp"
+#include "pairs.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -10,11 +11,12 @@ namespace SPLAT_VARIANT {
 template <class T>
 struct Inputs {
   int64_t count, terms;
-  const T *means, *quaternions, *scales, *opacities, *sh;
+  const T *means, *quaternions, *scales, *opacities, *sh, *displacements;
   explicit Inputs(const Rows& r)
       : count(r.count), terms(r.terms), means(static_cast<const T*>(r.means)),
         quaternions(static_cast<const T*>(r.quaternions)), scales(static_cast<const T*>(r.scales)),
-        opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)) {}
+        opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)),
+        displacements(static_cast<const T*>(r.displacements)) {}
 };
 
 // Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorises.
@@ -33,27 +35,88 @@ inline bool finite(const T* values, int64_t count) {
 }
 
 template <class T>
-inline bool valid_row(const Inputs<T>& in, int64_t i) {
-  const T *s = in.scales + 3 * i, opacity = in.opacities[i];
-  return finite(in.means + 3 * i, 3) && finite(in.quaternions + 4 * i, 4) && finite(s, 3) && s[0] >= 0 && s[1] >= 0 &&
-         s[2] >= 0 && opacity >= 0 && opacity <= 1 && finite(in.sh + 3 * in.terms * i, 3 * in.terms);
+inline bool valid_rows(const Inputs<T>& in, int64_t first, int64_t count) {
+  bool inside = true;
+  for (int64_t i = first; i < first + count; ++i) inside &= in.opacities[i] >= 0 && in.opacities[i] <= 1;
+  for (int64_t i = 3 * first; i < 3 * (first + count); ++i) inside &= in.scales[i] >= 0;
+  return inside && finite(in.means + 3 * first, 3 * count) && finite(in.quaternions + 4 * first, 4 * count) &&
+         finite(in.scales + 3 * first, 3 * count) && finite(in.sh + 3 * in.terms * first, 3 * in.terms * count) &&
+         (!in.displacements || finite(in.displacements + 3 * first, 3 * count));
 }
 
-// Fills ws.splats, ws.tiles and `radii`; false if a row holds a bad value.
-template <class T>
+// Rows row(0), row(1), ... of the input, one per lane.
+template <class E, class T, class RowAt>
+inline RowValues<Lanes<T>> load_rows(const Inputs<T>& in, RowAt row) {
+  RowValues<Lanes<T>> v;
+  load_columns<T>([&](int lane) { return in.means + 3 * row(lane); }, 3, &v.mean.x);
+  load_columns<T>([&](int lane) { return in.scales + 3 * row(lane); }, 3, &v.scales.x);
+  load_columns<T>([&](int lane) { return in.quaternions + 4 * row(lane); }, 4, v.quaternion);
+  load_columns<T>([&](int lane) { return in.opacities + row(lane); }, 1, &v.opacity);
+  if constexpr (E::SHUTTER) {
+    v.displacement = Vector<Lanes<T>>{};
+    if (in.displacements)
+      load_columns<T>([&](int lane) { return in.displacements + 3 * row(lane); }, 3, &v.displacement.x);
+  }
+  return v;
+}
+
+// The colour of the rows of a register in the direction in which the camera sees them.
+template <class T, class RowAt>
+inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, const Vector<Lanes<T>>& in_camera,
+                       Splat<Lanes<T>>& s) {
+  Lanes<T> sh[3 * 16];
+  load_columns<T>([&](int lane) { return in.sh + 3 * in.terms * row(lane); }, int(3 * in.terms), sh);
+  const Vector<Lanes<T>> color = view_color(camera, in_camera, sh, in.terms).raw;
+  s.color[0] = positive_part(color.x), s.color[1] = positive_part(color.y), s.color[2] = positive_part(color.z);
+  if (camera.half_colors)
+    for (auto& channel : s.color) channel = rounded_to_half<T>(channel);
+}
+
+// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii, counts pairs per tile.
+template <class E, class T>
+void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
+                   int count, T* radii, int64_t* counts) {
+  // The lanes of a last, partial block repeat its last row.
+  const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
+  const RowValues<Lanes<T>> values = load_rows<E>(in, row);
+  const Projection<E, Lanes<T>> p(camera, values);
+  Splat<Lanes<T>> s{};
+  const Integers<T> seen = project(camera, values, p, s);
+  const Lanes<T> radius = seen ? (s.half_x > s.half_y ? s.half_x : s.half_y) : Lanes<T>{};
+  if (radii)
+    for (int r = 0; r < count; ++r) radii[first + r] = radius[r];
+  if (!any<T>(seen)) {
+    for (int r = 0; r < count; ++r) ws.tiles[first + r].count = 0, ws.tiles[first + r].mask = 0;
+    return;
+  }
+  color_rows(camera, in, row, p.placement.mean, s);
+  Splat<T>* splats = &ws.splats[first];
+  store_columns<T>(&s.x, SPLAT_COLUMNS<T>, count, [&](int r) { return reinterpret_cast<T*>(splats + r); });
+  tile_sets(s, grid, seen, splats, count, &ws.tiles[first]);
+  for (int r = 0; r < count; ++r) {
+    ws.tiles[first + r].depth_key = depth_key(splats[r].depth, camera.depth_bits);
+    for_each_tile(ws.tiles[first + r], splats[r], grid, [&](int64_t tile) { ++counts[tile]; });
+  }
+}
+
+// Fills ws.splats, ws.tiles, `radii` and each thread's counts of pairs per tile; false if a row holds a bad value.
+template <class E, class T>
 bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* radii) {
   const Camera<T> camera(view);
-  const Grid<T> grid(view);
-  ws.splats.reserve(in.count), ws.tiles.reserve(in.count);
+  const Grid<T> grid(camera);
+  const int64_t tiles = grid.tiles_x * grid.tiles_y;
+  ws.splats.reserve(in.count), ws.tiles.reserve(in.count), ws.histogram.reserve(view.threads * tiles);
   int bad = 0;
 #pragma omp parallel for num_threads(view.threads) schedule(static) reduction(| : bad)
-  for (int64_t i = 0; i < in.count; ++i) {
-    bad |= !valid_row(in, i);
-    Splat<T>& splat = ws.splats[i];
-    const bool seen = project_row(camera, in.means + 3 * i, in.quaternions + 4 * i, in.scales + 3 * i, in.opacities[i],
-                                  in.sh + 3 * in.terms * i, in.terms, splat);
-    ws.tiles[i] = seen ? tile_set(splat, grid) : TileSet{0, 0, 0};
-    if (radii) radii[i] = !seen ? T(0) : (splat.half_x > splat.half_y ? splat.half_x : splat.half_y);
+  for (int64_t part = 0; part < view.threads; ++part) {
+    int64_t* counts = &ws.histogram[part * tiles];
+    std::memset(counts, 0, tiles * sizeof(int64_t));
+    const Range range = blocks_of_part<T>(in.count, part, view.threads);
+    for (int64_t first = range.begin; first < range.end; first += LANES<T>) {
+      const int count = int(range.end - first < LANES<T> ? range.end - first : LANES<T>);
+      bad |= !valid_rows(in, first, count);
+      project_block<E>(ws, camera, grid, in, first, count, radii, counts);
+    }
   }
   return !bad;
 }
@@ -73,22 +136,31 @@ void report_worst(const Workspace<T>& ws, int64_t rows, Report& report) {
   }
 }
 
+// Calls call(Effects<...>{}) with those that the view has.
+template <class Call>
+inline auto with_effects(const View& view, Call call) {
+  if (view.has_lens) return view.has_shutter ? call(Effects<true, true>{}) : call(Effects<true, false>{});
+  return view.has_shutter ? call(Effects<false, true>{}) : call(Effects<false, false>{});
+}
+
 template <class T>
 Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii, Report& report) {
   const Inputs<T> in(rows);
   const double start = omp_get_wtime();
-  if (!project_rows(ws, view, in, static_cast<T*>(radii))) return BAD_VALUE;
+  const bool valid = with_effects(view, [&](auto effects) {
+    return project_rows<decltype(effects)>(ws, view, in, static_cast<T*>(radii));
+  });
+  if (!valid) return BAD_VALUE;
   const double projected = omp_get_wtime();
-  list_visible(ws, in.count);
+  const Grid<T> grid{Camera<T>(view)};
+  ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
+  begin_tiles(ws, grid.tiles_x * grid.tiles_y, view.threads);
   report.pairs = ws.pair_count;
   if (ws.pair_count > view.pair_limit) {
     report_worst(ws, in.count, report);
     return TOO_MANY_PAIRS;
   }
-  const Grid<T> grid(view);
-  ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
-  sort_by_depth(ws, view.threads);
-  fill_tiles(ws, grid, view.threads);
+  fill_tiles(ws, grid, in.count, view.threads);
   ws.seconds[PROJECT] = projected - start, ws.seconds[BIN] = omp_get_wtime() - projected;
   return OK;
 }

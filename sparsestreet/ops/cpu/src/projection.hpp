@@ -1,9 +1,8 @@
-// From a Gaussian in the world to a splat on the screen. ops/reference.py states the same formulas.
+// From a Gaussian in the world to a splat on the screen. ops/reference states the same formulas. V is a register of
+// rows: nothing branches, a row that is culled is computed all the same and its lane of the mask is 0.
 #pragma once
-#include <cmath>
-#include <limits>
-
 #include "harmonics.hpp"
+#include "shutter.hpp"
 #include "workspace.hpp"
 
 namespace SPLAT_VARIANT {
@@ -14,150 +13,126 @@ constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: th
 constexpr double LOG2_SCALE = 0.84932180028801907;  // sqrt(log2(e) / 2)
 constexpr double TWO_LN2 = 1.3862943611198906;
 
-template <class T>
-struct Camera {
-  Matrix<T> rotation;
-  Vector<T> translation;
-  T fx, fy, cx, cy, slope_min[2], slope_max[2];
-  T alpha_min, blur, near_plane, width, height;
-  bool antialias;
+// What an image is taken through. Without a part, nothing of it is compiled in.
+template <bool WITH_LENS, bool WITH_SHUTTER>
+struct Effects {
+  static constexpr bool LENS = WITH_LENS, SHUTTER = WITH_SHUTTER;
+  template <class V>
+  using Model = std::conditional_t<LENS, Distorted<V>, Pinhole<V>>;
+};
 
-  explicit Camera(const View& v)
-      : fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy), alpha_min(v.alpha_min), blur(v.blur), near_plane(v.near_plane),
-        width(v.width), height(v.height), antialias(v.antialias) {
-    for (int i = 0; i < 3; ++i)
-      rotation.rows[i] = {T(v.rotation[3 * i]), T(v.rotation[3 * i + 1]), T(v.rotation[3 * i + 2])};
-    translation = {T(v.translation[0]), T(v.translation[1]), T(v.translation[2])};
-    const T margin_x = T(0.3) * width / (2 * fx), margin_y = T(0.3) * height / (2 * fy);
-    slope_min[0] = -cx / fx - margin_x, slope_max[0] = (width - cx) / fx + margin_x;
-    slope_min[1] = -cy / fy - margin_y, slope_max[1] = (height - cy) / fy + margin_y;
+// The covariance C = F F^T + blur of a footprint, and its determinant.
+template <class V, int K>
+struct Covariance {
+  V xx, xy, yy, determinant, bare_determinant;
+
+  template <class T>
+  Covariance(const Camera<T>& camera, const Footprint<V, K>& f) : xx{}, xy{}, yy{}, bare_determinant{} {
+    for (int i = 0; i < K; ++i) {
+      xx += f.factor_x[i] * f.factor_x[i], yy += f.factor_y[i] * f.factor_y[i], xy += f.factor_x[i] * f.factor_y[i];
+      // Cauchy-Binet: a sum of squares, so needles lose no digits and the determinant is never negative.
+      for (int j = 0; j < i; ++j) {
+        const V minor = f.factor_x[i] * f.factor_y[j] - f.factor_x[j] * f.factor_y[i];
+        bare_determinant += minor * minor;
+      }
+    }
+    determinant = bare_determinant + camera.blur * (xx + yy) + camera.blur * camera.blur;
+    xx += camera.blur, yy += camera.blur;
   }
 };
 
-template <class T>
-inline T limited(T value, T low, T high) { return value < low ? low : (value > high ? high : value); }
-
-// Everything between the parameters of one row and its splat that backward needs again.
-template <class T>
+// All between the parameters of a row and its splat that backward needs again.
+template <class E, class V>
 struct Projection {
-  Vector<T> in_camera;
-  T inverse_z, slope[2];
-  bool inside[2];          // the slope was not limited
-  T quaternion[4], length;  // unit; length 0: a zero quaternion, replaced by the identity
-  Matrix<T> world_from_gaussian, camera_from_gaussian;  // rotation; rotation times scales
-  Vector<T> factor_x, factor_y;                         // rows of V = J R S
-  T variance_x, variance_y, covariance, determinant, bare_determinant;
+  using T = Scalar<V>;
+  using Model = typename E::template Model<V>;
+  static constexpr int K = Model::COLUMNS;
+  Placement<V> placement;
+  Model model;
+  Motion<V, E::LENS> motion;
+  Footprint<V, K> footprint;
+  Index<V> seen;  // in front of the camera, and shown by lens and shutter
+
+  Projection(const Camera<T>& camera, const RowValues<V>& row) : placement(place(camera, row)) {
+    footprint = model.forward(camera, placement);
+    seen = placement.mean.z > camera.near_plane;
+    if constexpr (E::LENS) seen = seen && model.sees(camera, placement);
+    if constexpr (E::SHUTTER) {
+      motion = Motion<V, E::LENS>(camera, placement, row.displacement);
+      seen = seen && read_out(motion, camera.height, footprint) >= T(SLOWEST_READOUT);
+    }
+  }
 };
 
-template <class T>
-inline void rotation_from_quaternion(const T* given, Projection<T>& p) {
-  const T squared = given[0] * given[0] + given[1] * given[1] + given[2] * given[2] + given[3] * given[3];
-  const bool usable = squared > std::numeric_limits<T>::min();
-  p.length = usable ? std::sqrt(squared) : T(0);
-  const T inverse = usable ? 1 / p.length : T(0);
-  for (int i = 0; i < 4; ++i) p.quaternion[i] = usable ? given[i] * inverse : T(i == 0);
-  const T w = p.quaternion[0], x = p.quaternion[1], y = p.quaternion[2], z = p.quaternion[3];
-  p.world_from_gaussian = {{{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
-                            {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
-                            {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}}};
-}
-
-// The row's covariance on the screen; p.in_camera must be set and lie in front of the camera.
-template <class T>
-inline void project_shape(const Camera<T>& camera, const T* quaternion, const T* scales, Projection<T>& p) {
-  rotation_from_quaternion(quaternion, p);
-  Matrix<T> axes = p.world_from_gaussian;
-  for (auto& row : axes.rows) row = {row.x * scales[0], row.y * scales[1], row.z * scales[2]};
-  p.camera_from_gaussian = camera.rotation * axes;
-  p.inverse_z = 1 / p.in_camera.z;
-  const T slopes[2] = {p.in_camera.x * p.inverse_z, p.in_camera.y * p.inverse_z};
-  for (int axis = 0; axis < 2; ++axis) {
-    p.slope[axis] = limited(slopes[axis], camera.slope_min[axis], camera.slope_max[axis]);
-    p.inside[axis] = p.slope[axis] == slopes[axis];
-  }
-  const Matrix<T>& m = p.camera_from_gaussian;
-  p.factor_x = (camera.fx * p.inverse_z) * (m.rows[0] + -p.slope[0] * m.rows[2]);
-  p.factor_y = (camera.fy * p.inverse_z) * (m.rows[1] + -p.slope[1] * m.rows[2]);
-  const T xx = dot(p.factor_x, p.factor_x), yy = dot(p.factor_y, p.factor_y);
-  const Vector<T> c = cross(p.factor_x, p.factor_y);
-  // Cauchy-Binet: a sum of squares, so needles lose no digits and the determinant is never negative.
-  p.bare_determinant = dot(c, c);
-  p.determinant = p.bare_determinant + camera.blur * (xx + yy) + camera.blur * camera.blur;
-  p.variance_x = xx + camera.blur, p.variance_y = yy + camera.blur, p.covariance = dot(p.factor_x, p.factor_y);
-}
-
-template <class T>
-inline T compensation(const Camera<T>& camera, const Projection<T>& p) {
-  if (!camera.antialias) return T(1);
-  const T ratio = p.bare_determinant / p.determinant;
-  return std::sqrt(ratio > T(COMPENSATION_FLOOR) ? ratio : T(COMPENSATION_FLOOR));
+template <class T, class V, int K>
+inline V compensation(const Camera<T>& camera, const Covariance<V, K>& c) {
+  if (!camera.antialias) return V{} + T(1);
+  const V ratio = c.bare_determinant / c.determinant, floor = V{} + T(COMPENSATION_FLOOR);
+  return root(ratio > floor ? ratio : floor);
 }
 
 // Colour before the clamp at zero; also the unit direction, the distance and the basis for backward.
-template <class T>
+template <class V>
 struct ViewColor {
-  Vector<T> direction, raw;
-  T distance;
-  T values[16];
+  Vector<V> direction, raw;
+  V distance, values[16];
 };
 
-template <class T>
-inline ViewColor<T> view_color(const Camera<T>& camera, const Vector<T>& in_camera, const T* sh, int64_t terms) {
-  ViewColor<T> c;
-  const Vector<T> ray = transposed(camera.rotation, in_camera);
-  c.distance = std::sqrt(dot(ray, ray));
+template <class T, class V>
+inline ViewColor<V> view_color(const Camera<T>& camera, const Vector<V>& in_camera, const V* sh, int64_t terms) {
+  ViewColor<V> c;
+  const Vector<V> ray = transposed(camera.rotation, in_camera);
+  c.distance = root(dot(ray, ray));
   c.direction = (1 / c.distance) * ray;
   basis(c.direction, terms, c.values);
-  c.raw = {T(0.5), T(0.5), T(0.5)};
-  for (int64_t k = 0; k < terms; ++k) {
-    c.raw.x += c.values[k] * sh[3 * k], c.raw.y += c.values[k] * sh[3 * k + 1], c.raw.z += c.values[k] * sh[3 * k + 2];
-  }
+  const V middle = V{} + T(0.5);
+  c.raw = {middle, middle, middle};
+  for (int64_t k = 0; k < terms; ++k) c.raw = c.raw + c.values[k] * Vector<V>{sh[3 * k], sh[3 * k + 1], sh[3 * k + 2]};
   return c;
 }
 
-// First and last index whose pixel centre lies within [centre - half, centre + half], cut to [0, size); as T first,
+// First and last index whose pixel centre lies within [centre - half, centre + half], cut to [0, size); limited first,
 // since the box of a giant does not fit an integer.
-template <class T>
-inline void pixel_span(T centre, T half, T size, int32_t& first, int32_t& last) {
-  first = int32_t(limited(std::ceil(centre - half - T(0.5)), T(0), size));
-  last = int32_t(limited(std::floor(centre + half - T(0.5)), T(-1), size - 1));
+template <class T, class V>
+inline void pixel_span(const V& centre, const V& half, T size, Index<V>& first, Index<V>& last) {
+  first = ceiling(limited(centre - half - T(0.5), T(0), size));
+  last = floored(limited(centre + half - T(0.5), T(-1), size - 1));
 }
 
-// Fills `out` and answers true if the row can touch a pixel. Comparisons are written so that NaN culls.
-template <class T>
-inline bool project_row(const Camera<T>& camera, const T* mean, const T* quaternion, const T* scales, T opacity,
-                        const T* sh, int64_t terms, Splat<T>& out) {
-  Projection<T> p;
-  p.in_camera = camera.rotation * Vector<T>{mean[0], mean[1], mean[2]} + camera.translation;
-  if (!(p.in_camera.z > camera.near_plane && opacity > 0)) return false;
-  project_shape(camera, quaternion, scales, p);
-  if (!(p.determinant >= T(DETERMINANT_MIN) && p.determinant <= std::numeric_limits<T>::max())) return false;
-  const T effective = opacity * compensation(camera, p);
-  if (!(effective >= camera.alpha_min)) return false;
-  out.x = camera.fx * p.in_camera.x * p.inverse_z + camera.cx;
-  out.y = camera.fy * p.in_camera.y * p.inverse_z + camera.cy;
-  if (camera.alpha_min > 0) {
-    const T reach = 2 * std::log(effective / camera.alpha_min);
-    const T safe = reach > 0 ? reach : T(0);
-    out.half_x = std::sqrt(safe * p.variance_x), out.half_y = std::sqrt(safe * p.variance_y);
-  } else {
-    out.half_x = out.half_y = std::numeric_limits<T>::infinity();
+// Where a splat ends: o exp(-q/2) >= alpha_min needs q <= 2 ln(o / alpha_min), a box of b deviations q <= b^2. Fills
+// that as an exponent, and the box around the ellipse.
+template <class T, class V, int K>
+inline void bound(const Camera<T>& camera, const Covariance<V, K>& c, const V& opacity, Splat<V>& s) {
+  s.log2_opacity = log2_positive<T>(opacity);
+  s.least_exponent = V{} + camera.log2_alpha_min;
+  V reach = V{} + camera.box_squared;
+  if (camera.alpha_min > 0) reach = positive_part(T(TWO_LN2) * log2_positive<T>(opacity / camera.alpha_min));
+  if (camera.box_squared <= std::numeric_limits<T>::max()) {
+    const V end = s.log2_opacity - camera.box_squared / T(TWO_LN2), box = V{} + camera.box_squared;
+    const auto boxed = box <= reach && end > s.least_exponent;
+    s.least_exponent = boxed ? end : s.least_exponent;
+    reach = box < reach ? box : reach;
   }
-  const T box_x = out.half_x + T(BOX_MARGIN), box_y = out.half_y + T(BOX_MARGIN);
-  if (!(out.x + box_x >= T(0.5) && out.x - box_x <= camera.width - T(0.5))) return false;
-  if (!(out.y + box_y >= T(0.5) && out.y - box_y <= camera.height - T(0.5))) return false;
-  pixel_span(out.y, box_y + T(1e-5) * out.half_y, camera.height, out.first_row, out.last_row);
+  s.half_x = root(reach * c.xx), s.half_y = root(reach * c.yy);
+}
+
+// Fills `s` but for its colour; answers which rows can touch a pixel. Comparisons are written so that NaN culls.
+template <class T, class E, class V>
+inline Index<V> project(const Camera<T>& camera, const RowValues<V>& row, const Projection<E, V>& p, Splat<V>& s) {
+  const Covariance<V, Projection<E, V>::K> c(camera, p.footprint);
+  const V opacity = row.opacity * compensation(camera, c);
+  bound(camera, c, opacity, s);
+  s.x = p.footprint.x, s.y = p.footprint.y, s.depth = p.placement.mean.z;
+  const V box_x = s.half_x + T(BOX_MARGIN), box_y = s.half_y + T(BOX_MARGIN);
+  pixel_span(s.y, box_y + T(1e-5) * s.half_y, camera.height, s.first_row, s.last_row);
   const T scale = T(LOG2_SCALE);
-  out.l11 = scale * std::sqrt(p.variance_y / p.determinant);
-  out.l21 = -scale * p.covariance / (std::sqrt(p.variance_y) * std::sqrt(p.determinant));
-  out.l22 = scale / std::sqrt(p.variance_y);
-  out.log2_opacity = std::log2(effective);
-  const ViewColor<T> c = view_color(camera, p.in_camera, sh, terms);
-  out.color[0] = c.raw.x > 0 ? c.raw.x : T(0);
-  out.color[1] = c.raw.y > 0 ? c.raw.y : T(0);
-  out.color[2] = c.raw.z > 0 ? c.raw.z : T(0);
-  out.depth = p.in_camera.z;
-  return true;
+  const V deviation_y = root(c.yy);
+  s.l11 = scale * root(c.yy / c.determinant);
+  s.l21 = -scale * c.xy / (deviation_y * root(c.determinant));
+  s.l22 = scale / deviation_y;
+  return p.seen && row.opacity > T(0) && c.determinant >= T(DETERMINANT_MIN) &&
+         c.determinant <= std::numeric_limits<T>::max() && opacity >= camera.alpha_min && s.x + box_x >= T(0.5) &&
+         s.x - box_x <= camera.width - T(0.5) && s.y + box_y >= T(0.5) && s.y - box_y <= camera.height - T(0.5);
 }
 
 }  // namespace SPLAT_VARIANT

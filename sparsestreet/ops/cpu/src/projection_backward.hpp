@@ -1,4 +1,5 @@
-// From the sums over pixels back to the parameters, one row at a time: slots of a row are summed in a fixed order.
+// From the sums over pixels back to the parameters, a register of visible rows at a time: slots of a row are summed in
+// a fixed order.
 #pragma once
 #include <omp.h>
 
@@ -7,180 +8,191 @@
 namespace SPLAT_VARIANT {
 
 // Gradients of one splat on the screen, in natural units (exponent -|L d|^2 / 2).
-template <class T>
+template <class V>
 struct ScreenGradient {
-  T x, y, abs_x, abs_y, l11, l21, l22;
-  T opacity;  // of the effective opacity
-  Vector<T> color;
-  T depth;
+  V x, y, abs_x, abs_y, l11, l21, l22;
+  V log_opacity;
+  Vector<V> color;
+  V depth;
 };
 
-template <class T>
-inline Slot<T> sum_slots(const Workspace<T>& ws, int64_t row) {
-  Slot<T> sum{};
-  const Slot<T>* slots = ws.slots.data() + ws.first_slot[row];
-  for (int32_t k = 0; k < ws.tiles[row].count; ++k) {
-    const Slot<T>& o = slots[k];
-    sum.s += o.s, sum.sa += o.sa, sum.sb += o.sb, sum.sa_dx += o.sa_dx;
-    sum.sa_dy += o.sa_dy, sum.sb_dy += o.sb_dy;
-    sum.abs_x += o.abs_x, sum.abs_y += o.abs_y, sum.depth += o.depth;
-    for (int c = 0; c < 3; ++c) sum.color[c] += o.color[c];
-  }
-  return sum;
-}
-
 // ln alpha = ln o - ln 2 |L d|^2 with the record's L, which is the Cholesky factor times k = LOG2_SCALE.
-template <class T>
-inline ScreenGradient<T> screen_gradient(const Slot<T>& sum, const Splat<T>& s) {
+template <class V>
+inline ScreenGradient<V> screen_gradient(const Slot<V>& sum, const Splat<V>& s) {
+  using T = Scalar<V>;
   const T two_ln2 = T(TWO_LN2);
-  ScreenGradient<T> g;
+  ScreenGradient<V> g;
   g.x = two_ln2 * s.l11 * sum.sa;
   g.y = two_ln2 * (s.l21 * sum.sa + s.l22 * sum.sb);
   g.abs_x = two_ln2 * s.l11 * sum.abs_x, g.abs_y = two_ln2 * sum.abs_y;
   g.l11 = -two_ln2 * T(LOG2_SCALE) * sum.sa_dx;
   g.l21 = -two_ln2 * T(LOG2_SCALE) * sum.sa_dy;
   g.l22 = -two_ln2 * T(LOG2_SCALE) * sum.sb_dy;
-  g.opacity = sum.s * std::exp2(-s.log2_opacity);
+  g.log_opacity = sum.s;
   g.color = {sum.color[0], sum.color[1], sum.color[2]};
   g.depth = sum.depth;
   return g;
 }
 
-// Gradients of the rows of V.
-template <class T>
-struct FactorGradient {
-  Vector<T> x, y;
-};
-
-// Through l11 = sqrt(C / det), l21 = -B / sqrt(C det), l22 = 1 / sqrt(C) with C = |Vy|^2 + blur, B = Vx . Vy and
-// det = |Vx x Vy|^2 + blur |V|^2 + blur^2, and through the antialias compensation sqrt(|Vx x Vy|^2 / det).
-template <class T>
-inline FactorGradient<T> factor_backward(const Camera<T>& camera, const Projection<T>& p, const ScreenGradient<T>& g,
-                                         T opacity) {
-  const T root = std::sqrt(p.variance_y) * std::sqrt(p.determinant);
-  const T l11 = std::sqrt(p.variance_y / p.determinant), l21 = -p.covariance / root;
-  const T l22 = 1 / std::sqrt(p.variance_y);
-  const T v_variance = (g.l11 * l11 - g.l21 * l21 - g.l22 * l22) / (2 * p.variance_y);
-  const T v_covariance = -g.l21 / root;
-  T v_cross = -(g.l11 * l11 + g.l21 * l21) / (2 * p.determinant);  // of |Vx x Vy|^2
-  T v_square = v_cross * camera.blur;                               // of |V|^2
-  const T ratio = p.bare_determinant / p.determinant;
-  if (camera.antialias && ratio > T(COMPENSATION_FLOOR)) {
-    const T v_ratio = g.opacity * opacity / (2 * std::sqrt(ratio));
-    v_cross += v_ratio * (1 - ratio) / p.determinant;  // d ratio = ((1 - ratio) d|Vx x Vy|^2 - ratio blur d|V|^2) / det
-    v_square -= v_ratio * ratio * camera.blur / p.determinant;
+// Through l11 = sqrt(C_yy / det), l21 = -C_xy / sqrt(C_yy det), l22 = 1 / sqrt(C_yy) and the antialias compensation
+// sqrt(bare / det) to the footprint, with det = bare + blur |F|^2 + blur^2 and bare the sum of squared minors.
+template <class T, class V, int K>
+inline Footprint<V, K> footprint_backward(const Camera<T>& camera, const Footprint<V, K>& f,
+                                          const ScreenGradient<V>& g) {
+  const Covariance<V, K> c(camera, f);
+  const V deviations = root(c.yy) * root(c.determinant);
+  const V l11 = root(c.yy / c.determinant), l21 = -c.xy / deviations, l22 = 1 / root(c.yy);
+  const V v_yy = (g.l11 * l11 - g.l21 * l21 - g.l22 * l22) / (2 * c.yy), v_xy = -g.l21 / deviations;
+  V v_bare = -(g.l11 * l11 + g.l21 * l21) / (2 * c.determinant);
+  V v_square = v_bare * camera.blur;  // of |F|^2
+  if (camera.antialias) {
+    // d ratio = ((1 - ratio) d bare - ratio blur d|F|^2) / det, and the logarithm of the opacity holds ln(ratio) / 2.
+    const V ratio = c.bare_determinant / c.determinant;
+    const V v_ratio = ratio > T(COMPENSATION_FLOOR) ? g.log_opacity / (2 * ratio) : V{};
+    v_bare += v_ratio * (1 - ratio) / c.determinant;
+    v_square -= v_ratio * ratio * camera.blur / c.determinant;
   }
-  const Vector<T> c = cross(p.factor_x, p.factor_y);
-  return {(2 * v_cross) * cross(p.factor_y, c) + (2 * v_square) * p.factor_x + v_covariance * p.factor_y,
-          (2 * v_cross) * cross(c, p.factor_x) + (2 * (v_square + v_variance)) * p.factor_y +
-              v_covariance * p.factor_x};
+  Footprint<V, K> out;
+  out.x = g.x, out.y = g.y;
+  for (int i = 0; i < K; ++i) {
+    V along_x{}, along_y{};
+    for (int j = 0; j < K; ++j) {
+      const V minor = f.factor_x[i] * f.factor_y[j] - f.factor_x[j] * f.factor_y[i];
+      along_x += minor * f.factor_y[j], along_y -= minor * f.factor_x[j];
+    }
+    out.factor_x[i] = 2 * (v_bare * along_x + v_square * f.factor_x[i]) + v_xy * f.factor_y[i];
+    out.factor_y[i] = 2 * (v_bare * along_y + (v_square + v_yy) * f.factor_y[i]) + v_xy * f.factor_x[i];
+  }
+  return out;
 }
 
-template <class T>
-inline void quaternion_backward(const Projection<T>& p, const Matrix<T>& v, T* out) {
-  if (p.length == 0) {
-    out[0] = out[1] = out[2] = out[3] = 0;
-    return;
-  }
-  const T w = p.quaternion[0], x = p.quaternion[1], y = p.quaternion[2], z = p.quaternion[3];
-  const Vector<T>&a = v.rows[0], &b = v.rows[1], &c = v.rows[2];
-  const T g[4] = {2 * (x * (c.y - b.z) + y * (a.z - c.x) + z * (b.x - a.y)),
-                  2 * (w * (c.y - b.z) + y * (a.y + b.x) + z * (a.z + c.x)) - 4 * x * (b.y + c.z),
-                  2 * (w * (a.z - c.x) + x * (a.y + b.x) + z * (b.z + c.y)) - 4 * y * (a.x + c.z),
-                  2 * (w * (b.x - a.y) + x * (a.z + c.x) + y * (b.z + c.y)) - 4 * z * (a.x + b.y)};
-  const T along = g[0] * w + g[1] * x + g[2] * y + g[3] * z;
-  for (int i = 0; i < 4; ++i) out[i] = (g[i] - along * p.quaternion[i]) / p.length;
-}
-
-// Gradients of the shape: writes quaternion and scales, answers that of the mean in the camera through J.
-template <class T>
-inline Vector<T> shape_backward(const Camera<T>& camera, const Projection<T>& p, const FactorGradient<T>& g,
-                                const T* scales, T* quaternion_out, T* scales_out) {
-  const Matrix<T>& m = p.camera_from_gaussian;
-  const T jx = camera.fx * p.inverse_z, jy = camera.fy * p.inverse_z;
-  const Matrix<T> v_m{{jx * g.x, jy * g.y,
-                       (-jx * p.slope[0]) * g.x + (-jy * p.slope[1]) * g.y}};
-  Matrix<T> v_axes;  // R^T v_m
-  v_axes.rows[0] = camera.rotation.rows[0].x * v_m.rows[0] + camera.rotation.rows[1].x * v_m.rows[1] +
-                   camera.rotation.rows[2].x * v_m.rows[2];
-  v_axes.rows[1] = camera.rotation.rows[0].y * v_m.rows[0] + camera.rotation.rows[1].y * v_m.rows[1] +
-                   camera.rotation.rows[2].y * v_m.rows[2];
-  v_axes.rows[2] = camera.rotation.rows[0].z * v_m.rows[0] + camera.rotation.rows[1].z * v_m.rows[1] +
-                   camera.rotation.rows[2].z * v_m.rows[2];
-  const Matrix<T>& r = p.world_from_gaussian;
-  scales_out[0] = scales_out[1] = scales_out[2] = 0;
-  for (int i = 0; i < 3; ++i) {
-    scales_out[0] += v_axes.rows[i].x * r.rows[i].x;
-    scales_out[1] += v_axes.rows[i].y * r.rows[i].y;
-    scales_out[2] += v_axes.rows[i].z * r.rows[i].z;
-    v_axes.rows[i] = {v_axes.rows[i].x * scales[0], v_axes.rows[i].y * scales[1], v_axes.rows[i].z * scales[2]};
-  }
-  quaternion_backward(p, v_axes, quaternion_out);
-
-  const T v_jxx = dot(g.x, m.rows[0]), v_jxz = dot(g.x, m.rows[2]);
-  const T v_jyy = dot(g.y, m.rows[1]), v_jyz = dot(g.y, m.rows[2]);
-  const T iz = p.inverse_z;
-  Vector<T> v{0, 0, 0};
-  v.z = -iz * (jx * v_jxx + jy * v_jyy - jx * p.slope[0] * v_jxz - jy * p.slope[1] * v_jyz);
-  if (p.inside[0]) v.x = -jx * v_jxz * iz, v.z += jx * v_jxz * p.slope[0] * iz;
-  if (p.inside[1]) v.y = -jy * v_jyz * iz, v.z += jy * v_jyz * p.slope[1] * iz;
-  return v;
-}
-
-// Writes the gradient of the coefficients; answers that of the mean in the camera through the direction.
-template <class T>
-inline Vector<T> color_backward(const Camera<T>& camera, const Vector<T>& in_camera, Vector<T> v, const T* sh,
-                                int64_t terms, T* sh_out) {
-  const ViewColor<T> c = view_color(camera, in_camera, sh, terms);
-  v = {c.raw.x > 0 ? v.x : T(0), c.raw.y > 0 ? v.y : T(0), c.raw.z > 0 ? v.z : T(0)};
-  T v_values[16];
+// Fills the gradient of the coefficients; answers that of the mean in the camera through the direction.
+template <class T, class V>
+inline Vector<V> color_backward(const Camera<T>& camera, const Vector<V>& in_camera, const Vector<V>& v_colors,
+                                const V* sh, int64_t terms, V* sh_out) {
+  const ViewColor<V> c = view_color(camera, in_camera, sh, terms);
+  const Vector<V> v = {c.raw.x > V{} ? v_colors.x : V{}, c.raw.y > V{} ? v_colors.y : V{},
+                       c.raw.z > V{} ? v_colors.z : V{}};
+  V v_values[16];
   for (int64_t k = 0; k < terms; ++k) {
-    sh_out[3 * k] = c.values[k] * v.x, sh_out[3 * k + 1] = c.values[k] * v.y, sh_out[3 * k + 2] = c.values[k] * v.z;
     v_values[k] = sh[3 * k] * v.x + sh[3 * k + 1] * v.y + sh[3 * k + 2] * v.z;
+    sh_out[3 * k] = c.values[k] * v.x, sh_out[3 * k + 1] = c.values[k] * v.y, sh_out[3 * k + 2] = c.values[k] * v.z;
   }
-  const Vector<T> v_direction = basis_backward(c.direction, terms, v_values);
-  const T along = dot(v_direction, c.direction);
+  const Vector<V> v_direction = basis_backward(c.direction, terms, v_values);
+  const V along = dot(v_direction, c.direction);
   return camera.rotation * ((1 / c.distance) * (v_direction + -along * c.direction));
 }
 
-template <class T>
-inline void zero(T* values, int64_t count) {
-  std::memset(static_cast<void*>(values), 0, count * sizeof(T));
-}
-
-template <class T>
-void row_backward(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const RowGradients& out,
-                  int64_t i) {
-  T *means = static_cast<T*>(out.means) + 3 * i, *quaternions = static_cast<T*>(out.quaternions) + 4 * i;
-  T *scales = static_cast<T*>(out.scales) + 3 * i, *opacity = static_cast<T*>(out.opacities) + i;
-  T *sh = static_cast<T*>(out.sh) + 3 * in.terms * i, *screen = static_cast<T*>(out.screen) + 2 * i;
-  if (ws.tiles[i].count == 0) {
-    zero(means, 3), zero(quaternions, 4), zero(scales, 3), zero(opacity, 1), zero(sh, 3 * in.terms), zero(screen, 2);
-    return;
+// All gradients of a register of rows but that of the harmonics' coefficients. `v_color`: of the mean in the camera,
+// through the colour.
+template <class T, class E, class V>
+inline RowValues<V> row_backward(const Camera<T>& camera, const RowValues<V>& row, const Projection<E, V>& p,
+                                 const ScreenGradient<V>& g, const Vector<V>& v_color) {
+  auto v_footprint = footprint_backward(camera, p.footprint, g);
+  Vector<V> v_mean = v_color;
+  v_mean.z += g.depth;
+  if constexpr (E::SHUTTER) {
+    V v_u_x, v_u_y;
+    read_out_backward(p.motion, camera.height, p.footprint, v_footprint, v_u_x, v_u_y);
+    v_mean = v_mean + p.motion.backward(camera, p.placement, v_u_x, v_u_y);
   }
-  const T* mean = in.means + 3 * i;
-  Projection<T> p;
-  p.in_camera = camera.rotation * Vector<T>{mean[0], mean[1], mean[2]} + camera.translation;
-  project_shape(camera, in.quaternions + 4 * i, in.scales + 3 * i, p);
-  const ScreenGradient<T> g = screen_gradient(sum_slots(ws, i), ws.splats[i]);
-  screen[0] = g.abs_x, screen[1] = g.abs_y;
-  *opacity = g.opacity * compensation(camera, p);
-  Vector<T> v = shape_backward(camera, p, factor_backward(camera, p, g, in.opacities[i]), in.scales + 3 * i, quaternions, scales);
-  const T jx = camera.fx * p.inverse_z, jy = camera.fy * p.inverse_z;
-  v.x += g.x * jx, v.y += g.y * jy;
-  v.z += g.depth - (g.x * jx * p.in_camera.x + g.y * jy * p.in_camera.y) * p.inverse_z;
-  v = v + color_backward(camera, p.in_camera, g.color, in.sh + 3 * in.terms * i, in.terms, sh);
-  const Vector<T> world = transposed(camera.rotation, v);
-  means[0] = world.x, means[1] = world.y, means[2] = world.z;
+  PlacementGradient<V> v = p.model.backward(camera, p.placement, v_footprint);
+  v.mean = v.mean + v_mean;
+  RowValues<V> out;
+  place_backward(camera, row, p.placement, v, out);
+  out.opacity = g.log_opacity / row.opacity;
+  return out;
+}
+
+// Typed views of the gradients.
+template <class T>
+struct Outputs {
+  int64_t terms;
+  T *means, *quaternions, *scales, *opacities, *sh, *screen;
+  Outputs(const RowGradients& g, int64_t terms)
+      : terms(terms), means(static_cast<T*>(g.means)), quaternions(static_cast<T*>(g.quaternions)),
+        scales(static_cast<T*>(g.scales)), opacities(static_cast<T*>(g.opacities)), sh(static_cast<T*>(g.sh)),
+        screen(static_cast<T*>(g.screen)) {}
+
+  void set_zero(int64_t row) const {
+    std::memset(static_cast<void*>(means + 3 * row), 0, 3 * sizeof(T));
+    std::memset(static_cast<void*>(quaternions + 4 * row), 0, 4 * sizeof(T));
+    std::memset(static_cast<void*>(scales + 3 * row), 0, 3 * sizeof(T));
+    std::memset(static_cast<void*>(sh + 3 * terms * row), 0, 3 * terms * sizeof(T));
+    std::memset(static_cast<void*>(screen + 2 * row), 0, 2 * sizeof(T));
+    opacities[row] = 0;
+  }
+};
+
+// Sums of the slots of rows row(0), row(1), ..., one per lane.
+template <class T, class RowAt>
+inline Slot<Lanes<T>> sum_slots(const Workspace<T>& ws, RowAt row) {
+  constexpr int columns = SLOT_COLUMNS<T>;
+  T sums[LANES<T>][columns];
+  for (int lane = 0; lane < LANES<T>; ++lane) {
+    const T* slots = reinterpret_cast<const T*>(&ws.slots[ws.tiles[row(lane)].first_slot]);
+    for (int c = 0; c < columns; ++c) sums[lane][c] = slots[c];
+    for (int32_t k = 1; k < ws.tiles[row(lane)].count; ++k)
+      for (int c = 0; c < columns; ++c) sums[lane][c] += slots[k * columns + c];
+  }
+  Slot<Lanes<T>> sum;
+  load_columns<T>([&](int lane) { return sums[lane]; }, columns, &sum.s);
+  return sum;
+}
+
+// `count` visible rows, at most LANES.
+template <class E, class T>
+void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
+                    const int64_t* rows, int count) {
+  using V = Lanes<T>;
+  const auto row = [&](int lane) { return rows[lane < count ? lane : count - 1]; };
+  const int coefficients = int(3 * in.terms);
+  Splat<V> splat;
+  load_columns<T>([&](int r) { return reinterpret_cast<const T*>(&ws.splats[row(r)]); }, SPLAT_COLUMNS<T>, &splat.x);
+  const RowValues<V> values = load_rows<E>(in, row);
+  const Projection<E, V> p(camera, values);
+  const ScreenGradient<V> g = screen_gradient(sum_slots(ws, row), splat);
+  V sh[3 * 16], v_sh[3 * 16];
+  load_columns<T>([&](int r) { return in.sh + 3 * in.terms * row(r); }, coefficients, sh);
+  const Vector<V> v_color = color_backward(camera, p.placement.mean, g.color, sh, in.terms, v_sh);
+  const RowValues<V> v = row_backward(camera, values, p, g, v_color);
+  store_columns<T>(&v.mean.x, 3, count, [&](int r) { return out.means + 3 * row(r); });
+  store_columns<T>(v.quaternion, 4, count, [&](int r) { return out.quaternions + 4 * row(r); });
+  store_columns<T>(&v.scales.x, 3, count, [&](int r) { return out.scales + 3 * row(r); });
+  store_columns<T>(&v.opacity, 1, count, [&](int r) { return out.opacities + row(r); });
+  store_columns<T>(v_sh, coefficients, count, [&](int r) { return out.sh + 3 * in.terms * row(r); });
+  store_columns<T>(&g.abs_x, 2, count, [&](int r) { return out.screen + 2 * row(r); });
+}
+
+// Rows `range` of the input: culled ones get zeros, the others are gathered until they fill a register. In which lane
+// a row is computed does not change its bits.
+template <class E, class T>
+void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
+                    const Range& range) {
+  int64_t rows[LANES<T>];
+  int count = 0;
+  for (int64_t i = range.begin; i < range.end; ++i) {
+    if (ws.tiles[i].count == 0) {
+      out.set_zero(i);
+      continue;
+    }
+    rows[count++] = i;
+    if (count == LANES<T>) backward_block<E>(ws, camera, in, out, rows, count), count = 0;
+  }
+  if (count > 0) backward_block<E>(ws, camera, in, out, rows, count);
 }
 
 template <class T>
-void project_backward(Workspace<T>& ws, const View& view, const Rows& rows, const RowGradients& out) {
+void project_backward(Workspace<T>& ws, const View& view, const Rows& rows, const RowGradients& gradients) {
   const double start = omp_get_wtime();
   const Inputs<T> in(rows);
+  const Outputs<T> out(gradients, in.terms);
   const Camera<T> camera(view);
+  with_effects(view, [&](auto effects) {
 #pragma omp parallel for num_threads(view.threads) schedule(static)
-  for (int64_t i = 0; i < in.count; ++i) row_backward(ws, camera, in, out, i);
+    for (int64_t part = 0; part < view.threads; ++part)
+      backward_range<decltype(effects)>(ws, camera, in, out, Range(in.count, part, view.threads));
+  });
   ws.seconds[PROJECT_BACKWARD] = omp_get_wtime() - start;
 }
 

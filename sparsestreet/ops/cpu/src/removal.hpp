@@ -31,8 +31,9 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
   for (int x = 0; x < TILE; x += LANES<T>) {
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
-    const Sample<T> p = sample<T, EXCLUSIVE>(s, load(dx + x), along, base, cuts, transmittance, c.gate + at);
-    const Lanes<T> weight = p.alpha * transmittance, through = p.alpha / (T(1) - p.alpha);
+    const Lanes<T> alpha = still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha, cuts,
+                                                    transmittance, c.gate + at);
+    const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
     store(c.transmittance + at, transmittance - weight);
     for (int channel = 0; channel < 3; ++channel) {
       const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
@@ -52,6 +53,7 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
   std::memset(static_cast<void*>(&c), 0, sizeof(c));
   open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
   int64_t samples = 0;
+  sort_tile(ws, tile);
   blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
   behind_everything(c, view, background, x0, y0, behind);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
@@ -86,7 +88,7 @@ void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const void* b
   for (int64_t i = 0; i < rows; ++i) {
     typename Workspace<T>::Change sum{0, 0};
     for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
-      const auto& slot = ws.change_slots[ws.first_slot[i] + k];
+      const auto& slot = ws.change_slots[ws.tiles[i].first_slot + k];
       sum.largest = slot.largest > sum.largest ? slot.largest : sum.largest, sum.squared += slot.squared;
     }
     out.largest[i] = sum.largest, out.squared[i] = sum.squared;

@@ -6,41 +6,47 @@ namespace SPLAT_VARIANT {
 
 template <class T>
 struct Grid {
-  T width, height, log2_alpha_min;
-  bool bounded;  // alpha_min > 0
+  T width, height;
+  bool bounded;  // splats end somewhere
   int64_t tiles_x, tiles_y;
 
-  explicit Grid(const View& v)
-      : width(v.width), height(v.height), log2_alpha_min(v.alpha_min > 0 ? std::log2(v.alpha_min) : 0),
-        bounded(v.alpha_min > 0), tiles_x((v.width + TILE - 1) / TILE), tiles_y((v.height + TILE - 1) / TILE) {}
+  explicit Grid(const Camera<T>& c)
+      : width(c.width), height(c.height), bounded(c.bounded()), tiles_x((int64_t(c.width) + TILE - 1) / TILE),
+        tiles_y((int64_t(c.height) + TILE - 1) / TILE) {}
 };
 
 // The ellipse |L d|^2 <= reach as x(dy) = slope dy -+ half_width sqrt(1 - (dy / half_y)^2); its right-most point lies
-// at dy = peak, its left-most at -peak.
-template <class T>
+// at dy = peak, its left-most at -peak. V: a number or a register of splats.
+template <class V>
 struct Ellipse {
-  T slope, half_width, half_y, peak, margin_x, margin_y;
+  using T = Scalar<V>;
+  V slope, half_width, half_y, peak, margin_x, margin_y;
 
-  Ellipse(const Splat<T>& s, T log2_alpha_min) {
-    const T reach = s.log2_opacity - log2_alpha_min;
+  explicit Ellipse(const Splat<V>& s) {
     slope = -s.l21 / s.l11;
-    half_width = std::sqrt(reach > 0 ? reach : T(0)) / s.l11;
+    half_width = root(positive_part(s.log2_opacity - s.least_exponent)) / s.l11;
     half_y = s.half_y;
-    peak = s.half_x > 0 ? slope * half_y * half_y / s.half_x : T(0);
+    peak = s.half_x > V{} ? slope * half_y * half_y / s.half_x : V{};
     // The pixel loop's rounding grows with the distances it squares.
     margin_x = T(BOX_MARGIN) + T(1e-5) * s.half_x, margin_y = T(BOX_MARGIN) + T(1e-5) * s.half_y;
   }
-  T half_chord(T dy) const {
-    const T ratio = half_y > 0 ? dy / half_y : T(0);
-    const T rest = 1 - ratio * ratio;
-    return half_width * std::sqrt(rest > 0 ? rest : T(0));
+  V half_chord(const V& dy) const {
+    const V ratio = half_y > V{} ? dy / half_y : V{};
+    return half_width * root(positive_part(1 - ratio * ratio));
   }
-  // Extent in x, relative to the centre, over dy in [low, high].
-  void extent(T low, T high, T& left, T& right) const {
-    low = limited(low - margin_y, -half_y, half_y), high = limited(high + margin_y, -half_y, half_y);
-    const T at_right = limited(peak, low, high), at_left = limited(-peak, low, high);
+  // Extent in x, relative to the centre, over dy in [from, to].
+  void extent(const V& from, const V& to, V& left, V& right) const {
+    const V low = limited(from - margin_y, -half_y, half_y), high = limited(to + margin_y, -half_y, half_y);
+    const V at_right = limited(peak, low, high), at_left = limited(-peak, low, high);
     right = slope * at_right + half_chord(at_right) + margin_x;
     left = slope * at_left - half_chord(at_left) - margin_x;
+  }
+  // First and last pixel column in the row of tiles that starts at image row `top`.
+  void columns(const Splat<V>& s, const V& top, T width, Index<V>& first, Index<V>& last) const {
+    V left, right;
+    const V dy = top + T(0.5) - s.y;
+    extent(dy, dy + T(TILE - 1), left, right);
+    pixel_span(s.x + (left + right) / 2, (right - left) / 2, width, first, last);
   }
 };
 
@@ -48,43 +54,83 @@ struct Ellipse {
 template <class T, class Visit>
 inline void find_tiles(const Splat<T>& s, const Grid<T>& grid, Visit visit) {
   if (s.first_row > s.last_row) return;
-  const Ellipse<T> ellipse(s, grid.log2_alpha_min);
+  const Ellipse<T> ellipse(s);
   for (int64_t ty = s.first_row / TILE; ty <= s.last_row / TILE; ++ty) {
-    int32_t first = 0, last = int32_t(grid.width) - 1;
-    if (grid.bounded) {
-      T left, right;
-      const T top = T(ty * TILE) + T(0.5) - s.y;
-      ellipse.extent(top, top + T(TILE - 1), left, right);
-      pixel_span(s.x + (left + right) / 2, (right - left) / 2, grid.width, first, last);
-    }
+    Index<T> first = 0, last = Index<T>(grid.width) - 1;
+    if (grid.bounded) ellipse.columns(s, T(ty * TILE), grid.width, first, last);
     if (first > last) continue;
     for (int64_t tx = first / TILE; tx <= last / TILE; ++tx) visit(tx, ty);
   }
 }
 
+// The box of tiles around the box of pixels; `small` where it is at most 8x8.
 template <class T>
-inline TileSet tile_set(const Splat<T>& s, const Grid<T>& grid) {
-  int32_t first, last;
-  pixel_span(s.x, s.half_x + T(BOX_MARGIN) * 2 + T(1e-4) * s.half_x, grid.width, first, last);
-  if (first > last || s.first_row > s.last_row) return {0, 0, 0};
-  const int64_t left = first / TILE, top = s.first_row / TILE;
-  const int64_t columns = last / TILE - left + 1, rows = s.last_row / TILE - top + 1;
-  TileSet set{0, int32_t(top * grid.tiles_x + left), 0};
-  if (columns == 1 && rows == 1) return {1, set.first, 1};
-  if (columns <= 8 && rows <= 8) {
-    find_tiles(s, grid, [&](int64_t x, int64_t y) {
-      ++set.count, set.mask |= uint64_t(1) << (8 * (y - top) + x - left);
-    });
-  } else {
-    find_tiles(s, grid, [&](int64_t, int64_t) { ++set.count; });
+struct TileBoxes {
+  Integers<T> left, top, columns, rows, small;
+
+  TileBoxes(const Splat<Lanes<T>>& s, const Grid<T>& grid, const Integers<T>& seen) {
+    Integers<T> first, last;
+    pixel_span(s.x, s.half_x + T(BOX_MARGIN) * 2 + T(1e-4) * s.half_x, grid.width, first, last);
+    const Integers<T> some = seen && first <= last && s.first_row <= s.last_row, none{};
+    left = first / TILE, top = s.first_row / TILE;
+    columns = some ? last / TILE - left + 1 : none, rows = some ? s.last_row / TILE - top + 1 : none;
+    small = columns <= 8 && rows <= 8;
   }
-  return set;
+};
+
+// Bits of the tiles of small splats: rows 0 to 3 of their box in `masks[0]`, 4 to 7 in `masks[1]`.
+template <class T>
+inline void small_masks(const Splat<Lanes<T>>& s, const TileBoxes<T>& box, const Grid<T>& grid, Integers<T>* masks) {
+  const Integers<T> none{}, one = none + 1;
+  masks[0] = masks[1] = none;
+  const Ellipse<Lanes<T>> ellipse(s);
+  for (int row = 0; row < 8; ++row) {
+    const Integers<T> here = box.small && box.rows > row;
+    if (!any<T>(here)) break;
+    Integers<T> first = box.left * TILE, last = first + (box.columns - 1) * TILE;
+    if (grid.bounded) ellipse.columns(s, as_value((box.top + row) * TILE), grid.width, first, last);
+    // A splat in one tile has no corner to spare, so nothing is asked of its ellipse.
+    const Integers<T> lone = box.columns == 1 && box.rows == 1;
+    const Integers<T> low = lone ? none : first / TILE - box.left, high = lone ? none : last / TILE - box.left;
+    const Integers<T> bits = (one << (high + 1)) - (one << low);
+    masks[row / 4] |= here && (lone || first <= last) ? bits << (8 * (row % 4)) : none;
+  }
 }
 
-// Calls visit(tile) for each tile of a splat, always in the same order.
+// What orders splats by depth: the upper `bits` of the depth as float32, or all digits of T.
+template <class T>
+inline DepthKey<T> depth_key(T depth, int bits) {
+  if (sizeof(T) == 4 || bits < 32) {
+    const float single = float(depth);
+    uint32_t key;
+    std::memcpy(&key, &single, sizeof(key));
+    return key & (~uint32_t(0) << (32 - bits));
+  }
+  DepthKey<T> key;
+  std::memcpy(&key, &depth, sizeof(key));
+  return key;
+}
+
+// The tiles of each row of a register; count 0 where it was not seen.
+template <class T>
+inline void tile_sets(const Splat<Lanes<T>>& s, const Grid<T>& grid, const Integers<T>& seen, const Splat<T>* splats,
+                      int rows, TileSet<T>* sets) {
+  const TileBoxes<T> box(s, grid, seen);
+  Integers<T> masks[2];
+  small_masks(s, box, grid, masks);
+  for (int r = 0; r < rows; ++r) {
+    const uint64_t mask = uint64_t(uint32_t(masks[1][r])) << 32 | uint32_t(masks[0][r]);
+    sets[r].mask = mask, sets[r].count = __builtin_popcountll(mask);
+    sets[r].first = int32_t(box.top[r] * grid.tiles_x + box.left[r]);
+    if (!box.small[r]) find_tiles(splats[r], grid, [&](int64_t, int64_t) { ++sets[r].count; });
+  }
+}
+
+// Calls visit(tile) for each tile of a row, always in the same order; for none if it is culled.
 template <class T, class Visit>
-inline void for_each_tile(const TileSet& set, const Splat<T>& s, const Grid<T>& grid, Visit visit) {
+inline void for_each_tile(const TileSet<T>& set, const Splat<T>& s, const Grid<T>& grid, Visit visit) {
   if (set.mask == 0) {
+    if (set.count == 0) return;
     find_tiles(s, grid, [&](int64_t x, int64_t y) { visit(y * grid.tiles_x + x); });
     return;
   }

@@ -1,0 +1,46 @@
+// The camera and the settings of a view in the precision of the rows.
+#pragma once
+#include <cmath>
+#include <limits>
+
+#include "interface.h"
+#include "small_matrix.hpp"
+#include "values.hpp"
+
+namespace SPLAT_VARIANT {
+
+using namespace splat;
+
+constexpr double LEAST_EXPONENT = -126;  // without a cut-off alpha still ends where float does: 2^-126
+
+template <class T>
+struct Camera {
+  Matrix<T> rotation;
+  Vector<T> translation;
+  T fx, fy, cx, cy, slope_min[2], slope_max[2];
+  T k1, k2, p1, p2, k3, fold;  // Brown-Conrady; fold: the r^2 at which the radial polynomial turns back
+  Vector<T> shutter_translation, shutter_rotation;
+  T alpha_min, log2_alpha_min, blur, near_plane, width, height;
+  T box_squared;  // the largest |L d|^2 that is drawn
+  bool antialias, half_colors;
+  int depth_bits;
+
+  explicit Camera(const View& v)
+      : translation(vector(v.translation)), fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy), k1(v.distortion[0]),
+        k2(v.distortion[1]), p1(v.distortion[2]), p2(v.distortion[3]), k3(v.distortion[4]), fold(v.fold),
+        shutter_translation(vector(v.shutter_translation)), shutter_rotation(vector(v.shutter_rotation)),
+        alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), blur(v.blur),
+        near_plane(v.near_plane), width(v.width), height(v.height), box_squared(T(v.box) * T(v.box)),
+        antialias(v.antialias), half_colors(v.half_colors), depth_bits(int(v.depth_bits)) {
+    for (int i = 0; i < 3; ++i) rotation.rows[i] = vector(v.rotation + 3 * i);
+    const T margin_x = T(0.3) * width / (2 * fx), margin_y = T(0.3) * height / (2 * fy);
+    slope_min[0] = -cx / fx - margin_x, slope_max[0] = (width - cx) / fx + margin_x;
+    slope_min[1] = -cy / fy - margin_y, slope_max[1] = (height - cy) / fy + margin_y;
+  }
+  bool bounded() const { return alpha_min > 0 || box_squared <= std::numeric_limits<T>::max(); }
+
+ private:
+  static Vector<T> vector(const double* v) { return {T(v[0]), T(v[1]), T(v[2])}; }
+};
+
+}  // namespace SPLAT_VARIANT

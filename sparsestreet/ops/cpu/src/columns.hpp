@@ -1,0 +1,55 @@
+// Rows in memory to registers that hold one column each, and back: squares of LANES x LANES are transposed in registers.
+#pragma once
+#include "lanes.hpp"
+
+namespace SPLAT_VARIANT {
+
+// One step of the butterfly: exchanges the off-diagonal halves of blocks of 2 * half rows and columns.
+template <class T, int half>
+inline void exchange(Lanes<T>* square) {
+  Integers<T> upper, lower;
+  for (int i = 0; i < LANES<T>; ++i) {
+    upper[i] = i & half ? LANES<T> + i - half : i;
+    lower[i] = i & half ? LANES<T> + i : i + half;
+  }
+  for (int r = 0; r < LANES<T>; ++r) {
+    if (r & half) continue;
+    const Lanes<T> a = square[r], b = square[r + half];
+    square[r] = __builtin_shuffle(a, b, upper);
+    square[r + half] = __builtin_shuffle(a, b, lower);
+  }
+}
+
+template <class T, int half = LANES<T> / 2>
+inline void transpose(Lanes<T>* square) {
+  exchange<T, half>(square);
+  if constexpr (half > 1) transpose<T, half / 2>(square);
+}
+
+// out[c] lane r = row(r)[c]; row(r) must be readable for every lane.
+template <class T, class RowAt>
+inline void load_columns(RowAt row, int columns, Lanes<T>* out) {
+  int c = 0;
+  for (; c + LANES<T> <= columns; c += LANES<T>) {
+    for (int r = 0; r < LANES<T>; ++r) out[c + r] = load<T>(row(r) + c);
+    transpose<T>(out + c);
+  }
+  for (; c < columns; ++c)
+    for (int r = 0; r < LANES<T>; ++r) out[c][r] = row(r)[c];
+}
+
+// row(r)[c] = in[c] lane r, for the first `rows` lanes.
+template <class T, class RowAt>
+inline void store_columns(const Lanes<T>* in, int columns, int rows, RowAt row) {
+  int c = 0;
+  for (; c + LANES<T> <= columns; c += LANES<T>) {
+    Lanes<T> square[LANES<T>];
+    for (int r = 0; r < LANES<T>; ++r) square[r] = in[c + r];
+    transpose<T>(square);
+    for (int r = 0; r < rows; ++r) store<T>(row(r) + c, square[r]);
+  }
+  for (; c < columns; ++c)
+    for (int r = 0; r < rows; ++r) row(r)[c] = in[c][r];
+}
+
+}  // namespace SPLAT_VARIANT

@@ -1,0 +1,77 @@
+"""The C++ backend in other processes: forked and spawned workers, and loaded before torch."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sparsestreet.ops.cpu.library import find_library
+
+ROOT = Path(__file__).parents[2]
+SCENE = """
+import torch
+from sparsestreet.ops import splat
+from tests.ops.scenes import camera, cast, random_gaussians
+
+torch.set_num_threads(2)
+view = camera(70, 50)
+scene = random_gaussians(300, view)
+
+
+def image():
+    leaves = cast(scene, torch.float32, requires_grad=True)
+    rgb = splat(leaves, view, backend="cpu").rgb
+    rgb.sum().backward()
+    return rgb.detach(), leaves.sh.grad
+"""
+WORKER = """
+import multiprocessing, sys
+
+def work(queue):
+    queue.put([part.numpy() for part in image()])
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context(sys.argv[1])
+    expected = [part.numpy() for part in image()]  # starts the threads that a forked child lacks
+    queue = context.Queue()
+    worker = context.Process(target=work, args=(queue,), daemon=True)
+    worker.start()
+    result = queue.get(timeout=60)
+    assert all((a == b).all() for a, b in zip(expected, result, strict=True))
+    worker.join(60)
+    sys.exit(worker.exitcode)
+"""
+LOADED_FIRST = """
+import ctypes, sys
+ctypes.CDLL(sys.argv[1])
+"""
+SUBNORMALS = """
+rgb, gradient = image()
+assert rgb.any() and gradient.any()
+assert torch.tensor(1e-40) * torch.tensor(0.5) > 0, "the library switched the process to flush-to-zero"
+# In torch's own threads as well.
+assert (torch.full((1 << 22,), 1e-40) * 0.5 > 0).all()
+"""
+
+
+def run(script: Path, text: str, *arguments: str) -> None:
+    script.write_text(text)
+    command = [sys.executable, str(script), *arguments]
+    answer = subprocess.run(
+        command, cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=180, check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_in_a_worker_process(method, tmp_path):
+    run(tmp_path / "script.py", SCENE + WORKER, method)
+
+
+def test_loaded_before_torch(tmp_path):
+    run(tmp_path / "script.py", LOADED_FIRST + SCENE + SUBNORMALS, str(find_library()))
+
+
+def test_loaded_after_torch(tmp_path):
+    run(tmp_path / "script.py", SCENE + SUBNORMALS)
