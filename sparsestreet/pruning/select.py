@@ -56,9 +56,10 @@ def keep_by_cost(
     everything = torch.cat([cost.double() for cost in costs.values()])
     if not (everything >= 0).all():
         raise ValueError(f"costs of removal must be numbers >= 0, got {float(everything[~(everything >= 0)][0])}")
-    cheapest_first = torch.sort(everything, stable=True)
+    # Of equals the later goes first, as at the floor.
+    cheapest_first = torch.sort(everything.flip(0), stable=True)
     unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
-    unwanted[cheapest_first.indices] = cheapest_first.values.cumsum(0) <= allowed
+    unwanted[len(everything) - 1 - cheapest_first.indices] = cheapest_first.values.cumsum(0) <= allowed
     parts = unwanted.split([len(cost) for cost in costs.values()])
     return {name: _keep_best(costs[name], part, minimum_rows[name]) for name, part in zip(costs, parts, strict=True)}
 

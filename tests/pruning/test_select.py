@@ -116,7 +116,7 @@ def test_impossible_inputs_are_refused():
 def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, second, allowed, floor):
     costs = {name: torch.tensor(values, dtype=torch.float64) for name, values in (("a", first), ("b", second))}
     chosen = keep_by_cost(costs, allowed, {"a": floor, "b": 0})
-    order = sorted(range(len(first) + len(second)), key=lambda row: ((first + second)[row], row))
+    order = sorted(range(len(first) + len(second)), key=lambda row: ((first + second)[row], -row))
     spent, unwanted = 0.0, [False] * len(order)
     for row in order:
         spent += (first + second)[row]
