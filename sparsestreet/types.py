@@ -183,4 +183,4 @@ class Removal:
     largest: Float64[Tensor, " n"]
     """Largest absolute change of a channel of a pixel."""
     squared: Float64[Tensor, " n"]
-    """Sum over pixels and channels of the squared change."""
+    """Sum over pixels and channels of the squared change, each pixel times its weight."""

@@ -80,10 +80,13 @@ def removal(
     camera: Camera,
     *,
     background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None = None,
+    pixel_weights: Float[Tensor, "h w"] | None = None,
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
 ) -> Removal:
     """How far the view moves when each row alone is taken away, over a background (None: black). No gradients.
+
+    ``pixel_weights``, >= 0: how much the squared change of each pixel counts; None: 1.
 
     Exact for pixels that are not stopped: a pixel is linear in the alpha of each of its splats, so that the change is
     -alpha dC/dalpha. Where the stop rule hid splats behind, up to ``transmittance_min / (1 - alpha_max)`` of their
@@ -94,11 +97,23 @@ def removal(
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
+        _check_pixel_weights(pixel_weights, camera, gaussians.means)
         behind = None if background is None else background.expand(camera.height, camera.width, 3)
         if chosen == "reference":
             check_values(gaussians)
-            return reference.removal(gaussians, behind, camera, settings)
-        return cpu.removal(gaussians, behind, camera, settings)
+            return reference.removal(gaussians, behind, pixel_weights, camera, settings)
+        return cpu.removal(gaussians, behind, pixel_weights, camera, settings)
+
+
+def _check_pixel_weights(weights: Tensor | None, camera: Camera, means: Tensor) -> None:
+    shape = (camera.height, camera.width)
+    if weights is None:
+        return
+    if tuple(weights.shape) != shape or weights.dtype != means.dtype or weights.device != means.device:
+        raise ValueError(
+            f"pixel_weights must be {list(shape)} {means.dtype} on {means.device}, got {list(weights.shape)} "
+            f"{weights.dtype} on {weights.device}: give one weight per pixel of the camera"
+        )
 
 
 def _screen_offsets(gaussians: Gaussians) -> Float[Tensor, "n 2"]:

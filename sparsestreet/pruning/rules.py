@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
 
 from sparsestreet.ops import SplatSettings, contribution, removal
 from sparsestreet.pruning.importance import measure_importance
@@ -54,11 +56,13 @@ class ImportanceRule:
 class RemovalRule:
     """Rows go that the training images miss least, as many as cost ``allowed_db`` of their PSNR.
 
-    The cost of a row is the sum over views, pixels and channels of the squared change when it alone is taken away. The
-    row of least cost goes first, as long as the sum of costs stays below the share of the present squared error that
-    ``allowed_db`` decibels stand for: 10^(dB / 10) - 1. That sum takes changes as independent of each other and of
-    the error; what overlapping rows lose together is more, and is made up for by the steps that follow. Unlike the
-    importance gate this asks whether a row would be missed, not whether it leads somewhere.
+    The cost of a row is the sum over views, pixels and channels of the squared change when it alone is taken away,
+    relative to the present squared error: of the whole images, plus the same of the pixels that show vehicles and of
+    those that show people, where the log marks them. These are few, and a loss there would drown in the whole. The row
+    of least cost goes first, as long as the sum stays below the 10^(dB / 10) - 1 that ``allowed_db`` stands for: so
+    neither the images nor their vehicles nor their people pay more. That takes changes as independent of each other and
+    of the error; what overlapping rows lose together is more, and is made up for by the steps that follow. Unlike
+    the importance gate this asks whether a row would be missed, not whether it leads somewhere.
 
     A row that moves no channel of any pixel by more than ``noticeable`` costs nothing.
     """
@@ -78,29 +82,44 @@ class RemovalRule:
     def select(
         self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
     ) -> dict[str, Selection]:
-        changes = [_removal(scene, frame, view) for frame in frames]
+        errors = sum(_squared_errors(scene, frame, view) for frame in frames)
+        changes = [_removal(scene, frame, errors, view) for frame in frames]
         largest = torch.stack([change.largest for change in changes]).amax(0)
         squared = torch.stack([change.squared for change in changes]).sum(0)
         costs = torch.where(largest > self.noticeable, squared, 0.0)
         spans = scene.gaussians_at(frames[0].time).rows
-        allowed = (10 ** (self.allowed_db / 10) - 1) * sum(_squared_error(scene, frame, view) for frame in frames)
-        return keep_by_cost({name: costs[spans[name]] for name in minimum_rows}, allowed, minimum_rows)
+        return keep_by_cost(
+            {name: costs[spans[name]] for name in minimum_rows}, 10 ** (self.allowed_db / 10) - 1, minimum_rows
+        )
 
 
-def _removal(scene: SceneGraph, frame: Frame, view: View) -> Removal:
-    """Over the sky, as the image is seen."""
+def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
+    """1 where a pixel belongs to the whole image, to vehicles, to people."""
+    everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool, device=frame.image.device)
+    nowhere = torch.zeros_like(everywhere)
+    marked = [nowhere if mask is None else mask for mask in (frame.vehicle, frame.human)]
+    return torch.stack([everywhere, *marked]).float()
+
+
+def _removal(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], view: View) -> Removal:
+    """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
+    share = torch.where(errors > 0, 1 / errors, 0.0)
+    weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
     return removal(
         scene.gaussians_at(frame.time).gaussians,
         frame.camera,
         background=backdrop(scene, frame.camera),
+        pixel_weights=weights,
         settings=view.settings,
         backend=view.backend,
     )
 
 
-def _squared_error(scene: SceneGraph, frame: Frame, view: View) -> float:
+def _squared_errors(scene: SceneGraph, frame: Frame, view: View) -> Float64[Tensor, "3"]:
+    """Of each region of one frame."""
     image = render(scene, frame.camera, frame.time, settings=view.settings, backend=view.backend).rgb
-    return float((image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum())
+    squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
+    return (_regions(frame).double() * squared).sum((1, 2))
 
 
 def _contributions(scene: SceneGraph, frames: Sequence[Frame], view: View) -> Iterator[Contribution]:

@@ -1,4 +1,4 @@
-"""Lens distortion against a hand-computed case, its own text-book formula in NumPy, finite differences and its inverse."""
+"""Lens distortion against a hand case, its text-book formula in NumPy, finite differences and its inverse."""
 
 import math
 
@@ -26,11 +26,15 @@ def _naive(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: f
     """Polar form, one point at a time: the radius is scaled, then the tangential part is added."""
     r, angle = math.hypot(x, y), math.atan2(y, x)
     grown = r + k1 * r**3 + k2 * r**5 + k3 * r**7
-    tangential = r * r * np.array(
-        [
-            p1 * math.sin(2 * angle) + p2 * (2 + math.cos(2 * angle)),
-            p1 * (2 - math.cos(2 * angle)) + p2 * math.sin(2 * angle),
-        ]
+    tangential = (
+        r
+        * r
+        * np.array(
+            [
+                p1 * math.sin(2 * angle) + p2 * (2 + math.cos(2 * angle)),
+                p1 * (2 - math.cos(2 * angle)) + p2 * math.sin(2 * angle),
+            ]
+        )
     )
     return grown * math.cos(angle) + tangential[0], grown * math.sin(angle) + tangential[1]
 

@@ -47,6 +47,32 @@ def test_against_images_without_the_row(backend, behind):
     assert int((changes.largest > 0).sum()) > 20
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_pixels_count_as_much_as_their_weight(backend):
+    view = camera(37, 21, focal=30.0)
+    gaussians = random_gaussians(80, view, seed=7)
+    left = torch.zeros(21, 37, dtype=torch.float64)
+    left[:, :19] = 1
+    plain, one, other = (
+        removal(gaussians, view, pixel_weights=weights, backend=backend) for weights in (None, left, 3 * (1 - left))
+    )
+    torch.testing.assert_close(one.squared + other.squared / 3, plain.squared, rtol=1e-12, atol=1e-15)
+    assert torch.equal(one.largest, plain.largest)
+    # A weight alone: the change of one pixel, from an image without the row.
+    row = int(one.squared.argmax())
+    opacities = gaussians.opacities.clone()
+    opacities[row] = 0
+    images = [splat(g, view, backend=backend).rgb for g in (gaussians, replace(gaussians, opacities=opacities))]
+    change = (images[1] - images[0]).square().sum(-1)
+    assert float(one.squared[row]) == pytest.approx(float(change[:, :19].sum()), rel=1e-2)
+
+
+def test_weights_of_another_shape_are_refused():
+    view = camera(5, 4)
+    with pytest.raises(ValueError, match="pixel_weights"):
+        removal(random_gaussians(3, view), view, pixel_weights=torch.ones(5, 4, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
 @pytest.mark.parametrize("width_height", [(1, 1), (37, 53), (64, 17)])
 def test_backends_agree(width_height, stop):

@@ -85,6 +85,23 @@ def test_a_row_seen_in_one_view_of_two_stays():
     assert rule.select(scene, [front, behind], {"background": 0}, VIEW)["background"].removed == 0
 
 
+def test_what_shows_a_vehicle_costs_more():
+    # Equal discs side by side, each in its own half of the image; the right half is marked as a vehicle.
+    scene = scene_of([0.5, 0.5], [2.0, 2.0])
+    with torch.no_grad():
+        scene.nodes["background"].rows.means.copy_(torch.tensor([[-0.12, 0.0, 2.0], [0.12, 0.0, 2.0]]))
+        scene.nodes["background"].rows.log_scales.fill_(-4.5)
+    frame = frame_of(scene, 20)
+    halves = torch.zeros(7, 9, dtype=torch.bool)
+    halves[:, 5:] = True
+    for vehicle, kept in ((halves, [False, True]), (halves.flip(1), [True, False])):
+        marked = replace(frame, vehicle=vehicle)
+        budgets = [RemovalRule(db, noticeable=0.0) for db in torch.linspace(0.01, 6, 60).tolist()]
+        selections = [rule.select(scene, [marked], {"background": 0}, VIEW)["background"] for rule in budgets]
+        first = next(selection for selection in selections if selection.removed)
+        assert first.keep.tolist() == kept
+
+
 def test_the_floor_holds():
     scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0])
     for rule in (RemovalRule(50.0), ImportanceRule()):

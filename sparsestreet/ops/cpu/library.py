@@ -65,6 +65,12 @@ class Counters(ctypes.Structure):
     _fields_ = tuple((name, c_void_p) for name in ("weight", "pixels", "dominant"))
 
 
+class Backdrop(ctypes.Structure):
+    """Pointers to what stands behind the splats and to how much each pixel counts; null: black, and 1."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("rgb", "pixel_weights"))
+
+
 class Changes(ctypes.Structure):
     """Pointers to what the removal of each row changes."""
 

@@ -67,6 +67,7 @@ def contribution(
 def removal(
     gaussians: Gaussians,
     background: Float[Tensor, "h w 3"] | None,
+    pixel_weights: Float[Tensor, "h w"] | None,
     camera: Camera,
     settings: SplatSettings,
     variant: int = FASTEST_VARIANT,
@@ -78,12 +79,12 @@ def removal(
     displacements = _moved(g)
     lease, report = Lease(g.means.dtype, variant), native.Report()
     largest, squared = torch.empty(2, len(g), dtype=torch.float64)
-    behind = None if background is None else background.detach().contiguous()
+    behind = [None if layer is None else layer.detach().contiguous() for layer in (background, pixel_weights)]
     status = native.load_library().splat_removal(
         lease.workspace.handle,
         byref(_view(camera, settings)),
         byref(_rows(fields, displacements)),
-        None if behind is None else behind.data_ptr(),
+        byref(native.Backdrop(*(None if layer is None else layer.data_ptr() for layer in behind))),
         byref(native.Changes(largest.data_ptr(), squared.data_ptr())),
         byref(report),
     )

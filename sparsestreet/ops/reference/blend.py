@@ -60,7 +60,11 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
 
 @torch.no_grad()
 def removal(
-    gaussians: Gaussians, background: Float[Tensor, "h w 3"] | None, camera: Camera, settings: SplatSettings
+    gaussians: Gaussians,
+    background: Float[Tensor, "h w 3"] | None,
+    pixel_weights: Float[Tensor, "h w"] | None,
+    camera: Camera,
+    settings: SplatSettings,
 ) -> Removal:
     """Change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
     rows = visible_rows(gaussians, camera, settings)
@@ -70,11 +74,14 @@ def removal(
         return Removal(largest, squared)
     if background is None:
         background = splats.colors.new_zeros(camera.height, camera.width, 3)
+    if pixel_weights is None:
+        pixel_weights = splats.colors.new_ones(camera.height, camera.width)
     still, begin = torch.zeros_like(splats.means), 0
     for chunk in _pixel_chunks(camera, splats):
         weights, transmittance = _weights(_alphas(chunk, splats, still, settings), settings)
         light = weights[..., None] * splats.colors[:, None]
-        behind = transmittance[:, None] * background.reshape(-1, 3)[begin : begin + len(chunk)]
+        here = slice(begin, begin + len(chunk))
+        behind = transmittance[:, None] * background.reshape(-1, 3)[here]
         # Summed from the back, so that little light keeps its digits; without row k itself.
         rest = light.flip(0).cumsum(0).flip(0) - light + behind
         # Never 0: alpha_max < 1, and a finished pixel's weights are 0.
@@ -82,7 +89,7 @@ def removal(
         alphas = weights / before
         change = rest * (alphas / (1 - alphas))[..., None] - light
         largest[rows] = torch.maximum(largest[rows], change.abs().amax((1, 2)).double())
-        squared[rows] += change.double().square().sum((1, 2))
+        squared[rows] += change.double().square().sum(2) @ pixel_weights.reshape(-1)[here].double()
         begin += len(chunk)
     return Removal(largest, squared)
 

@@ -47,6 +47,11 @@ struct Counters {
   int64_t *pixels, *dominant;
 };
 
+// Behind the splats [h,w,3], null: black; how much each pixel's squared change counts [h,w], null: 1.
+struct Backdrop {
+  const void *rgb, *pixel_weights;
+};
+
 // How far a view moves when a row alone is removed.
 struct Changes {
   double *largest, *squared;

@@ -20,7 +20,7 @@ struct PixelKernels {
   void (*blend)(void*, const View&, const Layers&);
   void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
-  void (*remove)(void*, const View&, int64_t rows, const void* background, const Changes&);
+  void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
 };
 
 struct Kernels {

@@ -137,12 +137,11 @@ SPLAT_API int32_t splat_contribution(Handle* h, const View* view, const Rows* ro
   });
 }
 
-// background: [h,w,3] behind the splats, or null for black.
-SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, const void* background,
+SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, const Backdrop* backdrop,
                                 const Changes* changes, Report* report) {
   return guarded([&]() -> int32_t {
     const Status status = h->rows().prepare(h->workspace, *view, *rows, nullptr, *report);
-    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, background, *changes);
+    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, *backdrop, *changes);
     return status;
   });
 }

@@ -20,8 +20,8 @@ PixelKernels kernels() {
           [](void* w, const View& v, int64_t rows, const Counters& out) {
             count_contributions(as<T>(w), v, rows, out);
           },
-          [](void* w, const View& v, int64_t rows, const void* background, const Changes& out) {
-            remove_rows(as<T>(w), v, rows, background, out);
+          [](void* w, const View& v, int64_t rows, const Backdrop& backdrop, const Changes& out) {
+            remove_rows(as<T>(w), v, rows, backdrop, out);
           }};
 }
 

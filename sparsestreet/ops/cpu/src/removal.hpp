@@ -5,23 +5,26 @@
 
 namespace SPLAT_VARIANT {
 
-// What is seen behind a splat: total (over the background) minus all up to it.
+// What is seen behind a splat, total (over the background) minus all up to it, and how much each pixel counts.
 template <class T>
 struct TileBehind {
-  alignas(64) T color[3][PIXELS];
+  alignas(64) T color[3][PIXELS], pixel_weight[PIXELS];
 };
 
 template <class T>
-inline void behind_everything(const TileColors<T>& total, const View& view, const T* background, int64_t x0, int64_t y0,
-                              TileBehind<T>& behind) {
+inline void behind_everything(const TileColors<T>& total, const View& view, const Backdrop& backdrop, int64_t x0,
+                              int64_t y0, TileBehind<T>& behind) {
   const T* blended[3] = {total.red, total.green, total.blue};
-  for (int channel = 0; channel < 3; ++channel)
-    for (int i = 0; i < PIXELS; ++i) {
-      const int64_t x = x0 + i % TILE, y = y0 + i / TILE;
-      const bool inside = x < view.width && y < view.height;
-      const T back = background && inside ? background[3 * (y * view.width + x) + channel] : T(0);
+  const T *background = static_cast<const T*>(backdrop.rgb), *weights = static_cast<const T*>(backdrop.pixel_weights);
+  for (int i = 0; i < PIXELS; ++i) {
+    const int64_t x = x0 + i % TILE, y = y0 + i / TILE, pixel = y * view.width + x;
+    const bool inside = x < view.width && y < view.height;
+    behind.pixel_weight[i] = weights && inside ? weights[pixel] : T(1);
+    for (int channel = 0; channel < 3; ++channel) {
+      const T back = background && inside ? background[3 * pixel + channel] : T(0);
       behind.color[channel][i] = blended[channel][i] + total.transmittance[i] * back;
     }
+  }
 }
 
 template <class T, bool EXCLUSIVE>
@@ -35,18 +38,20 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
                                                     transmittance, c.gate + at);
     const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
     store(c.transmittance + at, transmittance - weight);
+    Lanes<T> sum{};
     for (int channel = 0; channel < 3; ++channel) {
       const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
       store(behind.color[channel] + at, rest);
       const Lanes<T> change = rest * through - own;
       largest = larger(largest, magnitude(change));
-      squared += change * change;
+      sum += change * change;
     }
+    squared += load(behind.pixel_weight + at) * sum;
   }
 }
 
 template <class T, bool EXCLUSIVE>
-void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const T* background) {
+void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const Backdrop& backdrop) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   TileColors<T> c;
   TileBehind<T> behind;
@@ -55,7 +60,7 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
   int64_t samples = 0;
   sort_tile(ws, tile);
   blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
-  behind_everything(c, view, background, x0, y0, behind);
+  behind_everything(c, view, backdrop, x0, y0, behind);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
@@ -73,16 +78,16 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
 }
 
 template <class T>
-void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const void* background, const Changes& out) {
+void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const Backdrop& backdrop, const Changes& out) {
   const double start = omp_get_wtime();
   const Cuts<T> cuts(view);
   ws.change_slots.reserve(ws.pair_count);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     if (view.exclusive_stop)
-      remove_tile<T, true>(ws, view, cuts, tile, static_cast<const T*>(background));
+      remove_tile<T, true>(ws, view, cuts, tile, backdrop);
     else
-      remove_tile<T, false>(ws, view, cuts, tile, static_cast<const T*>(background));
+      remove_tile<T, false>(ws, view, cuts, tile, backdrop);
   }
 #pragma omp parallel for num_threads(view.threads) schedule(static)
   for (int64_t i = 0; i < rows; ++i) {
