@@ -96,7 +96,7 @@ def test_what_shows_a_vehicle_costs_more():
     halves[:, 5:] = True
     for vehicle, kept in ((halves, [False, True]), (halves.flip(1), [True, False])):
         marked = replace(frame, vehicle=vehicle)
-        budgets = [RemovalRule(db, noticeable=0.0) for db in torch.linspace(0.01, 6, 60).tolist()]
+        budgets = [RemovalRule(db, noticeable=0.0) for db in torch.linspace(0.1, 25, 250).tolist()]
         selections = [rule.select(scene, [marked], {"background": 0}, VIEW)["background"] for rule in budgets]
         first = next(selection for selection in selections if selection.removed)
         assert first.keep.tolist() == kept
