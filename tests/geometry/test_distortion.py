@@ -1,4 +1,4 @@
-"""Lens distortion against a hand-computed case, its own text-book formula in NumPy, finite differences and its inverse."""
+"""Lens distortion against a hand-computed case, its polar form, finite differences and its inverse."""
 
 import math
 
@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.geometry.distortion import distort, distortion_jacobian, fold_radius_squared, undistort
+from sparsestreet.geometry.distortion import (
+    _continued_jacobian,
+    distort,
+    distortion_jacobian,
+    fold_radius_squared,
+    undistort,
+)
 
 BARREL = torch.tensor([-0.3, 0.1, 0.0, 0.0, -0.02], dtype=torch.float64)
 """A wide-angle front camera's order of magnitude."""
@@ -26,13 +32,10 @@ def _naive(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: f
     """Polar form, one point at a time: the radius is scaled, then the tangential part is added."""
     r, angle = math.hypot(x, y), math.atan2(y, x)
     grown = r + k1 * r**3 + k2 * r**5 + k3 * r**7
-    tangential = r * r * np.array(
-        [
-            p1 * math.sin(2 * angle) + p2 * (2 + math.cos(2 * angle)),
-            p1 * (2 - math.cos(2 * angle)) + p2 * math.sin(2 * angle),
-        ]
-    )
-    return grown * math.cos(angle) + tangential[0], grown * math.sin(angle) + tangential[1]
+    sine, cosine = math.sin(2 * angle), math.cos(2 * angle)
+    x = grown * math.cos(angle) + r * r * (p1 * sine + p2 * (2 + cosine))
+    y = grown * math.sin(angle) + r * r * (p1 * (2 - cosine) + p2 * sine)
+    return x, y
 
 
 @pytest.mark.parametrize("coefficients", [BARREL, FULL, PINCUSHION], ids=["barrel", "full", "pincushion"])
@@ -93,11 +96,14 @@ def test_derivative_in_the_points(reach):
 
 
 @pytest.mark.parametrize("coefficients", [FULL, PINCUSHION], ids=["full", "pincushion"])
-def test_jacobian(coefficients):
-    points = torch.rand(9, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.5
-    for point, jacobian in zip(points, distortion_jacobian(points, coefficients), strict=True):
-        expected = torch.autograd.functional.jacobian(lambda value: distort(value, coefficients), point)
-        torch.testing.assert_close(jacobian, expected, rtol=1e-12, atol=1e-14)
+@pytest.mark.parametrize(
+    ("jacobian", "reach"), [(distortion_jacobian, 1.0), (_continued_jacobian, 6.0)], ids=["before the fold", "across"]
+)
+def test_jacobian(coefficients, jacobian, reach):
+    points = reach * (torch.rand(9, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.5)
+    for point, value in zip(points, jacobian(points, coefficients), strict=True):
+        expected = torch.autograd.functional.jacobian(lambda at: distort(at, coefficients), point)
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("coefficients", [BARREL, FULL, PINCUSHION], ids=["barrel", "full", "pincushion"])
