@@ -111,3 +111,14 @@ def test_27_exponents_that_underflow(backend, dtype):
     assert result.is_finite()
     assert result.images["alpha"][0, 0] == 0
     assert result.images["alpha"][0, 50] == pytest.approx(0.8, rel=1e-6)
+
+
+@every_backend
+@every_dtype
+def test_28_bright_pixels_are_not_clamped(backend, dtype):
+    # A lamp of colour 3: clamped at 1, it could never be fitted, as nothing would flow back.
+    lamp = one_gaussian(sh=[[[2.5 / Y0] * 3]])
+    result = render(lamp, front_camera(5, 5, 40.0), backend, dtype)
+    assert result.images["rgb"][2, 2].tolist() == pytest.approx([0.8 * 3.0] * 3, rel=1e-6)
+    assert result.gradients["sh"].all()
+    assert result.gradients["opacities"].all()
