@@ -135,6 +135,16 @@ def test_half_colours_by_hand(backend, dtype):
 
 
 @every_effect_backend
+def test_half_colours_over_their_range(backend):
+    # Subnormal numbers of float16 among them; in float64, where 0.5 + Y0 sh still has the digits of 1e-7.
+    colours = np.array([2e-8, 4e-8, 3.3e-7, 5.9e-5, 6.2e-5, 1e-3, 0.2, 0.9999, 1.7, 33.3, 2047.7, 65503.0])
+    for triple in colours.reshape(-1, 3):
+        ball = one_gaussian(sh=[[((triple - 0.5) / Y0).tolist()]])
+        seen = splat(ball, front_camera(1, 1, 40.0), settings=SplatSettings(half_colors=True), backend=backend)
+        np.testing.assert_allclose(seen.rgb[0, 0].numpy(), 0.8 * triple.astype(np.float16).astype(float), rtol=1e-9)
+
+
+@every_effect_backend
 @every_dtype
 def test_half_colours_in_a_scene(backend, dtype):
     view = camera(37, 29)
