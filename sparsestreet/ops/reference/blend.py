@@ -10,13 +10,15 @@ from sparsestreet.ops.reference.projection import Splats, on_screen, visible_row
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 
+DTYPES = (torch.float32, torch.float64)
 _CHUNK_ELEMENTS = 1 << 20
 
 
 def rasterise(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
-    """Project all rows, sort them and blend them densely into every pixel."""
+    """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
+    _check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     offsets = screen_offsets[rows]
@@ -41,6 +43,7 @@ def rasterise(
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
+    _check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     weight = torch.zeros(len(gaussians), dtype=torch.float64, device=rows.device)
@@ -67,6 +70,7 @@ def removal(
     settings: SplatSettings,
 ) -> Removal:
     """Change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
+    _check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
@@ -92,6 +96,14 @@ def removal(
         squared[rows] += change.double().square().sum(2) @ pixel_weights.reshape(-1)[here].double()
         begin += len(chunk)
     return Removal(largest, squared)
+
+
+def _check_dtype(gaussians: Gaussians) -> None:
+    if gaussians.means.dtype not in DTYPES:
+        raise ValueError(
+            f"backend 'reference' computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
+            "with dataclasses.replace and .float()"
+        )
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:
