@@ -88,6 +88,20 @@ def tile_blocks(splats: Splats, tiles_x: int, tiles_y: int) -> Iterator[Block]:
 
 def blend_block(splats: Splats, block: Block, tiles_x: int, settings: SplatSettings) -> Float[Tensor, "t 256 4"]:
     """Colour and transmittance of the pixels of a block's tiles."""
+    weights, transmittance = block_weights(splats, block, tiles_x, settings)
+    colors = torch.einsum("tkp,tkc->tpc", weights, splats.colors[block.splats])
+    return torch.cat((colors, transmittance[..., None]), -1)
+
+
+def block_weights(
+    splats: Splats, block: Block, tiles_x: int, settings: SplatSettings
+) -> tuple[Float[Tensor, "t k 256"], Float[Tensor, "t 256"]]:
+    """Blend weight of each splat in each pixel, and what gets past all of them.
+
+    Raises ValueError for settings that this version does not have.
+    """
+    if settings.stop != "inclusive" or settings.box != float("inf"):
+        raise ValueError(f"torch tiles know the inclusive stop without a box, got {settings}: use backend='reference'")
     inside = torch.arange(TILE * TILE)
     x = (block.tiles % tiles_x * TILE)[:, None] + inside % TILE + 0.5
     y = (block.tiles // tiles_x * TILE)[:, None] + inside // TILE + 0.5
@@ -100,5 +114,4 @@ def blend_block(splats: Splats, block: Block, tiles_x: int, settings: SplatSetti
     passed = (1 - alpha).cumprod(1)
     before = torch.cat((torch.ones_like(passed[:, :1]), passed[:, :-1]), 1)
     alpha = torch.where(before > settings.transmittance_min, alpha, 0.0)
-    colors = torch.einsum("tkp,tkc->tpc", alpha * before, splats.colors[block.splats])
-    return torch.cat((colors, (1 - alpha).prod(1)[..., None]), -1)
+    return alpha * before, (1 - alpha).prod(1)
