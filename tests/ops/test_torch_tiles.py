@@ -1,9 +1,10 @@
 """The tile-vectorised torch blend against the reference: an oracle is worth as much as its own test."""
 
+import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.ops.bench import blend, torch_tiles
+from sparsestreet.ops.bench import torch_tiles
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.ops.reference import on_screen, visible_rows
 from tests.ops.scenes import camera, cast, cotangents, random_gaussians, relative_error
@@ -42,26 +43,10 @@ def test_cpu_agrees_on_a_large_scene():
     assert difference.max() < 1 / 255
 
 
-def test_benchmark_runs(monkeypatch, capsys, tmp_path):
-    path = tmp_path / "blend.csv"
-    arguments = [
-        "blend",
-        "--rows",
-        "300",
-        "--size",
-        "64x48",
-        "--repeats",
-        "2",
-        "--peer-repeats",
-        "1",
-        "--csv",
-        str(path),
-    ]
-    monkeypatch.setattr("sys.argv", arguments)
-    threads = torch.get_num_threads()
-    monkeypatch.setattr(blend, "measured_peak", lambda: 1e11)
-    monkeypatch.setattr(blend, "TRAINING_ROWS", (1000,))
-    blend.main()
-    torch.set_num_threads(threads)
-    assert "torch over C++" in capsys.readouterr().out
-    assert len(path.read_text().splitlines()) == 12 + 7
+@pytest.mark.parametrize("settings", [SplatSettings(stop="exclusive"), SplatSettings(box=3.0)])
+def test_settings_it_does_not_have_are_refused(settings):
+    view = camera(20, 12)
+    splats = on_screen(random_gaussians(5, view), torch.arange(0), view, SETTINGS)
+    block = torch_tiles.Block(torch.arange(1), torch.zeros(1, 0, dtype=torch.int64), torch.zeros(1, 0) > 0)
+    with pytest.raises(ValueError, match="inclusive stop"):
+        torch_tiles.block_weights(splats, block, 2, settings)

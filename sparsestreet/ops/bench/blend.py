@@ -156,7 +156,6 @@ def _projected(gaussians: Gaussians, camera: Camera) -> Splats:
 
 
 def _repeat(call: Callable[[], object], effort: Effort) -> list[float]:
-    call()
     seconds: list[float] = []
 
     def run() -> None:
@@ -164,5 +163,7 @@ def _repeat(call: Callable[[], object], effort: Effort) -> list[float]:
         call()
         seconds.append(time.perf_counter() - start)
 
+    effort.warm_up(run)
+    seconds.clear()
     effort.runs(run)
     return seconds

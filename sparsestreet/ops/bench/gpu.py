@@ -32,7 +32,6 @@ from sparsestreet.types import Camera, Gaussians
 ROWS = (100_000, 500_000, 1_500_000, 5_000_000)
 IMAGES = ((960, 640), (1920, 1280))
 EFFORT = Effort(repeats=30, seconds=8.0, least=20)
-_WARM_UP = 3
 
 
 @dataclass(frozen=True)
@@ -132,8 +131,7 @@ def measure(record: GpuRecord, draw: Draw, view: View, effort: Effort) -> GpuRec
         drop_gradients(view.rows)
 
     try:
-        for _ in range(_WARM_UP):
-            step()
+        effort.warm_up(step)
         forward, backward = _times(draw, cotangent, view, effort)
         record = replace(record, forward=forward, backward=backward, inference=_inference(draw, view, effort))
         if view.device.type == "cuda":
@@ -169,7 +167,7 @@ def _inference(draw: Draw, view: View, effort: Effort) -> Spread:
         draw(view.rows)
         seconds.append(clock.seconds(start, clock.mark()))
 
-    run()
+    effort.warm_up(run)
     seconds.clear()
     effort.runs(run)
     return spread(seconds)

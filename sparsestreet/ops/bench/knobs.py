@@ -19,6 +19,8 @@ KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
     "depth_bits": (12, 16, 24, 32),
 }
 """Fields of SplatSettings and their values."""
+BOXES_ALONE = (3.0, 3.33, 4.0)
+"""Boxes without alpha_min, two knobs at once: either of them bounds a splat, so each hides what the other costs."""
 FIXED = {
     ("tile size", "cpu"): "compiled for tiles of 16x16: a row of a tile is one AVX-512 register of float32",
     ("tile size", "reference"): "dense: it has no tiles",
@@ -71,6 +73,7 @@ def points() -> list[Point]:
     for knob, values in KNOBS.items():
         changed = [(value, replace(DEFAULT, **{knob: value})) for value in values]
         swept += [Point(knob, _text(knob, value), settings) for value, settings in changed if settings != DEFAULT]
+    swept += [Point("box alone", _text("box", box), replace(DEFAULT, alpha_min=0.0, box=box)) for box in BOXES_ALONE]
     met = [point.settings for point in swept]
     swept += [Point("preset", name, settings) for name, settings in named.items() if settings not in met]
     names = {settings: name for name, settings in reversed(named.items())}

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,11 +39,12 @@ class RecordFile:
         self._provenance = encode(provenance, "provenance")
 
     def write(self, kind: str, record: object) -> dict[str, Json]:
-        """Append a frozen dataclass as one line with its kind and provenance; returns what was written.
+        """Append a frozen dataclass as one line with its kind, the machine's load and provenance; returns what was written.
 
         Raises ValueError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
         """
-        entries = {"kind": kind, **encode(record, kind), "provenance": self._provenance}
+        load = encode(os.getloadavg()[0], "load")
+        entries = {"kind": kind, **encode(record, kind), "load": load, "provenance": self._provenance}
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entries, allow_nan=False) + "\n")
         return entries

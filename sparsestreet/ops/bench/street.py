@@ -45,7 +45,7 @@ class _Draw:
     def __init__(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
 
-    def between(self, low: float, high: float, *shape: int) -> Tensor:
+    def between(self, low: float | int, high: float | int, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=self._generator)
 
     def normal(self, *shape: int) -> Tensor:
@@ -58,7 +58,7 @@ class _Draw:
         """Log-uniform: as many splats per octave of distance, so that the image is filled evenly."""
         return torch.exp(self.between(math.log(_NEAR), math.log(_FAR), count))
 
-    def sizes(self, depth: Tensor, x: float, y: float, z: float) -> Tensor:
+    def sizes(self, depth: Tensor, x: float | int, y: float | int, z: float | int) -> Tensor:
         """Standard deviations: these factors of 4 thousandths of the distance, log-normal by half an octave."""
         spread = torch.exp(0.35 * self.normal(len(depth), 3))
         return 0.004 * depth[:, None] * spread * torch.tensor([x, y, z])

@@ -1,0 +1,143 @@
+"""The plumbing of device timings and of gsplat beside them, with a stand-in for gsplat: no device needed."""
+
+from types import ModuleType
+
+import pytest
+import torch
+
+from sparsestreet.ops import splat
+from sparsestreet.ops.bench import gpu, gsplat_peer
+from sparsestreet.ops.bench.device_profile import stage_of
+from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.ops.bench.records import RecordFile, read_records
+from sparsestreet.ops.bench.scenes import Size
+from sparsestreet.ops.bench.timing import Effort, leaves
+from sparsestreet.types import Camera, Gaussians
+from tests.ops.bench.test_records import PROVENANCE
+
+ONCE = Effort(repeats=2, seconds=0.0, least=1)
+CPU = torch.device("cpu")
+# What gsplat 1.5.3's rasterization takes, of which we use these.
+TAKES = {
+    *("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane"),
+    *("eps2d", "sh_degree", "packed", "absgrad", "rasterize_mode"),
+}
+
+
+def stand_in(brightness: float = 1.0) -> ModuleType:
+    """A module with gsplat's signature that renders with our op."""
+
+    def rasterization(**given):
+        assert set(given) == TAKES
+        assert given["viewmats"].shape == (1, 4, 4)
+        assert given["Ks"].shape == (1, 3, 3)
+        assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
+        fields = ("means", "quats", "scales", "opacities", "colors")
+        camera = Camera(given["viewmats"][0], given["Ks"][0], given["width"], given["height"])
+        rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=gsplat_peer.SETTINGS)
+        meta = {"flatten_ids": torch.zeros(7, dtype=torch.int32)}
+        return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
+
+    module = ModuleType("gsplat")
+    module.__version__ = "1.5.3"
+    module.rasterization = rasterization
+    return module
+
+
+@pytest.fixture
+def rows() -> Gaussians:
+    return leaves(frustum_gaussians(60, frustum_camera(48, 32), sigma_pixels=2.0, terms=9), torch.float32)
+
+
+def test_the_same_image_agrees(rows):
+    found = gsplat_peer.parity(stand_in(), rows, frustum_camera(48, 32), "cpu")
+    assert found.image.psnr is None
+    assert gsplat_peer.agrees(found)
+    assert rows.means.grad is None
+    assert gsplat_peer.draw(stand_in(), rows, frustum_camera(48, 32), packed=True)[2] == 7
+
+
+def test_another_image_or_another_gradient_disagrees(rows):
+    found = gsplat_peer.parity(stand_in(brightness=1.02), rows, frustum_camera(48, 32), "cpu")
+    assert not gsplat_peer.agrees(found)
+    assert found.gradients["sh"].relative_l2 == pytest.approx(0.02, rel=1e-3)
+    # The image alone would pass: 1 % of the colours is 60 dB where colours are faint.
+    slight = gsplat_peer.parity(stand_in(brightness=1.001), rows, frustum_camera(48, 32), "cpu")
+    assert gsplat_peer.agrees(slight)
+
+
+def test_settings_are_those_of_gsplat():
+    assert (gsplat_peer.SETTINGS.stop, gsplat_peer.SETTINGS.alpha_max, gsplat_peer.SETTINGS.near) == (
+        "exclusive",
+        0.999,
+        0.01,
+    )
+
+
+def test_gsplat_is_looked_for_on_a_cuda_device_only(monkeypatch):
+    assert "CUDA" in gsplat_peer.find_gsplat(CPU)
+    monkeypatch.setitem(__import__("sys").modules, "gsplat", None)  # makes the import fail
+    assert "cannot be imported" in gsplat_peer.find_gsplat(torch.device("cuda"))
+    module = stand_in()
+    monkeypatch.setitem(__import__("sys").modules, "gsplat", module)
+    assert gsplat_peer.find_gsplat(torch.device("cuda")) is module
+
+
+def test_both_renderers_get_a_record(tmp_path, monkeypatch):
+    module = stand_in()
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    assert gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20)], CPU, ONCE, file, said.append)
+    records = read_records(file.path)
+    assert [record["renderer"] for record in records] == [
+        "sparsestreet cpu",
+        "gsplat 1.5.3 packed",
+        "gsplat 1.5.3 unpacked",
+    ] * 2
+    for record in records:
+        assert record["failed"] is None
+        assert record["forward"]["median"] > 0
+        assert record["inference"]["repeats"] == 1
+        assert record["stages"] is None  # no device, no kernels
+    assert [record["agrees"] for record in records] == [None, True, True] * 2
+    assert any("agrees: equal" in line for line in said)
+
+
+def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
+    module = stand_in()
+
+    def broken(**given):
+        raise RuntimeError("no kernel image is available\nmore")
+
+    module.rasterization = broken
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append)
+    ours, *theirs = read_records(file.path)
+    assert ours["failed"] is None
+    assert [record["failed"] for record in theirs] == ["RuntimeError: no kernel image is available"] * 2
+    assert any("FAILED: RuntimeError" in line for line in said)
+
+
+def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
+    module = stand_in(brightness=0.9)
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    said: list[str] = []
+    assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, RecordFile(tmp_path / "g.jsonl", PROVENANCE), said.append)
+    assert any("DISAGREES" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stage"),
+    [
+        ("_project_kernel", "project"),
+        ("project_backward_kernel", "project_backward"),
+        ("_raster_forward", "blend"),
+        ("_raster_backward", "blend_backward"),
+        ("emit_pairs", "bin"),
+        ("void at_cuda_detail::cub::DeviceRadixSortOnesweepKernel<...>", "sort"),
+        ("Memset (Device)", "other"),
+    ],
+)
+def test_kernels_belong_to_stages(kernel, stage):
+    assert stage_of(kernel) == stage
