@@ -38,6 +38,13 @@ export PYTHONUNBUFFERED=1
 export TORCH_EXTENSIONS_DIR="$WORK/extensions"
 export MPLCONFIGDIR="$WORK/matplotlib"
 
+export SUMMARISE='
+import json, sys
+
+record = json.load(open(sys.argv[1]))
+seconds, psnr = record["run"]["training_seconds"], record["quality"]["psnr_full"]["mean"]
+print(f"{seconds:.1f} s of training, held-out PSNR {psnr:.2f} dB")'
+
 has() { "$PYTHON" -c "import $1" >/dev/null 2>&1; }
 
 has torch || { echo "gpu_check: $PYTHON has no torch; name another interpreter with PYTHON=" >&2; exit 2; }
@@ -62,7 +69,7 @@ run_part() { # part, limit in seconds, log, command...
   shift 3
   left="$(remaining)"
   [ "$limit" -le "$left" ] || limit="$left"
-  echo "== $part: $* (at most $limit s)"
+  echo "== $part (at most $limit s)"
   if [ "$limit" -lt 5 ]; then
     row "$part" failed 0 "no time was left"
     return 1
@@ -139,10 +146,11 @@ run_tests() {
 run_training() {
   local steps=400 trainer=gpu
   [ "$DRY" = 0 ] || { steps=20 trainer=cpu; }
-  run_part train 100 "$OUT/train.log" "$PYTHON" -m sparsestreet train "trainer=$trainer" "schedule.max_steps=$steps" \
-    data.log.settings.width=160 data.log.settings.height=96 data.log.settings.num_frames=10 \
-    "data.log.root=$WORK/street" "hydra.run.dir=$WORK/train"
-  find "$WORK/train" -maxdepth 2 -name 'summary.json' -exec cp {} "$OUT/train.json" \; 2>/dev/null
+  run_part train 100 "$OUT/train.log" bash -c '"$@" && cp "$0/train/records/summary.json" "$0/train.json" &&
+    "$1" -c "$SUMMARISE" "$0/train.json"' "$WORK" "$PYTHON" -m sparsestreet train "trainer=$trainer" \
+    "schedule.max_steps=$steps" data.log.settings.width=160 data.log.settings.height=96 \
+    data.log.settings.num_frames=10 "data.log.root=$WORK/street" "hydra.run.dir=$WORK/train"
+  [ ! -f "$WORK/train.json" ] || cp "$WORK/train.json" "$OUT/train.json"
 }
 
 run_bench() {

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sparsestreet.ops.bench.timing import leaves
 from sparsestreet.ops.bench.torch_tiles import TILE, Block, block_weights, tile_blocks
 from sparsestreet.ops.reference import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
@@ -39,7 +40,7 @@ class Culling:
 @torch.no_grad()
 def compare_culling(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Culling:
     """Blend with and without culling; for small views: without it the memory is splats x pixels."""
-    doubled = Gaussians(*(getattr(gaussians, name).detach().double() for name in _FIELDS))
+    doubled = leaves(gaussians, torch.float64)
     splats = on_screen(doubled, visible_rows(doubled, camera, settings), camera, settings)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     tiles = tiles_x * tiles_y
@@ -54,9 +55,6 @@ def compare_culling(gaussians: Gaussians, camera: Camera, settings: SplatSetting
         pixels_changed=int((images[0] != images[1]).any(-1).sum()),
         rows_touching_other_pixels=int((touched[0] != touched[1]).sum()),
     )
-
-
-_FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 
 
 def _sequential_blend(splats: Splats, blocks: list[Block], tiles: int, tiles_x: int, settings: SplatSettings) -> Tensor:

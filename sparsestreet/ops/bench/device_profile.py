@@ -1,26 +1,25 @@
 """Time and memory of a CUDA device: what each stage's kernels take, and the peak of a training step."""
 
+import re
 from collections.abc import Callable
 
 import torch
 from torch.profiler import DeviceType, ProfilerActivity, profile
 
 STAGES = {
-    "project_backward": ("project_backward", "projection_backward", "reduce_slots", "gather_slots"),
-    "blend_backward": ("blend_backward", "raster_backward", "rasterize_backward"),
-    "project": ("project", "colour"),
-    "blend": ("blend", "raster"),
-    "bin": ("tile", "emit", "count", "pairs"),
-    "sort": ("sort", "radix"),
-    "contribution": ("contribution",),
+    "blend_backward": r"(blend|raster).*backward",
+    "project_backward": r"project.*backward|slots",
+    "project": r"project",
+    "blend": r"blend|raster",
+    "sort": r"sort|radix",
+    "bin": r"list_|tile|pairs|isect|scan",
 }
-"""Stage -> parts of the names of its kernels; the first stage that fits gets the time, the rest is ``other``."""
+"""Stage -> pattern of its kernels' names; the first that fits gets the time, the rest is ``other``."""
 
 
 def stage_of(kernel: str) -> str:
     """The stage that a kernel's name belongs to."""
-    lowered = kernel.lower()
-    return next((stage for stage, parts in STAGES.items() if any(part in lowered for part in parts)), "other")
+    return next((stage for stage, pattern in STAGES.items() if re.search(pattern, kernel.lower())), "other")
 
 
 def kernel_milliseconds(run: Callable[[], None], repeats: int = 5) -> dict[str, float]:

@@ -96,7 +96,7 @@ def _measure_size(
 ) -> list[GpuRecord]:
     camera = frustum_camera(size.width, size.height)
     gaussians = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
-    view = View(leaves(gaussians, torch.float32, device), on_device(camera, device))
+    view = View(leaves(gaussians, torch.float32, device), camera)
     draws: dict[str, Draw] = {f"sparsestreet {backend}": _ours(view, backend)}
     if isinstance(peer, ModuleType):
         for packed, mode in ((True, "packed"), (False, "unpacked")):
@@ -119,7 +119,8 @@ def _ours(view: View, backend: str) -> Draw:
 
 
 def _theirs(view: View, peer: ModuleType, packed: bool) -> Draw:
-    return lambda rows: gsplat_peer.draw(peer, rows, view.camera, packed)[:2]
+    camera = on_device(view.camera, view.device)
+    return lambda rows: gsplat_peer.draw(peer, rows, camera, packed)[:2]
 
 
 def measure(record: GpuRecord, draw: Draw, view: View, effort: Effort) -> GpuRecord:

@@ -39,7 +39,7 @@ class RecordFile:
         self._provenance = encode(provenance, "provenance")
 
     def write(self, kind: str, record: object) -> dict[str, Json]:
-        """Append a frozen dataclass as one line with its kind, the machine's load and provenance; returns what was written.
+        """Append a frozen dataclass as one line with its kind, the machine's load and provenance; returns the line.
 
         Raises ValueError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
         """

@@ -12,7 +12,7 @@ from sparsestreet.ops.bench.culling import Culling, compare_culling
 from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point
 from sparsestreet.ops.bench.records import RecordFile
 from sparsestreet.ops.bench.scenes import BenchScene, Size
-from sparsestreet.ops.bench.timing import Effort, OpTimes, leaves, on_device, time_op
+from sparsestreet.ops.bench.timing import Effort, OpTimes, leaves, time_op
 from sparsestreet.ops.settings import SplatSettings
 
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(48, 32, 200)
@@ -140,9 +140,8 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effor
     times = exact = same = model_psnr = None
     if reason is None:
         device = "cuda" if point.backend == "triton" else "cpu"
-        rows, view = leaves(gaussians, point.dtype, device), on_device(camera, device)
-        times = time_op(rows, view, point.settings, point.backend, effort)
-        value = answer(gaussians, view, point.settings, point.backend, point.dtype, device)
+        times = time_op(leaves(gaussians, point.dtype, device), camera, point.settings, point.backend, effort)
+        value = answer(gaussians, camera, point.settings, point.backend, point.dtype, device)
         exact = errors(value, truths.of(point.exact))
         same = errors(value, truths.of(point.same_cutoffs))
         if point.other_model:

@@ -103,7 +103,7 @@ def leaves(gaussians: Gaussians, dtype: torch.dtype, device: str | torch.device 
 
 
 def on_device(camera: Camera, device: str | torch.device) -> Camera:
-    """The camera with its matrices on the device, for peers that want them there."""
+    """The camera with its matrices on the device, for peers that want them there (ours reads them on the host)."""
     return replace(
         camera, camera_from_world=camera.camera_from_world.to(device), intrinsics=camera.intrinsics.to(device)
     )

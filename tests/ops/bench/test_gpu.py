@@ -130,11 +130,12 @@ def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("kernel", "stage"),
     [
-        ("_project_kernel", "project"),
-        ("project_backward_kernel", "project_backward"),
-        ("_raster_forward", "blend"),
-        ("_raster_backward", "blend_backward"),
-        ("emit_pairs", "bin"),
+        ("project_rows", "project"),
+        ("project_rows_backward", "project_backward"),
+        ("sum_slots", "project_backward"),
+        ("blend_tiles", "blend"),
+        ("blend_tiles_backward", "blend_backward"),
+        ("list_pairs", "bin"),
         ("void at_cuda_detail::cub::DeviceRadixSortOnesweepKernel<...>", "sort"),
         ("Memset (Device)", "other"),
     ],

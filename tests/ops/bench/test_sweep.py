@@ -49,8 +49,9 @@ def test_errors_are_against_the_right_truth(swept):
         assert record["other_model"] or record["model_psnr"] is None
         if record["value"] in ("exact", "0") and record["knob"] != "blur":
             assert exact > 110  # float32: 1e-6 of a colour
-        if record["knob"] == "blur":
-            assert record["model_psnr"] < exact  # another model is further away than a cut-off is
+        if record["knob"] == "blur" and record["scene"] == "random frustum":
+            # Splats of 2 px: another model is further away than a cut-off.
+            assert record["model_psnr"] < exact
     for scene in SCENES:
         by_value = {r["value"]: r["exact"]["image"]["mean"] for r in knobs if r["scene"] == scene.name}
         assert by_value["1/1024"] < by_value["default"] < by_value["1/64"]
