@@ -172,7 +172,7 @@ def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
     for time, value, record in sorted(points, key=lambda point: (point[2]["preset"] is None, point[1])):
         preset = record["preset"]
         text = preset if preset is not None else f"{record['knob']} {record['value']}".replace("_", " ")
-        x, y = axes.transData.transform((time, value))
+        x, y = axes.transData.transform((time, value)).tolist()
         width = 4.9 * len(text) / pixel
         left = x + 7 / pixel if x + 7 / pixel + width < axes.bbox.x1 else x - 7 / pixel - width
 

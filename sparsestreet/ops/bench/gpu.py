@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import ModuleType
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.bench import gsplat_peer
-from sparsestreet.ops.bench.accuracy import Errors
+from sparsestreet.ops.bench.accuracy import Errors, answer, errors
 from sparsestreet.ops.bench.device_profile import kernel_milliseconds, peak_megabytes
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.ops.bench.records import RecordFile
@@ -26,11 +27,14 @@ from sparsestreet.ops.bench.timing import (
     spread,
     time_once,
 )
+from sparsestreet.ops.cpu.library import find_library
 from sparsestreet.ops.splat import splat
 from sparsestreet.types import Camera, Gaussians
 
 ROWS = (100_000, 500_000, 1_500_000, 5_000_000)
 IMAGES = ((960, 640), (1920, 1280))
+TRUTH_ROWS = 1_500_000
+"""Splats up to which we are compared with float64 on the host: seconds, where the device takes milliseconds."""
 EFFORT = Effort(repeats=30, seconds=8.0, least=20)
 
 
@@ -55,7 +59,7 @@ class GpuRecord:
     memory_peak: float | None = None
     """Most during one forward and backward; includes what lay there before: the Gaussians."""
     parity: Errors | None = None
-    """gsplat against us under the settings that match it."""
+    """gsplat against us; us against the C++ backend in float64, where it is built and the splats are not too many."""
     agrees: bool | None = None
 
     @property
@@ -88,7 +92,9 @@ def run_gpu(
             file.write("gpu", record)
             say(line(record))
             records.append(record)
-    return all(record.ok for record in records)
+    good = sum(record.ok for record in records)
+    say(f"{good} of {len(records)} measured and in agreement")
+    return good == len(records)
 
 
 def _measure_size(
@@ -105,7 +111,9 @@ def _measure_size(
     for renderer, draw in draws.items():
         record = measure(GpuRecord(renderer, name, size.rows, size.width, size.height), draw, view, effort)
         if isinstance(peer, ModuleType) and renderer.startswith("gsplat"):
-            record = with_parity(record, peer, view, backend)
+            record = compared(record, partial(gsplat_peer.parity, peer, view.rows, view.camera, backend))
+        elif size.rows <= TRUTH_ROWS and find_library() is not None:
+            record = compared(record, partial(_against_truth, view, backend))
         records.append(record)
     return records
 
@@ -143,13 +151,20 @@ def measure(record: GpuRecord, draw: Draw, view: View, effort: Effort) -> GpuRec
     return record
 
 
-def with_parity(record: GpuRecord, peer: ModuleType, view: View, backend: str) -> GpuRecord:
-    """The record with gsplat's differences to us, or with the reason why there are none."""
+def compared(record: GpuRecord, compare: Callable[[], Errors]) -> GpuRecord:
+    """The record with its differences, or with the reason why there are none."""
     try:
-        difference = gsplat_peer.parity(peer, view.rows, view.camera, backend)
+        difference = compare()
     except Exception as error:  # a peer may raise anything
         return replace(record, failed=record.failed or _reason(error))
     return replace(record, parity=difference, agrees=gsplat_peer.agrees(difference))
+
+
+def _against_truth(view: View, backend: str) -> Errors:
+    """Us on the device against the C++ backend in float64."""
+    settings, kind = gsplat_peer.SETTINGS, view.device.type
+    ours = answer(view.rows, view.camera, settings, backend, torch.float32, kind)
+    return errors(ours, answer(view.rows, view.camera, settings, "cpu", torch.float64))
 
 
 def _times(draw: Draw, cotangent: Cotangent, view: View, effort: Effort) -> tuple[Spread, Spread]:

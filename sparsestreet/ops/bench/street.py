@@ -21,7 +21,7 @@ _SHARES = {"road": 0.3, "facades": 0.4, "cars": 0.15, "poles": 0.1, "adrift": 0.
 
 def street_standin(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
     """``rows`` splats with spherical harmonics of ``terms`` terms; float32, the same for the same seed."""
-    draw = _Draw(seed)
+    draw = _Draw(seed, unit=0.9 / math.sqrt(max(1, rows)))
     counts = {name: int(share * rows) for name, share in _SHARES.items()}
     counts["facades"] += rows - sum(counts.values())
     parts = (
@@ -35,14 +35,15 @@ def street_standin(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
     sh = 0.05 * draw.normal(rows, terms, 3)
     sh[:, 0] = (colors - 0.5) * math.sqrt(4 * math.pi)
     # Turned a little about a random axis: surfaces are rough.
-    quaternions = torch.cat((torch.ones(rows, 1), 0.15 * draw.normal(rows, 3)), -1)
+    quaternions = torch.cat((torch.ones(rows, 1), 0.03 * draw.normal(rows, 3)), -1)
     return Gaussians(means, quaternions, scales, opacities, sh)
 
 
 class _Draw:
-    """Random numbers of one seed."""
+    """Random numbers of one seed, and sizes in a ``unit``, radians, that closes surfaces with the rows there are."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, unit: float) -> None:
+        self._unit = unit
         self._generator = torch.Generator().manual_seed(seed)
 
     def between(self, low: float | int, high: float | int, *shape: int) -> Tensor:
@@ -59,9 +60,9 @@ class _Draw:
         return torch.exp(self.between(math.log(_NEAR), math.log(_FAR), count))
 
     def sizes(self, depth: Tensor, x: float | int, y: float | int, z: float | int) -> Tensor:
-        """Standard deviations: these factors of 4 thousandths of the distance, log-normal by half an octave."""
+        """Standard deviations: these factors of unit times the distance, log-normal by half an octave."""
         spread = torch.exp(0.35 * self.normal(len(depth), 3))
-        return 0.004 * depth[:, None] * spread * torch.tensor([x, y, z])
+        return self._unit * depth[:, None] * spread * torch.tensor([x, y, z])
 
     def opacities(self, count: int) -> Tensor:
         """Two thirds nearly opaque surface, one third faint filling."""
@@ -75,14 +76,14 @@ _Part = tuple[Tensor, Tensor, Tensor, Tensor]
 def _road(draw: _Draw, count: int) -> _Part:
     z, x = draw.depth(count), draw.between(-9, 9, count)
     grey = draw.between(0.2, 0.4, count, 1).expand(-1, 3)
-    return torch.stack((x, torch.full_like(x, _ROAD), z), -1), draw.sizes(z, 1.5, 0.1, 4), draw.opacities(count), grey
+    return torch.stack((x, torch.full_like(x, _ROAD), z), -1), draw.sizes(z, 1.5, 0.1, 6), draw.opacities(count), grey
 
 
 def _facades(draw: _Draw, count: int) -> _Part:
     z, y = draw.depth(count), draw.between(-12, _ROAD, count)
     side = 2.0 * draw.pick(2, count) - 1
     color = draw.between(0.3, 0.8, 8, 3)[(z / 9).long()]  # a house every nine metres
-    sizes = draw.sizes(z, 0.1, 1.5, 3)
+    sizes = draw.sizes(z, 0.1, 1.2, 4)
     return torch.stack((9.5 * side, y, z), -1), sizes, draw.opacities(count), color
 
 
@@ -105,11 +106,11 @@ def _poles(draw: _Draw, count: int) -> _Part:
     side = 2.0 * draw.pick(2, count) - 1
     means = torch.stack((6.5 * side, draw.between(-5, _ROAD, count), z), -1)
     dark = draw.between(0.05, 0.25, count, 1).expand(-1, 3)
-    return means, draw.sizes(z, 0.3, 8, 0.3), draw.opacities(count), dark
+    return means, draw.sizes(z, 0.2, 6, 0.2), draw.opacities(count), dark
 
 
 def _adrift(draw: _Draw, count: int) -> _Part:
     z = draw.depth(count)
     means = torch.stack((z * draw.between(-0.6, 0.6, count), draw.between(-6, 1, count), z), -1)
     grey = draw.between(0.4, 0.7, count, 1).expand(-1, 3)
-    return means, draw.sizes(z, 8, 8, 8), draw.between(0.01, 0.15, count), grey
+    return means, draw.sizes(z, 6, 6, 6), draw.between(0.01, 0.15, count), grey
