@@ -7,6 +7,7 @@ import pytest
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.bench import culling, torch_tiles
 from sparsestreet.ops.bench.scenes import Size, bench_scenes
+from sparsestreet.types import Gaussians
 
 SCENES = bench_scenes(Size(53, 37, 150))
 
@@ -17,6 +18,16 @@ def test_images_are_identical(scene):
     assert found.pixels_changed == 0
     assert found.rows_touching_other_pixels == 0
     assert 0 < found.pairs_listed < found.pairs
+
+
+def test_tiles_without_a_splat_are_the_same():
+    first = SCENES[0]
+    one = Gaussians(
+        *(getattr(first.gaussians, name)[:1] for name in ("means", "quaternions", "scales", "opacities", "sh"))
+    )
+    found = culling.compare_culling(one, first.camera, SplatSettings())
+    assert 0 < found.pairs_listed < found.pairs == 12
+    assert found.pixels_changed == 0
 
 
 def test_boxes_that_are_too_small_are_found(monkeypatch):

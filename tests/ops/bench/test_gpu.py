@@ -7,6 +7,7 @@ import torch
 
 from sparsestreet.ops import splat
 from sparsestreet.ops.bench import gpu, gsplat_peer
+from sparsestreet.ops.bench.accuracy import Errors, GradientError, ImageError
 from sparsestreet.ops.bench.device_profile import stage_of
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.ops.bench.records import RecordFile, read_records
@@ -64,6 +65,14 @@ def test_another_image_or_another_gradient_disagrees(rows):
     # A thousandth of the colours is within the limits.
     slight = gsplat_peer.parity(stand_in(brightness=1.001), rows, frustum_camera(48, 32), "cpu")
     assert gsplat_peer.agrees(slight)
+
+
+def test_a_gradient_alone_can_disagree():
+    image = ImageError(0.0, 0.0, None)
+    good, bad = GradientError(1e-3, 1e-3), GradientError(6e-3, 1e-3)
+    assert gsplat_peer.agrees(Errors(image, {"means": good, "sh": good}))
+    assert not gsplat_peer.agrees(Errors(image, {"means": good, "sh": bad}))
+    assert not gsplat_peer.agrees(Errors(image, {"means": GradientError(None, None)}))
 
 
 def test_settings_are_those_of_gsplat():

@@ -57,6 +57,7 @@ def test_truths_of_a_point():
     boxed = by_value["box", "3"]
     assert boxed.same_cutoffs == boxed.settings
     assert not boxed.other_model
+    assert boxed.exact.box == inf
     assert by_value["backend", "cpu float64"].dtype == torch.float64
     clamped = next(point for point in POINTS if point.preset == "gsplat15")
     assert clamped.other_model
