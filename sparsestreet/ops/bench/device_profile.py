@@ -31,10 +31,10 @@ def kernel_milliseconds(run: Callable[[], None], repeats: int = 5) -> dict[str, 
             run()
         torch.cuda.synchronize()
     stages: dict[str, float] = {}
-    for event in profiler.events():
-        if event.device_type == DeviceType.CUDA:
-            stage = stage_of(event.name)
-            stages[stage] = stages.get(stage, 0.0) + 1e-3 * event.device_time_total / repeats
+    for kernel in profiler.key_averages():
+        if kernel.device_type == DeviceType.CUDA:
+            stage = stage_of(kernel.key)
+            stages[stage] = stages.get(stage, 0.0) + 1e-3 * kernel.self_device_time_total / repeats
     return stages
 
 

@@ -86,6 +86,9 @@ def run_gpu(
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
     backend, peer = resolve_backend("auto", device), gsplat_peer.find_gsplat(device)
     say(f"{name}; backend {backend}; {peer if isinstance(peer, str) else 'gsplat ' + gsplat_peer.version(peer)}")
+    if device.type == "cuda" and backend == "reference":
+        say("nothing is measured: the dense reference would take hours at these sizes; install triton")
+        return False
     records = []
     for size in sizes:
         for record in _measure_size(size, device, name, backend, peer, effort):

@@ -1,12 +1,13 @@
 """The plumbing of device timings and of gsplat beside them, with a stand-in for gsplat: no device needed."""
 
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+from torch.profiler import DeviceType
 
 from sparsestreet.ops import splat
-from sparsestreet.ops.bench import gpu, gsplat_peer
+from sparsestreet.ops.bench import device_profile, gpu, gsplat_peer
 from sparsestreet.ops.bench.accuracy import Errors, GradientError, ImageError
 from sparsestreet.ops.bench.device_profile import stage_of
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
@@ -151,3 +152,41 @@ def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
 )
 def test_kernels_belong_to_stages(kernel, stage):
     assert stage_of(kernel) == stage
+
+
+def test_device_time_is_the_mean_of_the_kernels_of_a_stage(monkeypatch):
+    def kernel(name: str, microseconds: float, device: DeviceType) -> SimpleNamespace:
+        return SimpleNamespace(key=name, self_device_time_total=microseconds, device_type=device)
+
+    class Profiler:
+        def __init__(self, activities: list) -> None:
+            self.kernels = [
+                kernel("blend_tiles", 3000.0, DeviceType.CUDA),
+                kernel("raster_more", 1000.0, DeviceType.CUDA),
+                kernel("project_rows", 500.0, DeviceType.CUDA),
+                kernel("blend_tiles", 9000.0, DeviceType.CPU),  # the launch: not a time of the device
+            ]
+
+        def __enter__(self) -> "Profiler":
+            return self
+
+        def __exit__(self, *error: object) -> None: ...
+
+        def key_averages(self) -> list[SimpleNamespace]:
+            return self.kernels
+
+    runs: list[int] = []
+    monkeypatch.setattr(device_profile, "profile", Profiler)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    stages = device_profile.kernel_milliseconds(lambda: runs.append(1), repeats=2)
+    assert stages == pytest.approx({"blend": 2.0, "project": 0.25})
+    assert len(runs) == 3  # one before: kernels are compiled
+
+
+def test_a_device_without_a_fast_backend_is_not_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu, "resolve_backend", lambda name, device: "reference")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a device")
+    file, said = RecordFile(tmp_path / "g.jsonl", PROVENANCE), []
+    assert not gpu.run_gpu([Size(48, 32, 60)], torch.device("cuda"), ONCE, file, said.append)
+    assert read_records(file.path) == []
+    assert any("install triton" in line for line in said)
