@@ -41,7 +41,7 @@ def draw_pareto(records: Sequence[Record], folder: Path) -> list[Path]:
     Filled points are the default's model and make up the front; hollow ones are another model (blur, clamp), whose
     error is against their own exact version. Presets carry their names.
     """
-    measured = [record for record in records if record["kind"] == "knob" and record["skipped"] is None]
+    measured = [record for record in records if record["kind"] == "knob" and record["exact"] is not None]
     drawn = (
         (
             "pareto_image",
@@ -96,30 +96,37 @@ def _pareto_figure(
     scenes = list(dict.fromkeys(record["scene"] for record in measured))
     columns = min(3, len(scenes))
     rows = len(scenes) // columns + 1  # the place after the last panel holds the legend
-    width, height = 5.4 * columns, 4.6 * rows
-    figure = Figure(figsize=(width, height), dpi=110)
-    FigureCanvasAgg(figure)
-    # Fixed margins in inches: a layout engine would draw everything several times over.
-    figure.subplots_adjust(
-        left=0.9 / width, right=1 - 0.2 / width, bottom=0.8 / height, top=1 - 0.4 / height, wspace=0.22, hspace=0.24
-    )
+    figure = _blank_figure(5.4 * columns, 4.6 * rows, x_label, y_label)
     panels = {}
     for place, scene in enumerate(scenes, start=1):
         axes = figure.add_subplot(rows, columns, place)
         axes.set_title(scene, fontsize=11)
         points = [(cost(record), error(record), record) for record in measured if record["scene"] == scene]
         panels[axes] = _pareto_panel(axes, [point for point in points if math.isfinite(point[1])])
-    handles: dict[str, object] = {}
-    for axes in panels:
-        handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    legend = figure.add_subplot(rows, columns, rows * columns)
-    legend.axis("off")
-    legend.legend(handles.values(), handles.keys(), loc="center left", frameon=False, fontsize=9)
-    figure.supxlabel(x_label, y=0.15 / height)
-    figure.supylabel(y_label, x=0.1 / width)
+    _legend(figure.add_subplot(rows, columns, rows * columns), list(panels))
     for axes, points in panels.items():
         _label(axes, points)
     return figure
+
+
+def _blank_figure(width: float, height: float, x_label: str, y_label: str) -> Figure:
+    """Inches. Margins are fixed: a layout engine would draw everything several times over."""
+    figure = Figure(figsize=(width, height), dpi=110)
+    FigureCanvasAgg(figure)
+    left, right, bottom, top = 0.9 / width, 1 - 0.2 / width, 0.8 / height, 1 - 0.4 / height
+    figure.subplots_adjust(left, bottom, right, top, wspace=0.22, hspace=0.24)
+    figure.supxlabel(x_label, y=0.15 / height)
+    figure.supylabel(y_label, x=0.1 / width)
+    return figure
+
+
+def _legend(place: Axes, panels: Sequence[Axes]) -> None:
+    """One legend of all panels, alone in its place."""
+    handles: dict[str, object] = {}
+    for axes in panels:
+        handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    place.axis("off")
+    place.legend(handles.values(), handles.keys(), loc="center left", frameon=False, fontsize=9)
 
 
 def _pareto_panel(axes: Axes, points: Sequence[PlottedPoint]) -> list[PlottedPoint]:

@@ -13,6 +13,7 @@ from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point
 from sparsestreet.ops.bench.records import RecordFile
 from sparsestreet.ops.bench.scenes import BenchScene, Size
 from sparsestreet.ops.bench.timing import Effort, OpTimes, leaves, time_op
+from sparsestreet.ops.bench.torch_tiles import TILE
 from sparsestreet.ops.settings import SplatSettings
 
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(48, 32, 200)
@@ -21,6 +22,8 @@ EFFORT = Effort(repeats=20, seconds=2.0, least=3)
 QUICK_EFFORT = Effort(repeats=2, seconds=0.1, least=1)
 DENSE_SAMPLES = 1 << 28
 """(row, pixel) samples beyond which the dense reference is not timed: it takes about a second for each 10^8."""
+UNBOUNDED_PAIRS = 1 << 26
+"""(splat, tile) pairs of a view without any bound that are still computed: about 7 GB in float64."""
 _EXACT_BACKEND = "cpu"
 
 
@@ -40,15 +43,15 @@ class KnobRecord:
     dtype: str
     settings: SplatSettings
     skipped: str | None
-    """Why there is no measurement; everything below is then None."""
+    """Why there is no measurement; times and errors are then None."""
     other_model: bool
     """What is drawn differs by intention; ``model_psnr`` is then no error."""
-    model_psnr: float | None
+    model_psnr: float | None = None
     """dB between this model without cut-offs and the default one without; None where they draw the same."""
-    times: OpTimes | None
-    exact: Errors | None
-    """Against this model in float64 without cut-offs (R0)."""
-    same_cutoffs: Errors | None
+    times: OpTimes | None = None
+    exact: Errors | None = None
+    """Against this model in float64 without cut-offs (R0); None where that covers too many tiles to be held."""
+    same_cutoffs: Errors | None = None
     """Against this model in float64 with the same cut-offs (R1): what rounding alone does."""
 
 
@@ -135,37 +138,46 @@ def run_sweep(
 
 def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effort) -> KnobRecord:
     """Time and error of one point, or why it cannot be had here."""
-    camera, gaussians = scene.camera, scene.gaussians
-    reason = unavailable(scene, point)
-    times = exact = same = model_psnr = None
-    if reason is None:
-        device = "cuda" if point.backend == "triton" else "cpu"
-        times = time_op(leaves(gaussians, point.dtype, device), camera, point.settings, point.backend, effort)
-        value = answer(gaussians, camera, point.settings, point.backend, point.dtype, device)
-        exact = errors(value, truths.of(point.exact))
-        same = errors(value, truths.of(point.same_cutoffs))
-        if point.other_model:
-            default = Point("default", "default", DEFAULT).exact
-            model_psnr = image_error(truths.of(point.exact).image, truths.of(default).image).psnr
+    record = _unmeasured(scene, point)
+    if record.skipped is not None:
+        return record
+    device = "cuda" if point.backend == "triton" else "cpu"
+    rows = leaves(scene.gaussians, point.dtype, device)
+    times = time_op(rows, scene.camera, point.settings, point.backend, effort)
+    value = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype, device)
+    record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs)))
+    if not affordable(scene, point.exact):
+        return record
+    record = replace(record, exact=errors(value, truths.of(point.exact)))
+    if not point.other_model:
+        return record
+    default = Point("default", "default", DEFAULT).exact
+    return replace(record, model_psnr=image_error(truths.of(point.exact).image, truths.of(default).image).psnr)
+
+
+def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
     return KnobRecord(
         scene=scene.name,
         source=scene.source,
-        rows=len(gaussians),
-        width=camera.width,
-        height=camera.height,
+        rows=len(scene.gaussians),
+        width=scene.camera.width,
+        height=scene.camera.height,
         knob=point.knob,
         value=point.value,
         preset=point.preset,
         backend=point.backend,
         dtype=str(point.dtype).removeprefix("torch."),
         settings=point.settings,
-        skipped=reason,
+        skipped=unavailable(scene, point),
         other_model=point.other_model,
-        model_psnr=model_psnr,
-        times=times,
-        exact=exact,
-        same_cutoffs=same,
     )
+
+
+def affordable(scene: BenchScene, settings: SplatSettings) -> bool:
+    """Whether the pairs can be held where nothing bounds a splat, so that each covers every tile."""
+    tiles = -(-scene.camera.width // TILE) * -(-scene.camera.height // TILE)
+    bounded = settings.alpha_min > 0 or settings.box < float("inf")
+    return bounded or int((scene.gaussians.opacities > 0).sum()) * tiles <= UNBOUNDED_PAIRS
 
 
 def unavailable(scene: BenchScene, point: Point) -> str | None:
@@ -173,6 +185,8 @@ def unavailable(scene: BenchScene, point: Point) -> str | None:
     samples = len(scene.gaussians) * scene.camera.width * scene.camera.height
     if point.backend == "reference" and samples > DENSE_SAMPLES:
         return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed"
+    if not affordable(scene, point.settings):
+        return f"nothing bounds a splat: more than {UNBOUNDED_PAIRS:.2g} (splat, tile) pairs"
     if point.backend == "triton":
         if "triton" not in BACKENDS:
             return "this version has no triton backend"
@@ -199,14 +213,14 @@ def describe(record: KnobRecord) -> str:
     name = f"  {record.knob} {record.value}" if record.knob != "default" else "  default"
     if record.skipped is not None:
         return f"{name:<34} -- {record.skipped}"
+    stages = record.times.stages
+    times = f"{name:<34}{stages['forward'].median:9.2f} + {stages['backward'].median:9.2f} ms"
+    if record.exact is None:
+        return f"{times}   no exact image: too many pairs"
     psnr = record.exact.image.psnr
     image = "equal" if psnr is None else f"{psnr:6.1f} dB"
     note = f"  other model ({record.model_psnr:.1f} dB)" if record.model_psnr is not None else ""
-    stages = record.times.stages
-    return (
-        f"{name:<34}{stages['forward'].median:9.2f} + {stages['backward'].median:9.2f} ms   {image}   "
-        f"gradient {worst_gradient(record.exact):.1e}{note}"
-    )
+    return f"{times}   {image}   gradient {worst_gradient(record.exact):.1e}{note}"
 
 
 def worst_gradient(error: Errors) -> float:

@@ -69,6 +69,19 @@ def test_points_that_cannot_be_had_say_why(swept):
     assert sweep.unavailable(large, Point("default", "default", DEFAULT)) is None
 
 
+def test_what_nothing_bounds_is_left_out_where_it_does_not_fit(monkeypatch):
+    monkeypatch.setattr(sweep, "UNBOUNDED_PAIRS", 120 * 6 - 1)  # 120 rows, six tiles
+    scene, truths = SCENES[0], sweep.Truths(SCENES[0])
+    default = sweep.measure_point(scene, Point("default", "default", DEFAULT), truths, ONCE)
+    assert default.exact is None
+    assert default.same_cutoffs is not None
+    assert "no exact image" in sweep.describe(default)
+    exact = sweep.measure_point(scene, Point("preset", "exact", EXACT), truths, ONCE)
+    assert "nothing bounds" in exact.skipped
+    monkeypatch.setattr(sweep, "UNBOUNDED_PAIRS", 120 * 6)
+    assert sweep.measure_point(scene, Point("preset", "exact", EXACT), truths, ONCE).exact is not None
+
+
 def test_the_truth_agrees_with_the_dense_reference(swept):
     oracles = [record for record in swept[0] if record["kind"] == "oracle"]
     assert len(oracles) == 2
