@@ -173,6 +173,7 @@ def _steps(front: Sequence[PlottedPoint]) -> list[PlottedPoint]:
 def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
     """Names beside points; of names that would overlap, the later one moves up or down to the next free place."""
     axes.get_xlim(), axes.get_ylim()  # fixes the limits, and with them the transform to pixels
+    bottom, top, end_of_panel = (float(side) for side in (axes.bbox.y0, axes.bbox.y1, axes.bbox.x1))
     pixel = 72 / axes.figure.dpi
     height = 9.5 / pixel
     taken: list[tuple[float, float, float]] = []
@@ -181,10 +182,10 @@ def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
         text = preset if preset is not None else f"{record['knob']} {record['value']}".replace("_", " ")
         x, y = axes.transData.transform((time, value)).tolist()
         width = 4.9 * len(text) / pixel
-        left = x + 7 / pixel if x + 7 / pixel + width < axes.bbox.x1 else x - 7 / pixel - width
+        left = x + 7 / pixel if x + 7 / pixel + width < end_of_panel else x - 7 / pixel - width
 
         def free(shift: float, left: float = left, width: float = width, y: float = y) -> bool:
-            return axes.bbox.y0 + height / 2 < y + shift < axes.bbox.y1 - height / 2 and all(
+            return bottom + height / 2 < y + shift < top - height / 2 and all(
                 left + width < start or left > end or abs(y + shift - middle) >= height for start, end, middle in taken
             )
 

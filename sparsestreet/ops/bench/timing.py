@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.cpu.workspace import Workspace, idle_workspaces
+from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Workspace, idle_workspaces
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
 from sparsestreet.types import Camera, Gaussians
@@ -169,7 +169,7 @@ def work_of(gaussians: Gaussians, backend: str) -> tuple[int | None, int | None]
 
 
 def _last_workspace(dtype: torch.dtype) -> Workspace:
-    return [workspace for workspace in idle_workspaces() if workspace.key[0] == dtype][-1]
+    return [workspace for workspace in idle_workspaces() if workspace.key == (dtype, FASTEST_VARIANT)][-1]
 
 
 class WallClock:
