@@ -14,7 +14,7 @@ from sparsestreet.ops.bench.scenes import BenchScene, Size
 EXAMPLES = """\
 examples:
   sparsestreet bench                            knobs, on five scenes; the street is a stand-in made of numbers
-  sparsestreet bench knobs --street RUN         the street of a run that train wrote
+  sparsestreet bench knobs --street RUN         the street of a run that train wrote; its exact images take minutes
   sparsestreet bench knobs --quick              the same at sizes that take seconds: to see that it runs
   sparsestreet bench blend                      stages of the C++ backend beside vectorised torch, and the floor
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
