@@ -33,7 +33,9 @@ lint: $(VENV)/.ok
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.ok
-	$(BIN)/sparsestreet bench
+	$(BIN)/sparsestreet bench blend
+	$(BIN)/sparsestreet bench knobs
+	$(BIN)/sparsestreet bench scaling
 
 clean:
 	rm -rf $(VENV) build outputs/demo outputs/streets

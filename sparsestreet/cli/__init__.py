@@ -15,7 +15,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet report DIR [DIR ...]                   tables from the records of runs, one a scene
   sparsestreet data check data.root=DIR               everything that is wrong with a log, at once
   sparsestreet data make seed=1                       write a synthetic street to disk
-  sparsestreet bench                                  time the splat op beside its peer
+  sparsestreet bench                                  what the splat op costs in time, memory and accuracy
 
 Every command takes --help. Options are Hydra overrides (key=value); `sparsestreet train --cfg job` prints them all.
 """
@@ -54,7 +54,7 @@ def _run(command: str, rest: list[str]) -> int:
 
         return demo(rest)
     if command == "bench":
-        from sparsestreet.ops.bench.blend import main as bench
+        from sparsestreet.cli.bench import bench
 
         return bench(rest)
     print(f"sparsestreet: no command {command!r}\n\n{USAGE}", file=sys.stderr)

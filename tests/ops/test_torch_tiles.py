@@ -1,9 +1,10 @@
 """The tile-vectorised torch blend against the reference: an oracle is worth as much as its own test."""
 
+import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.ops.bench import blend, torch_tiles
+from sparsestreet.ops.bench import torch_tiles
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.ops.reference import on_screen, visible_rows
 from tests.ops.scenes import camera, cast, cotangents, random_gaussians, relative_error
@@ -11,21 +12,30 @@ from tests.ops.scenes import camera, cast, cotangents, random_gaussians, relativ
 SETTINGS = SplatSettings()
 
 
-def test_image_and_gradients():
+@pytest.mark.parametrize(
+    "settings",
+    [
+        SETTINGS,
+        SplatSettings(stop="exclusive", transmittance_min=0.1),
+        SplatSettings(box=1.5),
+        SplatSettings(half_colors=True, depth_bits=12),
+    ],
+)
+def test_image_and_gradients(settings):
     view = camera(37, 29)
     gaussians = random_gaussians(200, view)
-    splats = on_screen(gaussians, visible_rows(gaussians, view, SETTINGS), view, SETTINGS)
-    colors, transmittance = torch_tiles.blend(splats, 37, 29, SETTINGS)
+    splats = on_screen(gaussians, visible_rows(gaussians, view, settings), view, settings)
+    colors, transmittance = torch_tiles.blend(splats, 37, 29, settings)
     leaves = cast(gaussians, torch.float64, requires_grad=True)
-    truth = splat(leaves, view, backend="reference")
+    truth = splat(leaves, view, settings=settings, backend="reference")
     assert (colors - truth.rgb).abs().max() < 1e-12
     assert (1 - transmittance - truth.alpha).abs().max() < 1e-12
     # Through the projection of the reference, with the gradients of the tiles put in at the screen.
     cotangent = cotangents(view)[0]
     truth.rgb.backward(cotangent)
     other = cast(gaussians, torch.float64, requires_grad=True)
-    graph = on_screen(other, visible_rows(other, view, SETTINGS), view, SETTINGS)
-    gradients = torch_tiles.blend_gradients(splats, 37, 29, SETTINGS, cotangent)
+    graph = on_screen(other, visible_rows(other, view, settings), view, settings)
+    gradients = torch_tiles.blend_gradients(splats, 37, 29, settings, cotangent)
     torch.autograd.backward([getattr(graph, name) for name in gradients], list(gradients.values()))
     for name in ("means", "quaternions", "scales", "opacities", "sh"):
         assert relative_error(getattr(other, name).grad, getattr(leaves, name).grad) < 1e-10, name
@@ -40,28 +50,3 @@ def test_cpu_agrees_on_a_large_scene():
     # A splat within rounding of the cut-off is blended by one and not by the other: at most one pixel in thousands.
     assert (difference > 1e-5).sum() <= 3
     assert difference.max() < 1 / 255
-
-
-def test_benchmark_runs(monkeypatch, capsys, tmp_path):
-    path = tmp_path / "blend.csv"
-    arguments = [
-        "blend",
-        "--rows",
-        "300",
-        "--size",
-        "64x48",
-        "--repeats",
-        "2",
-        "--peer-repeats",
-        "1",
-        "--csv",
-        str(path),
-    ]
-    monkeypatch.setattr("sys.argv", arguments)
-    threads = torch.get_num_threads()
-    monkeypatch.setattr(blend, "measured_peak", lambda: 1e11)
-    monkeypatch.setattr(blend, "TRAINING_ROWS", (1000,))
-    blend.main()
-    torch.set_num_threads(threads)
-    assert "torch over C++" in capsys.readouterr().out
-    assert len(path.read_text().splitlines()) == 12 + 7

@@ -29,7 +29,7 @@ class Block:
 def blend(
     splats: Splats, width: int, height: int, settings: SplatSettings
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Colour (premultiplied) and transmittance, for the inclusive stop rule; splats must come nearest first."""
+    """Colour (premultiplied) and transmittance; splats must come nearest first."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     image = splats.means.new_zeros(tiles_x * tiles_y, TILE * TILE, 4)
     image[..., 3] = 1
@@ -88,17 +88,27 @@ def tile_blocks(splats: Splats, tiles_x: int, tiles_y: int) -> Iterator[Block]:
 
 def blend_block(splats: Splats, block: Block, tiles_x: int, settings: SplatSettings) -> Float[Tensor, "t 256 4"]:
     """Colour and transmittance of the pixels of a block's tiles."""
+    weights, transmittance = block_weights(splats, block, tiles_x, settings)
+    colors = torch.einsum("tkp,tkc->tpc", weights, splats.colors[block.splats])
+    return torch.cat((colors, transmittance[..., None]), -1)
+
+
+def block_weights(
+    splats: Splats, block: Block, tiles_x: int, settings: SplatSettings
+) -> tuple[Float[Tensor, "t k 256"], Float[Tensor, "t 256"]]:
+    """Blend weight of each splat in each pixel, and what gets past all of them."""
     inside = torch.arange(TILE * TILE)
     x = (block.tiles % tiles_x * TILE)[:, None] + inside % TILE + 0.5
     y = (block.tiles // tiles_x * TILE)[:, None] + inside // TILE + 0.5
     mean, factor = splats.means[block.splats], splats.cholesky[block.splats]
     dx, dy = x[:, None] - mean[..., :1], y[:, None] - mean[..., 1:]
     a = factor[..., :1] * dx + factor[..., 1:2] * dy
-    raw = splats.opacities[block.splats][..., None] * torch.exp(-0.5 * (a.square() + (factor[..., 2:] * dy).square()))
-    touched = (raw >= settings.alpha_min) & block.listed[..., None]
+    q = a.square() + (factor[..., 2:] * dy).square()
+    touched = (q <= splats.reaches[block.splats][..., None]) & block.listed[..., None]
+    raw = splats.opacities[block.splats][..., None] * torch.exp(-0.5 * q)
     alpha = torch.where(touched, raw.clamp(max=settings.alpha_max), 0.0)
     passed = (1 - alpha).cumprod(1)
     before = torch.cat((torch.ones_like(passed[:, :1]), passed[:, :-1]), 1)
-    alpha = torch.where(before > settings.transmittance_min, alpha, 0.0)
-    colors = torch.einsum("tkp,tkc->tpc", alpha * before, splats.colors[block.splats])
-    return torch.cat((colors, (1 - alpha).prod(1)[..., None]), -1)
+    still_open = (before if settings.stop == "inclusive" else passed) > settings.transmittance_min
+    alpha = torch.where(still_open, alpha, 0.0)
+    return alpha * before, (1 - alpha).prod(1)

@@ -1,0 +1,149 @@
+"""``sparsestreet bench``: what the splat op costs in time, memory and accuracy."""
+
+import argparse
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from sparsestreet.evaluation.provenance import this_machine, this_source
+from sparsestreet.ops.bench.records import Provenance, RecordFile
+from sparsestreet.ops.bench.scenes import BenchScene, Size
+
+EXAMPLES = """\
+examples:
+  sparsestreet bench                            knobs, on five scenes; the street is a stand-in made of numbers
+  sparsestreet bench knobs --street RUN         the street of a run that train wrote; its exact images take minutes
+  sparsestreet bench knobs --quick              the same at sizes that take seconds: to see that it runs
+  sparsestreet bench blend                      stages of the C++ backend beside vectorised torch, and the floor
+  sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
+  sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
+
+Records go to OUT/MODE.jsonl, one JSON object a line; figures beside them as SVG and PNG.
+"""
+
+
+def bench(arguments: list[str]) -> int:
+    """Run one mode (knobs unless another is named); 0 if all went well, 1 if a renderer failed."""
+    modes: dict[str, Callable[[argparse.Namespace], bool]] = {
+        "knobs": _knobs,
+        "blend": _blend,
+        "scaling": _scaling,
+        "gpu": _gpu,
+    }
+    options = _parser(list(modes)).parse_args(arguments)
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    options.command = shlex.join(["sparsestreet", "bench", *arguments])
+    return 0 if modes[options.mode](options) else 1
+
+
+def _parser(modes: list[str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sparsestreet bench",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("mode", nargs="?", default="knobs", choices=modes, help="what to measure (default: knobs)")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
+    parser.add_argument("--street", type=Path, metavar="RUN", help="knobs: the trained street of this run's folder")
+    parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
+    parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
+    return parser
+
+
+def _knobs(options: argparse.Namespace) -> bool:
+    from sparsestreet.ops.bench import figures, knobs, sweep
+    from sparsestreet.ops.bench.records import read_records
+    from sparsestreet.ops.bench.scenes import bench_scenes
+
+    street = None if options.street is None else trained_street(options.street)
+    size = sweep.QUICK if options.quick else sweep.FULL
+    file = _file(options)
+    sweep.run_sweep(
+        bench_scenes(size, street),
+        bench_scenes(sweep.SMALL),
+        knobs.points(),
+        sweep.QUICK_EFFORT if options.quick else sweep.EFFORT,
+        file,
+    )
+    for path in figures.draw_pareto(read_records(file.path), options.out):
+        print(f"drawn: {path}")
+    return True
+
+
+def _blend(options: argparse.Namespace) -> bool:
+    from sparsestreet.ops.bench import blend
+    from sparsestreet.ops.bench.timing import Effort
+
+    if options.quick:
+        once = Effort(repeats=2, least=1)
+        blend.run_blend(Size(64, 48, 300), [Size(48, 32, 200)], once, once, _file(options))
+    else:
+        blend.run_blend(blend.MAIN, blend.TRAINING, Effort(), Effort(repeats=3), _file(options))
+    return True
+
+
+def _scaling(options: argparse.Namespace) -> bool:
+    from sparsestreet.ops.bench import scaling
+    from sparsestreet.ops.bench.timing import Effort
+
+    file = _file(options)
+    if options.quick:
+        scaling.run_scaling((200, 400, 800), None, Effort(repeats=2, least=1), file, options.out)
+    else:
+        scaling.run_scaling(scaling.ROWS, scaling.LARGE, Effort(seconds=15.0, least=5), file, options.out)
+    return True
+
+
+def _gpu(options: argparse.Namespace) -> bool:
+    from sparsestreet.ops.bench import gpu
+    from sparsestreet.ops.bench.timing import Effort
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if device.type == "cpu" and not options.quick:
+        raise SystemExit("sparsestreet bench gpu: no CUDA device is available; --quick runs it on the CPU, tiny")
+    sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
+    if options.quick:
+        return gpu.run_gpu([Size(64, 48, 500)], device, Effort(repeats=2, least=1), _file(options))
+    return gpu.run_gpu(sizes, device, gpu.EFFORT, _file(options))
+
+
+def trained_street(run: Path) -> BenchScene:
+    """A held-out view of a trained run, in the middle of its log, as ``evaluate`` would render it (without the sky).
+
+    Raises FileNotFoundError if the folder holds no run or no checkpoint.
+    """
+    from sparsestreet.cli.assemble import assemble
+    from sparsestreet.cli.compose import load_run_config
+
+    cfg = load_run_config(run)
+    parts = assemble(cfg)
+    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=True)
+    parts.system.load_state_dict(checkpoint["state_dict"])
+    split = parts.datamodule.split
+    frames = split.held_out or split.train
+    frame = frames[len(frames) // 2]
+    with torch.no_grad():
+        gaussians = parts.system.eval().scene.gaussians_at(frame.time).gaussians
+    steps = checkpoint["global_step"]
+    source = f"trained: {cfg.name} on {parts.log.name}, seed {cfg.seed}, {steps} steps, frame {frame.index}"
+    return BenchScene("trained street", source, gaussians, frame.camera)
+
+
+def _file(options: argparse.Namespace) -> RecordFile:
+    machine, source = this_machine(), this_source()
+    provenance = Provenance(
+        command=options.command,
+        commit=source.commit,
+        modified=source.dirty,
+        processor=machine.processor,
+        cores=machine.cores,
+        threads=torch.get_num_threads(),
+        system=machine.system,
+        python=machine.python,
+        torch=machine.torch,
+    )
+    return RecordFile(options.out / f"{options.mode}.jsonl", provenance)

@@ -1,0 +1,95 @@
+"""The points of the sweep: one knob at a time around the default, then the presets."""
+
+from dataclasses import dataclass, replace
+from math import inf
+
+import torch
+
+from sparsestreet.ops.settings import SplatSettings
+
+DEFAULT = SplatSettings()
+PRESETS = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast")
+KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
+    "alpha_min": (0.0, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64),
+    "box": (3.0, 3.33, 4.0, inf),
+    "transmittance_min": (1e-5, 1e-4, 1e-3, 1e-2),
+    "stop": ("inclusive", "exclusive"),
+    "blur": (0.0, 0.1, 0.3),
+    "half_colors": (False, True),
+    "depth_bits": (12, 16, 24, 32),
+}
+"""Fields of SplatSettings and their values."""
+BOXES_ALONE = (3.0, 3.33, 4.0)
+"""Boxes without alpha_min, two knobs at once: either of them bounds a splat, so each hides what the other costs."""
+FIXED = {
+    ("tile size", "cpu"): "compiled for tiles of 16x16: a row of a tile is one AVX-512 register of float32",
+    ("tile size", "reference"): "dense: it has no tiles",
+    ("tile size", "triton"): "compiled for tiles of 16x16",
+    ("exact tiles", "cpu"): "always exact; that this changes no pixel is measured as 'culling'",
+    ("exact tiles", "reference"): "dense: it has no tiles",
+    ("exact tiles", "triton"): "always exact",
+    ("dot precision", "cpu"): "no backend has a matrix product in its blend",
+    ("dot precision", "reference"): "a truth: matrix products in the dtype of the Gaussians",
+    ("dot precision", "triton"): "no backend has a matrix product in its blend",
+}
+"""What would be a knob but is a property of a backend: (knob, backend) -> what holds instead."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One thing to time."""
+
+    knob: str
+    """Which knob is off its default; ``default``, ``preset`` and ``backend`` for the rest."""
+    value: str
+    settings: SplatSettings
+    preset: str | None = None
+    """Name of the preset that has these settings."""
+    backend: str = "cpu"
+    dtype: torch.dtype = torch.float32
+
+    @property
+    def other_model(self) -> bool:
+        """Whether what is drawn differs by intention: blur, clamp and compensation are model, not precision."""
+        return _model(self.settings) != _model(DEFAULT)
+
+    @property
+    def exact(self) -> SplatSettings:
+        """This point's own model without cut-offs: R0."""
+        blur, alpha_max, antialias = _model(self.settings)
+        exact = SplatSettings.preset("exact")
+        return replace(exact, blur=blur, alpha_max=alpha_max, antialias=antialias, near=self.settings.near)
+
+    @property
+    def same_cutoffs(self) -> SplatSettings:
+        """This point's cut-offs without its rounding of colours and depths: R1."""
+        return replace(self.settings, half_colors=False, depth_bits=32)
+
+
+def points() -> list[Point]:
+    """The default first, then every knob, the presets that no knob reaches, and the other backends."""
+    named = {name: SplatSettings.preset(name) for name in PRESETS}
+    swept = [Point("default", "default", DEFAULT)]
+    for knob, values in KNOBS.items():
+        changed = [(value, replace(DEFAULT, **{knob: value})) for value in values]
+        swept += [Point(knob, _text(knob, value), settings) for value, settings in changed if settings != DEFAULT]
+    swept += [Point("box alone", _text("box", box), replace(DEFAULT, alpha_min=0.0, box=box)) for box in BOXES_ALONE]
+    met = [point.settings for point in swept]
+    swept += [Point("preset", name, settings) for name, settings in named.items() if settings not in met]
+    names = {settings: name for name, settings in reversed(named.items())}
+    swept = [replace(point, preset=names.get(point.settings)) for point in swept]
+    others = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
+    return swept + [
+        Point("backend", f"{name} {str(dtype).removeprefix('torch.')}", DEFAULT, backend=name, dtype=dtype)
+        for name, dtype in others
+    ]
+
+
+def _model(settings: SplatSettings) -> tuple[float, float, bool]:
+    return settings.blur, settings.alpha_max, settings.antialias
+
+
+def _text(knob: str, value: float | int | bool | str) -> str:
+    if knob == "alpha_min" and value:
+        return f"1/{round(1 / value)}"
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,229 @@
+"""``sparsestreet bench knobs``: time, work and error of every knob on every scene, one record a point."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from sparsestreet.ops.backend import BACKENDS, resolve_backend
+from sparsestreet.ops.bench.accuracy import Answer, Errors, answer, errors, image_error
+from sparsestreet.ops.bench.culling import Culling, compare_culling
+from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point
+from sparsestreet.ops.bench.records import RecordFile
+from sparsestreet.ops.bench.scenes import BenchScene, Size
+from sparsestreet.ops.bench.timing import Effort, OpTimes, leaves, time_op
+from sparsestreet.ops.bench.torch_tiles import TILE
+from sparsestreet.ops.settings import SplatSettings
+
+FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(48, 32, 200)
+"""Sizes of a sweep, of a trial, and of the copies on which truths and culling are checked densely."""
+EFFORT = Effort(repeats=20, seconds=2.0, least=3)
+QUICK_EFFORT = Effort(repeats=2, seconds=0.1, least=1)
+DENSE_SAMPLES = 1 << 28
+"""(row, pixel) samples beyond which the dense reference is not timed: it takes about a second for each 10^8."""
+UNBOUNDED_PAIRS = 1 << 26
+"""(splat, tile) pairs of a view without any bound that are still computed: about 7 GB in float64."""
+_EXACT_BACKEND = "cpu"
+
+
+@dataclass(frozen=True)
+class KnobRecord:
+    """One point of one scene. Times are milliseconds."""
+
+    scene: str
+    source: str
+    rows: int
+    width: int
+    height: int
+    knob: str
+    value: str
+    preset: str | None
+    backend: str
+    dtype: str
+    settings: SplatSettings
+    skipped: str | None
+    """Why there is no measurement; times and errors are then None."""
+    other_model: bool
+    """What is drawn differs by intention; ``model_psnr`` is then no error."""
+    model_psnr: float | None = None
+    """dB between this model without cut-offs and the default one without; None where they draw the same."""
+    times: OpTimes | None = None
+    exact: Errors | None = None
+    """Against this model in float64 without cut-offs (R0); None where that covers too many tiles to be held."""
+    same_cutoffs: Errors | None = None
+    """Against this model in float64 with the same cut-offs (R1): what rounding alone does."""
+
+
+@dataclass(frozen=True)
+class CullingRecord:
+    """That culling by tiles is exact on this scene: identical images, not a trade."""
+
+    scene: str
+    culling: Culling
+
+
+@dataclass(frozen=True)
+class OracleRecord:
+    """The exact model of the C++ backend in float64 against the dense reference, on a small copy of a scene."""
+
+    scene: str
+    rows: int
+    width: int
+    height: int
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class FixedRecord:
+    """What would be a knob but is a property of a backend."""
+
+    knob: str
+    backend: str
+    holds: str
+
+
+class Truths:
+    """Float64 answers of one scene, each computed once."""
+
+    def __init__(self, scene: BenchScene) -> None:
+        self._scene = scene
+        self._answers: dict[SplatSettings, Answer] = {}
+
+    def of(self, settings: SplatSettings) -> Answer:
+        near, scene = settings.near, self._scene
+        if not self._depths_between(near, DEFAULT.near):
+            settings = replace(settings, near=DEFAULT.near)  # the same rows, the same answer
+        if settings not in self._answers:
+            self._answers[settings] = answer(scene.gaussians, scene.camera, settings, _EXACT_BACKEND, torch.float64)
+        return self._answers[settings]
+
+    def _depths_between(self, near: float, other: float) -> bool:
+        pose = self._scene.camera.camera_from_world
+        depths = self._scene.gaussians.means.double() @ pose[2, :3].double() + pose[2, 3].double()
+        return bool(((depths > min(near, other)) & (depths <= max(near, other))).any())
+
+
+def run_sweep(
+    scenes: Sequence[BenchScene],
+    small: Sequence[BenchScene],
+    points: Sequence[Point],
+    effort: Effort,
+    file: RecordFile,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Measure all points of all scenes into ``file``; ``small`` are copies on which the truth itself is checked.
+
+    Raises RuntimeError with the remedy if the C++ backend, which computes the truths, is not built.
+    """
+    resolve_backend(_EXACT_BACKEND, torch.device("cpu"))
+    for (knob, backend), holds in FIXED.items():
+        file.write("fixed", FixedRecord(knob, backend, holds))
+    for scene in small:
+        file.write("oracle", check_oracle(scene))
+    for scene in scenes:
+        say(
+            f"\n{scene.name}: {scene.source}; {len(scene.gaussians)} splats, {scene.camera.width}x{scene.camera.height}"
+        )
+        truths = Truths(scene)
+        for point in points:
+            record = measure_point(scene, point, truths, effort)
+            file.write("knob", record)
+            say(describe(record))
+    for scene in small:
+        culling = compare_culling(scene.gaussians, scene.camera, DEFAULT)
+        file.write("culling", CullingRecord(scene.name, culling))
+        say(f"culling, {scene.name}: {culling}")
+
+
+def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effort) -> KnobRecord:
+    """Time and error of one point, or why it cannot be had here."""
+    record = _unmeasured(scene, point)
+    if record.skipped is not None:
+        return record
+    device = "cuda" if point.backend == "triton" else "cpu"
+    rows = leaves(scene.gaussians, point.dtype, device)
+    times = time_op(rows, scene.camera, point.settings, point.backend, effort)
+    value = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype, device)
+    record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs)))
+    if not affordable(scene, point.exact):
+        return record
+    record = replace(record, exact=errors(value, truths.of(point.exact)))
+    if not point.other_model:
+        return record
+    default = Point("default", "default", DEFAULT).exact
+    return replace(record, model_psnr=image_error(truths.of(point.exact).image, truths.of(default).image).psnr)
+
+
+def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
+    return KnobRecord(
+        scene=scene.name,
+        source=scene.source,
+        rows=len(scene.gaussians),
+        width=scene.camera.width,
+        height=scene.camera.height,
+        knob=point.knob,
+        value=point.value,
+        preset=point.preset,
+        backend=point.backend,
+        dtype=str(point.dtype).removeprefix("torch."),
+        settings=point.settings,
+        skipped=unavailable(scene, point),
+        other_model=point.other_model,
+    )
+
+
+def affordable(scene: BenchScene, settings: SplatSettings) -> bool:
+    """Whether the pairs can be held where nothing bounds a splat, so that each covers every tile."""
+    tiles = -(-scene.camera.width // TILE) * -(-scene.camera.height // TILE)
+    bounded = settings.alpha_min > 0 or settings.box < float("inf")
+    return bounded or int((scene.gaussians.opacities > 0).sum()) * tiles <= UNBOUNDED_PAIRS
+
+
+def unavailable(scene: BenchScene, point: Point) -> str | None:
+    """Why a point cannot be timed here; None if it can."""
+    samples = len(scene.gaussians) * scene.camera.width * scene.camera.height
+    if point.backend == "reference" and samples > DENSE_SAMPLES:
+        return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed"
+    if not affordable(scene, point.settings):
+        return f"nothing bounds a splat: more than {UNBOUNDED_PAIRS:.2g} (splat, tile) pairs"
+    if point.backend == "triton":
+        if "triton" not in BACKENDS:
+            return "this version has no triton backend"
+        if os.environ.get("TRITON_INTERPRET") == "1":
+            return "the interpreter is on: its times say nothing about a device"
+        if not torch.cuda.is_available():
+            return "no CUDA device"
+    return None
+
+
+def check_oracle(scene: BenchScene) -> OracleRecord:
+    """Truth against truth: two implementations of the exact model in float64."""
+    exact = SplatSettings.preset("exact")
+    fast, dense = (
+        answer(scene.gaussians, scene.camera, exact, backend, torch.float64)
+        for backend in (_EXACT_BACKEND, "reference")
+    )
+    camera = scene.camera
+    return OracleRecord(scene.name, len(scene.gaussians), camera.width, camera.height, errors(fast, dense))
+
+
+def describe(record: KnobRecord) -> str:
+    """One line for the terminal."""
+    name = f"  {record.knob} {record.value}" if record.knob != "default" else "  default"
+    if record.skipped is not None:
+        return f"{name:<34} -- {record.skipped}"
+    stages = record.times.stages
+    times = f"{name:<34}{stages['forward'].median:9.2f} + {stages['backward'].median:9.2f} ms"
+    if record.exact is None:
+        return f"{times}   no exact image: too many pairs"
+    psnr = record.exact.image.psnr
+    image = "equal" if psnr is None else f"{psnr:6.1f} dB"
+    note = f"  other model ({record.model_psnr:.1f} dB)" if record.model_psnr is not None else ""
+    return f"{times}   {image}   gradient {worst_gradient(record.exact):.1e}{note}"
+
+
+def worst_gradient(error: Errors) -> float:
+    """Relative L2 of the parameter group that is furthest off; infinite where a group's truth is zero."""
+    values = [group.relative_l2 for group in error.gradients.values()]
+    return float("inf") if None in values else max(values)

@@ -1,0 +1,67 @@
+"""``sparsestreet bench``: modes, help, and the street of a run."""
+
+import json
+
+import pytest
+import torch
+
+from sparsestreet.cli.assemble import assemble
+from sparsestreet.cli.bench import bench, trained_street
+from sparsestreet.cli.compose import load_run_config
+from sparsestreet.ops import splat
+from sparsestreet.ops.bench import gpu, scaling
+
+
+def test_help_teaches_by_example(capsys):
+    with pytest.raises(SystemExit) as ended:
+        bench(["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert all(f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "scaling", "gpu"))
+
+
+def test_unknown_mode_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        bench(["knob"])
+    assert ended.value.code == 2
+    assert "invalid choice" in capsys.readouterr().err
+
+
+def test_records_name_command_and_threads(tmp_path, capsys):
+    assert bench(["scaling", "--quick", "--out", str(tmp_path), "--threads", str(torch.get_num_threads())]) == 0
+    first = json.loads((tmp_path / "scaling.jsonl").read_text().splitlines()[0])
+    assert first["provenance"]["command"].startswith("sparsestreet bench scaling --quick")
+    assert first["provenance"]["threads"] == torch.get_num_threads()
+    assert first["rows"] < min(scaling.ROWS)
+
+
+def test_gpu_without_a_device_is_an_error_and_quick_is_not(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="no CUDA device"):
+        bench(["gpu", "--out", str(tmp_path)])
+    assert bench(["gpu", "--quick", "--out", str(tmp_path)]) == 0
+    assert "no GPU timings" in capsys.readouterr().out
+    monkeypatch.setattr(gpu, "run_gpu", lambda *arguments: False)
+    assert bench(["gpu", "--quick", "--out", str(tmp_path)]) == 1
+
+
+def test_a_folder_that_is_no_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is no run"):
+        trained_street(tmp_path)
+
+
+def test_the_street_of_a_run_is_what_the_run_renders(run_train, tmp_path):
+    run = run_train(tmp_path / "run", "schedule.max_steps=20")
+    street = trained_street(run)
+    assert street.source.startswith("trained: streetgs on ")
+    assert ", 20 steps, frame " in street.source
+    assert not street.gaussians.means.requires_grad
+    parts = assemble(load_run_config(run))
+    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=True)
+    parts.system.load_state_dict(checkpoint["state_dict"])
+    frame = parts.datamodule.split.held_out[len(parts.datamodule.split.held_out) // 2]
+    with torch.no_grad():
+        rendering = parts.system.eval().render(frame)
+        again = splat(street.gaussians, street.camera)
+    assert torch.equal(again.rgb, rendering.splats.rgb)  # without the sky
+    assert float(again.alpha.mean()) > 0.2
