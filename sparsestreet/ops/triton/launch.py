@@ -1,0 +1,24 @@
+"""How kernels are started: one place, so that tests can see what is compiled for what."""
+
+from typing import Any
+
+from triton.runtime.interpreter import InterpretedFunction
+from triton.runtime.jit import KernelInterface
+
+
+def launch(
+    kernel: KernelInterface,
+    items: int,
+    block: int,
+    *arguments: Any,
+    options: dict[str, Any] | None = None,
+    **constants: Any,
+) -> None:
+    """Run ``kernel`` over ``items`` in programs of ``block``, given to it as BLOCK; nothing runs for no items."""
+    if items:
+        kernel[(-(-items // block),)](*arguments, **constants, BLOCK=block, **(options or {}))
+
+
+def is_interpreted(kernel: KernelInterface) -> bool:
+    """Whether Triton's interpreter runs the kernel, on CPU tensors (TRITON_INTERPRET=1 when it was imported)."""
+    return isinstance(kernel, InterpretedFunction)
