@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -10,6 +11,13 @@ from sparsestreet.types import Camera, Gaussians
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
+BACKENDS = ("reference", "cpu")
+"""Every implementation of the op: what is tested for all of them takes the list from here."""
+EFFECT_BACKENDS = ("reference",)
+"""Those with lens, shutter, box, depth bits and half colours."""
+every_backend = pytest.mark.parametrize("backend", BACKENDS)
+every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+every_effect_backend = pytest.mark.parametrize("backend", EFFECT_BACKENDS)
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:
@@ -67,9 +75,11 @@ def one_gaussian(**fields: list) -> Gaussians:
 
 
 def cast(gaussians: Gaussians, dtype: torch.dtype, requires_grad: bool = False) -> Gaussians:
-    """Detached copy in another precision."""
+    """Detached copy in another precision; displacements never ask for a gradient."""
+    moved = gaussians.displacements
     return Gaussians(
-        *(getattr(gaussians, name).detach().clone().to(dtype).requires_grad_(requires_grad) for name in FIELDS)
+        *(getattr(gaussians, name).detach().clone().to(dtype).requires_grad_(requires_grad) for name in FIELDS),
+        None if moved is None else moved.detach().to(dtype),
     )
 
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, reference, splat
+from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.cpu.workspace import idle_workspaces
+from sparsestreet.ops.reference import projection
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -77,8 +78,8 @@ def test_03_determinant_of_needles(length):
     factors = torch.zeros(1, 2, 3, dtype=torch.float64)
     factors[0, :, :2] = turn @ torch.diag(torch.tensor([length, 1e-3], dtype=torch.float64))
     factors = factors.float()
-    single = reference._determinants(factors, 0.3)[0]
-    double = reference._determinants(factors.double(), 0.3)[0]
+    single = projection._determinants(factors, 0.3)[0]
+    double = projection._determinants(factors.double(), 0.3)[0]
     assert single > 0
     assert relative_error(single.double(), double) < 1e-6
 

@@ -10,6 +10,7 @@ from scipy.special import sph_harm_y
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.spherical_harmonics import basis
 from sparsestreet.types import Camera, Gaussians
+from tests.ops.oracles import naive_image
 from tests.ops.scenes import FIELDS, camera, cast, front_camera, one_gaussian, random_gaussians, render
 
 LOOSE = SplatSettings(alpha_min=1e-9)
@@ -60,45 +61,12 @@ def test_stop_rule_by_hand(stop):
     assert rendering.alpha.item() == pytest.approx(expected, rel=1e-12)
 
 
-def _naive_image(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> np.ndarray:
-    """Per pixel, from the textbook: matrix inverse of the covariance, no tricks; degree 0 colours."""
-    pose, intrinsics = view.camera_from_world.numpy(), view.intrinsics.numpy()
-    splats = []
-    for mean, q, scale, opacity, sh in zip(*(getattr(gaussians, name).numpy() for name in FIELDS), strict=True):
-        x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
-        if z <= settings.near:
-            continue
-        w, i, j, k = q / np.linalg.norm(q)
-        skew = np.array([[0, -k, j], [k, 0, -i], [-j, i, 0]])
-        rotation = np.eye(3) + 2 * w * skew + 2 * skew @ skew
-        fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
-        margin_x, margin_y = 0.15 * view.width / fx, 0.15 * view.height / fy
-        u = np.clip(x / z, -cx / fx - margin_x, (view.width - cx) / fx + margin_x)
-        v = np.clip(y / z, -cy / fy - margin_y, (view.height - cy) / fy + margin_y)
-        jacobian = np.array([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
-        half = jacobian @ pose[:3, :3] @ rotation @ np.diag(scale)
-        conic = np.linalg.inv(half @ half.T + settings.blur * np.eye(2))
-        colour = np.maximum(0, 0.5 + sh[0] / (2 * np.sqrt(np.pi)))
-        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, colour))
-    image = np.zeros((view.height, view.width, 3))
-    for row, column in np.ndindex(view.height, view.width):
-        passed = 1.0
-        for _, mean, conic, opacity, colour in sorted(splats, key=lambda item: item[0]):
-            d = np.array([column + 0.5, row + 0.5]) - mean
-            alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
-            if alpha < settings.alpha_min or passed <= settings.transmittance_min:
-                continue
-            image[row, column] += passed * alpha * colour
-            passed *= 1 - alpha
-    return image
-
-
 def test_against_a_naive_renderer():
     view = camera(13, 9)
     gaussians = random_gaussians(40, view, terms=1)
     image = splat(gaussians, view, backend="reference").rgb.numpy()
     # float64 on both sides, different order of operations.
-    np.testing.assert_allclose(image, _naive_image(gaussians, view, SplatSettings()), atol=1e-12)
+    np.testing.assert_allclose(image, naive_image(gaussians, view, SplatSettings()), atol=1e-12)
 
 
 def test_harmonics_against_scipy():
@@ -165,7 +133,7 @@ def test_image_does_not_depend_on_the_chunks_of_pixels(monkeypatch):
     view = camera(13, 9)
     gaussians = random_gaussians(40, view)
     whole = render(gaussians, view, "reference")
-    monkeypatch.setattr("sparsestreet.ops.reference._CHUNK_ELEMENTS", 700)
+    monkeypatch.setattr("sparsestreet.ops.reference.blend._CHUNK_ELEMENTS", 700)
     pieces = render(gaussians, view, "reference")
     for name, gradient in whole.gradients.items():
         torch.testing.assert_close(pieces.gradients[name], gradient, rtol=1e-10, atol=1e-12)

@@ -1,0 +1,102 @@
+"""Splats blended front to back into every pixel, and what each of them adds."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.types import Camera, Contribution, Gaussians
+
+_CHUNK_ELEMENTS = 1 << 20
+
+
+def rasterise(
+    gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
+) -> Raster:
+    """Project all rows, sort them and blend them densely into every pixel."""
+    rows = visible_rows(gaussians, camera, settings)
+    splats = on_screen(gaussians, rows, camera, settings)
+    offsets = screen_offsets[rows]
+
+    def blend(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        weights, transmittance = _weights(_alphas(pixels, splats, offsets, settings), settings)
+        return weights.T @ splats.colors, transmittance, weights.T @ splats.depths
+
+    # Recomputed in backward chunk by chunk: memory does not grow with the image.
+    parts = [
+        checkpoint(blend, chunk, use_reentrant=False, preserve_rng_state=False)
+        for chunk in _pixel_chunks(camera, splats)
+    ]
+    rgb, transmittance, depth_sum = (torch.cat(part) for part in zip(*parts, strict=True))
+    radii = gaussians.means.detach().new_zeros(len(gaussians))
+    if len(rows):
+        radii[rows] = splats.half_boxes.amax(-1)
+    shape = (camera.height, camera.width)
+    return Raster(rgb.reshape(*shape, 3), transmittance.reshape(shape), depth_sum.reshape(shape), radii)
+
+
+@torch.no_grad()
+def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
+    """Blend weights, touched pixels and dominated pixels per row of one view."""
+    rows = visible_rows(gaussians, camera, settings)
+    splats = on_screen(gaussians, rows, camera, settings)
+    weight = torch.zeros(len(gaussians), dtype=torch.float64, device=rows.device)
+    pixels, dominant = torch.zeros(2, len(gaussians), dtype=torch.int64, device=rows.device)
+    if not len(rows):
+        return Contribution(weight, pixels, dominant)
+    for chunk in _pixel_chunks(camera, splats):
+        weights = _weights(_alphas(chunk, splats, torch.zeros_like(splats.means), settings), settings)[0]
+        touched = weights > 0
+        weight[rows] += weights.double().sum(1)
+        pixels[rows] += touched.sum(1)
+        # argmax does not promise the first of equal maxima; the first row that equals the maximum is the nearer one.
+        first = (weights == weights.amax(0)).to(torch.int8).cumsum(0).eq(0).sum(0)
+        dominant[rows] += torch.bincount(first[touched.any(0)], minlength=len(rows))
+    return Contribution(weight, pixels, dominant)
+
+
+def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:
+    """Pixel centres in row order, as many at a time as keep a splats x pixels table small."""
+    like = {"dtype": splats.means.dtype, "device": splats.means.device}
+    y, x = torch.meshgrid(torch.arange(camera.height, **like), torch.arange(camera.width, **like), indexing="ij")
+    centres = torch.stack((x, y), dim=-1).reshape(-1, 2) + 0.5
+    return centres.split(max(1, _CHUNK_ELEMENTS // max(1, len(splats.means))))
+
+
+def _alphas(
+    pixels: Float[Tensor, "p 2"], splats: Splats, offsets: Float[Tensor, "v 2"], settings: SplatSettings
+) -> Float[Tensor, "v p"]:
+    """Clamped alpha of each splat in each pixel, 0 past the splat's reach."""
+    shifts = _AbsoluteOffset.apply(offsets, len(pixels))
+    dx, dy = (pixels[None] - splats.means[:, None] - shifts).unbind(-1)
+    l11, l21, l22 = (column[:, None] for column in splats.cholesky.unbind(-1))
+    q = (l11 * dx + l21 * dy).square() + (l22 * dy).square()
+    raw = splats.opacities[:, None] * torch.exp(-0.5 * q)
+    return torch.where(q <= splats.reaches[:, None], raw.clamp(max=settings.alpha_max), 0.0)
+
+
+def _weights(alphas: Float[Tensor, "v p"], settings: SplatSettings) -> tuple[Float[Tensor, "v p"], Float[Tensor, " p"]]:
+    """Blend weight of each splat in each pixel, and the light that gets past all of them.
+
+    Transmittance never rises along a ray, so the stop rule is one test per splat and pixel.
+    """
+    passed = (1 - alphas).cumprod(0)
+    before = torch.cat((torch.ones_like(passed[:1]), passed[:-1]))
+    still_open = (before if settings.stop == "inclusive" else passed) > settings.transmittance_min
+    alphas = torch.where(still_open, alphas, 0.0)
+    return alphas * before, (1 - alphas).prod(0)
+
+
+class _AbsoluteOffset(torch.autograd.Function):
+    """Spreads offsets [v, 2] over p pixels; backward sums absolute values over them (AbsGS, Ye et al. 2024)."""
+
+    @staticmethod
+    def forward(ctx, offsets: Tensor, pixels: int) -> Tensor:
+        return offsets[:, None].expand(-1, pixels, -1)
+
+    @staticmethod
+    def backward(ctx, cotangent: Tensor) -> tuple[Tensor, None]:
+        return cotangent.abs().sum(1), None

@@ -1,0 +1,147 @@
+"""From rows of Gaussians to splats on the screen.
+
+Notation: u = mean on the screen, d = pixel centre - u, Sigma = V V^T + blur I with the screen factor V (footprint.py),
+Sigma^-1 = L^T L with L = [[l11, l21], [0, l22]]; a splat's alpha is o exp(-q/2) with q = |L d|^2.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry.distortion import fold_radius_squared
+from sparsestreet.geometry.quaternions import to_matrix
+from sparsestreet.ops.reference.footprint import pinhole, unscented
+from sparsestreet.ops.reference.shutter import read_out, screen_motion
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.spherical_harmonics import view_colors
+from sparsestreet.types import Camera, Gaussians
+
+BOX_MARGIN = 0.01
+"""Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""
+COMPENSATION_FLOOR = 0.005
+"""Least antialias compensation (gsplat 1.6): below it the ratio of determinants has no correct digits."""
+DETERMINANT_MIN = 1e-12
+"""px^4. Reached only without blur, by splats so thin that they touch no pixel centre; their conic would overflow."""
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Rows on the screen."""
+
+    means: Float[Tensor, "v 2"]
+    cholesky: Float[Tensor, "v 3"]
+    """(l11, l21, l22), 1/px: exponent = -((l11 dx + l21 dy)^2 + (l22 dy)^2) / 2, never positive."""
+    opacities: Float[Tensor, " v"]
+    colors: Float[Tensor, "v 3"]
+    depths: Float[Tensor, " v"]
+    reaches: Float[Tensor, " v"]
+    """Largest q that is drawn: where alpha falls to alpha_min or the settings' box ends, whichever is nearer."""
+    half_boxes: Float[Tensor, "v 2"]
+    """Half sides of the box around the ellipse q = reach, pixels; infinite where nothing ends it."""
+    usable: Bool[Tensor, " v"]
+    """False where the determinant vanished or overflowed the dtype, past the fold of the lens, and where the splat
+    outruns the shutter."""
+
+
+@torch.no_grad()
+def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Int[Tensor, " v"]:
+    """Rows whose box holds a pixel centre, nearest first, ties in row order.
+
+    Found before anything is differentiated: a culled row takes no part in the graph, so no infinity of its
+    intermediates can meet a zero cotangent.
+    """
+    depths = _in_camera(gaussians.means, camera)[:, 2]
+    rows = ((depths > settings.near) & (gaussians.opacities > 0)).nonzero().squeeze(-1)
+    splats = on_screen(gaussians, rows, camera, settings)
+    size = torch.tensor([camera.width, camera.height], dtype=depths.dtype, device=depths.device)
+    box = splats.half_boxes + BOX_MARGIN
+    inside = ((splats.means + box >= 0.5) & (splats.means - box <= size - 0.5)).all(-1)
+    rows = rows[splats.usable & (splats.opacities >= settings.alpha_min) & inside]
+    return rows[torch.sort(_sort_keys(depths[rows], settings.depth_bits), stable=True).indices]
+
+
+def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings) -> Splats:
+    """Project the given rows, which must lie in front of the camera."""
+    in_camera = _in_camera(gaussians.means[rows], camera)
+    means, factors, usable = _footprints(gaussians, rows, in_camera, camera, settings)
+    determinant, bare = _determinants(factors, settings.blur)
+    variances = factors.square().sum(-1) + settings.blur
+    covariance, variance_y = (factors[:, 0] * factors[:, 1]).sum(-1), variances[:, 1]
+    l11 = (variance_y / determinant).sqrt()
+    cholesky = torch.stack((l11, -covariance / (variance_y.sqrt() * determinant.sqrt()), variance_y.rsqrt()), -1)
+
+    opacities = gaussians.opacities[rows]
+    if settings.antialias:
+        ratio, floor = bare / determinant, COMPENSATION_FLOOR**2
+        opacities = opacities * torch.where(ratio > floor, ratio, floor).sqrt()
+    colors = view_colors(gaussians.sh[rows], in_camera @ _rotation(camera, in_camera))
+    if settings.half_colors:
+        colors = _rounded_to_half(colors)
+    reaches = _reaches(opacities.detach(), settings)
+    half_boxes = (reaches[:, None] * variances.detach()).sqrt()
+    usable &= (determinant >= DETERMINANT_MIN) & torch.isfinite(determinant)
+    return Splats(means, cholesky, opacities, colors, in_camera[:, 2], reaches, half_boxes, usable)
+
+
+def _rotation(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
+    return camera.camera_from_world[:3, :3].to(like)
+
+
+def _in_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
+    return means @ _rotation(camera, means).T + camera.camera_from_world[:3, 3].to(means)
+
+
+def _footprints(
+    gaussians: Gaussians,
+    rows: Int[Tensor, " v"],
+    in_camera: Float[Tensor, "v 3"],
+    camera: Camera,
+    settings: SplatSettings,
+) -> tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"], Bool[Tensor, " v"]]:
+    """Means and screen factors, and which rows the lens and the shutter can show."""
+    axes = to_matrix(gaussians.quaternions[rows]) * gaussians.scales[rows][:, None]
+    axes = _rotation(camera, in_camera) @ axes
+    usable = torch.ones_like(rows, dtype=torch.bool)
+    if camera.distortion is None:
+        means, factors = pinhole(in_camera, axes, camera)
+    else:
+        means, factors = unscented(in_camera, axes, camera, settings.near)
+        slopes = in_camera.detach()[:, :2] / in_camera.detach()[:, 2:]
+        usable &= slopes.square().sum(-1) <= fold_radius_squared(camera.distortion)
+    if camera.shutter is not None:
+        motion = screen_motion(gaussians, rows, in_camera, camera)
+        (means, factors), read = read_out(means, factors, motion, camera.height)
+        usable &= read
+    return means, factors, usable
+
+
+def _determinants(factors: Float[Tensor, "v 2 k"], blur: float) -> tuple[Float[Tensor, " v"], Float[Tensor, " v"]]:
+    """det(V V^T + blur I) and det(V V^T) by Cauchy-Binet: sums of squares, no cancellation for needles."""
+    products = factors[:, 0, :, None] * factors[:, 1, None]
+    bare = (products - products.mT).square().sum((-1, -2)) / 2  # each pair of columns comes twice
+    return bare + blur * factors.square().sum((-1, -2)) + blur * blur, bare
+
+
+def _reaches(opacities: Float[Tensor, " v"], settings: SplatSettings) -> Float[Tensor, " v"]:
+    """o exp(-q/2) >= alpha_min needs q <= 2 ln(o / alpha_min); ``box`` standard deviations need q <= box^2."""
+    end = settings.box * settings.box
+    if settings.alpha_min == 0:
+        return torch.full_like(opacities, end)
+    return (2 * (opacities / settings.alpha_min).log().clamp(min=0)).clamp(max=end)
+
+
+def _sort_keys(depths: Float[Tensor, " v"], bits: int) -> Float[Tensor, " v"]:
+    """Depths with only the upper ``bits`` of their float32 form; all digits of the dtype for 32."""
+    if bits == 32:
+        return depths
+    # Positive floats are ordered as their bits are.
+    return (depths.float().view(torch.int32) & -(1 << (32 - bits))).view(torch.float32)
+
+
+def _rounded_to_half(colors: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3"]:
+    """Nearest float16, at most its largest finite value; the gradient passes straight through."""
+    exact = colors.detach()
+    rounded = exact.clamp(max=torch.finfo(torch.float16).max).half().to(colors.dtype)
+    return rounded + (colors - exact)

@@ -1,0 +1,76 @@
+"""Renderers and measurements that share no code with the package."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from torch import Tensor
+
+from sparsestreet.ops import SplatSettings
+from sparsestreet.types import Camera, Gaussians
+from tests.ops.scenes import FIELDS
+
+
+def naive_image(
+    gaussians: Gaussians, view: Camera, settings: SplatSettings, rows: Iterable[int] | None = None
+) -> np.ndarray:
+    """Per pixel, from the textbook: matrix inverse of the covariance, no tricks; pinhole, degree 0 colours.
+
+    Image rows that are not asked for stay black.
+    """
+    splats = sorted(_naive_splats(gaussians, view, settings), key=lambda item: item[0])
+    image = np.zeros((view.height, view.width, 3))
+    for row in range(view.height) if rows is None else rows:
+        for column in range(view.width):
+            passed = 1.0
+            for _, mean, conic, opacity, colour in splats:
+                d = np.array([column + 0.5, row + 0.5]) - mean
+                alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
+                if alpha < settings.alpha_min or passed <= settings.transmittance_min:
+                    continue
+                image[row, column] += passed * alpha * colour
+                passed *= 1 - alpha
+    return image
+
+
+def _naive_splats(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> list[tuple]:
+    pose, intrinsics = view.camera_from_world.double().numpy(), view.intrinsics.double().numpy()
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    splats = []
+    for mean, q, scale, opacity, sh in zip(*(getattr(gaussians, name).numpy() for name in FIELDS), strict=True):
+        x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
+        if z <= settings.near:
+            continue
+        margin_x, margin_y = 0.15 * view.width / fx, 0.15 * view.height / fy
+        u = np.clip(x / z, -cx / fx - margin_x, (view.width - cx) / fx + margin_x)
+        v = np.clip(y / z, -cy / fy - margin_y, (view.height - cy) / fy + margin_y)
+        jacobian = np.array([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
+        half = jacobian @ pose[:3, :3] @ rotation_matrix(q) @ np.diag(scale)
+        conic = np.linalg.inv(half @ half.T + settings.blur * np.eye(2))
+        colour = np.maximum(0, 0.5 + sh[0] / (2 * np.sqrt(np.pi)))
+        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, colour))
+    return splats
+
+
+def rotation_matrix(q: np.ndarray) -> np.ndarray:
+    """Of a quaternion wxyz of any length, by Rodrigues' formula."""
+    w, i, j, k = q / np.linalg.norm(q)
+    skew = np.array([[0, -k, j], [k, 0, -i], [-j, i, 0]])
+    return np.eye(3) + 2 * w * skew + 2 * skew @ skew
+
+
+def fitted_splat(alpha: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance, in pixels, of the one splat that made this float64 image (no cut-off, no clamp acting).
+
+    Its log is exactly quadratic in the pixel: six coefficients by least squares.
+    """
+    height, width = alpha.shape
+    y, x = (axis.ravel() + 0.5 for axis in np.mgrid[:height, :width])
+    # 1 - T keeps few digits of the faint pixels: they are left out, and the others weigh as they are bright.
+    kept = alpha.numpy().ravel() > 1e-6
+    weight, x, y = alpha.numpy().ravel()[kept], x[kept], y[kept]
+    terms = np.stack((np.ones_like(x), x, y, x * x, x * y, y * y), -1)
+    solution, *_ = np.linalg.lstsq(terms * weight[:, None], np.log(weight) * weight, rcond=None)
+    _, bx, by, xx, xy, yy = solution
+    precision = -np.array([[2 * xx, xy], [xy, 2 * yy]])
+    covariance = np.linalg.inv(precision)
+    return covariance @ np.array([bx, by]), covariance

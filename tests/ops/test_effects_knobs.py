@@ -1,0 +1,165 @@
+"""The box, the bits of the depth that are sorted, and half-precision colours, against hand-computed pixels."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.types import Gaussians
+from tests.ops.scenes import (
+    FIELDS,
+    camera,
+    cast,
+    every_dtype,
+    every_effect_backend,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    relative_error,
+    render,
+)
+
+Y0 = 0.28209479177387814
+RED, GREEN = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
+
+
+@every_effect_backend
+@every_dtype
+@pytest.mark.parametrize("alpha_min", [0.0, 1 / 255])
+def test_box_by_hand(backend, dtype, alpha_min):
+    # 0.1 m at 2 m with focal 40: variance 4 + 0.3. Two standard deviations: squared distance up to 17.2.
+    view = front_camera(13, 13, 40.0)
+    result = render(one_gaussian(), view, backend, dtype, SplatSettings(alpha_min=alpha_min, box=2.0))
+    for row, column in np.ndindex(13, 13):
+        squared = (row - 6) ** 2 + (column - 6) ** 2
+        expected = 0.8 * math.exp(-0.5 * squared / 4.3) if squared <= 17.2 else 0.0
+        assert float(result.images["alpha"][row, column]) == pytest.approx(expected, rel=1e-5), (row, column)
+    assert float(result.radii[0]) == pytest.approx(2 * math.sqrt(4.3), rel=1e-6)
+
+
+@every_effect_backend
+def test_the_nearer_of_box_and_cut_off_ends_a_splat(backend):
+    # Opacity 0.05 falls to 1/255 at q = 2 ln 12.75 = 5.09: a box of 2.25 (5.06) acts, one of 2.26 (5.11) does not.
+    view = front_camera(13, 13, 40.0)
+    faint = one_gaussian(opacities=[0.05])
+    plain = render(faint, view, backend)
+    assert float(plain.radii[0]) == pytest.approx(math.sqrt(2 * math.log(12.75) * 4.3), rel=1e-12)
+    assert torch.equal(render(faint, view, backend, settings=SplatSettings(box=2.26)).radii, plain.radii)
+    assert float(render(faint, view, backend, settings=SplatSettings(box=2.25)).radii[0]) == pytest.approx(
+        2.25 * math.sqrt(4.3), rel=1e-12
+    )
+
+
+@every_effect_backend
+@every_dtype
+def test_a_box_that_ends_nothing_changes_no_bit(backend, dtype):
+    view = camera(21, 13)
+    gaussians = random_gaussians(60, view)
+    # 1/255 of opacity 1 lies at 3.33 standard deviations; the square of 1e200 is no number.
+    for box in (3.34, 1e200):
+        plain, boxed = (render(gaussians, view, backend, dtype, SplatSettings(box=b)) for b in (math.inf, box))
+        for part in ("images", "gradients"):
+            for name, value in getattr(plain, part).items():
+                assert torch.equal(value, getattr(boxed, part)[name]), name
+
+
+@every_effect_backend
+def test_gradients_inside_the_box_are_right(backend):
+    # Pixels at a distance from the box's edge: there the image is smooth.
+    view = front_camera(6, 5, 14.0)
+    ball = one_gaussian(scales=[[0.3, 0.2, 0.25]], means=[[0.03, -0.02, 2.0]])
+    for field in FIELDS:
+        values = {name: getattr(ball, name).clone() for name in FIELDS}
+
+        def image(value, field=field, values=values):
+            settings = SplatSettings(box=1.0, alpha_min=0.0)
+            return splat(Gaussians(**(values | {field: value})), view, settings=settings, backend=backend).rgb
+
+        alpha = image(values[field])
+        assert (alpha == 0).any()
+        assert (alpha > 0).any()
+        assert torch.autograd.gradcheck(image, values[field].requires_grad_(), fast_mode=True)
+
+
+@every_effect_backend
+@every_dtype
+@pytest.mark.parametrize(
+    ("bits", "far", "first_row_in_front"),
+    [
+        # Seven bits of mantissa: steps of 2^-6 = 0.0156 between 2 and 4.
+        (16, 2.01, True),
+        (16, 2.02, False),
+        # None: powers of two.
+        (9, 3.99, True),
+        (9, 4.01, False),
+        # Float64 depths are rounded to float32 first, and all bits are sorted for 32 only.
+        (31, 2.0 + 2**-22, True),
+        (31, 2.0 + 2**-21, False),
+        (32, 2.0 + 2**-22, False),
+    ],
+)
+def test_depth_bits(backend, dtype, bits, far, first_row_in_front):
+    view = front_camera(5, 5, 40.0)
+    wide = {"scales": [[90.0] * 3]}
+    behind, before = one_gaussian(sh=RED, means=[[0.0, 0.0, far]], **wide), one_gaussian(sh=GREEN, **wide)
+    rows = Gaussians.concatenate([behind, before])
+    centre = render(rows, view, backend, dtype, SplatSettings(depth_bits=bits)).images["rgb"][2, 2]
+    front, back = (0, 1) if first_row_in_front else (1, 0)
+    # 0.8 (0.5 + 1) + 0.2 * 0.8 * 0.5 in the front one's channel.
+    assert float(centre[front]) == pytest.approx(1.28, rel=1e-5)
+    assert float(centre[back]) == pytest.approx(0.8 * 0.5 + 0.2 * 0.8 * 1.5, rel=1e-5)
+
+
+@every_effect_backend
+def test_float64_depths_that_round_to_one_float32_are_tied(backend):
+    view = front_camera(5, 5, 40.0)
+    far, near = one_gaussian(sh=RED), one_gaussian(sh=GREEN, means=[[0.0, 0.0, 2.0 - 1e-9]])
+    for bits, front in ((32, 1), (31, 0)):
+        settings = SplatSettings(depth_bits=bits)
+        centre = render(Gaussians.concatenate([far, near]), view, backend, settings=settings).images["rgb"][2, 2]
+        assert float(centre[front]) == pytest.approx(1.28, rel=1e-6)
+
+
+@every_effect_backend
+@every_dtype
+def test_half_colours_by_hand(backend, dtype):
+    # Colours 0.5 + x; float16 has 11 significant bits; a value past 65504 stays there, where infinity would poison.
+    colours = np.array([0.1, 1 / 3, 70000.0])
+    ball = one_gaussian(sh=[[((colours - 0.5) / Y0).tolist()]])
+    centre = render(ball, front_camera(5, 5, 40.0), backend, dtype, SplatSettings(half_colors=True))
+    expected = 0.8 * np.minimum(colours, 65504).astype(np.float16).astype(np.float64)
+    np.testing.assert_allclose(centre.images["rgb"][2, 2].numpy(), expected, rtol=1e-6)
+    assert centre.is_finite()
+
+
+@every_effect_backend
+@every_dtype
+def test_half_colours_in_a_scene(backend, dtype):
+    view = camera(37, 29)
+    gaussians = random_gaussians(200, view)
+    plain, rounded = (
+        render(gaussians, view, backend, dtype, SplatSettings(half_colors=half)) for half in (False, True)
+    )
+    difference = plain.images["rgb"] - rounded.images["rgb"]
+    assert difference.any()
+    # Half an ulp of float16 is 2.4e-4 below 1: 80 dB after blending.
+    assert -10 * math.log10(float(difference.square().mean())) > 75
+    # Straight through: the harmonics' gradient does not know about the rounding at all.
+    assert torch.equal(plain.gradients["sh"], rounded.gradients["sh"])
+    for name in FIELDS:
+        assert relative_error(rounded.gradients[name], plain.gradients[name]) < 1e-2
+
+
+def test_what_is_off_is_not_run(monkeypatch):
+    # The graph of a plain camera holds nothing of the effects.
+    def refused(*_):
+        raise AssertionError("an effect ran that nobody asked for")
+
+    for name in ("unscented", "screen_motion", "read_out", "_rounded_to_half", "fold_radius_squared"):
+        monkeypatch.setattr(f"sparsestreet.ops.reference.projection.{name}", refused)
+    view = camera(9, 7)
+    leaves = cast(random_gaussians(20, view), torch.float64, requires_grad=True)
+    splat(leaves, view, backend="reference").rgb.sum().backward()
+    assert leaves.means.grad.any()

@@ -1,0 +1,242 @@
+"""Rolling shutter against a brute-force one: every image row rendered at its own instant."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
+from sparsestreet.ops import SplatSettings, contribution, splat
+from sparsestreet.types import Camera, Gaussians, Shutter
+from tests.ops.oracles import fitted_splat, naive_image
+from tests.ops.scenes import (
+    FIELDS,
+    camera,
+    cast,
+    every_dtype,
+    every_effect_backend,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    render,
+)
+
+# The low-pass belongs to the sensor and does not move with the splat, so the moving-Gaussian identity is exact without.
+SHARP = SplatSettings(blur=0.0)
+FITTED = SplatSettings(blur=0.0, alpha_min=0.0, transmittance_min=0.0)
+
+
+def vector(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def rolling(view: Camera, translation=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0)) -> Camera:
+    return dataclasses.replace(view, shutter=Shutter(vector(*translation), vector(*rotation)))
+
+
+def moved(gaussians: Gaussians, displacements) -> Gaussians:
+    return dataclasses.replace(gaussians, displacements=torch.as_tensor(displacements, dtype=torch.float64))
+
+
+def at_instant(gaussians: Gaussians, view: Camera, tau: float) -> tuple[Gaussians, Camera]:
+    """The world and the global-shutter camera at ``tau`` of the readout, -1/2 to 1/2."""
+    turn = torch.eye(4, dtype=torch.float64)
+    # world_from_camera(tau) = world_from_camera [R(tau w) | tau t]
+    turn[:3, :3] = to_matrix(from_rotation_vector(tau * view.shutter.rotation))
+    turn[:3, 3] = tau * view.shutter.translation
+    means = gaussians.means
+    if gaussians.displacements is not None:
+        means = means + tau * gaussians.displacements
+    pose = torch.linalg.inv(turn) @ view.camera_from_world
+    return dataclasses.replace(gaussians, means=means), dataclasses.replace(view, camera_from_world=pose)
+
+
+def brute_force(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> np.ndarray:
+    image = np.zeros((view.height, view.width, 3))
+    for row in range(view.height):
+        scene, instant = at_instant(gaussians, view, (row + 0.5) / view.height - 0.5)
+        image[row] = naive_image(scene, instant, settings, [row])[row]
+    return image
+
+
+def flat_cards(generator_seed: int = 2) -> Gaussians:
+    """Splats without thickness, parallel to the image plane of front_camera: there J does not depend on x and y."""
+    generator = torch.Generator().manual_seed(generator_seed)
+    rows = 6
+    half_angles = 3 * torch.rand(rows, generator=generator, dtype=torch.float64)
+    zero = torch.zeros(rows, dtype=torch.float64)
+    means = torch.rand(rows, 3, generator=generator, dtype=torch.float64) - 0.5
+    return Gaussians(
+        means + vector(0.0, 0.0, 2.0),
+        torch.stack((half_angles.cos(), zero, zero, half_angles.sin()), -1),
+        torch.stack((0.2 + 0.1 * half_angles, 0.1 + zero, zero), -1),
+        0.3 + 0.1 * half_angles,
+        torch.randn(rows, 1, 3, generator=generator, dtype=torch.float64),
+    )
+
+
+@every_effect_backend
+@pytest.mark.parametrize(
+    ("translation", "displacement"),
+    [((0.3, 0.0, 0.0), None), ((0.0, -0.25, 0.0), None), ((-0.2, 0.3, 0.0), (0.1, 0.3, 0.0))],
+    ids=["sideways", "up", "both and the rows move"],
+)
+def test_cards_moving_in_their_planes_are_exact(backend, translation, displacement):
+    view = rolling(front_camera(13, 11, 12.0), translation)
+    gaussians = flat_cards()
+    if displacement is not None:
+        speeds = torch.linspace(-1, 1, len(gaussians), dtype=torch.float64)[:, None]
+        gaussians = moved(gaussians, speeds * vector(*displacement))
+    image = splat(gaussians, view, settings=SHARP, backend=backend).rgb
+    expected = brute_force(gaussians, view, SHARP)
+    still = naive_image(gaussians, view, SHARP)
+    assert abs(expected - still).max() > 0.05
+    np.testing.assert_allclose(image.numpy(), expected, atol=1e-11)
+
+
+@every_effect_backend
+def test_ball_on_the_axis_is_exact_to_first_order(backend):
+    # Sideways motion and yaw leave the shape of a ball on the optical axis alone, to first order; half, then a quarter.
+    ball = one_gaussian(scales=[[0.25] * 3])
+    errors = []
+    for size in (0.01, 0.005, 0.0025):
+        view = rolling(front_camera(15, 13, 14.0), (2 * size, -size, 0.0), (0.5 * size, size, 0.0))
+        gaussians = moved(ball, [[size, size, 0.0]])
+        image = splat(gaussians, view, settings=FITTED, backend=backend).rgb.numpy()
+        errors.append(abs(image - brute_force(gaussians, view, FITTED)).max())
+    assert errors[-1] > 1e-7, "the test measures nothing"
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.05)
+    assert errors[1] / errors[2] == pytest.approx(4, rel=0.03)
+
+
+@every_effect_backend
+@pytest.mark.parametrize("lens", [None, (-0.25, 0.08, 2e-3, -1e-3, -0.01)], ids=["pinhole", "distorted"])
+def test_mean_follows_any_motion_to_first_order(backend, lens):
+    # A long lens shifted off the axis shows 20 x 40 pixels; the ball, 1.5 px in size, is read late.
+    focal, mean = 2000.0, vector(0.7, -0.4, 2.0)
+    intrinsics = torch.tensor([[focal, 0, 0.0], [0, focal, 0.0], [0, 0, 1]], dtype=torch.float64)
+    view = Camera(torch.eye(4, dtype=torch.float64), intrinsics, 20, 40, None if lens is None else vector(*lens))
+    ball = one_gaussian(means=[mean.tolist()], scales=[[1.5 * 2 / focal] * 3])
+
+    def place(instant: Camera, scene: Gaussians) -> np.ndarray:
+        x, y, z = (instant.camera_from_world[:3, :3] @ scene.means[0] + instant.camera_from_world[:3, 3]).tolist()
+        x, y = x / z, y / z
+        k1, k2, p1, p2, k3 = (0.0,) * 5 if lens is None else lens
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x_d = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        y_d = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return focal * np.array([x_d, y_d])
+
+    start = place(view, ball)
+    view.intrinsics[0, 2], view.intrinsics[1, 2] = 10 - start[0], 28 - start[1]
+    settled = fitted_splat(splat(ball, view, settings=FITTED, backend=backend).alpha)[0]
+    errors = []
+    for size in (1.0, 0.5):
+        shot = rolling(view, (6e-3 * size, -4e-3 * size, 0.02 * size), (3e-3 * size, -5e-3 * size, 4e-3 * size))
+        gaussians = moved(ball, [[4e-3 * size, 6e-3 * size, -0.03 * size]])
+        found = fitted_splat(splat(gaussians, shot, settings=FITTED, backend=backend).alpha)[0]
+        # Where the true path crosses the row that is being read; the settled mean includes what the shape adds.
+        true = settled
+        for _ in range(50):
+            scene, instant = at_instant(gaussians, shot, true[1] / 40 - 0.5)
+            true = settled + place(instant, scene) - start
+        assert np.abs(true - settled).max() > 0.2 * size
+        errors.append(np.abs(found - true).max())
+    assert errors[0] < 0.02
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
+
+
+@every_effect_backend
+def test_most_of_a_moving_scene_is_right(backend):
+    # Tilted ellipsoids everywhere, a camera that drives, yaws and bumps, rows that walk: their shapes change during the
+    # readout, which one Gaussian cannot follow. That is a seventh of the effect here.
+    view = rolling(camera(20, 15, focal=80.0), (0.15, -0.05, 0.3), (0.02, 0.03, 0.02))
+    still = random_gaussians(30, view, terms=1)
+    near = (still.means @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3])[:, 2] < 3
+    still = Gaussians(*(getattr(still, name)[~near] for name in FIELDS))
+    gaussians = moved(still, 0.2 * torch.randn(len(still), 3, generator=torch.Generator().manual_seed(3)).double())
+    expected = brute_force(gaussians, view, FITTED)
+    image = splat(gaussians, view, settings=FITTED, backend=backend).rgb.numpy()
+    effect = np.linalg.norm(naive_image(gaussians, view, FITTED) - expected)
+    assert effect > 0.3
+    assert np.linalg.norm(image - expected) < 0.2 * effect
+
+
+@every_effect_backend
+@every_dtype
+def test_no_motion_is_no_shutter_bit_for_bit(backend, dtype):
+    view = camera(21, 13)
+    gaussians = random_gaussians(60, view)
+    plain = render(gaussians, view, backend, dtype)
+    resting = render(moved(gaussians, torch.zeros(60, 3)), rolling(view), backend, dtype)
+    # Without a shutter the rows' own motion shows nothing.
+    unseen = render(moved(gaussians, torch.ones(60, 3)), view, backend, dtype)
+    for name, image in plain.images.items():
+        assert torch.equal(image, unseen.images[name])
+        assert torch.equal(image, resting.images[name])
+    assert torch.equal(plain.radii, resting.radii)
+    for name, gradient in plain.gradients.items():
+        assert torch.equal(gradient, unseen.gradients[name])
+        torch.testing.assert_close(gradient, resting.gradients[name], rtol=50 * torch.finfo(dtype).eps, atol=1e-6)
+
+
+@every_effect_backend
+@every_dtype
+@pytest.mark.parametrize(("fall", "drawn"), [(-20.0, True), (0.85, True), (0.95, False), (1.0, False), (20.0, False)])
+def test_rows_that_outrun_the_readout_are_culled(backend, dtype, fall, drawn):
+    # The ball falls by `fall` image heights during the readout, so 1 - u_y / H = 1 - fall; culled below 0.1. Its peak
+    # is at the middle row whenever it is drawn.
+    view = rolling(front_camera(9, 10, 20.0))
+    ball = moved(one_gaussian(), [[0.0, fall * 10 / 20 * 2, 0.0]])
+    result = render(ball, view, backend, dtype)
+    assert result.is_finite()
+    assert bool(result.radii[0] > 0) == drawn
+    assert bool(result.images["alpha"].any()) == drawn
+    if not drawn:
+        assert not any(gradient.any() for gradient in result.gradients.values())
+
+
+@every_effect_backend
+def test_cameras_and_displacements_get_no_gradient(backend):
+    view = rolling(front_camera(9, 7, 12.0), (0.1, 0.1, 0.1), (0.01, 0.02, 0.03))
+    view = dataclasses.replace(view, distortion=vector(-0.1, 0.0, 0.0, 0.0, 0.0))
+    gaussians = moved(cast(one_gaussian(), torch.float64, requires_grad=True), [[0.1, 0.1, 0.1]])
+    given = (view.shutter.translation, view.shutter.rotation, view.distortion, gaussians.displacements)
+    for value in given:
+        value.requires_grad_()
+    splat(gaussians, view, backend=backend).rgb.sum().backward()
+    assert gaussians.means.grad.any()
+    assert all(value.grad is None or not value.grad.any() for value in given)
+
+
+@every_effect_backend
+def test_contribution_sees_what_is_drawn(backend):
+    view = rolling(camera(13, 11), (0.15, -0.5, 0.3), (0.02, 0.04, 0.02))
+    view = dataclasses.replace(view, distortion=vector(-0.2, 0.05, 0.0, 0.0, 0.0))
+    gaussians = random_gaussians(60, view)
+    settings = SplatSettings(box=1.5, depth_bits=12)
+    counters = contribution(gaussians, view, settings=settings, backend=backend)
+    alpha = splat(gaussians, view, settings=settings, backend=backend).alpha
+    assert float(counters.weight.sum()) == pytest.approx(float(alpha.sum()), rel=1e-10)
+    assert int(counters.dominant.sum()) == int((alpha > 0).sum())
+
+
+@every_effect_backend
+@pytest.mark.parametrize("lens", [None, (-0.25, 0.08, 2e-3, -1e-3, -0.01)], ids=["pinhole", "distorted"])
+@pytest.mark.parametrize("field", FIELDS)
+def test_gradient_of_each_field(backend, field, lens):
+    view = rolling(camera(5, 4), (0.15, -0.3, 0.3), (0.02, 0.04, 0.02))
+    view = dataclasses.replace(view, distortion=None if lens is None else vector(*lens))
+    gaussians = random_gaussians(8, view, terms=4, seed=3)
+    speeds = 0.3 * torch.randn(8, 3, generator=torch.Generator().manual_seed(3)).double()
+    values = {name: getattr(gaussians, name).clone() for name in FIELDS}
+    settings = SplatSettings(alpha_min=1e-9, antialias=True)
+
+    def images(value):
+        moving = Gaussians(**(values | {field: value}), displacements=speeds)
+        rendering = splat(moving, view, settings=settings, backend=backend)
+        return rendering.rgb, rendering.alpha, rendering.depth
+
+    assert torch.autograd.gradcheck(images, values[field].requires_grad_(), fast_mode=True)
