@@ -121,7 +121,7 @@ class _Blend(torch.autograd.Function):
         outputs = [torch.empty_like(field) for field in fields]
         v_screen = rgb.new_empty(len(fields[0]), 2)
         launch(
-            rows_backward.project_rows_backward, len(fields[0]), rows.BLOCK,
+            rows_backward.project_rows_backward, len(fields[0]), rows.block_of(view),
             *fields, *_displacements(fields, ctx.displacements), screen.table, screen.records, screen.tile_counts, sums,
             *outputs, v_screen, len(fields[0]),
             TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, **_effects(view, ctx.displacements),
@@ -135,9 +135,9 @@ def _project(fields: tuple[Tensor, ...], displacements: Tensor | None, view: Vie
     n, settings, table = len(means), view.settings, view.table(means.device)
     splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
     tile_counts = means.new_empty(n, dtype=torch.int32)
-    bad = means.new_empty(-(-n // rows.BLOCK), dtype=torch.int32)
+    bad = means.new_empty(-(-n // rows.block_of(view)), dtype=torch.int32)
     launch(
-        rows.project_rows, n, rows.BLOCK,
+        rows.project_rows, n, rows.block_of(view),
         *fields, *_displacements(fields, displacements), table, splats, tile_counts, radii, bad, n,
         TERMS=sh.shape[1], ANTIALIAS=settings.antialias, HALF_COLORS=settings.half_colors, BOUNDED=view.bounded,
         **_effects(view, displacements), options={"enable_fp_fusion": False},

@@ -4,6 +4,7 @@ import triton
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.constants import constant
 from sparsestreet.ops.triton.harmonics import basis, direction_of, raw_color
 from sparsestreet.ops.triton.lens import pinhole
 from sparsestreet.ops.triton.shape import (
@@ -29,11 +30,16 @@ from sparsestreet.ops.triton.view import (
     SIZE,
     TRANSLATION,
     load_matrix,
+    View,
     load_vector,
 )
 
-BLOCK = 128
-"""Rows of a program."""
+HALF_LARGEST = constant(65504.0)
+
+
+def block_of(view: View) -> int:
+    """Rows of a program: fewer where a lane holds the eight points of a distorted row."""
+    return 32 if view.distorted else 128
 
 
 @triton.jit
@@ -144,6 +150,6 @@ def project_rows(
         # As in torch.where(colour > 0, colour, 0).
         channel = tl.where(color[i] > 0, color[i], 0.0)
         if HALF_COLORS:
-            channel = channel.to(tl.float16).to(tl.float32)
+            channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
         tl.store(to + record.COLOR + i, channel, seen)
     tl.store(to + record.DEPTH, mean[2], seen)

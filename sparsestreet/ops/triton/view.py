@@ -4,13 +4,13 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 import triton
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton.constants import constant
 from sparsestreet.types import Camera
@@ -91,7 +91,7 @@ class View:
             # Without a cut-off the exponent still ends where float32 does: 2^-126.
             *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.box * s.box),
             *distortion,
-            fold(distortion),
+            math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
             *motion,
         ]
 
@@ -100,11 +100,3 @@ def _slope_limits(focal: float, centre: float, size: int) -> tuple[float, float]
     """Where x/z is limited in the Jacobian: 1.3 tan(fov/2) of 3DGS, moved with the principal point."""
     margin = 0.3 * size / (2 * focal)
     return -centre / focal - margin, (size - centre) / focal + margin
-
-
-def fold(distortion: list[float]) -> float:
-    """Least r^2 > 0 where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; infinite if it never does."""
-    k1, k2, _, _, k3 = distortion
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-    positive = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return float(positive.min()) if len(positive) else math.inf
