@@ -21,11 +21,11 @@ PINCUSHION = torch.tensor([0.2, 0.05, 0.0, 0.0, 0.01], dtype=torch.float64)
 
 
 def test_by_hand():
-    # x = 0.5, y = -1, r2 = 1.25: radial = 1 + 0.125 + 0.3125 + 0.5859375 = 2.0234375 for k = 0.1, 0.2, 0.3.
+    # x = 0.5, y = -1, r2 = 1.25: radial = 1 + 0.125 + 0.03125 + 0.05859375 = 1.21484375 for k = 0.1, 0.02, 0.03.
     # x: 0.5 radial + 2 * 0.01 * (-0.5) + 0.02 * (1.25 + 0.5);  y: -radial + 0.01 * (1.25 + 2) + 2 * 0.02 * (-0.5).
-    coefficients = torch.tensor([0.1, 0.2, 0.01, 0.02, 0.3], dtype=torch.float64)
+    coefficients = torch.tensor([0.1, 0.02, 0.01, 0.02, 0.03], dtype=torch.float64)
     values = distort(torch.tensor([[0.5, -1.0]], dtype=torch.float64), coefficients)
-    assert values[0].tolist() == pytest.approx([1.03671875, -2.0109375], rel=1e-14)
+    assert values[0].tolist() == pytest.approx([0.632421875, -1.20234375], rel=1e-14)
 
 
 def _naive(x: float, y: float, k1: float, k2: float, p1: float, p2: float, k3: float) -> tuple[float, float]:
@@ -61,8 +61,10 @@ def test_fold_by_hand():
     assert fold(k1=-0.5, k2=0.1) == pytest.approx(1.0, rel=1e-12)
     # Too small a k3 to matter must not disturb the fold that k1 makes.
     assert fold(k1=-0.1, k3=1e-30) == pytest.approx(1 / 0.3, rel=1e-12)
-    for unfolding in ({}, {"k1": 0.1}, {"k1": 0.2, "k2": 0.1, "k3": 0.01}, {"k1": -0.1, "k2": 0.1}):
-        assert fold(**unfolding) == math.inf
+    # Not folding, but too steep: 1 + 3 k1 u = 4; 1 - 0.3 u + 0.5 u^2 = 4.
+    assert fold(k1=0.1) == pytest.approx(10, rel=1e-12)
+    assert fold(k1=-0.1, k2=0.1) == pytest.approx(0.3 + math.sqrt(0.09 + 6), rel=1e-12)
+    assert fold() == math.inf
 
 
 @pytest.mark.parametrize("coefficients", [BARREL, FULL], ids=["barrel", "full"])

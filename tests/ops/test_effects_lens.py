@@ -42,11 +42,12 @@ def brown_conrady(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...])
 
 @cache
 def fold(coefficients: tuple[float, ...]) -> float:
-    """By search: where r radial(r2) stops growing."""
+    """By search: where r radial(r2) stops growing, or grows more than fourfold."""
     r = np.linspace(0, 5, 2_000_001)
     grown = brown_conrady(r, 0 * r, (*coefficients[:2], 0.0, 0.0, coefficients[4]))[:, 0]
-    falls = np.nonzero(np.diff(grown) < 0)[0]
-    return float(r[falls[0]]) ** 2 if len(falls) else math.inf
+    slope = np.diff(grown) / np.diff(r)
+    left = np.nonzero((slope < 0) | (slope > 4))[0]
+    return float(r[left[0]]) ** 2 if len(left) else math.inf
 
 
 def imaged(points: np.ndarray, view: Camera, near: float) -> np.ndarray:
