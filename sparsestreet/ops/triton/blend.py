@@ -5,18 +5,17 @@ load for all lanes. Pixels lie on the axes (x, y), so that a lane's pixels share
 is computed once. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
 """
 
-import triton
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.view import TILE
 
 # Pairs between two looks at whether the whole tile is finished.
 LOOK = constant(32)
 
 
-@triton.jit
+@jit
 def pixels_of(tile, width, height, tiles_x):
     """Columns [16, 1] and lines [1, 16] of a tile, and which of its pixels lie in the image [16, 16]."""
     x = (tile % tiles_x) * TILE + tl.arange(0, TILE)[:, None]
@@ -24,7 +23,7 @@ def pixels_of(tile, width, height, tiles_x):
     return x, y, (x < width) & (y < height)
 
 
-@triton.jit
+@jit
 def whitened(s, px, py):
     """d = pixel - mean along both axes, L d, and log2 of alpha before the clamp, all over [16, 16] or broadcast."""
     dx, dy = px - tl.load(s + record.X), py - tl.load(s + record.Y)
@@ -33,7 +32,7 @@ def whitened(s, px, py):
     return dx, dy, a, b, tl.load(s + record.LOG2_OPACITY) - b * b - a * a
 
 
-@triton.jit
+@jit
 def blend_weight(s, exponent, raw, transmittance, gate, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
     """Alpha (0 below the cut-off and in finished pixels) and the gate after it.
 
@@ -50,7 +49,7 @@ def blend_weight(s, exponent, raw, transmittance, gate, alpha_max, transmittance
     return alpha, gate
 
 
-@triton.jit
+@jit
 def blend_tiles(
     records, pair_rows, begins, ends, order, rgb, transmittance, depth_sum, lasts,
     width, height, tiles_x, alpha_max, transmittance_min,

@@ -6,19 +6,20 @@ A slot holds, with s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d and w the b
 s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + l22 b)|; w times the cotangents.
 """
 
-import triton
+from functools import partial
+
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import blend_weight, pixels_of, whitened
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 
 SLOT_LENGTH = 12
 SLOT = constant(SLOT_LENGTH)
 ZEROED = constant(32)
 
 
-@triton.jit
+@jit
 def store_sums(
     o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr
 ):
@@ -47,7 +48,7 @@ def store_sums(
     tl.store(o + 11, depth)
 
 
-@triton.jit
+@jit
 def zero_slots(slots, pair_slots, begin, end, COUNT: tl.constexpr):
     """Pairs behind the last one that was looked at."""
     for k in range(begin, end, ZEROED):
@@ -57,7 +58,7 @@ def zero_slots(slots, pair_slots, begin, end, COUNT: tl.constexpr):
             tl.store(to + i, 0.0, pair < end)
 
 
-@triton.jit(do_not_specialize=["step"])
+@partial(jit, do_not_specialize=["step"])
 def blend_tiles_backward(
     records, pair_rows, pair_slots, begins, ends, lasts, order, rgb, transmittance, depth_sum,
     v_rgb, v_transmittance, v_depth_sum, slots, width, height, step, tiles_x, alpha_max, transmittance_min,

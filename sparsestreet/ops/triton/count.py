@@ -1,19 +1,18 @@
 """What each row adds to a view: sum of weights, touched pixels, dominated pixels. A pass of its own, so that training
 does not pay for it; slots instead of atomics, as in backward."""
 
-import triton
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import LOOK, blend_weight, pixels_of, whitened
 from sparsestreet.ops.triton.blend_backward import zero_slots
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 
 COUNTER_COUNT = 3
 COUNTERS = constant(COUNTER_COUNT)
 
 
-@triton.jit
+@jit
 def count_tiles_pixels(
     records, pair_rows, pair_slots, begins, ends, order, slots,
     width, height, tiles_x, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr, BLOCK: tl.constexpr,

@@ -2,10 +2,9 @@
 
 import math
 
-import triton
 import triton.language as tl
 
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.vectors import dot, plus, scaled, times, transposed_times
 
 Y0 = constant(0.5 / math.sqrt(math.pi))
@@ -16,15 +15,15 @@ Y3_OUTER, Y3_CORNER, Y3_MIDDLE, Y3_ZONAL, Y3_PLANAR = (
 )
 
 
-@triton.jit
+@jit
 def basis(d, TERMS: tl.constexpr):
     """The first TERMS functions at the unit direction d."""
     x, y, z = d[0], d[1], d[2]
     values = (0 * x + Y0,)
     if TERMS > 1:
-        values = values + (-Y1 * y, Y1 * z, -Y1 * x)
+        values += (-Y1 * y, Y1 * z, -Y1 * x)
     if TERMS > 4:
-        values = values + (
+        values += (
             Y2_MIXED * x * y,
             -Y2_MIXED * y * z,
             Y2_ZONAL * (2 * z * z - x * x - y * y),
@@ -32,7 +31,7 @@ def basis(d, TERMS: tl.constexpr):
             Y2_PLANAR * (x * x - y * y),
         )
     if TERMS > 9:
-        values = values + (
+        values += (
             -Y3_OUTER * y * (3 * x * x - y * y),
             Y3_CORNER * x * y * z,
             -Y3_MIDDLE * y * (4 * z * z - x * x - y * y),
@@ -44,7 +43,7 @@ def basis(d, TERMS: tl.constexpr):
     return values
 
 
-@triton.jit
+@jit
 def basis_backward(d, v, TERMS: tl.constexpr):
     """sum_i v[i] d(basis_i)/d(direction)."""
     x, y, z = d[0], d[1], d[2]
@@ -70,7 +69,7 @@ def basis_backward(d, v, TERMS: tl.constexpr):
     return gx, gy, gz
 
 
-@triton.jit
+@jit
 def direction_of(rotation, mean):
     """Unit direction from the camera to ``mean`` (camera frame) in the world, and the distance."""
     ray = transposed_times(rotation, mean)
@@ -78,7 +77,7 @@ def direction_of(rotation, mean):
     return scaled(1.0 / distance, ray), distance
 
 
-@triton.jit
+@jit
 def raw_color(values, sh, mask, TERMS: tl.constexpr):
     """0.5 + sum_i basis_i sh_i, before the clamp at 0; ``sh`` points at the lanes' first coefficients."""
     red, green, blue = 0 * values[0] + 0.5, 0 * values[0] + 0.5, 0 * values[0] + 0.5
@@ -89,9 +88,9 @@ def raw_color(values, sh, mask, TERMS: tl.constexpr):
     return red, green, blue
 
 
-@triton.jit
+@jit
 def color_backward(rotation, mean, v, sh, v_sh, seen, mask, TERMS: tl.constexpr):
-    """Writes the gradient of the coefficients (0 where not ``seen``); answers that of ``mean`` through the direction."""
+    """Writes the coefficients' gradient (0 where not ``seen``); answers that of ``mean`` through the direction."""
     direction, distance = direction_of(rotation, mean)
     values = basis(direction, TERMS)
     raw = raw_color(values, sh, seen, TERMS)
@@ -107,7 +106,7 @@ def color_backward(rotation, mean, v, sh, v_sh, seen, mask, TERMS: tl.constexpr)
         tl.store(v_sh + 3 * i + 2, tl.where(seen, values[i] * blue, 0.0), mask)
         at = sh + 3 * i
         term = tl.load(at, seen, 0.0) * red + tl.load(at + 1, seen, 0.0) * green + tl.load(at + 2, seen, 0.0) * blue
-        v_values = v_values + (term,)
+        v_values += (term,)
     v_direction = basis_backward(direction, v_values, TERMS)
     across = plus(v_direction, scaled(-dot(v_direction, direction), direction))
     return times(rotation, scaled(1.0 / distance, across))

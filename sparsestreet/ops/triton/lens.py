@@ -4,19 +4,19 @@ A shape on the screen is (x, y, xx, yy, xy, bare): mean and covariance V V^T in 
 bare = det(V V^T) by Cauchy-Binet, a sum of squares, so that needles lose no digits.
 """
 
-import triton
 import triton.language as tl
 
+from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.vectors import cross, dot, plus, scaled
 from sparsestreet.ops.triton.view import CENTRE, FOCAL, SLOPE_LEAST, SLOPE_MOST
 
 
-@triton.jit
+@jit
 def limited_slope(view, slope, AXIS: tl.constexpr):
     return tl.minimum(tl.maximum(slope, tl.load(view + SLOPE_LEAST + AXIS)), tl.load(view + SLOPE_MOST + AXIS))
 
 
-@triton.jit
+@jit
 def factor(view, mean, along, across, AXIS: tl.constexpr):
     """One row of V; ``along`` and ``across`` are the axis' own row and the depth's row of R S."""
     scale = tl.load(view + FOCAL + AXIS) / mean[2]
@@ -24,7 +24,7 @@ def factor(view, mean, along, across, AXIS: tl.constexpr):
     return scaled(scale, plus(along, scaled(-slope, across)))
 
 
-@triton.jit
+@jit
 def pinhole(view, mean, axes):
     """Shape on the screen of a Gaussian at ``mean`` with ``axes`` = camera_from_gaussian times scales."""
     vx, vy = factor(view, mean, axes[0], axes[2], 0), factor(view, mean, axes[1], axes[2], 1)
@@ -34,7 +34,7 @@ def pinhole(view, mean, axes):
     return x, y, dot(vx, vx), dot(vy, vy), dot(vx, vy), dot(c, c)
 
 
-@triton.jit
+@jit
 def factor_backward(view, mean, along, across, v, AXIS: tl.constexpr):
     """From the gradient v of a row of V to those of the axis' row, of the depth's row, of mean[AXIS] and of z."""
     inverse_z = 1.0 / mean[2]
@@ -48,7 +48,7 @@ def factor_backward(view, mean, along, across, v, AXIS: tl.constexpr):
     return scaled(scale, v), scaled(-scale * slope, v), v_slope * inverse_z, v_z
 
 
-@triton.jit
+@jit
 def pinhole_backward(view, mean, axes, v):
     """From the gradient of the shape to those of ``mean`` and ``axes``."""
     vx, vy = factor(view, mean, axes[0], axes[2], 0), factor(view, mean, axes[1], axes[2], 1)

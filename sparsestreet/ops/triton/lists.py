@@ -8,13 +8,13 @@ are the slots its gradient is summed from.
 from dataclasses import dataclass
 
 import torch
-import triton
 import triton.language as tl
 from jaxtyping import Int
 from torch import Tensor
 
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
 from sparsestreet.ops.triton.view import View
@@ -43,7 +43,7 @@ class Lists:
     """Tiles, those with most pairs first: the longest must not start last."""
 
 
-@triton.jit
+@jit
 def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: tl.constexpr, BLOCK: tl.constexpr):
     """Rows with tiles, and the sorted bits of their depths, in row order; ``places`` counts from 1."""
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -56,7 +56,7 @@ def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: 
     tl.store(rows + place, row, seen)
 
 
-@triton.jit
+@jit
 def list_pairs(
     records, ranks, rows, first_pairs, keys, pair_rows, pairs, width, height, tiles_x,
     BOUNDED: tl.constexpr, BLOCK: tl.constexpr,

@@ -182,6 +182,6 @@ def _check(gaussians: Gaussians) -> None:
         )
     if means.device.type != "cuda" and not is_interpreted(blend.blend_tiles):
         raise ValueError(
-            f"backend 'triton' needs tensors on a CUDA device, got {means.device}: move them, use backend='cpu', or set "
-            "TRITON_INTERPRET=1 before Python starts to run the kernels slowly on the CPU"
+            f"backend 'triton' needs tensors on a CUDA device, got {means.device}: move them, use backend='cpu', or "
+            "set TRITON_INTERPRET=1 before Python starts to run the kernels slowly on the CPU"
         )

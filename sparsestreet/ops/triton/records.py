@@ -1,9 +1,8 @@
 """What a visible splat is to the kernels behind the projection: 12 numbers (48 bytes)."""
 
-import triton
-import triton.language as tl  # noqa: F401  (the interpreter looks for it beside each function)
+import triton.language as tl
 
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 
 LENGTH = 12
 RECORD = constant(LENGTH)
@@ -12,7 +11,7 @@ X, Y, L11, L21, L22, LOG2_OPACITY = (constant(i) for i in range(6))
 CUTOFF, COLOR, DEPTH = constant(6), constant(7), constant(10)
 
 
-@triton.jit
+@jit
 def record_of(records, row):
     """Pointer to the record of a row."""
     return records + row.to(tl.int64) * RECORD

@@ -1,11 +1,10 @@
 """From the rows of a scene to splats on the screen: one lane per row, every input read once."""
 
-import triton
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.constants import constant
 from sparsestreet.ops.triton.harmonics import basis, direction_of, raw_color
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.lens import pinhole
 from sparsestreet.ops.triton.shape import (
     DETERMINANT_MIN,
@@ -29,8 +28,8 @@ from sparsestreet.ops.triton.view import (
     ROTATION,
     SIZE,
     TRANSLATION,
-    load_matrix,
     View,
+    load_matrix,
     load_vector,
 )
 
@@ -42,16 +41,16 @@ def block_of(view: View) -> int:
     return 32 if view.distorted else 128
 
 
-@triton.jit
+@jit
 def load_row(field, row, mask, COUNT: tl.constexpr):
     """COUNT numbers of each lane's row."""
     values = ()
     for i in tl.static_range(COUNT):
-        values = values + (tl.load(field + row * COUNT + i, mask, 0.0),)
+        values += (tl.load(field + row * COUNT + i, mask, 0.0),)
     return values
 
 
-@triton.jit
+@jit
 def all_finite(values, COUNT: tl.constexpr):
     finite = tl.abs(values[0]) <= LARGEST
     for i in tl.static_range(1, COUNT):
@@ -59,7 +58,7 @@ def all_finite(values, COUNT: tl.constexpr):
     return finite
 
 
-@triton.jit
+@jit
 def finite_terms(sh, mask, COUNT: tl.constexpr):
     finite = mask
     for i in tl.static_range(COUNT):
@@ -67,7 +66,7 @@ def finite_terms(sh, mask, COUNT: tl.constexpr):
     return finite
 
 
-@triton.jit
+@jit
 def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: tl.constexpr):
     """Shape on the screen (lens.py) of rows in front of the camera, and whether the lens and the shutter see them."""
     rotation = load_matrix(view + ROTATION)
@@ -84,7 +83,7 @@ def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: 
     return shape, sees
 
 
-@triton.jit
+@jit
 def project_rows(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, bad, rows,
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, HALF_COLORS: tl.constexpr, BOUNDED: tl.constexpr,

@@ -1,10 +1,10 @@
 """From the sums over pixels back to the parameters: one lane per row, every gradient written once."""
 
-import triton
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.harmonics import color_backward
+from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.lens import pinhole, pinhole_backward
 from sparsestreet.ops.triton.rows import load_row
 from sparsestreet.ops.triton.shape import (
@@ -23,31 +23,23 @@ from sparsestreet.ops.triton.vectors import plus, times, transposed_times
 from sparsestreet.ops.triton.view import ROTATION, TRANSLATION, load_matrix, load_vector
 
 
-@triton.jit
+@jit
 def store_row(field, row, values, mask, COUNT: tl.constexpr):
     for i in tl.static_range(COUNT):
         tl.store(field + row * COUNT + i, values[i], mask)
 
 
-@triton.jit
+@jit
 def lens_shape(view, mean, axes, DISTORTED: tl.constexpr):
-    if DISTORTED:
-        shape = unscented(view, mean, axes)
-    else:
-        shape = pinhole(view, mean, axes)
-    return shape
+    return unscented(view, mean, axes) if DISTORTED else pinhole(view, mean, axes)
 
 
-@triton.jit
+@jit
 def lens_backward(view, mean, axes, v, DISTORTED: tl.constexpr):
-    if DISTORTED:
-        v_mean, v_axes = unscented_backward(view, mean, axes, v)
-    else:
-        v_mean, v_axes = pinhole_backward(view, mean, axes, v)
-    return v_mean, v_axes
+    return unscented_backward(view, mean, axes, v) if DISTORTED else pinhole_backward(view, mean, axes, v)
 
 
-@triton.jit
+@jit
 def screen_gradient(s, to, mask):
     """A row's sums over pixels (blend_backward.py) in natural units (exponent -|L d|^2 / 2).
 
@@ -61,7 +53,7 @@ def screen_gradient(s, to, mask):
     return v_mean, v_absolute, (k * s[3], k * s[4], k * s[5]), s[0] * tl.exp2(-log2_opacity)
 
 
-@triton.jit
+@jit
 def project_rows_backward(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
     v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,
@@ -111,10 +103,10 @@ def project_rows_backward(
     tl.store(v_opacities + row, tl.where(seen, v_opacity, 0.0), given)
 
 
-@triton.jit
+@jit
 def masked(values, mask, COUNT: tl.constexpr):
     """``values``, exactly 0 where the mask is off."""
     out = ()
     for i in tl.static_range(COUNT):
-        out = out + (tl.where(mask, values[i], 0.0),)
+        out += (tl.where(mask, values[i], 0.0),)
     return out

@@ -2,11 +2,10 @@
 
 import math
 
-import triton
 import triton.language as tl
 
-from sparsestreet.ops.triton.constants import constant
-from sparsestreet.ops.triton.vectors import dot, plus, product, scaled, transposed
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.vectors import dot, product, transposed
 from sparsestreet.ops.triton.view import ALPHA_MIN, BLUR, BOX_REACH, LOG2_ALPHA_MIN
 
 # alpha = 2^(log2 opacity - |L d|^2) with L the Cholesky factor of the conic times sqrt(log2(e) / 2).
@@ -20,7 +19,7 @@ DETERMINANT_MIN = constant(1e-12)
 LARGEST = constant(3.4028234663852886e38)
 
 
-@triton.jit
+@jit
 def unit_quaternion(q):
     """Unit quaternion and 1 / length; a zero one (shorter than squares can tell) is the identity with 1 / length 0."""
     squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
@@ -29,7 +28,7 @@ def unit_quaternion(q):
     return (tl.where(usable, q[0] * inverse, 1.0), q[1] * inverse, q[2] * inverse, q[3] * inverse), inverse
 
 
-@triton.jit
+@jit
 def rotation_of(q):
     """world_from_gaussian of a unit quaternion wxyz."""
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -40,7 +39,7 @@ def rotation_of(q):
     )
 
 
-@triton.jit
+@jit
 def times_columns(m, s):
     """m diag(s)."""
     a, b, c = m[0], m[1], m[2]
@@ -51,13 +50,13 @@ def times_columns(m, s):
     )
 
 
-@triton.jit
+@jit
 def camera_axes(rotation, q, scales):
     """Columns: the Gaussian's axes in the camera, one standard deviation long; ``q`` is a unit quaternion."""
     return product(rotation, times_columns(rotation_of(q), scales))
 
 
-@triton.jit
+@jit
 def axes_backward(rotation, q, inverse_length, scales, v_axes):
     """From the gradient of camera_axes to those of the given quaternion and of the scales."""
     v = product(transposed(rotation), v_axes)
@@ -75,14 +74,14 @@ def axes_backward(rotation, q, inverse_length, scales, v_axes):
     return ((gw - along * w) * k, (gx - along * x) * k, (gy - along * y) * k, (gz - along * z) * k), v_scales
 
 
-@triton.jit
+@jit
 def blurred(view, xx, yy, bare):
     """Variances and determinant after the low-pass."""
     blur = tl.load(view + BLUR)
     return xx + blur, yy + blur, bare + blur * (xx + yy) + blur * blur
 
 
-@triton.jit
+@jit
 def compensation(bare, determinant, ANTIALIAS: tl.constexpr):
     if ANTIALIAS:
         ratio = bare / determinant
@@ -92,14 +91,14 @@ def compensation(bare, determinant, ANTIALIAS: tl.constexpr):
     return factor
 
 
-@triton.jit
+@jit
 def conic(variance_y, covariance, determinant):
     """Cholesky factor (l11, l21, l22) of the inverse covariance, 1/px."""
     root = tl.sqrt(variance_y)
     return tl.sqrt(variance_y / determinant), -covariance / (root * tl.sqrt(determinant)), 1.0 / root
 
 
-@triton.jit
+@jit
 def conic_backward(view, shape, v_l, v_opacity, opacity, ANTIALIAS: tl.constexpr):
     """From the gradients of the conic and of the effective opacity to those of (xx, yy, xy, bare)."""
     blur = tl.load(view + BLUR)
@@ -118,14 +117,14 @@ def conic_backward(view, shape, v_l, v_opacity, opacity, ANTIALIAS: tl.constexpr
     return v_trace, v_trace + v_variance, v_covariance, v_bare
 
 
-@triton.jit
+@jit
 def reach_of(view, opacity):
     """|L d|^2 (natural units: alpha = opacity exp(-|L d|^2 / 2)) up to which a splat is drawn."""
     reach = 2 * tl.log(opacity / tl.load(view + ALPHA_MIN))
     return tl.minimum(tl.maximum(reach, 0.0), tl.load(view + BOX_REACH))
 
 
-@triton.jit
+@jit
 def cutoff_of(view, log2_opacity):
     """The exponent of 2 below which a splat is not drawn: alpha_min, or where its box ends."""
     return tl.maximum(tl.load(view + LOG2_ALPHA_MIN), log2_opacity - HALF_LOG2_E * tl.load(view + BOX_REACH))

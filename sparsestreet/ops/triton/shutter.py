@@ -1,13 +1,12 @@
 """Rolling shutter: a splat that moves while rows are read one after the other is again a 2D Gaussian.
 
-A point at u tau + p, read at image row y where tau = y / H - 1/2, is seen where y = p_y + u_y (y / H - 1/2): the map from
-p to what is seen is linear, with a = 1 - u_y / H.
+A point at p + u tau, read at image row y where tau = y / H - 1/2, is seen where y = p_y + u_y (y / H - 1/2): the map
+from p to what is seen is linear, with a = 1 - u_y / H.
 """
 
-import triton
 import triton.language as tl
 
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.unscented import curvature, jacobian
 from sparsestreet.ops.triton.vectors import cross, plus, scaled
 from sparsestreet.ops.triton.view import FOCAL, SHIFT, SIZE, TURN, load_vector
@@ -16,19 +15,19 @@ from sparsestreet.ops.triton.view import FOCAL, SHIFT, SIZE, TURN, load_vector
 ROLL_LEAST = constant(0.1)
 
 
-@triton.jit
+@jit
 def drift(view, mean, moved):
     """Motion of the mean in the camera over the readout, metres; ``moved`` is its own displacement there."""
     turned = cross(load_vector(view + TURN), mean)
     return plus(moved, scaled(-1.0, plus(load_vector(view + SHIFT), turned)))
 
 
-@triton.jit
+@jit
 def normalised_speed(mean, dX):
     return (dX[0] - mean[0] / mean[2] * dX[2]) / mean[2], (dX[1] - mean[1] / mean[2] * dX[2]) / mean[2]
 
 
-@triton.jit
+@jit
 def velocity(view, mean, moved, DISTORTED: tl.constexpr):
     """Motion on the screen, pixels per readout: J dX with the exact Jacobian, through the distortion where given."""
     n_x, n_y = normalised_speed(mean, drift(view, mean, moved))
@@ -38,7 +37,7 @@ def velocity(view, mean, moved, DISTORTED: tl.constexpr):
     return tl.load(view + FOCAL) * n_x, tl.load(view + FOCAL + 1) * n_y
 
 
-@triton.jit
+@jit
 def velocity_backward(view, mean, moved, v, DISTORTED: tl.constexpr):
     """From the gradient of the velocity to that of the mean in the camera."""
     dX, inverse = drift(view, mean, moved), 1.0 / mean[2]
@@ -59,7 +58,7 @@ def velocity_backward(view, mean, moved, v, DISTORTED: tl.constexpr):
     return plus((v_x * inverse, v_y * inverse, v_z), cross(load_vector(view + TURN), v_drift))
 
 
-@triton.jit
+@jit
 def roll(view, shape, speed):
     """The shape (lens.py) as it is read out, and a."""
     height = tl.load(view + SIZE + 1)
@@ -71,7 +70,7 @@ def roll(view, shape, speed):
     return (x, y, shape[2] + shear * (2 * xy + shear * yy), yy, xy + shear * yy, shape[5] / (a * a)), a
 
 
-@triton.jit
+@jit
 def roll_backward(view, shape, speed, v):
     """From the gradient of the rolled shape to those of the shape and of the velocity."""
     height = tl.load(view + SIZE + 1)

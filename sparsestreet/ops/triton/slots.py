@@ -1,13 +1,14 @@
 """Sums over the slots of each row, which are neighbours, in a fixed order."""
 
-import triton
 import triton.language as tl
+
+from sparsestreet.ops.triton.language import jit
 
 ROWS = 8
 """Rows of a program."""
 
 
-@triton.jit
+@jit
 def sum_slots(
     slots, rows, first_pairs, tile_counts, sums, visible,
     COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,

@@ -4,10 +4,9 @@ The counting and the listing kernel both compute this from the record alone, and
 multiply-adds: they cannot disagree.
 """
 
-import triton
 import triton.language as tl
 
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.view import TILE
 
 # Of ops/reference.py: rounding must never cull a touched pixel.
@@ -16,12 +15,12 @@ BOX_MARGIN = constant(0.01)
 RELATIVE_MARGIN = constant(1e-5)
 
 
-@triton.jit
+@jit
 def limited(value, least, most):
     return tl.minimum(tl.maximum(value, least), most)
 
 
-@triton.jit
+@jit
 def tile_span(low, high, size):
     """First and last tile with a pixel centre in [low, high]; last < first if there is none. ``size`` in pixels."""
     # As float first: the box of a giant does not fit an integer.
@@ -30,7 +29,7 @@ def tile_span(low, high, size):
     return first // TILE, tl.where(first <= last, last // TILE, first // TILE - 1)
 
 
-@triton.jit
+@jit
 def tile_rows(y, l22, reach, height, BOUNDED: tl.constexpr):
     """First and last row of tiles a splat reaches; ``reach`` is log2 opacity - cutoff, L in the record's units."""
     low = tl.zeros_like(y)
@@ -42,14 +41,14 @@ def tile_rows(y, l22, reach, height, BOUNDED: tl.constexpr):
     return tile_span(low, high, height)
 
 
-@triton.jit
+@jit
 def half_chord(dy, half_width, half_y):
     """Half the width of the ellipse at height dy."""
     ratio = tl.where(half_y > 0, dy / half_y, 0.0)
     return half_width * tl.sqrt(tl.maximum(1 - ratio * ratio, 0.0))
 
 
-@triton.jit
+@jit
 def tile_columns(x, y, l11, l21, l22, reach, row, width, BOUNDED: tl.constexpr):
     """First and last tile of row ``row`` that the ellipse x(dy) = slope dy -+ half_chord(dy) passes through."""
     low_x = tl.zeros_like(x)
@@ -70,7 +69,7 @@ def tile_columns(x, y, l11, l21, l22, reach, row, width, BOUNDED: tl.constexpr):
     return tile_span(low_x, high_x, width)
 
 
-@triton.jit
+@jit
 def count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED: tl.constexpr):
     """Number of tiles of each lane's splat; 0 where not ``seen``."""
     first, last = tile_rows(y, l22, reach, height, BOUNDED)

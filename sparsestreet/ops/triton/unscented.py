@@ -8,10 +8,9 @@ Points lie along the second axis of a block: mu, +a_1..3, -a_1..3, and one of we
 
 import math
 
-import triton
 import triton.language as tl
 
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.view import CENTRE, DISTORTION, FOCAL, FOLD, NEAR
 
 POINTS = constant(8)
@@ -19,14 +18,14 @@ SQRT3 = constant(math.sqrt(3))
 SIXTH = constant(1 / 6)
 
 
-@triton.jit
+@jit
 def radial(view, r2):
     """The radial polynomial and its first two derivatives by r2."""
     k1, k2, k3 = tl.load(view + DISTORTION), tl.load(view + DISTORTION + 1), tl.load(view + DISTORTION + 4)
     return 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + r2 * 3 * k3), 2 * k2 + r2 * 6 * k3
 
 
-@triton.jit
+@jit
 def distort(view, x, y):
     """Normalised coordinates as the lens shows them."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
@@ -35,7 +34,7 @@ def distort(view, x, y):
     return x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * f + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-@triton.jit
+@jit
 def jacobian(view, x, y):
     """(D_xx, D_xy, D_yy): the distortion is the gradient of a potential, so D_xy = D_yx."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
@@ -44,7 +43,7 @@ def jacobian(view, x, y):
     return f + 2 * x * x * f1 + 2 * p1 * y + 6 * p2 * x, mixed, f + 2 * y * y * f1 + 6 * p1 * y + 2 * p2 * x
 
 
-@triton.jit
+@jit
 def curvature(view, x, y):
     """(D_xxx, D_xxy, D_xyy, D_yyy): derivatives of the Jacobian."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
@@ -57,14 +56,14 @@ def curvature(view, x, y):
     )
 
 
-@triton.jit
+@jit
 def within_fold(view, mean):
     """Whether the lens sees the point: the radial polynomial still grows there."""
     x, y = mean[0] / mean[2], mean[1] / mean[2]
     return x * x + y * y <= tl.load(view + FOLD)
 
 
-@triton.jit
+@jit
 def shrink(view, x, y):
     """s = min(1, sqrt(r2_max / r2)): beyond the fold D(s x) / s goes on growing."""
     r2, fold = x * x + y * y, tl.load(view + FOLD)
@@ -72,7 +71,7 @@ def shrink(view, x, y):
     return tl.where(beyond, tl.sqrt(fold / tl.where(beyond, r2, 1.0)), 1.0)
 
 
-@triton.jit
+@jit
 def shown(view, x, y):
     """Pixels of normalised coordinates, beyond the fold as well."""
     s = shrink(view, x, y)
@@ -83,7 +82,7 @@ def shown(view, x, y):
     )
 
 
-@triton.jit
+@jit
 def shown_backward(view, x, y, v_x, v_y):
     """From the gradient of pixels to that of normalised coordinates.
 
@@ -99,33 +98,33 @@ def shown_backward(view, x, y, v_x, v_y):
     return xx * g_x + xy * g_y - inward * x, xy * g_x + yy * g_y - inward * y
 
 
-@triton.jit
+@jit
 def stretch():
     """How far each point goes along its axis: 0, sqrt(3) three times, -sqrt(3) three times, 0."""
     point = tl.arange(0, POINTS)[None, :]
     return tl.where((point == 0) | (point == 7), 0.0, tl.where(point < 4, SQRT3, -SQRT3))
 
 
-@triton.jit
+@jit
 def covariance_roots():
     """sqrt(w_i) of the covariance: sqrt(2), 1 / sqrt(6) six times, 0."""
     point = tl.arange(0, POINTS)[None, :]
     return tl.where(point == 0, 1.4142135623730951, tl.where(point == 7, 0.0, 0.4082482904638631))
 
 
-@triton.jit
+@jit
 def mean_weights():
     point = tl.arange(0, POINTS)[None, :]
     return tl.where((point == 0) | (point == 7), 0.0, SIXTH)
 
 
-@triton.jit
+@jit
 def on_axis(point, K: tl.constexpr):
     """Whether a point lies on axis K."""
     return (point == K + 1) | (point == K + 4)
 
 
-@triton.jit
+@jit
 def sigma(centre, row):
     """One coordinate of the points; ``row`` holds that coordinate of the three axes."""
     point = tl.arange(0, POINTS)[None, :]
@@ -133,7 +132,7 @@ def sigma(centre, row):
     return centre[:, None] + stretch() * axis
 
 
-@triton.jit
+@jit
 def sigma_backward(v):
     """From the gradient of one coordinate of the points to those of the centre and of the three axes."""
     point, g = tl.arange(0, POINTS)[None, :], stretch() * v
@@ -145,7 +144,7 @@ def sigma_backward(v):
     return tl.sum(v, 1), along
 
 
-@triton.jit
+@jit
 def normalised_points(view, mean, axes):
     """x/z and y/z of the points, 1/z, and whether z was left as it is: it is limited to >= near."""
     depth, near = sigma(mean[2], axes[2]), tl.load(view + NEAR)
@@ -153,7 +152,7 @@ def normalised_points(view, mean, axes):
     return sigma(mean[0], axes[0]) * inverse, sigma(mean[1], axes[1]) * inverse, inverse, depth >= near
 
 
-@triton.jit
+@jit
 def screen_factor(view, x, y):
     """Mean on the screen and the rows of V, 8 columns."""
     at_x, at_y = shown(view, x, y)
@@ -161,13 +160,13 @@ def screen_factor(view, x, y):
     return m_x, m_y, covariance_roots() * (at_x - m_x[:, None]), covariance_roots() * (at_y - m_y[:, None])
 
 
-@triton.jit
+@jit
 def minors(vx, vy):
     """All 2x2 minors of V."""
     return vx[:, :, None] * vy[:, None, :] - vx[:, None, :] * vy[:, :, None]
 
 
-@triton.jit
+@jit
 def unscented(view, mean, axes):
     """Shape on the screen (lens.py) of a Gaussian behind the distorted lens."""
     x, y, _, _ = normalised_points(view, mean, axes)
@@ -177,14 +176,14 @@ def unscented(view, mean, axes):
     return m_x, m_y, tl.sum(vx * vx, 1), tl.sum(vy * vy, 1), tl.sum(vx * vy, 1), bare
 
 
-@triton.jit
+@jit
 def point_gradient(v_mean, g):
     """From the gradients of the screen mean and of V's row to those of the points' pixels."""
     g = covariance_roots() * g
     return g + mean_weights() * (v_mean - tl.sum(g, 1))[:, None]
 
 
-@triton.jit
+@jit
 def unscented_backward(view, mean, axes, v):
     """From the gradient of the shape to those of ``mean`` and ``axes``."""
     x, y, inverse, free = normalised_points(view, mean, axes)

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-import triton
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.triton.constants import constant
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.types import Camera
 
 TILE_SIZE = 16
@@ -28,12 +27,12 @@ DISTORTION, FOLD = constant(27), constant(32)
 SHIFT, TURN = constant(33), constant(36)
 
 
-@triton.jit
+@jit
 def load_vector(table):
     return tl.load(table), tl.load(table + 1), tl.load(table + 2)
 
 
-@triton.jit
+@jit
 def load_matrix(table):
     return load_vector(table), load_vector(table + 3), load_vector(table + 6)
 
@@ -82,7 +81,7 @@ class View:
         motion = [0.0] * 6
         if camera.shutter is not None:
             motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
-        return [
+        numbers = (
             *(value for row in pose[:3] for value in row[:3]),
             *(row[3] for row in pose[:3]),
             *(K[0][0], K[1][1], K[0][2], K[1][2]),
@@ -93,7 +92,8 @@ class View:
             *distortion,
             math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
             *motion,
-        ]
+        )
+        return [float(number) for number in numbers]
 
 
 def _slope_limits(focal: float, centre: float, size: int) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Compiles kernels for GPUs that need not be there, and counts what the machine code holds.
 
-Run as a script, without TRITON_INTERPRET: launches (recorded by test_machine_code.py) come in as JSON on standard input,
-what was compiled of them goes out as JSON.
+Run as a script, without TRITON_INTERPRET: launches (recorded by test_machine_code.py) come in as JSON on standard
+input, what was compiled of them goes out as JSON.
 """
 
 import importlib
@@ -37,7 +37,7 @@ def compile_launch(launch: dict, arch: int) -> dict:
     return {
         **_resources(ptx, compiled.metadata, arch),
         "tensor_core": sum(bool(re.match(r"[HIBD]?G?MMA|HGMMA", text)) for _, text in instructions) + ptx.count("tf32"),
-        "atomics": sum(text.split()[0].startswith(("ATOM", "RED")) for _, text in instructions),
+        "atomics": sum(text.split()[0].startswith(("ATOM", "RED.")) for _, text in instructions),
         "sample": _per_sample(instructions),
     }
 
