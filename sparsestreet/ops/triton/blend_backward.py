@@ -19,6 +19,11 @@ SLOT = constant(SLOT_LENGTH)
 ZEROED = constant(32)
 
 
+def registers(depth: bool, exclusive: bool) -> int:
+    """Registers of a lane: the fewest without spills, so that many tiles run at once."""
+    return 128 if exclusive else 112 if depth else 96
+
+
 @jit
 def store_sums(
     o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr
@@ -27,12 +32,10 @@ def store_sums(
     ga = g * a
     line_g, line_ga = tl.sum(g, 0), tl.sum(ga, 0)
     line_b, line_dy = tl.sum(b, 0), tl.sum(dy, 0)
-    tl.store(o, tl.sum(line_g))
-    tl.store(o + 1, tl.sum(line_ga))
-    tl.store(o + 2, tl.sum(line_g * line_b))
-    tl.store(o + 3, tl.sum(tl.sum(ga * dx, 0)))
-    tl.store(o + 4, tl.sum(line_ga * line_dy))
-    tl.store(o + 5, tl.sum(line_g * line_b * line_dy))
+    sums = (
+        tl.sum(line_g), tl.sum(line_ga), tl.sum(line_g * line_b),
+        tl.sum(tl.sum(ga * dx, 0)), tl.sum(line_ga * line_dy), tl.sum(line_g * line_b * line_dy),
+    )  # fmt: skip
     absolute_x, absolute_y, depth = 0.0, 0.0, 0.0
     if ABSOLUTE:
         absolute_x = tl.sum(tl.sum(tl.abs(ga), 0))
@@ -40,12 +43,17 @@ def store_sums(
         absolute_y = tl.sum(tl.sum(tl.abs(l21 * ga + l22 * (g * b)), 0))
     if DEPTH:
         depth = tl.sum(tl.sum(weight * v_depth, 0))
-    tl.store(o + 6, absolute_x)
-    tl.store(o + 7, absolute_y)
-    tl.store(o + 8, tl.sum(tl.sum(weight * v_red, 0)))
-    tl.store(o + 9, tl.sum(tl.sum(weight * v_green, 0)))
-    tl.store(o + 10, tl.sum(tl.sum(weight * v_blue, 0)))
-    tl.store(o + 11, depth)
+    sums += (
+        absolute_x, absolute_y,
+        tl.sum(tl.sum(weight * v_red, 0)), tl.sum(tl.sum(weight * v_green, 0)), tl.sum(tl.sum(weight * v_blue, 0)),
+        depth,
+    )  # fmt: skip
+    # One store for all: as many as there are sums would each take an address of its own.
+    field = tl.arange(0, 16)
+    values = tl.where(field == 0, sums[0], 0.0)
+    for i in tl.static_range(1, SLOT):
+        values = tl.where(field == i, sums[i], values)
+    tl.store(o + field, values, field < SLOT)
 
 
 @jit
@@ -87,6 +95,7 @@ def blend_tiles_backward(
     passed = tl.where(inside, 1.0, 0.0)
     gate = passed
     last = tl.load(lasts + tile)
+    zero_slots(slots, pair_slots, last, tl.load(ends + tile), SLOT)
     for k in range(tl.load(begins + tile), last):
         s = record.record_of(records, tl.load(pair_rows + k))
         dx, dy, a, b, exponent = whitened(s, px, py)
@@ -107,4 +116,3 @@ def blend_tiles_backward(
         g = tl.where(raw <= alpha_max, g, 0.0)
         o = slots + tl.load(pair_slots + k) * SLOT
         store_sums(o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH, ABSOLUTE)
-    zero_slots(slots, pair_slots, last, tl.load(ends + tile), SLOT)

@@ -113,8 +113,7 @@ class _Blend(torch.autograd.Function):
             screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, ctx.lasts, lists.order,
             *layers, *cotangents, gradients, width, height, 1, *others,
             EXCLUSIVE=view.exclusive, DEPTH=depth, ABSOLUTE=ctx.needs_input_grad[5],
-            # Fewer registers than it would take: more tiles at once. With depth or a gate it would spill.
-            options=ONE_WARP | {"maxnreg": 128 if depth or view.exclusive else 96},
+            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth, view.exclusive)},
         )  # fmt: skip
         sums = rgb.new_empty(len(fields[0]), blend_backward.SLOT_LENGTH)
         _sum_slots(gradients, lists, sums, 16, tl.float32)

@@ -10,7 +10,13 @@ import triton.language as tl
 from sparsestreet.ops.triton import launch as package
 from sparsestreet.ops.triton import lists, rasteriser
 
-_POINTERS = {torch.float32: "*fp32", torch.float64: "*fp64", torch.int16: "*i16", torch.int32: "*i32", torch.int64: "*i64"}
+_POINTERS = {
+    torch.float32: "*fp32",
+    torch.float64: "*fp64",
+    torch.int16: "*i16",
+    torch.int32: "*i32",
+    torch.int64: "*i64",
+}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -123,7 +123,10 @@ def test_pairs_behind_an_opaque_stack(stop):
     view = front_camera(5, 4, 10.0)
     stack = [
         one_gaussian(
-            means=[[0.02 * k, 0.01 * k, 2.0 + 0.1 * k]], scales=[[3.0, 2.0, 2.5]], opacities=[0.95], sh=[[[0.01 * k] * 3]]
+            means=[[0.02 * k, 0.01 * k, 2.0 + 0.1 * k]],
+            scales=[[3.0, 2.0, 2.5]],
+            opacities=[0.95],
+            sh=[[[0.01 * k] * 3]],
         )
         for k in range(40)
     ]
