@@ -33,10 +33,11 @@ def compile_launch(launch: dict, arch: int) -> dict:
     compiled = triton.compile(
         ASTSource(kernel, signature, constants, attributes), GPUTarget("cuda", arch, 32), options=launch["options"]
     )
-    ptx, instructions = compiled.asm["ptx"], _instructions(compiled.asm["cubin"])
+    resources, instructions = _machine_code(compiled.asm["cubin"])
     return {
-        **_resources(ptx, compiled.metadata, arch),
-        "tensor_core": sum(bool(re.match(r"[HIBD]?G?MMA|HGMMA", text)) for _, text in instructions) + ptx.count("tf32"),
+        **resources,
+        "tensor_core": sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
+        + compiled.asm["ptx"].count("tf32"),
         "atomics": sum(text.split()[0].startswith(("ATOM", "RED.")) for _, text in instructions),
         "sample": _per_sample(instructions),
     }
@@ -46,28 +47,16 @@ def _constant(value: object) -> object:
     return tl.dtype(value["dtype"]) if isinstance(value, dict) else value
 
 
-def _resources(ptx: str, metadata: object, arch: int) -> dict:
-    """What ptxas says under the options the kernel was compiled with."""
-    target = re.search(r"\.target (sm_\w+)", ptx)[1]
-    options = [] if metadata.maxnreg is None else [f"-maxrregcount={metadata.maxnreg}"]
-    options += [] if metadata.enable_fp_fusion else ["--fmad=false"]
-    with tempfile.NamedTemporaryFile(suffix=".ptx") as file:
-        Path(file.name).write_text(ptx)
-        command = [_TOOLS / "ptxas", "-v", "--gpu-name", target, *options, file.name, "-o", "/dev/null"]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-    return {
-        "registers": int(re.search(r"Used (\d+) registers", said)[1]),
-        "spilled": int(re.search(r"(\d+) bytes spill stores", said)[1]),
-    }
-
-
-def _instructions(cubin: bytes) -> list[tuple[int, str]]:
+def _machine_code(cubin: bytes) -> tuple[dict, list[tuple[int, str]]]:
+    """Registers and bytes of stack (where spilled registers go), and the instructions with their addresses."""
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         Path(file.name).write_bytes(cubin)
-        command = [_TOOLS / "cuobjdump", "-sass", file.name]
+        command = [_TOOLS / "cuobjdump", "-res-usage", "-sass", file.name]
         listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    used = re.search(r"REG:(\d+) STACK:(\d+)", listing)
     found = re.findall(r"^\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\d+\s+)?(.*?);", listing, re.MULTILINE)
-    return [(int(address, 16), text.strip()) for address, text in found]
+    resources = {"registers": int(used[1]), "spilled": int(used[2])}
+    return resources, [(int(address, 16), text.strip()) for address, text in found]
 
 
 def _per_sample(instructions: list[tuple[int, str]]) -> float | None:
