@@ -59,14 +59,14 @@ def test_masked_rows_leave_no_trace():
 
 @pytest.mark.parametrize("effects", [False, True])
 def test_nothing_is_read_before_it_is_written(effects, monkeypatch):
-    # An empty tile, culled rows, and a stack of which the last pairs are never looked at.
+    # The third tile is empty; the stack closes the first one, so that its pairs behind the 32nd are never looked at.
     view = front_camera(33, 5, 20.0)
     if effects:
-        view = dataclasses.replace(
-            view, distortion=torch.full((5,), 0.01), shutter=Shutter(torch.ones(3), torch.ones(3))
-        )
+        slow = Shutter(torch.full((3,), 0.01), torch.full((3,), 0.01))
+        view = dataclasses.replace(view, distortion=torch.full((5,), 0.001), shutter=slow)
     stack = [
-        one_gaussian(scales=[[0.3, 0.2, 0.1]], opacities=[1.0], means=[[-1.0, 0.0, 2.0 + 0.02 * k]]) for k in range(34)
+        one_gaussian(scales=[[0.6, 0.4, 0.1]], opacities=[1.0], means=[[-0.85, 0.0, 2.0 + 0.002 * k]])
+        for k in range(34)
     ]
     scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, -2.0]]), *stack, one_gaussian(opacities=[0.0])])
     expected = render(scene, view, "triton", torch.float32)
