@@ -83,6 +83,15 @@ def test_odd_sizes(width_height):
     assert_matches_reference(random_gaussians(8, view, seed=7), view)
 
 
+def test_past_the_limit_of_the_jacobian():
+    # The limits lie at x/z = 0.49 and y/z = 0.38; each row is past one of them and wide enough to be seen.
+    rows = [
+        one_gaussian(means=[mean], scales=[[0.6, 0.5, 0.4]], quaternions=[[0.9, 0.2, -0.3, 0.1]])
+        for mean in ([1.2, 0.1, 2.0], [-1.2, 0.1, 2.1], [0.1, 1.0, 2.2], [0.1, -1.0, 2.3], [1.1, 0.9, 2.4])
+    ]
+    assert_matches_reference(Gaussians.concatenate(rows), front_camera(9, 7, 12.0))
+
+
 @pytest.mark.parametrize("name", EFFECTS)
 @pytest.mark.parametrize("antialias", [False, True])
 def test_effects(name, antialias):
