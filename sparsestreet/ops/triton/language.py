@@ -12,7 +12,11 @@ _INTERPRETED = triton.knobs.runtime.interpret
 
 
 def jit(function: Callable, **options: Any) -> KernelInterface:
-    """triton.jit of the function as it is written: a type checker wrapped around it would hide its globals."""
+    """triton.jit of the function as it is written: a type checker wrapped around it would hide its globals.
+
+    Counts that change from one rendering to the next belong in ``do_not_specialize``: the compiler would make a kernel
+    for multiples of 16, one for 1 and one for the rest.
+    """
     return triton.jit(inspect.unwrap(function), **options)
 
 

@@ -6,6 +6,7 @@ are the slots its gradient is summed from.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import triton.language as tl
@@ -43,7 +44,7 @@ class Lists:
     """Tiles, those with most pairs first: the longest must not start last."""
 
 
-@jit
+@partial(jit, do_not_specialize=["row_count"])
 def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: tl.constexpr, BLOCK: tl.constexpr):
     """Rows with tiles, and the sorted bits of their depths, in row order; ``places`` counts from 1."""
     row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -56,7 +57,7 @@ def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: 
     tl.store(rows + place, row, seen)
 
 
-@jit
+@partial(jit, do_not_specialize=["pairs"])
 def list_pairs(
     records, ranks, rows, first_pairs, keys, pair_rows, pairs, width, height, tiles_x,
     BOUNDED: tl.constexpr, BLOCK: tl.constexpr,

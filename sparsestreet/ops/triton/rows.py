@@ -1,5 +1,7 @@
 """From the rows of a scene to splats on the screen: one lane per row, every input read once."""
 
+from functools import partial
+
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
@@ -83,7 +85,7 @@ def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: 
     return shape, sees
 
 
-@jit
+@partial(jit, do_not_specialize=["rows"])
 def project_rows(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, bad, rows,
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, HALF_COLORS: tl.constexpr, BOUNDED: tl.constexpr,

@@ -1,5 +1,7 @@
 """From the sums over pixels back to the parameters: one lane per row, every gradient written once."""
 
+from functools import partial
+
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
@@ -53,7 +55,7 @@ def screen_gradient(s, to, mask):
     return v_mean, v_absolute, (k * s[3], k * s[4], k * s[5]), s[0] * tl.exp2(-log2_opacity)
 
 
-@jit
+@partial(jit, do_not_specialize=["rows"])
 def project_rows_backward(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
     v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,

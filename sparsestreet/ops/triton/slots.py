@@ -1,5 +1,7 @@
 """Sums over the slots of each row, which are neighbours, in a fixed order."""
 
+from functools import partial
+
 import triton.language as tl
 
 from sparsestreet.ops.triton.language import jit
@@ -8,7 +10,7 @@ ROWS = 8
 """Rows of a program."""
 
 
-@jit
+@partial(jit, do_not_specialize=["visible"])
 def sum_slots(
     slots, rows, first_pairs, tile_counts, sums, visible,
     COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
