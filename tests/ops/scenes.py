@@ -16,9 +16,29 @@ BACKENDS = ("reference", "cpu")
 """Every implementation of the op: what is tested for all of them takes the list from here."""
 EFFECT_BACKENDS = ("reference",)
 """Those with lens, shutter, box, depth bits and half colours."""
+SINGLE_PRECISION = ("triton",)
+"""Those that compute in float32 only; tests whose oracle needs float64 leave them out."""
+
+
+def _dtypes(backend: str) -> tuple[torch.dtype, ...]:
+    return (torch.float32,) if backend in SINGLE_PRECISION else (torch.float32, torch.float64)
+
+
+def _in_every_precision(backends: tuple[str, ...]) -> pytest.MarkDecorator:
+    pairs = [(backend, dtype) for backend in backends for dtype in _dtypes(backend)]
+    names = [f"{backend}-{str(dtype).removeprefix('torch.')}" for backend, dtype in pairs]
+    return pytest.mark.parametrize(("backend", "dtype"), pairs, ids=names)
+
+
+def _in_double(backends: tuple[str, ...]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("backend", [name for name in backends if torch.float64 in _dtypes(name)])
+
+
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
-every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-every_effect_backend = pytest.mark.parametrize("backend", EFFECT_BACKENDS)
+every_precision = _in_every_precision(BACKENDS)
+every_double = _in_double(BACKENDS)
+every_effect_precision = _in_every_precision(EFFECT_BACKENDS)
+every_effect_double = _in_double(EFFECT_BACKENDS)
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:

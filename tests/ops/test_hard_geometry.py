@@ -14,8 +14,9 @@ from tests.ops.scenes import (
     FIELDS,
     cast,
     cotangents,
+    device_of,
     every_backend,
-    every_dtype,
+    every_precision,
     front_camera,
     one_gaussian,
     relative_error,
@@ -61,14 +62,13 @@ def test_04_exponent_far_along_a_needle(backend):
     view = front_camera(512, 512, 400.0)
     needle = one_gaussian(quaternions=[[0.93, 0.05, -0.02, 0.36]], scales=[[10.0, 1e-4, 1e-4]])
     truth = splat(needle, view, backend="reference")
-    alpha = splat(cast(needle, torch.float32), view, backend=backend).alpha
+    alpha = render(needle, view, backend, torch.float32).images["alpha"]
     assert (truth.alpha[:64] > 0.5).any()
     # The difference l11 dx + l21 dy keeps 300 * 6e-8 of a standard deviation; the profile changes by 1 in one.
     assert (alpha - truth.alpha).abs().max() < 2e-4
 
 
-@every_backend
-@every_dtype
+@every_precision
 def test_06_through_the_near_plane(backend, dtype):
     view = front_camera(21, 13, 20.0)
     depths = [0.2 - 1e-3, 0.2, 0.2 + 1e-6, 0.2 + 1e-3, 0.21, 0.25, 0.5]
@@ -84,8 +84,7 @@ def test_06_through_the_near_plane(backend, dtype):
     assert (near.images["rgb"] - nearer.images["rgb"]).abs().max() < 1e-4
 
 
-@every_backend
-@every_dtype
+@every_precision
 def test_06_camera_inside_a_splat(backend, dtype):
     view = front_camera(21, 13, 20.0)
     assert render(one_gaussian(means=[[0.0, 0.0, 0.0]], scales=[[3.0] * 3]), view, backend, dtype).is_finite()
@@ -109,49 +108,53 @@ def test_13_antialias_of_tiny_splats(backend):
         # Of the colours alone: depth divides by alpha = 1 - T, and this cut-off lets through alphas of 1e-6.
         gradients = []
         for name, dtype in (("reference", torch.float64), (backend, torch.float32)):
-            leaves = cast(ball, dtype, requires_grad=True)
-            splat(leaves, view, settings=settings, backend=name).rgb.backward(cotangents(view)[0].to(dtype))
-            gradients.append(leaves.scales.grad.double())
+            device = device_of(name)
+            leaves = cast(ball, dtype, requires_grad=True, device=device)
+            splat(leaves, view, settings=settings, backend=name).rgb.backward(cotangents(view)[0].to(device, dtype))
+            gradients.append(leaves.scales.grad.double().cpu())
         assert relative_error(gradients[1], gradients[0]) < 1e-4 or not gradients[0].any()
 
 
-@every_backend
+@every_precision
 @pytest.mark.parametrize("slope", [0.64, 0.66], ids=["before", "past"])
-def test_07_gradients_on_both_sides_of_the_jacobian_limit(backend, slope):
+def test_07_gradients_on_both_sides_of_the_jacobian_limit(backend, dtype, slope):
     # 20 px wide at focal 20: half the field of view is 0.5, the limit 0.65. Large enough to reach the image from there.
     view = front_camera(20, 16, 20.0)
-    splats = one_gaussian(
-        means=[[2 * slope, 1.4 * slope, 2.0]], scales=[[0.7, 0.5, 0.6]], quaternions=[[0.9, 0.3, 0.2, 0.1]]
-    )
+    settings = SplatSettings(alpha_min=1e-9)
+    shape = {"scales": [[0.7, 0.5, 0.6]], "quaternions": [[0.9, 0.3, 0.2, 0.1]]}
+    beside = one_gaussian(means=[[2 * slope, 1.4 * slope, 2.0]], **shape)
+    truth = render(beside, view, "reference", settings=settings)
+    assert (truth.images["rgb"] > 0.05).any()
     for field in ("means", "quaternions", "scales"):
-        values = {name: getattr(splats, name).clone() for name in FIELDS}
+        values = {name: getattr(beside, name).clone() for name in FIELDS}
 
         def image(value, field=field, values=values):
-            settings = SplatSettings(alpha_min=1e-9)
             return splat(Gaussians(**(values | {field: value})), view, settings=settings, backend=backend).rgb
 
-        assert (image(values[field]) > 0.05).any()
-        assert torch.autograd.gradcheck(image, values[field].requires_grad_(), fast_mode=True)
+        if dtype == torch.float64:
+            assert torch.autograd.gradcheck(image, values[field].requires_grad_(), fast_mode=True)
+        else:
+            result = render(beside, view, backend, dtype, settings)
+            assert relative_error(result.gradients[field], truth.gradients[field]) < 1e-4
 
 
-@every_backend
-def test_07_the_limit_acts_and_is_continuous(backend):
+@every_precision
+def test_07_the_limit_acts_and_is_continuous(backend, dtype):
     # Past the limit only the Jacobian stays behind: the image goes on without a step, but not as without a limit.
     view = front_camera(20, 16, 20.0)
     wide = Camera(view.camera_from_world, view.intrinsics, 60, 16)
 
     def strip(slope: float, seen: Camera) -> torch.Tensor:
         ball = one_gaussian(means=[[2 * slope, 0.0, 2.0]], scales=[[0.5] * 3])
-        return splat(ball, seen, settings=SplatSettings(alpha_min=1e-9), backend=backend).rgb[:, :20]
+        return render(ball, seen, backend, dtype, SplatSettings(alpha_min=1e-9)).images["rgb"][:, :20]
 
-    assert (strip(0.65 - 1e-9, view) - strip(0.65 + 1e-9, view)).abs().max() < 1e-6
+    assert (strip(0.65 - 1e-7, view) - strip(0.65 + 1e-7, view)).abs().max() < 1e-6
     # The wider image of the same camera has a wider limit, (60 - 10) / 20 + 0.3 * 1.5.
-    assert torch.allclose(strip(0.6, view), strip(0.6, wide), atol=1e-12)
+    assert (strip(0.6, view) - strip(0.6, wide)).abs().max() < 1e-7
     assert (strip(0.8, view) - strip(0.8, wide)).abs().max() > 1e-3
 
 
-@every_backend
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@every_precision
 def test_19_large_world_coordinates(backend, dtype):
     # A ball 10 m ahead of a camera with a focal length of 1000 px; world and camera moved together.
     angle = 0.7
@@ -164,9 +167,9 @@ def test_19_large_world_coordinates(backend, dtype):
         pose = turned.clone()
         pose[:3, 3] -= turned[:3, :3] @ offset
         mean = turned[:3, :3].T @ torch.tensor([0.01, 0.02, 10.0], dtype=torch.float64) + offset
-        ball = cast(one_gaussian(means=[mean.tolist()], scales=[[0.03] * 3]), dtype)
+        ball = one_gaussian(means=[mean.tolist()], scales=[[0.03] * 3])
         view = Camera(pose, at_origin.intrinsics, 40, 40)
-        alpha = splat(ball, view, settings=SplatSettings(alpha_min=1e-3), backend=backend).alpha.double()
+        alpha = render(ball, view, backend, dtype, SplatSettings(alpha_min=1e-3)).images["alpha"]
         places = torch.arange(40, dtype=torch.float64) + 0.5
         return torch.stack(((alpha.sum(0) @ places), (alpha.sum(1) @ places))) / alpha.sum()
 
@@ -182,8 +185,7 @@ def test_19_large_world_coordinates(backend, dtype):
         assert 0.01 < edge < 0.8
 
 
-@every_backend
-@every_dtype
+@every_precision
 @pytest.mark.parametrize("axis", [0, 1])
 def test_21_brightness_of_a_sub_pixel_splat(backend, dtype, axis):
     # Sigma 0.05 px moves over a pixel. Its light is that of its own ellipse, o 2 pi sigma^2, wherever it is: pixel sums
@@ -204,21 +206,22 @@ def test_21_brightness_of_a_sub_pixel_splat(backend, dtype, axis):
     assert plain == pytest.approx([121 * expected] * 9, rel=0.01)
 
 
-def _touched_pixels(mean: np.ndarray, covariance: np.ndarray, reach: float, width: int, height: int) -> np.ndarray:
+def _squared_distances(mean: np.ndarray, covariance: np.ndarray, width: int, height: int) -> np.ndarray:
+    """q of every pixel, in standard deviations squared."""
     y, x = np.mgrid[:height, :width] + 0.5
     d = np.stack((x - mean[0], y - mean[1]), -1)
-    return np.einsum("hwi,ij,hwj->hw", d, np.linalg.inv(covariance), d) <= reach
+    return np.einsum("hwi,ij,hwj->hw", d, np.linalg.inv(covariance), d)
 
 
-@every_backend
-def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend):
-    # 37 x 11 tiles, the last ones cut; brute force: every pixel of the image against every ellipse.
-    width, height = 37 * 16 - 5, 11 * 16 - 3
+@every_precision
+def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend, dtype):
+    # 13 x 5 tiles, the last ones cut; brute force: every pixel of the image against every ellipse.
+    width, height = 13 * 16 - 5, 5 * 16 - 3
     view = front_camera(width, height, 100.0)
     rng = np.random.default_rng(0)
     for _ in range(12):
-        x, y = rng.uniform(-40, width + 40), rng.uniform(-40, height + 40)
-        turn, sides = rng.uniform(0, math.pi), np.exp(rng.uniform(0, 4, 2))
+        x, y = rng.uniform(-30, width + 30), rng.uniform(-30, height + 30)
+        turn, sides = rng.uniform(0, math.pi), np.exp(rng.uniform(0, 3.5, 2))
         # A flat card parallel to the image, 1 m ahead: 100 px a metre.
         card = one_gaussian(
             means=[[(x - width / 2) / 100, (y - height / 2) / 100, 1.0]],
@@ -226,15 +229,17 @@ def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend):
             quaternions=[[math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]],
         )
         axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) * sides
-        ellipse = (np.array([x, y]), axes @ axes.T + 0.3 * np.eye(2), 2 * math.log(0.8 * 255), width, height)
-        touched = _touched_pixels(*ellipse)
-        counted = contribution(card, view, backend=backend)
-        assert int(counted.pixels[0]) == touched.sum()
-        alpha = splat(card, view, backend=backend).alpha.numpy()
-        np.testing.assert_array_equal(alpha > 0, touched)
+        q = _squared_distances(np.array([x, y]), axes @ axes.T + 0.3 * np.eye(2), width, height)
+        reach = 2 * math.log(0.8 * 255)
+        # Where rounding may decide: an ellipse 1e-3 of a standard deviation wider or narrower.
+        clear = abs(np.sqrt(q) - math.sqrt(reach)) > (1e-3 if dtype == torch.float32 else 1e-9)
+        drawn = render(card, view, backend, dtype).images["alpha"].numpy() > 0
+        np.testing.assert_array_equal(drawn[clear], (q <= reach)[clear])
+        counted = contribution(cast(card, dtype, device=device_of(backend)), view, backend=backend)
+        assert int(counted.pixels[0]) == drawn.sum()
         if backend == "cpu":
-            blocks = np.pad(touched, ((0, 3), (0, 5))).reshape(11, 16, 37, 16)
+            blocks = np.pad(drawn, ((0, 3), (0, 5))).reshape(5, 16, 13, 16)
             needed = int(blocks.any((1, 3)).sum())
-            listed = idle_workspaces()[-1].pair_count()
+            listed = next(w.pair_count() for w in idle_workspaces()[::-1] if w.key[0] == dtype)
             # A tile whose pixel centres an ellipse just misses may be listed, one that it meets must be.
             assert needed <= listed <= needed + 2 + 0.1 * needed

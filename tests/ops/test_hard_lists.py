@@ -11,7 +11,7 @@ from tests.ops.scenes import (
     FIELDS,
     camera,
     every_backend,
-    every_dtype,
+    every_precision,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -21,8 +21,7 @@ from tests.ops.scenes import (
 Y0 = 0.28209479177387814
 
 
-@every_backend
-@every_dtype
+@every_precision
 @pytest.mark.parametrize("width_height", [(1, 1), (17, 9)])
 def test_15_nothing_to_draw(backend, dtype, width_height):
     view = front_camera(*width_height, 20.0)
@@ -60,8 +59,7 @@ def test_16_nothing_is_read_before_it_is_written(settings, monkeypatch):
             assert torch.equal(value, getattr(result, part)[name]), name
 
 
-@every_backend
-@every_dtype
+@every_precision
 def test_17_depth_ties_keep_the_row_order(backend, dtype):
     view = front_camera(5, 5, 40.0)
     red, green = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
@@ -72,8 +70,7 @@ def test_17_depth_ties_keep_the_row_order(backend, dtype):
         assert centre[channel] == pytest.approx(1.28, rel=1e-6)
 
 
-@every_backend
-@every_dtype
+@every_precision
 def test_17_neighbouring_depths_are_told_apart(backend, dtype):
     far = torch.tensor(731.25, dtype=dtype)
     depths = (float(torch.nextafter(far, 2 * far)), float(far))

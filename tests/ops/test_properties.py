@@ -20,11 +20,13 @@ SMOOTH = SplatSettings(alpha_min=1e-12, transmittance_min=0.0)
 
 
 @st.composite
-def scenes(draw: DrawFn, terms: tuple[int, ...] = (1, 4, 9, 16)) -> tuple[Gaussians, Camera, Tensor]:
+def scenes(draw: DrawFn) -> tuple[Gaussians, Camera, Tensor]:
     """Gaussians, a camera of odd size and as many random numbers as a test wants, all from one seed."""
     seed = draw(st.integers(0, 2**31 - 1))
     view = camera(draw(st.integers(1, 24)), draw(st.integers(1, 20)), focal=draw(st.floats(8, 40)))
-    gaussians = random_gaussians(draw(st.integers(0, 40)), view, terms=draw(st.sampled_from(terms)), seed=seed)
+    gaussians = random_gaussians(
+        draw(st.integers(0, 40)), view, terms=draw(st.sampled_from([1, 1, 4, 9, 16])), seed=seed
+    )
     return gaussians, view, torch.randn(64, generator=torch.Generator().manual_seed(seed + 1), dtype=torch.float64)
 
 
@@ -55,12 +57,13 @@ def assert_same(seen: Rendering, expected: Rendering, bar: float) -> None:
 
 @every_backend
 @few
-@given(scene=scenes(terms=(1,)))
+@given(scene=scenes())
 def test_moving_the_world_and_the_camera_together(backend, scene):
-    # Degree 0: higher harmonics are fixed to the world's axes.
     gaussians, view, noise = scene
     gaussians, view = with_effects(gaussians, view, noise, backend)
     turn, shift = to_matrix(noise[10:14]), 5 * noise[14:17]
+    if gaussians.sh.shape[1] > 1:  # Harmonics of higher degree are fixed to the world's axes.
+        turn = torch.eye(3, dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ shift
     moved = dataclasses.replace(
