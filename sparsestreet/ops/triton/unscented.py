@@ -73,13 +73,10 @@ def shrink(view, x, y):
 
 @jit
 def shown(view, x, y):
-    """Pixels of normalised coordinates, beyond the fold as well."""
+    """Pixels from the principal point, whose digits differences would lose, beyond the fold as well."""
     s = shrink(view, x, y)
     at_x, at_y = distort(view, s * x, s * y)
-    return (
-        tl.load(view + FOCAL) * at_x / s + tl.load(view + CENTRE),
-        tl.load(view + FOCAL + 1) * at_y / s + tl.load(view + CENTRE + 1),
-    )
+    return tl.load(view + FOCAL) * at_x / s, tl.load(view + FOCAL + 1) * at_y / s
 
 
 @jit
@@ -154,7 +151,7 @@ def normalised_points(view, mean, axes):
 
 @jit
 def screen_factor(view, x, y):
-    """Mean on the screen and the rows of V, 8 columns."""
+    """Mean on the screen, from the principal point, and the rows of V, 8 columns."""
     at_x, at_y = shown(view, x, y)
     m_x, m_y = tl.sum(at_x * mean_weights(), 1), tl.sum(at_y * mean_weights(), 1)
     return m_x, m_y, covariance_roots() * (at_x - m_x[:, None]), covariance_roots() * (at_y - m_y[:, None])
@@ -173,6 +170,7 @@ def unscented(view, mean, axes):
     m_x, m_y, vx, vy = screen_factor(view, x, y)
     c = minors(vx, vy)
     bare = 0.5 * tl.sum(tl.sum(c * c, 2), 1)
+    m_x, m_y = m_x + tl.load(view + CENTRE), m_y + tl.load(view + CENTRE + 1)
     return m_x, m_y, tl.sum(vx * vx, 1), tl.sum(vy * vy, 1), tl.sum(vx * vy, 1), bare
 
 

@@ -133,7 +133,8 @@ def test_pairs_behind_an_opaque_stack(stop):
     stack = [
         one_gaussian(
             means=[[0.02 * k, 0.01 * k, 2.0 + 0.1 * k]],
-            scales=[[3.0, 2.0, 2.5]],
+            quaternions=[[0.9, 0.2, -0.3, 0.1 + 0.01 * k]],
+            scales=[[3.0, 1.0, 2.0]],
             opacities=[0.95],
             sh=[[[0.01 * k] * 3]],
         )

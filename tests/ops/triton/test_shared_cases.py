@@ -1,5 +1,6 @@
 """The cases that every backend is tested with, as far as they are small enough for the interpreter, in float32."""
 
+import inspect
 import itertools
 from collections.abc import Callable, Iterator
 
@@ -46,12 +47,12 @@ def _cases(functions: tuple[Callable, ...]) -> Iterator:
     for function in functions:
         axes = []
         for mark in function.pytestmark:
-            names = mark.args[0].split(",") if isinstance(mark.args[0], str) else mark.args[0]
-            if names[0] not in ("backend", "dtype"):
+            names = (mark.args[0],) if isinstance(mark.args[0], str) else mark.args[0]
+            if "backend" not in names:
                 rows = [values if len(names) > 1 else (values,) for values in mark.args[1]]
-                axes.append([dict(zip((name.strip() for name in names), values, strict=True)) for values in rows])
+                axes.append([dict(zip(names, values, strict=True)) for values in rows])
         given = {"backend": "triton"}
-        if any(mark.args[0] == "dtype" for mark in function.pytestmark):
+        if "dtype" in inspect.signature(function).parameters:
             given["dtype"] = torch.float32
         for number, chosen in enumerate(itertools.product(*axes)):
             arguments = given | {name: value for values in chosen for name, value in values.items()}
