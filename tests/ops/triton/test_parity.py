@@ -102,6 +102,12 @@ def test_effects(name, antialias):
     assert_matches_reference(gaussians, view, SplatSettings(antialias=antialias))
 
 
+def test_sigma_point_before_the_near_plane():
+    # Along z the points lie at 0.6 +- 0.52 m: the nearer one is taken at 0.2 m, where its depth has no derivative.
+    row = one_gaussian(means=[[0.05, 0.02, 0.6]], scales=[[0.02, 0.03, 0.3]], quaternions=[[0.99, 0.04, 0.05, 0.01]])
+    assert_matches_reference(row, dataclasses.replace(front_camera(15, 13, 20.0), distortion=LENS))
+
+
 def test_shutter_alone_moves_what_stands_still():
     view = camera(17, 13)
     gaussians = random_gaussians(9, view, terms=1)
