@@ -1,6 +1,8 @@
 """What breaks renderers at the edges, on the Triton kernels: lists, memory, order, bad input, devices."""
 
 import dataclasses
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -230,6 +232,11 @@ def test_cpu_tensors_need_the_interpreter(monkeypatch):
     monkeypatch.setattr(rasteriser, "is_interpreted", lambda kernel: False)
     with pytest.raises(ValueError, match=r"'triton' needs tensors on a CUDA device, got cpu: move them, .*INTERPRET=1"):
         splat(cast(one_gaussian(), torch.float32), VIEW, backend="triton")
+
+
+def test_the_op_does_not_import_triton_before_it_is_used():
+    code = "import sys, sparsestreet.ops; sys.exit('triton' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_where_triton_runs(monkeypatch):
