@@ -142,8 +142,8 @@ def test_half_colours_over_their_range(backend):
 
 @every_effect_precision
 def test_half_colours_in_a_scene(backend, dtype):
-    view = camera(37, 29)
-    gaussians = random_gaussians(200, view)
+    view = camera(21, 13)
+    gaussians = random_gaussians(60, view)
     plain, rounded = (
         render(gaussians, view, backend, dtype, SplatSettings(half_colors=half)) for half in (False, True)
     )

@@ -219,9 +219,10 @@ def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend, dtype):
     width, height = 13 * 16 - 5, 5 * 16 - 3
     view = front_camera(width, height, 100.0)
     rng = np.random.default_rng(0)
-    for _ in range(12):
-        x, y = rng.uniform(-30, width + 30), rng.uniform(-30, height + 30)
-        turn, sides = rng.uniform(0, math.pi), np.exp(rng.uniform(0, 3.5, 2))
+    for longest in (60, 30, 20, 10, 10, 10):
+        # The first one reaches further than the 8 tiles that a mask can hold.
+        x, y = rng.uniform(0, width), rng.uniform(0, height)
+        turn, sides = rng.uniform(0, math.pi), np.array([longest, rng.uniform(1, 10)])
         # A flat card parallel to the image, 1 m ahead: 100 px a metre.
         card = one_gaussian(
             means=[[(x - width / 2) / 100, (y - height / 2) / 100, 1.0]],

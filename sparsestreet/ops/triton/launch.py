@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import torch
 from triton.runtime.interpreter import InterpretedFunction
 from triton.runtime.jit import KernelInterface
 
@@ -15,11 +16,15 @@ def launch(
     options: dict[str, Any] | None = None,
     **constants: Any,
 ) -> None:
-    """Run ``kernel`` over ``items`` in programs of ``block``, given to it as BLOCK; nothing runs for no items."""
+    """Run ``kernel`` over ``items`` in programs of ``block``, given to it as BLOCK; nothing runs for no items.
+
+    The first of ``arguments`` must be a tensor. ``options`` are the compiler's (num_warps, maxnreg, enable_fp_fusion).
+    """
     if not items:
         return
-    # NumPy, which the interpreter computes in, would warn of infinities in lanes that are masked off.
-    with np.errstate(all="ignore"):
+    # On the device of the first tensor, which need not be the current one. NumPy, which the interpreter computes in, would
+    # warn of infinities in lanes that are masked off.
+    with torch.cuda.device_of(arguments[0]), np.errstate(all="ignore"):
         kernel[(-(-items // block),)](*arguments, **constants, BLOCK=block, **(options or {}))
 
 

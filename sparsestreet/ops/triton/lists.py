@@ -111,7 +111,7 @@ def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: in
 
 
 def _rows_by_depth(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: View) -> Tensor:
-    keys, rows = tile_counts.new_empty(2, visible)
+    keys, rows = tile_counts.new_empty(visible), tile_counts.new_empty(visible)
     mask = -1 << (32 - view.settings.depth_bits)
     launch(
         list_visible, len(tile_counts), _BLOCK,

@@ -58,14 +58,14 @@ def curvature(view, x, y):
 
 @jit
 def within_fold(view, mean):
-    """Whether the lens sees the point: the radial polynomial still grows there."""
+    """Whether the lens sees the point (geometry/distortion.py says where its range ends)."""
     x, y = mean[0] / mean[2], mean[1] / mean[2]
     return x * x + y * y <= tl.load(view + FOLD)
 
 
 @jit
 def shrink(view, x, y):
-    """s = min(1, sqrt(r2_max / r2)): beyond the fold D(s x) / s goes on growing."""
+    """s = min(1, sqrt(r2_max / r2)): beyond the fold the map goes on as D(s x) / s."""
     r2, fold = x * x + y * y, tl.load(view + FOLD)
     beyond = r2 > fold
     return tl.where(beyond, tl.sqrt(fold / tl.where(beyond, r2, 1.0)), 1.0)
