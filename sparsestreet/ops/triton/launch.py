@@ -22,8 +22,8 @@ def launch(
     """
     if not items:
         return
-    # The device of the first tensor need not be the current one. NumPy, which the interpreter computes in, would warn of
-    # infinities in lanes that are masked off.
+    # The device of the first tensor need not be the current one. NumPy, which the interpreter computes in, would warn
+    # of infinities in lanes that are masked off.
     with torch.cuda.device_of(arguments[0]), np.errstate(all="ignore"):
         kernel[(-(-items // block),)](*arguments, **constants, BLOCK=block, **(options or {}))
 
