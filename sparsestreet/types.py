@@ -174,3 +174,13 @@ class Contribution:
     """Number of pixels the row was blended into."""
     dominant: Int[Tensor, " n"]
     """Number of pixels in which the row has the largest weight (ties: the nearer splat)."""
+
+
+@dataclass(frozen=True)
+class Removal:
+    """How far one view moves when each row alone is taken away, the others staying as they are."""
+
+    largest: Float64[Tensor, " n"]
+    """Largest absolute change of a channel of a pixel."""
+    squared: Float64[Tensor, " n"]
+    """Sum over pixels and channels of the squared change."""

@@ -15,11 +15,12 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend, blend_backward, count, records, rows, rows_backward, slots
+from sparsestreet.ops.triton import removal as remove
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists, check_pairs, list_tiles
 from sparsestreet.ops.triton.view import View
 from sparsestreet.ops.validate import check_values
-from sparsestreet.types import Camera, Contribution, Gaussians
+from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 
 ONE_WARP = {"num_warps": 1}
 
@@ -70,6 +71,32 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
     return Contribution(weight, pixels.long(), dominant.long())
 
 
+@torch.no_grad()
+def removal(
+    gaussians: Gaussians, background: Float[Tensor, "h w 3"] | None, camera: Camera, settings: SplatSettings
+) -> Removal:
+    """How far the view moves when each row alone is taken away, over a background (None: black)."""
+    _check(gaussians)
+    g, view = gaussians, View(camera, settings)
+    fields = tuple(field.contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
+    screen = _project(fields, g.displacements, view)
+    lists, (rgb, transmittance, _, lasts) = screen.lists, _blend(screen, view)
+    changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)
+    width, height, *others = _pixel_arguments(view)
+    launch(
+        remove.remove_from_tiles, len(lists.order), 1,
+        screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, lasts, lists.order,
+        rgb, transmittance, rgb if background is None else background.contiguous(), changes,
+        width, height, 1, *others, EXCLUSIVE=view.exclusive, BEHIND=background is not None, options=ONE_WARP,
+    )  # fmt: skip
+    totals = torch.zeros(len(g), remove.CHANGE_COUNT, dtype=torch.float64, device=g.means.device)
+    _sum_slots(changes, lists, totals, 2, tl.float64)
+    # A maximum is the same in any order.
+    largest = torch.zeros_like(totals[:, 0])
+    largest.scatter_reduce_(0, lists.pair_rows.long(), changes[lists.slots, 0].double(), "amax")
+    return Removal(largest, totals[:, 1])
+
+
 class _Blend(torch.autograd.Function):
     """Five fields and the screen offsets to the layers of a Raster."""
 
@@ -79,16 +106,7 @@ class _Blend(torch.autograd.Function):
         fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
         displacements = None if displacements is None else displacements.contiguous()
         screen = _project(fields, displacements, view)
-        lists, (height, width) = screen.lists, (view.camera.height, view.camera.width)
-        rgb = means.new_empty(height, width, 3)
-        transmittance, depth_sum = means.new_empty(height, width), means.new_empty(height, width)
-        lasts = lists.begins.new_empty(len(lists.begins))
-        launch(
-            blend.blend_tiles, len(lists.order), 1,
-            screen.records, lists.pair_rows, lists.begins, lists.ends, lists.order,
-            rgb, transmittance, depth_sum, lasts, *_pixel_arguments(view),
-            EXCLUSIVE=view.exclusive, DEPTH=True, options=ONE_WARP,
-        )  # fmt: skip
+        rgb, transmittance, depth_sum, lasts = _blend(screen, view)
         ctx.mark_non_differentiable(screen.radii)
         ctx.save_for_backward(*fields, rgb, transmittance, depth_sum)
         ctx.screen, ctx.view, ctx.displacements, ctx.lasts = screen, view, displacements, lasts
@@ -126,6 +144,21 @@ class _Blend(torch.autograd.Function):
             TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, **_effects(view, ctx.displacements),
         )  # fmt: skip
         return *outputs, v_screen, None, None
+
+
+def _blend(screen: Screen, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Colours, transmittance, sum of depths; and per tile the index after the last pair that was looked at."""
+    lists, shape = screen.lists, (view.camera.height, view.camera.width)
+    rgb = screen.records.new_empty(*shape, 3)
+    transmittance, depth_sum = screen.records.new_empty(shape), screen.records.new_empty(shape)
+    lasts = lists.begins.new_empty(len(lists.begins))
+    launch(
+        blend.blend_tiles, len(lists.order), 1,
+        screen.records, lists.pair_rows, lists.begins, lists.ends, lists.order,
+        rgb, transmittance, depth_sum, lasts, *_pixel_arguments(view),
+        EXCLUSIVE=view.exclusive, DEPTH=True, options=ONE_WARP,
+    )  # fmt: skip
+    return rgb, transmittance, depth_sum, lasts
 
 
 def _project(fields: tuple[Tensor, ...], displacements: Tensor | None, view: View) -> Screen:

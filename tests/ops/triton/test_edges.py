@@ -166,6 +166,33 @@ def test_of_equal_weights_the_nearer_splat_dominates():
     assert contribution(single(twice), front_camera(1, 1, 40.0), backend="triton").dominant.tolist() == [0, 1, 0]
 
 
+@pytest.mark.parametrize("behind", [False, True], ids=["black", "background"])
+def test_removal_against_taking_rows_away(behind):
+    # Without a stop rule a pixel is linear in each alpha; alphas below the cut-off stay out with and without a row.
+    settings = SplatSettings(transmittance_min=0.0)
+    view = camera(9, 7)
+    gaussians = random_gaussians(8, view)
+    generator = torch.Generator().manual_seed(1)
+    background = (
+        torch.rand(7, 9, 3, generator=generator, dtype=torch.float64) if behind else torch.zeros(7, 9, 3).double()
+    )
+
+    def image(scene: Gaussians) -> torch.Tensor:
+        return splat(scene, view, settings=settings, background=background, backend="reference").rgb
+
+    moved = []
+    for row in range(8):
+        without = torch.where(torch.arange(8) == row, 0.0, gaussians.opacities)
+        moved.append(image(dataclasses.replace(gaussians, opacities=without)) - image(gaussians))
+    given = background.to(DEVICE, torch.float32) if behind else None
+    found = rasteriser.removal(single(gaussians), given, view, settings)
+    largest = torch.stack([change.abs().max() for change in moved])
+    squared = torch.stack([change.square().sum() for change in moved])
+    assert (largest > 0.01).sum() > 3
+    torch.testing.assert_close(found.largest.cpu(), largest, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(found.squared.cpu(), squared, rtol=1e-4, atol=1e-6)
+
+
 def test_no_rows():
     counted = contribution(single(random_gaussians(0, VIEW)), VIEW, backend="triton")
     assert counted.weight.shape == counted.pixels.shape == counted.dominant.shape == (0,)

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution, splat
+from sparsestreet.ops.triton import rasteriser
 from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, record_launches
@@ -34,6 +35,7 @@ def launches_of_the_op(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
     )
     splat(large, view, backend="triton").rgb.sum().backward()
     contribution(large, view, backend="triton")
+    rasteriser.removal(large, None, view, SplatSettings())
     # One term of colour: what the other switches add compiles faster.
     rendering = splat(small, view, backend="triton", settings=SplatSettings(stop="exclusive", antialias=True))
     rendering.depth.sum().backward()
@@ -78,7 +80,7 @@ def compiled() -> list[tuple[Launch, dict]]:
 def test_every_kernel_is_compiled(compiled):
     assert {launch.name for launch, _ in compiled} == {
         "project_rows", "list_visible", "list_pairs", "blend_tiles", "count_tiles_pixels", "blend_tiles_backward",
-        "sum_slots", "project_rows_backward",
+        "sum_slots", "project_rows_backward", "remove_from_tiles",
     }  # fmt: skip
 
 
