@@ -1,7 +1,7 @@
-"""The splat op: one signature, a dense reference and a fast CPU backend."""
+"""The splat op: one signature, a dense reference, a fast CPU backend and a Triton one."""
 
 from sparsestreet.ops.backend import resolve_backend
-from sparsestreet.ops.cpu.rasteriser import PairLimitError
+from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import contribution, removal, splat
 

@@ -1,19 +1,22 @@
 """Which implementations of the op there are, and which one runs on a device."""
 
+import importlib.util
 import warnings
 
 import torch
 
 from sparsestreet.ops.cpu.library import find_library, remedy
 
-BACKENDS = ("reference", "cpu")
+BACKENDS = ("reference", "cpu", "triton")
+_TRITON_REMEDY = "pip install 'sparsestreet[gpu]' (Linux)"
 
 
 def resolve_backend(name: str, device: torch.device) -> str:
     """``name`` if it can run on ``device``; for "auto" the fastest that can.
 
     Raises ValueError for an unknown name or a device the backend does not run on, RuntimeError with the remedy if the
-    library of "cpu" is not built. "auto" without the library takes "reference" and warns once.
+    library of "cpu" is not built or the package of "triton" is not installed. "auto" takes "triton" on CUDA devices and
+    "cpu" on the CPU; where those are missing it takes "reference" and warns once.
     """
     if name not in (*BACKENDS, "auto"):
         raise ValueError(f"no splat backend {name!r}: choose one of {sorted(BACKENDS)} or 'auto'")
@@ -25,10 +28,29 @@ def resolve_backend(name: str, device: torch.device) -> str:
         if find_library() is None:
             raise RuntimeError(f"backend 'cpu' is not built: {remedy()}")
         return name
+    if name == "triton":
+        if device.type not in ("cuda", "cpu"):
+            raise ValueError(f"backend 'triton' needs tensors on a CUDA device, got {device}: move them")
+        if not has_triton():
+            raise RuntimeError(f"backend 'triton' needs the package triton: {_TRITON_REMEDY}")
+        return name
+    return _fastest(device)
+
+
+def has_triton() -> bool:
+    """Whether the package triton is installed; does not import it."""
+    return importlib.util.find_spec("triton") is not None
+
+
+def _fastest(device: torch.device) -> str:
+    if device.type == "cuda" and has_triton():
+        return "triton"
     if device.type == "cpu" and find_library() is not None:
         return "cpu"
     if device.type == "cpu":
         _warn_once(f"the C++ splat library is not built, so the dense reference renders, slowly: {remedy()}")
+    elif device.type == "cuda":
+        _warn_once(f"triton is not installed, so the dense reference renders, slowly: {_TRITON_REMEDY}")
     else:
         _warn_once(f"no fast splat backend runs on {device}, so the dense reference renders, slowly: use the cpu")
     return "reference"
@@ -40,4 +62,4 @@ _warned: set[str] = set()
 def _warn_once(message: str) -> None:
     if message not in _warned:
         _warned.add(message)
-        warnings.warn(message, RuntimeWarning, stacklevel=4)
+        warnings.warn(message, RuntimeWarning, stacklevel=5)

@@ -1,9 +1,22 @@
-"""What a backend hands to the op before a background is put behind it."""
+"""What a backend hands to the op before a background is put behind it, or raises."""
 
 from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
+
+
+class PairLimitError(RuntimeError):
+    """The splats of one view cover more 16x16 tiles than may be held in memory."""
+
+    @staticmethod
+    def of(pairs: int, limit: int, worst: list[tuple[int, int]]) -> "PairLimitError":
+        """The error for ``pairs`` of at most ``limit``; ``worst``: rows with most tiles, and how many."""
+        named = ", ".join(f"row {row} ({tiles})" for row, tiles in worst)
+        return PairLimitError(
+            f"the splats cover {pairs} tiles, more than the {limit} that may be held; most: {named}. "
+            "Prune or shrink those rows, or render a smaller image"
+        )
 
 
 @dataclass(frozen=True)

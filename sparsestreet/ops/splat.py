@@ -1,5 +1,7 @@
 """The one public signature of the op: Gaussians and a camera in, a differentiable Rendering out."""
 
+from types import ModuleType
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -35,7 +37,7 @@ def splat(
         camera: pinhole without skew.
         background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha.
         settings: cut-offs and filters.
-        backend: "reference", "cpu" or "auto".
+        backend: "reference", "cpu", "triton" or "auto".
 
     Raises:
         ValueError: wrong shapes, dtypes, devices or camera; a value that is not finite, an opacity outside [0, 1] or
@@ -51,7 +53,7 @@ def splat(
             check_values(gaussians)
             raster = reference.rasterise(gaussians, offsets, camera, settings)
         else:
-            raster = cpu.rasterise(gaussians, offsets, camera, settings)
+            raster = _fast(chosen).rasterise(gaussians, offsets, camera, settings)
         return _compose(raster, offsets, background)
 
 
@@ -72,7 +74,16 @@ def contribution(
         if chosen == "reference":
             check_values(gaussians)
             return reference.contribution(gaussians, camera, settings)
-        return cpu.contribution(gaussians, camera, settings)
+        return _fast(chosen).contribution(gaussians, camera, settings)
+
+
+def _fast(backend: str) -> ModuleType:
+    """The module of a backend that checks values itself. Triton is imported only here, when it is first used."""
+    if backend == "cpu":
+        return cpu
+    from sparsestreet.ops.triton import rasteriser
+
+    return rasteriser
 
 
 def removal(

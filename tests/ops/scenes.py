@@ -12,9 +12,11 @@ from sparsestreet.types import Camera, Gaussians
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
 CPU = torch.device("cpu")
-BACKENDS = ("reference", "cpu")
-"""Every implementation of the op: what is tested for all of them takes the list from here."""
-EFFECT_BACKENDS = ("reference", "cpu")
+_ON_A_GPU = ("triton",) if torch.cuda.is_available() else ()
+BACKENDS = ("reference", "cpu", *_ON_A_GPU)
+"""Every implementation of the op that is fast enough for all tests: what is tested for all of them takes the list from
+here. Triton's interpreter bears only small scenes (triton/test_shared_cases.py)."""
+EFFECT_BACKENDS = BACKENDS
 """Those with lens, shutter, box, depth bits and half colours."""
 SINGLE_PRECISION = ("triton",)
 """Those that compute in float32 only; tests whose oracle needs float64 leave them out."""

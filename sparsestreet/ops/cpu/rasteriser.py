@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
-from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.raster import PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_values
 from sparsestreet.types import Camera, Contribution, Gaussians, Removal
@@ -18,10 +18,6 @@ from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
 """(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward in float32."""
-
-
-class PairLimitError(RuntimeError):
-    """The splats of one view cover more 16x16 tiles than may be held in memory."""
 
 
 def rasterise(
@@ -202,13 +198,8 @@ def _raise_for(
     if status == native.STATUS_BAD_VALUE:
         check_values(Gaussians(*fields, displacements))
     if status == native.STATUS_TOO_MANY_PAIRS:
-        worst = ", ".join(
-            f"row {row} ({pairs})" for row, pairs in zip(report.worst_rows, report.worst_pairs, strict=True) if row >= 0
-        )
-        raise PairLimitError(
-            f"the splats cover {report.pairs} tiles, more than the {PAIR_LIMIT} that may be held; most: {worst}. "
-            "Prune or shrink those rows, or render a smaller image"
-        )
+        worst = [(row, pairs) for row, pairs in zip(report.worst_rows, report.worst_pairs, strict=True) if row >= 0]
+        raise PairLimitError.of(report.pairs, PAIR_LIMIT, worst)
     if status == native.STATUS_OUT_OF_MEMORY:
         raise MemoryError("no memory for the buffers of the splat op: render a smaller image or fewer rows")
     raise RuntimeError(f"the splat library answered status {status}, which this package does not know")

@@ -1,0 +1,129 @@
+"""Visible rows by depth, and the tiles' lists of splats in that order.
+
+Rows are sorted by depth first and pairs then stably by their tile's short key: a fraction of the traffic of sorting
+long keys. A pair keeps its number from before the second sort, so the pairs of a row have neighbouring numbers: these
+are the slots its gradient is summed from.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+import triton.language as tl
+from jaxtyping import Int
+from torch import Tensor
+
+from sparsestreet.ops.raster import PairLimitError
+from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
+from sparsestreet.ops.triton.view import View
+
+PAIR_LIMIT = 1 << 28
+"""(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward."""
+_SHORT_KEYS = 1 << 15
+_BLOCK = 256
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Who is drawn where: v visible rows, p (splat, tile) pairs, t tiles."""
+
+    rows: Int[Tensor, " v"]
+    """Visible rows, nearest first."""
+    first_pairs: Int[Tensor, " v"]
+    tile_counts: Int[Tensor, " v"]
+    pair_rows: Int[Tensor, " p"]
+    """Rows of the pairs tile by tile, nearest first."""
+    slots: Int[Tensor, " p"]
+    """Number of each of those pairs before it was sorted by tile."""
+    begins: Int[Tensor, " t"]
+    ends: Int[Tensor, " t"]
+    order: Int[Tensor, " t"]
+    """Tiles, those with most pairs first: the longest must not start last."""
+
+
+@partial(jit, do_not_specialize=["row_count"])
+def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: tl.constexpr, BLOCK: tl.constexpr):
+    """Rows with tiles, and the sorted bits of their depths, in row order; ``places`` counts from 1."""
+    row = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    given = row < row_count
+    seen = given & (tl.load(tile_counts + row, given, 0) > 0)
+    place = tl.load(places + row, seen, 1) - 1
+    # Bits of a positive float order as the float does.
+    depth = tl.load(record.record_of(records, row) + record.DEPTH, seen, 1.0)
+    tl.store(keys + place, depth.to(tl.int32, bitcast=True) & KEY_MASK, seen)
+    tl.store(rows + place, row, seen)
+
+
+@partial(jit, do_not_specialize=["pairs"])
+def list_pairs(
+    records, ranks, rows, first_pairs, keys, pair_rows, pairs, width, height, tiles_x,
+    BOUNDED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The tile of each pair: pair i of a row lies in the i-th tile of its splat, counted row of tiles by row."""
+    pair = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    given = pair < pairs
+    rank = tl.load(ranks + pair, given, 0)
+    row = tl.load(rows + rank, given, 0)
+    rest = pair - tl.load(first_pairs + rank, given, 0)
+    s = record.record_of(records, row)
+    x, y = tl.load(s + record.X, given, 0.0), tl.load(s + record.Y, given, 0.0)
+    l11, l21 = tl.load(s + record.L11, given, 1.0), tl.load(s + record.L21, given, 0.0)
+    l22 = tl.load(s + record.L22, given, 1.0)
+    reach = tl.load(s + record.LOG2_OPACITY, given, 0.0) - tl.load(s + record.CUTOFF, given, 0.0)
+    reach = tl.maximum(reach, 0.0)
+    first, last = tile_rows(y, l22, reach, height, BOUNDED)
+    tile = tl.zeros_like(pair)
+    for i in range(tl.max(tl.where(given, last - first + 1, 0), 0)):
+        left, right = tile_columns(x, y, l11, l21, l22, reach, first + i, width, BOUNDED)
+        here = (rest >= 0) & (rest <= right - left) & (first + i <= last)
+        tile = tl.where(here, (first + i) * tiles_x + left + rest, tile)
+        rest -= right - left + 1
+    # Each lane writes its own pair, so nothing is left unwritten or written outside.
+    tl.store(keys + pair, tile, given)
+    tl.store(pair_rows + pair, row, given)
+
+
+def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: View) -> Lists:
+    """Sort rows and pairs; ``visible`` and ``pairs`` are the numbers of both, already checked."""
+    rows = _rows_by_depth(records, tile_counts, places, visible, view)
+    counts = tile_counts[rows.long()]
+    first_pairs = (counts.cumsum(0) - counts).int()
+    columns, lines = view.tiles
+    keys = tile_counts.new_empty(pairs, dtype=torch.int16 if columns * lines <= _SHORT_KEYS else torch.int32)
+    unsorted_rows = tile_counts.new_empty(pairs)
+    ranks = torch.repeat_interleave(
+        torch.arange(visible, dtype=torch.int32, device=rows.device), counts, output_size=pairs
+    )
+    launch(
+        list_pairs, pairs, _BLOCK,
+        records, ranks, rows, first_pairs, keys, unsorted_rows, pairs,
+        float(view.camera.width), float(view.camera.height), columns,
+        BOUNDED=view.bounded, options={"enable_fp_fusion": False},
+    )  # fmt: skip
+    keys, slots = torch.sort(keys, stable=True)
+    begins = torch.searchsorted(keys, torch.arange(columns * lines, device=keys.device).to(keys.dtype), out_int32=True)
+    ends = torch.cat((begins[1:], begins.new_full((1,), pairs)))
+    order = torch.argsort(ends - begins, descending=True).int()
+    return Lists(rows, first_pairs, counts, unsorted_rows[slots], slots, begins, ends, order)
+
+
+def _rows_by_depth(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: View) -> Tensor:
+    keys, rows = tile_counts.new_empty(visible), tile_counts.new_empty(visible)
+    mask = -1 << (32 - view.settings.depth_bits)
+    launch(
+        list_visible, len(tile_counts), _BLOCK,
+        records, tile_counts, places, keys, rows, len(tile_counts), KEY_MASK=mask,
+    )  # fmt: skip
+    return rows[torch.sort(keys, stable=True).indices]
+
+
+def check_pairs(pairs: int, tile_counts: Tensor) -> None:
+    """Raises PairLimitError, naming the rows with most tiles, before anything of that size is allocated."""
+    if pairs <= PAIR_LIMIT:
+        return
+    most = torch.sort(tile_counts, descending=True, stable=True)
+    worst = [(int(row), int(count)) for row, count in zip(most.indices[:3], most.values[:3], strict=True)]
+    raise PairLimitError.of(pairs, PAIR_LIMIT, [(row, count) for row, count in worst if count > 0])

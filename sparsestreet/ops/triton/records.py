@@ -1,0 +1,17 @@
+"""What a visible splat is to the kernels behind the projection: 12 numbers (48 bytes)."""
+
+import triton.language as tl
+
+from sparsestreet.ops.triton.language import constant, jit
+
+LENGTH = 12
+RECORD = constant(LENGTH)
+X, Y, L11, L21, L22, LOG2_OPACITY = (constant(i) for i in range(6))
+# The exponent of 2 below which the splat is not drawn; then the colour's three numbers and the depth.
+CUTOFF, COLOR, DEPTH = constant(6), constant(7), constant(10)
+
+
+@jit
+def record_of(records, row):
+    """Pointer to the record of a row."""
+    return records + row.to(tl.int64) * RECORD

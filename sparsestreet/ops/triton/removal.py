@@ -1,0 +1,68 @@
+"""How far a view moves when one row alone is taken away. A pixel is linear in the alpha of each of its splats, so the
+change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
+
+from functools import partial
+
+import triton.language as tl
+
+from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.blend import blend_weight, pixels_of, whitened
+from sparsestreet.ops.triton.blend_backward import zero_slots
+from sparsestreet.ops.triton.language import constant, jit
+
+CHANGE_COUNT = 2
+CHANGES = constant(CHANGE_COUNT)
+
+
+@jit
+def light_over(image, background, passed, at, inside, CHANNEL: tl.constexpr, BEHIND: tl.constexpr):
+    """One channel of the tile: what was blended, over the background where there is one."""
+    light = tl.load(image + 3 * at + CHANNEL, inside, 0.0)
+    if BEHIND:
+        light += passed * tl.load(background + 3 * at + CHANNEL, inside, 0.0)
+    return light
+
+
+@jit
+def change_of(light, own, through):
+    """The light still behind a splat, and the change of the channel without the splat."""
+    light -= own
+    return light, light * through - own
+
+
+@partial(jit, do_not_specialize=["step"])
+def remove_from_tiles(
+    records, pair_rows, pair_slots, begins, ends, lasts, order, rgb, transmittance, background, slots,
+    width, height, step, tiles_x, alpha_max, transmittance_min,
+    EXCLUSIVE: tl.constexpr, BEHIND: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the slots of all pairs of one tile: largest change, sum of squares. ``step``: see blend_backward.py."""
+    tl.static_assert(BLOCK == 1)
+    tile = tl.load(order + tl.program_id(0))
+    x, y, inside = pixels_of(tile, width, height, tiles_x)
+    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
+    at = y * width + x * step
+    total = tl.load(transmittance + at, inside, 0.0)
+    red = light_over(rgb, background, total, at, inside, 0, BEHIND)
+    green = light_over(rgb, background, total, at, inside, 1, BEHIND)
+    blue = light_over(rgb, background, total, at, inside, 2, BEHIND)
+    passed = tl.where(inside, 1.0, 0.0)
+    gate = passed
+    last = tl.load(lasts + tile)
+    zero_slots(slots, pair_slots, last, tl.load(ends + tile), CHANGES)
+    for k in range(tl.load(begins + tile), last):
+        s = record.record_of(records, tl.load(pair_rows + k))
+        _, _, _, _, exponent = whitened(s, px, py)
+        raw = tl.exp2(exponent)
+        alpha, gate = blend_weight(s, exponent, raw, passed, gate, alpha_max, transmittance_min, EXCLUSIVE)
+        weight = alpha * passed
+        passed -= weight
+        root = tl.rsqrt(1.0 - alpha)
+        through = alpha * (root * root)
+        red, of_red = change_of(red, weight * tl.load(s + record.COLOR), through)
+        green, of_green = change_of(green, weight * tl.load(s + record.COLOR + 1), through)
+        blue, of_blue = change_of(blue, weight * tl.load(s + record.COLOR + 2), through)
+        largest = tl.maximum(tl.maximum(tl.abs(of_red), tl.abs(of_green)), tl.abs(of_blue))
+        o = slots + tl.load(pair_slots + k) * CHANGES
+        tl.store(o, tl.max(largest))
+        tl.store(o + 1, tl.sum(of_red * of_red + of_green * of_green + of_blue * of_blue))

@@ -1,0 +1,156 @@
+"""From the rows of a scene to splats on the screen: one lane per row, every input read once."""
+
+from functools import partial
+
+import triton.language as tl
+
+from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.harmonics import basis, direction_of, raw_color
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.lens import pinhole
+from sparsestreet.ops.triton.shape import (
+    DETERMINANT_MIN,
+    LARGEST,
+    LOG2_SCALE,
+    blurred,
+    camera_axes,
+    compensation,
+    conic,
+    cutoff_of,
+    reach_of,
+    unit_quaternion,
+)
+from sparsestreet.ops.triton.shutter import ROLL_LEAST, roll, velocity
+from sparsestreet.ops.triton.tiles import BOX_MARGIN, count_tiles
+from sparsestreet.ops.triton.unscented import unscented, within_fold
+from sparsestreet.ops.triton.vectors import plus, times
+from sparsestreet.ops.triton.view import (
+    ALPHA_MIN,
+    NEAR,
+    ROTATION,
+    SIZE,
+    TRANSLATION,
+    View,
+    load_matrix,
+    load_vector,
+)
+
+HALF_LARGEST = constant(65504.0)
+
+
+def block_of(view: View) -> int:
+    """Rows of a program: fewer where a lane holds the eight points of a distorted row."""
+    return 32 if view.distorted else 128
+
+
+@jit
+def load_row(field, row, mask, COUNT: tl.constexpr):
+    """COUNT numbers of each lane's row."""
+    values = ()
+    for i in tl.static_range(COUNT):
+        values += (tl.load(field + row * COUNT + i, mask, 0.0),)
+    return values
+
+
+@jit
+def all_finite(values, COUNT: tl.constexpr):
+    finite = tl.abs(values[0]) <= LARGEST
+    for i in tl.static_range(1, COUNT):
+        finite = finite & (tl.abs(values[i]) <= LARGEST)
+    return finite
+
+
+@jit
+def finite_terms(sh, mask, COUNT: tl.constexpr):
+    finite = mask
+    for i in tl.static_range(COUNT):
+        finite = finite & (tl.abs(tl.load(sh + i, mask, 0.0)) <= LARGEST)
+    return finite
+
+
+@jit
+def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: tl.constexpr):
+    """Shape on the screen (lens.py) of rows in front of the camera, and whether the lens and the shutter see them."""
+    rotation = load_matrix(view + ROTATION)
+    sees = mean[2] > 0
+    if DISTORTED:
+        sees = within_fold(view, mean)
+        shape = unscented(view, mean, axes)
+    else:
+        shape = pinhole(view, mean, axes)
+    if ROLLING:
+        speed = velocity(view, mean, times(rotation, displacement), DISTORTED)
+        shape, slowness = roll(view, shape, speed)
+        sees = sees & (slowness >= ROLL_LEAST)
+    return shape, sees
+
+
+@partial(jit, do_not_specialize=["rows"])
+def project_rows(
+    means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, bad, rows,
+    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, HALF_COLORS: tl.constexpr, BOUNDED: tl.constexpr,
+    DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
+
+    A row of opacity 0 is not read beyond its opacity. Comparisons are written so that NaN culls.
+    """
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    given = row < rows
+    opacity = tl.load(opacities + row, given, 0.0)
+    alive = given & (opacity != 0)
+    mean, q = load_row(means, row, alive, 3), load_row(quaternions, row, alive, 4)
+    size, moved = load_row(scales, row, alive, 3), load_row(displacements, row, alive & DISPLACED, 3)
+    coefficients = sh + row * (3 * TERMS)
+    good = all_finite(mean, 3) & all_finite(q, 4) & all_finite(size, 3) & all_finite(moved, 3)
+    good = good & (size[0] >= 0) & (size[1] >= 0) & (size[2] >= 0) & (opacity >= 0) & (opacity <= 1)
+    good = good & finite_terms(coefficients, alive, 3 * TERMS)
+    tl.store(bad + tl.program_id(0), tl.max((alive & (good == 0)).to(tl.int32), 0))
+
+    rotation = load_matrix(view + ROTATION)
+    mean = plus(times(rotation, mean), load_vector(view + TRANSLATION))
+    seen = alive & (mean[2] > tl.load(view + NEAR))
+    # Lanes that are not drawn compute with a harmless row.
+    mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
+    unit, _ = unit_quaternion(q)
+    shape, sees = on_screen(view, mean, camera_axes(rotation, unit, size), moved, DISTORTED, ROLLING)
+    variance_x, variance_y, determinant = blurred(view, shape[2], shape[3], shape[5])
+    seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST)
+    effective = opacity * compensation(shape[5], determinant, ANTIALIAS)
+    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective > 0)
+
+    x, y, half_x, half_y = shape[0], shape[1], 0 * effective + float("inf"), 0 * effective + float("inf")
+    if BOUNDED:
+        reach = reach_of(view, effective)
+        half_x, half_y = tl.sqrt(reach * variance_x), tl.sqrt(reach * variance_y)
+    width, height = tl.load(view + SIZE), tl.load(view + SIZE + 1)
+    seen = seen & (x + (half_x + BOX_MARGIN) >= 0.5) & (x - (half_x + BOX_MARGIN) <= width - 0.5)
+    seen = seen & (y + (half_y + BOX_MARGIN) >= 0.5) & (y - (half_y + BOX_MARGIN) <= height - 0.5)
+    tl.store(radii + row, tl.where(seen, tl.maximum(half_x, half_y), 0.0), given)
+
+    l11, l21, l22 = conic(variance_y, shape[4], determinant)
+    l11, l21, l22 = LOG2_SCALE * l11, LOG2_SCALE * l21, LOG2_SCALE * l22
+    log2_opacity = tl.log2(effective)
+    cutoff = cutoff_of(view, log2_opacity)
+    reach = tl.maximum(log2_opacity - cutoff, 0.0)
+    tiles = count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED)
+    tl.store(tile_counts + row, tiles, given)
+
+    seen = seen & (tiles > 0)
+    direction, _ = direction_of(rotation, mean)
+    color = raw_color(basis(direction, TERMS), coefficients, seen, TERMS)
+    to = record.record_of(records, row)
+    tl.store(to + record.X, x, seen)
+    tl.store(to + record.Y, y, seen)
+    tl.store(to + record.L11, l11, seen)
+    tl.store(to + record.L21, l21, seen)
+    tl.store(to + record.L22, l22, seen)
+    tl.store(to + record.LOG2_OPACITY, log2_opacity, seen)
+    tl.store(to + record.CUTOFF, cutoff, seen)
+    for i in tl.static_range(3):
+        # As in torch.where(colour > 0, colour, 0).
+        channel = tl.where(color[i] > 0, color[i], 0.0)
+        if HALF_COLORS:
+            channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
+        tl.store(to + record.COLOR + i, channel, seen)
+    tl.store(to + record.DEPTH, mean[2], seen)

@@ -1,0 +1,85 @@
+"""Rolling shutter: a splat that moves while rows are read one after the other is again a 2D Gaussian.
+
+A point at p + u tau, read at image row y where tau = y / H - 1/2, is seen where y = p_y + u_y (y / H - 1/2): the map
+from p to what is seen is linear, with a = 1 - u_y / H.
+"""
+
+import triton.language as tl
+
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.unscented import curvature, jacobian
+from sparsestreet.ops.triton.vectors import cross, plus, scaled
+from sparsestreet.ops.triton.view import FOCAL, SHIFT, SIZE, TURN, load_vector
+
+# Rows with a smaller a outrun the readout.
+ROLL_LEAST = constant(0.1)
+
+
+@jit
+def drift(view, mean, moved):
+    """Motion of the mean in the camera over the readout, metres; ``moved`` is its own displacement there."""
+    turned = cross(load_vector(view + TURN), mean)
+    return plus(moved, scaled(-1.0, plus(load_vector(view + SHIFT), turned)))
+
+
+@jit
+def normalised_speed(mean, dX):
+    return (dX[0] - mean[0] / mean[2] * dX[2]) / mean[2], (dX[1] - mean[1] / mean[2] * dX[2]) / mean[2]
+
+
+@jit
+def velocity(view, mean, moved, DISTORTED: tl.constexpr):
+    """Motion on the screen, pixels per readout: J dX with the exact Jacobian, through the distortion where given."""
+    n_x, n_y = normalised_speed(mean, drift(view, mean, moved))
+    if DISTORTED:
+        xx, xy, yy = jacobian(view, mean[0] / mean[2], mean[1] / mean[2])
+        n_x, n_y = xx * n_x + xy * n_y, xy * n_x + yy * n_y
+    return tl.load(view + FOCAL) * n_x, tl.load(view + FOCAL + 1) * n_y
+
+
+@jit
+def velocity_backward(view, mean, moved, v, DISTORTED: tl.constexpr):
+    """From the gradient of the velocity to that of the mean in the camera."""
+    dX, inverse = drift(view, mean, moved), 1.0 / mean[2]
+    x, y = mean[0] * inverse, mean[1] * inverse
+    n_x, n_y = normalised_speed(mean, dX)
+    g_x, g_y = tl.load(view + FOCAL) * v[0], tl.load(view + FOCAL + 1) * v[1]
+    v_x, v_y = 0 * g_x, 0 * g_y
+    if DISTORTED:
+        xxx, xxy, xyy, yyy = curvature(view, x, y)
+        v_x = g_x * (xxx * n_x + xxy * n_y) + g_y * (xxy * n_x + xyy * n_y)
+        v_y = g_x * (xxy * n_x + xyy * n_y) + g_y * (xyy * n_x + yyy * n_y)
+        xx, xy, yy = jacobian(view, x, y)
+        g_x, g_y = xx * g_x + xy * g_y, xy * g_x + yy * g_y
+    v_x -= g_x * dX[2] * inverse
+    v_y -= g_y * dX[2] * inverse
+    v_z = -(g_x * n_x + g_y * n_y + v_x * x + v_y * y) * inverse
+    v_drift = (g_x * inverse, g_y * inverse, -(g_x * x + g_y * y) * inverse)
+    return plus((v_x * inverse, v_y * inverse, v_z), cross(load_vector(view + TURN), v_drift))
+
+
+@jit
+def roll(view, shape, speed):
+    """The shape (lens.py) as it is read out, and a."""
+    height = tl.load(view + SIZE + 1)
+    a, shear = 1 - speed[1] / height, speed[0] / height
+    y = (shape[1] - 0.5 * speed[1]) / a
+    x = shape[0] + speed[0] * (y / height - 0.5)
+    # V'_y = V_y / a and V'_x = V_x + shear V'_y, in second moments.
+    yy, xy = shape[3] / (a * a), shape[4] / a
+    return (x, y, shape[2] + shear * (2 * xy + shear * yy), yy, xy + shear * yy, shape[5] / (a * a)), a
+
+
+@jit
+def roll_backward(view, shape, speed, v):
+    """From the gradient of the rolled shape to those of the shape and of the velocity."""
+    height = tl.load(view + SIZE + 1)
+    a, shear = 1 - speed[1] / height, speed[0] / height
+    y = (shape[1] - 0.5 * speed[1]) / a
+    yy, xy = shape[3] / (a * a), shape[4] / a
+    v_y = v[1] + v[0] * shear
+    v_yy, v_xy = v[3] + shear * (v[4] + shear * v[2]), v[4] + 2 * shear * v[2]
+    v_shear = 2 * v[2] * (xy + shear * yy) + v[4] * yy
+    v_a = -(v_y * y + 2 * v_yy * yy + v_xy * xy + 2 * v[5] * shape[5] / (a * a)) / a
+    v_speed = (v[0] * (y / height - 0.5) + v_shear / height, -0.5 * v_y / a - v_a / height)
+    return (v[0], v_y / a, v[2], v_yy / (a * a), v_xy / a, v[5] / (a * a)), v_speed

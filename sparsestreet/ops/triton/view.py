@@ -1,0 +1,102 @@
+"""A camera and the settings as the table of numbers that the row kernels read, and the grid of tiles."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+import triton.language as tl
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.geometry.distortion import fold_radius_squared
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.types import Camera
+
+TILE_SIZE = 16
+TILE = constant(TILE_SIZE)
+
+# Places in the table.
+ROTATION, TRANSLATION = constant(0), constant(9)
+FOCAL, CENTRE = constant(12), constant(14)
+SLOPE_LEAST, SLOPE_MOST = constant(16), constant(18)
+SIZE, BLUR, NEAR = constant(20), constant(22), constant(23)
+ALPHA_MIN, LOG2_ALPHA_MIN, BOX_REACH = constant(24), constant(25), constant(26)
+DISTORTION, FOLD = constant(27), constant(32)
+SHIFT, TURN = constant(33), constant(36)
+
+
+@jit
+def load_vector(table):
+    return tl.load(table), tl.load(table + 1), tl.load(table + 2)
+
+
+@jit
+def load_matrix(table):
+    return load_vector(table), load_vector(table + 3), load_vector(table + 6)
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera and the settings, with the switches that kernels are compiled for."""
+
+    camera: Camera
+    settings: SplatSettings
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of 16x16 tiles."""
+        return -(-self.camera.width // TILE_SIZE), -(-self.camera.height // TILE_SIZE)
+
+    @property
+    def distorted(self) -> bool:
+        return self.camera.distortion is not None
+
+    @property
+    def rolling(self) -> bool:
+        return self.camera.shutter is not None
+
+    @property
+    def bounded(self) -> bool:
+        """Whether splats end anywhere."""
+        return self.settings.alpha_min > 0 or math.isfinite(self.settings.box)
+
+    @property
+    def exclusive(self) -> bool:
+        return self.settings.stop == "exclusive"
+
+    def table(self, device: torch.device) -> Float[Tensor, " numbers"]:
+        """The numbers on the device: one small copy, rounded from float64."""
+        return torch.tensor(self._numbers, dtype=torch.float32).to(device, non_blocking=True)
+
+    @cached_property
+    def _numbers(self) -> list[float]:
+        camera, s = self.camera, self.settings
+        pose, K = camera.camera_from_world.double().tolist(), camera.intrinsics.double().tolist()
+        slopes = [
+            _slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))
+        ]
+        distortion = [0.0] * 5 if camera.distortion is None else camera.distortion.double().tolist()
+        motion = [0.0] * 6
+        if camera.shutter is not None:
+            motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
+        numbers = (
+            *(value for row in pose[:3] for value in row[:3]),
+            *(row[3] for row in pose[:3]),
+            *(K[0][0], K[1][1], K[0][2], K[1][2]),
+            *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
+            *(camera.width, camera.height, s.blur, s.near),
+            # Without a cut-off the exponent still ends where float32 does: 2^-126.
+            *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.box * s.box),
+            *distortion,
+            math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
+            *motion,
+        )
+        return [float(number) for number in numbers]
+
+
+def _slope_limits(focal: float, centre: float, size: int) -> tuple[float, float]:
+    """Where x/z is limited in the Jacobian: 1.3 tan(fov/2) of 3DGS, moved with the principal point."""
+    margin = 0.3 * size / (2 * focal)
+    return -centre / focal - margin, (size - centre) / focal + margin

@@ -1,0 +1,80 @@
+"""Compiles kernels for GPUs that need not be there, and counts what the machine code holds.
+
+Run as a script, without TRITON_INTERPRET: launches (recorded by test_machine_code.py) come in as JSON on standard
+input, what was compiled of them goes out as JSON.
+"""
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import triton
+import triton.language as tl
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+_TOOLS = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
+
+
+def compile_launch(launch: dict, arch: int) -> dict:
+    """Registers, spills, instructions per sample and tensor-core instructions of one launch on one architecture."""
+    kernel = getattr(importlib.import_module(launch["module"]), launch["name"])
+    constants = {name: _constant(value) for name, value in launch["constants"].items()}
+    types = {**launch["types"], **dict.fromkeys(constants, "constexpr")}
+    signature = {name: types[name] for name in kernel.arg_names}
+    # Tensors begin at multiples of 16 bytes; whole numbers are taken as arbitrary, which costs most.
+    attributes = {
+        (i,): [["tt.divisibility", 16]] for i, name in enumerate(kernel.arg_names) if types[name].startswith("*")
+    }
+    compiled = triton.compile(
+        ASTSource(kernel, signature, constants, attributes), GPUTarget("cuda", arch, 32), options=launch["options"]
+    )
+    resources, instructions = _machine_code(compiled.asm["cubin"])
+    return {
+        **resources,
+        "tensor_core": sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
+        + compiled.asm["ptx"].count("tf32"),
+        "atomics": sum(text.split()[0].startswith(("ATOM", "RED.")) for _, text in instructions),
+        "sample": _per_sample(instructions),
+    }
+
+
+def _constant(value: object) -> object:
+    return tl.dtype(value["dtype"]) if isinstance(value, dict) else value
+
+
+def _machine_code(cubin: bytes) -> tuple[dict, list[tuple[int, str]]]:
+    """Registers and bytes of stack (where spilled registers go), and the instructions with their addresses."""
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        Path(file.name).write_bytes(cubin)
+        command = [_TOOLS / "cuobjdump", "-res-usage", "-sass", file.name]
+        listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    used = re.search(r"REG:(\d+) STACK:(\d+)", listing)
+    found = re.findall(r"^\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\d+\s+)?(.*?);", listing, re.MULTILINE)
+    resources = {"registers": int(used[1]), "spilled": int(used[2])}
+    return resources, [(int(address, 16), text.strip()) for address, text in found]
+
+
+def _per_sample(instructions: list[tuple[int, str]]) -> float | None:
+    """Instructions of the shortest loop around powers of two, per power: each (splat, pixel) sample takes one."""
+    loops = []
+    for address, text in instructions:
+        jump = re.match(r"BRA\S*\s+.*?(0x[0-9a-f]+)", text)
+        if jump and int(jump[1], 16) < address:
+            body = [other for at, other in instructions if int(jump[1], 16) <= at <= address]
+            powers = sum(other.startswith("MUFU.EX2") for other in body)
+            if powers:
+                loops.append((len(body), len(body) / powers))
+    return min(loops)[1] if loops else None
+
+
+if __name__ == "__main__":
+    given = json.load(sys.stdin)
+    json.dump(
+        [{str(arch): compile_launch(launch, arch) for arch in given["archs"]} for launch in given["launches"]],
+        sys.stdout,
+    )

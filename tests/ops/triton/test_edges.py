@@ -1,0 +1,289 @@
+"""What breaks renderers at the edges, on the Triton kernels: lists, memory, order, bad input, devices."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, resolve_backend, splat
+from sparsestreet.ops.triton import lists, rasteriser
+from sparsestreet.types import Gaussians, Shutter
+from tests.ops.scenes import FIELDS, camera, cast, device_of, front_camera, one_gaussian, random_gaussians, render
+
+DEVICE = device_of("triton")
+VIEW = camera(9, 7)
+
+
+def single(gaussians: Gaussians) -> Gaussians:
+    return cast(gaussians, torch.float32, device=DEVICE)
+
+
+def assert_same_bits(result, other) -> None:
+    for part in ("images", "gradients"):
+        for name, value in getattr(result, part).items():
+            assert torch.equal(value, getattr(other, part)[name]), name
+
+
+def test_two_runs_are_bitwise_equal():
+    view = camera(19, 17)
+    gaussians = random_gaussians(12, view)
+    assert_same_bits(*(render(gaussians, view, "triton", torch.float32) for _ in range(2)))
+
+
+def test_the_order_of_rows_does_not_matter_without_ties():
+    view = camera(19, 17)
+    gaussians = random_gaussians(12, view)
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+    shuffled = Gaussians(*(getattr(gaussians, name)[order] for name in FIELDS))
+    plain, other = (render(scene, view, "triton", torch.float32) for scene in (gaussians, shuffled))
+    assert torch.equal(plain.images["rgb"], other.images["rgb"])
+    for name in FIELDS:
+        assert torch.equal(plain.gradients[name][order], other.gradients[name]), name
+
+
+def test_masked_rows_leave_no_trace():
+    view = camera(13, 9)
+    gaussians = random_gaussians(12, view)
+    keep = torch.arange(12) % 3 > 0
+    without = Gaussians(*(getattr(gaussians, name)[keep] for name in FIELDS))
+    masked = dataclasses.replace(gaussians, opacities=gaussians.opacities * keep)
+    # Nothing but their opacity is read.
+    masked.means[~keep] = float("nan")
+    plain, dropped = (render(scene, view, "triton", torch.float32) for scene in (without, masked))
+    for name, image in plain.images.items():
+        assert torch.equal(image, dropped.images[name])
+    for name in FIELDS:
+        assert torch.equal(plain.gradients[name], dropped.gradients[name][keep])
+        assert not dropped.gradients[name][~keep].any()
+
+
+@pytest.mark.parametrize("effects", [False, True])
+def test_nothing_is_read_before_it_is_written(effects, monkeypatch):
+    # The third tile is empty; the stack closes the first one, so that its pairs behind the 32nd are never looked at.
+    view = front_camera(33, 5, 20.0)
+    if effects:
+        slow = Shutter(torch.full((3,), 0.01), torch.full((3,), 0.01))
+        view = dataclasses.replace(view, distortion=torch.full((5,), 0.001), shutter=slow)
+    stack = [
+        one_gaussian(scales=[[0.6, 0.4, 0.1]], opacities=[1.0], means=[[-0.85, 0.0, 2.0 + 0.002 * k]])
+        for k in range(34)
+    ]
+    scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, -2.0]]), *stack, one_gaussian(opacities=[0.0])])
+    expected = render(scene, view, "triton", torch.float32)
+    counted = contribution(single(scene), view, backend="triton")
+
+    def poisoned(like):
+        def filled(*args, **kwargs):
+            tensor = like(*args, **kwargs)
+            return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
+
+        return filled
+
+    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
+    monkeypatch.setattr(torch, "empty_like", poisoned(torch.empty_like))
+    assert_same_bits(render(scene, view, "triton", torch.float32), expected)
+    again = contribution(single(scene), view, backend="triton")
+    assert torch.equal(again.weight, counted.weight)
+    assert torch.equal(again.dominant, counted.dominant)
+
+
+def test_an_overflowing_row_is_culled():
+    # 1e25 m is finite, its variance on the screen is not.
+    good = random_gaussians(4, VIEW)
+    both = Gaussians.concatenate([good, one_gaussian(scales=[[1e25] * 3], sh=[[[0.0] * 3] * 4])])
+    alone, together = (render(scene, VIEW, "triton", torch.float32) for scene in (good, both))
+    assert torch.equal(alone.images["rgb"], together.images["rgb"])
+    assert together.is_finite()
+    assert together.radii[-1] == 0
+
+
+def test_no_motion_is_no_shutter_bit_for_bit():
+    gaussians = random_gaussians(6, VIEW)
+    still = dataclasses.replace(VIEW, shutter=Shutter(torch.zeros(3), torch.zeros(3)))
+    assert_same_bits(*(render(gaussians, view, "triton", torch.float32) for view in (VIEW, still)))
+
+
+def test_behind_the_fold_of_the_lens():
+    # 1 + 3 k1 r2 vanishes at r2 = 1 / 3: the first row lies at 0.3, the second at 0.36.
+    view = dataclasses.replace(front_camera(41, 9, 15.0), distortion=torch.tensor([-1.0, 0.0, 0.0, 0.0, 0.0]))
+    rows = [one_gaussian(means=[[2 * r2**0.5, 0.0, 2.0]]) for r2 in (0.3, 0.36)]
+    result = render(Gaussians.concatenate(rows), view, "triton", torch.float32)
+    assert (result.radii > 0).tolist() == [True, False]
+    assert result.is_finite()
+    assert not result.gradients["means"][1].any()
+
+
+@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(antialias=True, stop="exclusive", blur=0.0)])
+def test_no_nan_in_extreme_scenes(settings):
+    generator = torch.Generator().manual_seed(3)
+
+    def spread(*shape: int, low: float, high: float) -> torch.Tensor:
+        return 10 ** (low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64))
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    depth = torch.cat((0.2 + spread(15, 1, low=-7, high=-3), spread(25, 1, low=-2, high=4)))
+    parts = (
+        torch.cat((normal(40, 2) * depth, depth), -1),
+        normal(40, 4) * spread(40, 1, low=-22, high=8),
+        spread(40, 3, low=-12, high=6) * (torch.rand(40, 3, generator=generator) > 0.1),
+        torch.rand(40, generator=generator, dtype=torch.float64).round(decimals=1),
+        normal(40, 4, 3) * spread(40, 1, 1, low=-3, high=3),
+    )
+    gaussians = Gaussians(*(part.float().double() for part in parts))
+    result = render(gaussians, front_camera(9, 7, 12.0), "triton", torch.float32, settings)
+    culled = result.radii == 0
+    assert result.is_finite()
+    assert culled.any()
+    assert not culled.all()
+    assert not any(result.gradients[name][culled].any() for name in FIELDS)
+
+
+@pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
+def test_contribution(stop):
+    view = camera(17, 13)
+    gaussians = random_gaussians(12, view, seed=2)
+    settings = SplatSettings(stop=stop, transmittance_min=0.02)
+    truth = contribution(gaussians, view, settings=settings, backend="reference")
+    counted = contribution(single(gaussians), view, settings=settings, backend="triton")
+    torch.testing.assert_close(counted.weight.cpu(), truth.weight, rtol=1e-5, atol=1e-6)
+    assert truth.pixels.any()
+    assert torch.equal(counted.pixels.cpu(), truth.pixels)
+    assert torch.equal(counted.dominant.cpu(), truth.dominant)
+
+
+def test_of_equal_weights_the_nearer_splat_dominates():
+    # 0.5 of everything, then all but a bit of the other half: 0.5 against (1 - 0.5) * 0.99; then 0.25 twice.
+    layers = [(0.25, 2.0), (1 / 3, 2.5)]
+    gaussians = [one_gaussian(opacities=[o], scales=[[900.0] * 3], means=[[0.0, 0.0, z]]) for o, z in reversed(layers)]
+    counted = contribution(single(Gaussians.concatenate(gaussians)), front_camera(1, 1, 40.0), backend="triton")
+    near = int(counted.weight[1] >= counted.weight[0])
+    assert counted.dominant.tolist() == ([0, 1] if near else [1, 0])
+    twice = Gaussians.concatenate([one_gaussian(opacities=[0.0]), *[one_gaussian(opacities=[0.5])] * 2])
+    assert contribution(single(twice), front_camera(1, 1, 40.0), backend="triton").dominant.tolist() == [0, 1, 0]
+
+
+@pytest.mark.parametrize("behind", [False, True], ids=["black", "background"])
+def test_removal_against_taking_rows_away(behind):
+    # Without a stop rule a pixel is linear in each alpha; alphas below the cut-off stay out with and without a row.
+    settings = SplatSettings(transmittance_min=0.0)
+    view = camera(9, 7)
+    gaussians = random_gaussians(8, view)
+    generator = torch.Generator().manual_seed(1)
+    background = (
+        torch.rand(7, 9, 3, generator=generator, dtype=torch.float64) if behind else torch.zeros(7, 9, 3).double()
+    )
+
+    def image(scene: Gaussians) -> torch.Tensor:
+        return splat(scene, view, settings=settings, background=background, backend="reference").rgb
+
+    moved = []
+    for row in range(8):
+        without = torch.where(torch.arange(8) == row, 0.0, gaussians.opacities)
+        moved.append(image(dataclasses.replace(gaussians, opacities=without)) - image(gaussians))
+    given = background.to(DEVICE, torch.float32) if behind else None
+    found = rasteriser.removal(single(gaussians), given, view, settings)
+    largest = torch.stack([change.abs().max() for change in moved])
+    squared = torch.stack([change.square().sum() for change in moved])
+    assert (largest > 0.01).sum() > 3
+    torch.testing.assert_close(found.largest.cpu(), largest, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(found.squared.cpu(), squared, rtol=1e-4, atol=1e-6)
+
+
+def test_no_rows():
+    counted = contribution(single(random_gaussians(0, VIEW)), VIEW, backend="triton")
+    assert counted.weight.shape == counted.pixels.shape == counted.dominant.shape == (0,)
+
+
+@pytest.mark.parametrize("poison", [float("nan"), -float("inf")])
+@pytest.mark.parametrize("field", FIELDS)
+def test_value_that_is_not_finite(field, poison):
+    gaussians = single(random_gaussians(5, VIEW, terms=4))
+    getattr(gaussians, field)[3].view(-1)[-1] = poison
+    with pytest.raises(ValueError, match=f"{field} must be finite, but row 3 has {poison}"):
+        splat(gaussians, VIEW, backend="triton")
+
+
+@pytest.mark.parametrize(("field", "value"), [("opacities", 1.5), ("opacities", -0.5), ("scales", -0.5)])
+def test_values_out_of_range(field, value):
+    gaussians = single(random_gaussians(5, VIEW))
+    getattr(gaussians, field)[3] = value
+    with pytest.raises(ValueError, match=f"{field} must .*row 3 has {value}"):
+        contribution(gaussians, VIEW, backend="triton")
+
+
+def test_displacements_that_are_not_finite():
+    displacements = torch.zeros(5, 3)
+    displacements[2, 1] = float("nan")
+    gaussians = single(dataclasses.replace(random_gaussians(5, VIEW), displacements=displacements.double()))
+    with pytest.raises(ValueError, match="displacements must be finite, but row 2 has nan"):
+        splat(gaussians, VIEW, backend="triton")
+
+
+def test_more_pairs_than_may_be_held(monkeypatch):
+    view = front_camera(64, 48, 40.0)
+    giant = one_gaussian(scales=[[90.0] * 3])
+    gaussians = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, -2.0]]), giant, one_gaussian()])
+    # The ball of 0.1 m lies in the middle and reaches 7 px: tiles 1, 2 of rows 1; and the giant covers all 4 x 3.
+    monkeypatch.setattr(lists, "PAIR_LIMIT", 13)
+    with pytest.raises(PairLimitError, match=r"cover 14 tiles, more than the 13.*row 1 \(12\), row 2 \(2\)\. Prune"):
+        contribution(single(gaussians), view, backend="triton")
+
+
+def test_pairs_beyond_32_bits_are_counted_not_allocated():
+    # 2^20 tiles in one row of tiles, covered by 2100 giants of 5e8 px: more than 2^31 pairs.
+    giant = one_gaussian(scales=[[1e7] * 3], opacities=[1.0])
+    gaussians = single(Gaussians.concatenate([giant] * 2100))
+    with pytest.raises(PairLimitError, match=f"cover {2100 * 2**20} tiles"):
+        contribution(gaussians, front_camera(2**24, 16, 100.0), backend="triton")
+
+
+def test_many_tiles_take_wide_keys(monkeypatch):
+    monkeypatch.setattr(lists, "_SHORT_KEYS", 2)
+    view = camera(19, 17)
+    gaussians = random_gaussians(6, view)
+    wide = render(gaussians, view, "triton", torch.float32)
+    monkeypatch.undo()
+    assert_same_bits(wide, render(gaussians, view, "triton", torch.float32))
+
+
+def test_float64_is_refused():
+    with pytest.raises(ValueError, match=r"'triton' computes in float32, got torch.float64: convert"):
+        splat(one_gaussian(), VIEW, backend="triton")
+
+
+def test_cpu_tensors_need_the_interpreter(monkeypatch):
+    monkeypatch.setattr(rasteriser, "is_interpreted", lambda kernel: False)
+    with pytest.raises(ValueError, match=r"'triton' needs tensors on a CUDA device, got cpu: move them, .*INTERPRET=1"):
+        splat(cast(one_gaussian(), torch.float32), VIEW, backend="triton")
+
+
+def test_the_op_does_not_import_triton_before_it_is_used():
+    code = "import sys, sparsestreet.ops; sys.exit('triton' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_where_triton_runs(monkeypatch):
+    cuda = torch.device("cuda")
+    assert resolve_backend("auto", cuda) == "triton"
+    assert resolve_backend("triton", cuda) == "triton"
+    with pytest.raises(ValueError, match="needs tensors on a CUDA device, got meta"):
+        resolve_backend("triton", torch.device("meta"))
+    monkeypatch.setattr(backend, "has_triton", lambda: False)
+    monkeypatch.setattr(backend, "_warned", set())
+    with pytest.raises(RuntimeError, match="'triton' needs the package triton: pip install"):
+        resolve_backend("triton", cuda)
+    with pytest.warns(RuntimeWarning, match=r"triton is not installed.*pip install"):
+        assert resolve_backend("auto", cuda) == "reference"
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_autocast_changes_nothing(dtype):
+    gaussians = single(random_gaussians(4, VIEW))
+    plain = splat(gaussians, VIEW, backend="triton")
+    with torch.autocast(DEVICE.type, dtype=dtype):
+        inside = splat(gaussians, VIEW, backend="triton")
+    assert torch.equal(plain.rgb, inside.rgb)
