@@ -77,15 +77,6 @@ def contribution(
         return _fast(chosen).contribution(gaussians, camera, settings)
 
 
-def _fast(backend: str) -> ModuleType:
-    """The module of a backend that checks values itself. Triton is imported only here, when it is first used."""
-    if backend == "cpu":
-        return cpu
-    from sparsestreet.ops.triton import rasteriser
-
-    return rasteriser
-
-
 def removal(
     gaussians: Gaussians,
     camera: Camera,
@@ -113,7 +104,16 @@ def removal(
         if chosen == "reference":
             check_values(gaussians)
             return reference.removal(gaussians, behind, pixel_weights, camera, settings)
-        return cpu.removal(gaussians, behind, pixel_weights, camera, settings)
+        return _fast(chosen).removal(gaussians, behind, pixel_weights, camera, settings)
+
+
+def _fast(backend: str) -> ModuleType:
+    """The module of a backend that checks values itself. Triton is imported only here, when it is first used."""
+    if backend == "cpu":
+        return cpu
+    from sparsestreet.ops.triton import rasteriser
+
+    return rasteriser
 
 
 def _check_pixel_weights(weights: Tensor | None, camera: Camera, means: Tensor) -> None:

@@ -73,7 +73,11 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
 
 @torch.no_grad()
 def removal(
-    gaussians: Gaussians, background: Float[Tensor, "h w 3"] | None, camera: Camera, settings: SplatSettings
+    gaussians: Gaussians,
+    background: Float[Tensor, "h w 3"] | None,
+    pixel_weights: Float[Tensor, "h w"] | None,
+    camera: Camera,
+    settings: SplatSettings,
 ) -> Removal:
     """How far the view moves when each row alone is taken away, over a background (None: black)."""
     _check(gaussians)
@@ -86,8 +90,9 @@ def removal(
     launch(
         remove.remove_from_tiles, len(lists.order), 1,
         screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, lasts, lists.order,
-        rgb, transmittance, rgb if background is None else background.contiguous(), changes,
-        width, height, 1, *others, EXCLUSIVE=view.exclusive, BEHIND=background is not None, options=ONE_WARP,
+        rgb, transmittance, rgb if background is None else background.contiguous(),
+        transmittance if pixel_weights is None else pixel_weights.contiguous(), changes, width, height, 1, *others,
+        EXCLUSIVE=view.exclusive, BEHIND=background is not None, WEIGHTED=pixel_weights is not None, options=ONE_WARP,
     )  # fmt: skip
     totals = torch.zeros(len(g), remove.CHANGE_COUNT, dtype=torch.float64, device=g.means.device)
     _sum_slots(changes, lists, totals, 2, tl.float64)

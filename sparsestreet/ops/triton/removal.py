@@ -32,9 +32,9 @@ def change_of(light, own, through):
 
 @partial(jit, do_not_specialize=["step"])
 def remove_from_tiles(
-    records, pair_rows, pair_slots, begins, ends, lasts, order, rgb, transmittance, background, slots,
+    records, pair_rows, pair_slots, begins, ends, lasts, order, rgb, transmittance, background, pixel_weights, slots,
     width, height, step, tiles_x, alpha_max, transmittance_min,
-    EXCLUSIVE: tl.constexpr, BEHIND: tl.constexpr, BLOCK: tl.constexpr,
+    EXCLUSIVE: tl.constexpr, BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the slots of all pairs of one tile: largest change, sum of squares. ``step``: see blend_backward.py."""
     tl.static_assert(BLOCK == 1)
@@ -46,6 +46,7 @@ def remove_from_tiles(
     red = light_over(rgb, background, total, at, inside, 0, BEHIND)
     green = light_over(rgb, background, total, at, inside, 1, BEHIND)
     blue = light_over(rgb, background, total, at, inside, 2, BEHIND)
+    counts = tl.load(pixel_weights + at, inside, 0.0) if WEIGHTED else 1.0
     passed = tl.where(inside, 1.0, 0.0)
     gate = passed
     last = tl.load(lasts + tile)
@@ -65,4 +66,4 @@ def remove_from_tiles(
         largest = tl.maximum(tl.maximum(tl.abs(of_red), tl.abs(of_green)), tl.abs(of_blue))
         o = slots + tl.load(pair_slots + k) * CHANGES
         tl.store(o, tl.max(largest))
-        tl.store(o + 1, tl.sum(of_red * of_red + of_green * of_green + of_blue * of_blue))
+        tl.store(o + 1, tl.sum(counts * (of_red * of_red + of_green * of_green + of_blue * of_blue)))

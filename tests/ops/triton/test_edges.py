@@ -180,14 +180,18 @@ def test_removal_against_taking_rows_away(behind):
     def image(scene: Gaussians) -> torch.Tensor:
         return splat(scene, view, settings=settings, background=background, backend="reference").rgb
 
+    weights = torch.rand(7, 9, generator=generator, dtype=torch.float64) if behind else torch.ones(7, 9).double()
+
     moved = []
     for row in range(8):
         without = torch.where(torch.arange(8) == row, 0.0, gaussians.opacities)
         moved.append(image(dataclasses.replace(gaussians, opacities=without)) - image(gaussians))
     given = background.to(DEVICE, torch.float32) if behind else None
-    found = rasteriser.removal(single(gaussians), given, view, settings)
+    found = rasteriser.removal(
+        single(gaussians), given, weights.to(DEVICE, torch.float32) if behind else None, view, settings
+    )
     largest = torch.stack([change.abs().max() for change in moved])
-    squared = torch.stack([change.square().sum() for change in moved])
+    squared = torch.stack([(weights * change.square().sum(-1)).sum() for change in moved])
     assert (largest > 0.01).sum() > 3
     torch.testing.assert_close(found.largest.cpu(), largest, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(found.squared.cpu(), squared, rtol=1e-4, atol=1e-6)

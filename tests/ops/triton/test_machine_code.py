@@ -35,7 +35,7 @@ def launches_of_the_op(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
     )
     splat(large, view, backend="triton").rgb.sum().backward()
     contribution(large, view, backend="triton")
-    rasteriser.removal(large, None, view, SplatSettings())
+    rasteriser.removal(large, None, None, view, SplatSettings())
     # One term of colour: what the other switches add compiles faster.
     rendering = splat(small, view, backend="triton", settings=SplatSettings(stop="exclusive", antialias=True))
     rendering.depth.sum().backward()
