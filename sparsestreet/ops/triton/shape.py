@@ -13,7 +13,7 @@ LOG2_SCALE = constant(math.sqrt(math.log2(math.e) / 2))
 TWO_LN2 = constant(2 * math.log(2))
 HALF_LOG2_E = constant(math.log2(math.e) / 2)
 TINY = constant(1.1754943508222875e-38)
-# Of ops/reference.py: COMPENSATION_FLOOR squared, and DETERMINANT_MIN.
+# Of ops/reference: COMPENSATION_FLOOR squared, and DETERMINANT_MIN.
 RATIO_FLOOR = constant(2.5e-5)
 DETERMINANT_MIN = constant(1e-12)
 LARGEST = constant(3.4028234663852886e38)

@@ -9,7 +9,7 @@ import triton.language as tl
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.view import TILE
 
-# Of ops/reference.py: rounding must never cull a touched pixel.
+# Of ops/reference: rounding must never cull a touched pixel.
 BOX_MARGIN = constant(0.01)
 # The pixel loop's rounding grows with the distances it squares.
 RELATIVE_MARGIN = constant(1e-5)
