@@ -22,9 +22,9 @@ def project(
 
 def ray_directions(camera: Camera) -> Float[Tensor, "h w 3"]:
     """Unit directions in the world through the pixel centres."""
-    dtype = camera.intrinsics.dtype
-    x = (torch.arange(camera.width, dtype=dtype) + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
-    y = (torch.arange(camera.height, dtype=dtype) + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
+    like = {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}
+    x = (torch.arange(camera.width, **like) + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
+    y = (torch.arange(camera.height, **like) + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
     y, x = torch.meshgrid(y, x, indexing="ij")
     in_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)
     in_world = in_camera @ camera.camera_from_world[:3, :3]

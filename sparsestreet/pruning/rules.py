@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.data.datamodule import to_device
 from sparsestreet.ops import SplatSettings, contribution, removal
 from sparsestreet.pruning.importance import measure_importance
 from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance
@@ -82,12 +83,14 @@ class RemovalRule:
     def select(
         self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
     ) -> dict[str, Selection]:
-        errors = sum(_squared_errors(scene, frame, view) for frame in frames)
-        changes = [_removal(scene, frame, errors, view) for frame in frames]
-        largest = torch.stack([change.largest for change in changes]).amax(0)
-        squared = torch.stack([change.squared for change in changes]).sum(0)
-        costs = torch.where(largest > self.noticeable, squared, 0.0)
+        errors = sum(_squared_errors(scene, frame, view) for frame in _beside(scene, frames))
         spans = scene.gaussians_at(frames[0].time).rows
+        rows = max(span.stop for span in spans.values())
+        largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
+        for frame in _beside(scene, frames):
+            change = _removal(scene, frame, errors, view)
+            largest, squared = torch.maximum(largest, change.largest), squared + change.squared
+        costs = torch.where(largest > self.noticeable, squared, 0.0)
         return keep_by_cost(
             {name: costs[spans[name]] for name in minimum_rows}, 10 ** (self.allowed_db / 10) - 1, minimum_rows
         )
@@ -122,7 +125,13 @@ def _squared_errors(scene: SceneGraph, frame: Frame, view: View) -> Float64[Tens
     return (_regions(frame).double() * squared).sum((1, 2))
 
 
+def _beside(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
+    """One frame at a time on the scene's device."""
+    device = next(scene.parameters()).device
+    return (to_device(frame, device) for frame in frames)
+
+
 def _contributions(scene: SceneGraph, frames: Sequence[Frame], view: View) -> Iterator[Contribution]:
-    for frame in frames:
+    for frame in _beside(scene, frames):
         gaussians = scene.gaussians_at(frame.time).gaussians
         yield contribution(gaussians, frame.camera, settings=view.settings, backend=view.backend)

@@ -58,6 +58,11 @@ class DensityControl(Callback):
             if name not in self.statistics:
                 self.statistics[name] = DensityStatistics(rows)
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # Only now are rows on their device, and statistics of a checkpoint restored.
+        for statistics in self.statistics.values():
+            statistics.to(pl_module.device)
+
     def follow_rows(self, node: str, plan: RowPlan) -> None:
         """Keep statistics beside the rows, whoever resized them."""
         if node in self.statistics:

@@ -72,6 +72,11 @@ class DensityStatistics:
         """For a checkpoint: a run resumed between two refinements densifies as the uninterrupted one."""
         return {"gradient_sum": self.gradient_sum, "visits": self.visits, "largest_screen": self.largest_screen}
 
+    def to(self, device: torch.device) -> None:
+        """Move to the device of the rows."""
+        for name, values in self.state_dict().items():
+            setattr(self, name, values.to(device))
+
     @staticmethod
     def from_state(state: dict[str, Tensor]) -> "DensityStatistics":
         """Continue from a checkpoint, with as many rows as it has."""
