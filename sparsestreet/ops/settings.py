@@ -70,7 +70,7 @@ _PRESETS = {
     "gsplat15": SplatSettings(alpha_max=0.999, stop="exclusive", near=0.01),
     "gsplat16": SplatSettings(stop="exclusive", near=0.01),
     "inria": SplatSettings(stop="exclusive"),
-    # Each splat ends at 4 standard deviations instead of at an alpha: 20 dB and more nearer to "exact" than the default,
+    # Splats end at 4 standard deviations instead of at an alpha: 20 dB and more nearer to "exact" than the default,
     # for little more time where stacks are shallow (docs/scaling.md).
     "fine": SplatSettings(alpha_min=0.0, box=4.0),
     # About 50 dB against "exact"; fewer pixels per splat and earlier stops.
