@@ -5,9 +5,11 @@ With r2 = x^2 + y^2 and radial = 1 + k1 r2 + k2 r2^2 + k3 r2^3 (Brown, "Close-ra
     x_d = x radial + 2 p1 x y + p2 (r2 + 2 x^2)
     y_d = y radial + p1 (r2 + 2 y^2) + 2 p2 x y
 
-The radius r radial(r2) of the distorted point grows only up to a certain r2, where the polynomial folds back. Past it
-the map is continued along each ray from the centre in proportion to the radius, D(x) = D(s x) / s with s x at the fold:
-it stays continuous, and no point from far outside lands in the image.
+A polynomial that was fitted inside an image does not describe the lens far outside of it. The radius r radial(r2) of
+the distorted point grows only up to a certain r2, where it folds back; or it grows with r^7, beyond what float32 can
+carry. From where its slope leaves (0, 4), here called the fold in both cases, the map is continued along each ray from
+the centre in proportion to the radius, D(x) = D(s x) / s with s x at the fold: it stays continuous, no point from far
+outside lands in the image, and none lands more than 4 times as far out as a pinhole would put it.
 """
 
 import math
@@ -17,15 +19,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_NEWTON_STEPS = 60
-"""Far out r^7 rules, and there a step takes one seventh off the radius."""
+_STEEPEST = 4.0
+"""Largest d(r radial)/dr: lenses stay far below it."""
+_NEWTON_STEPS = 30
 
 
 def fold_radius_squared(distortion: Float[Tensor, "5"]) -> float:
-    """The smallest r2 > 0 at which d(r radial)/dr = 1 + 3 k1 r2 + 5 k2 r2^2 + 7 k3 r2^3 vanishes; inf if none does."""
+    """The smallest r2 > 0 where d(r radial)/dr = 1 + 3 k1 r2 + 5 k2 r2^2 + 7 k3 r2^3 is 0 or 4; inf if it never is."""
     k1, k2, _, _, k3 = distortion.tolist()
-    # In v = 1 / r2 the polynomial is monic whatever the coefficients: no division by a small k3.
-    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    # In v = 1 / r2 the leading coefficient is 1 - slope whatever the others are: no division by a small k3.
+    roots = np.concatenate([np.roots([1 - slope, 3 * k1, 5 * k2, 7 * k3]) for slope in (0.0, _STEEPEST)])
     positive = roots.real[(np.abs(roots.imag) <= 1e-7 * np.abs(roots)) & (roots.real > 0)]
     return float(1 / positive.max()) if len(positive) else math.inf
 

@@ -11,13 +11,34 @@ from sparsestreet.types import Camera, Gaussians
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
+CPU = torch.device("cpu")
 BACKENDS = ("reference", "cpu")
 """Every implementation of the op: what is tested for all of them takes the list from here."""
 EFFECT_BACKENDS = ("reference", "cpu")
 """Those with lens, shutter, box, depth bits and half colours."""
+SINGLE_PRECISION = ("triton",)
+"""Those that compute in float32 only; tests whose oracle needs float64 leave them out."""
+
+
+def _dtypes(backend: str) -> tuple[torch.dtype, ...]:
+    return (torch.float32,) if backend in SINGLE_PRECISION else (torch.float32, torch.float64)
+
+
+def _in_every_precision(backends: tuple[str, ...]) -> pytest.MarkDecorator:
+    pairs = [(backend, dtype) for backend in backends for dtype in _dtypes(backend)]
+    names = [f"{backend}-{str(dtype).removeprefix('torch.')}" for backend, dtype in pairs]
+    return pytest.mark.parametrize(("backend", "dtype"), pairs, ids=names)
+
+
+def _in_double(backends: tuple[str, ...]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("backend", [name for name in backends if torch.float64 in _dtypes(name)])
+
+
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
-every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-every_effect_backend = pytest.mark.parametrize("backend", EFFECT_BACKENDS)
+every_precision = _in_every_precision(BACKENDS)
+every_double = _in_double(BACKENDS)
+every_effect_precision = _in_every_precision(EFFECT_BACKENDS)
+every_effect_double = _in_double(EFFECT_BACKENDS)
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:
@@ -74,13 +95,21 @@ def one_gaussian(**fields: list) -> Gaussians:
     return Gaussians(*(torch.tensor(values[name], dtype=torch.float64) for name in FIELDS))
 
 
-def cast(gaussians: Gaussians, dtype: torch.dtype, requires_grad: bool = False) -> Gaussians:
+def cast(
+    gaussians: Gaussians, dtype: torch.dtype, requires_grad: bool = False, device: torch.device = CPU
+) -> Gaussians:
     """Detached copy in another precision; displacements never ask for a gradient."""
     moved = gaussians.displacements
+    fields = (getattr(gaussians, name).detach().clone().to(device, dtype) for name in FIELDS)
     return Gaussians(
-        *(getattr(gaussians, name).detach().clone().to(dtype).requires_grad_(requires_grad) for name in FIELDS),
-        None if moved is None else moved.detach().to(dtype),
+        *(field.requires_grad_(requires_grad) for field in fields),
+        None if moved is None else moved.detach().to(device, dtype),
     )
+
+
+def device_of(backend: str) -> torch.device:
+    """Where a backend is tested: "triton" on a GPU if there is one, else on the CPU by Triton's interpreter."""
+    return torch.device("cuda") if backend == "triton" and torch.cuda.is_available() else CPU
 
 
 def cotangents(view: Camera, seed: int = 5) -> tuple[Tensor, Tensor, Tensor]:
@@ -114,19 +143,20 @@ def render(
     settings: SplatSettings = DEFAULT,
     background: Tensor | None = None,
 ) -> Result:
-    """Forward and backward with the same random cotangents for every backend."""
-    leaves = cast(gaussians, dtype, requires_grad=True)
-    behind = None if background is None else background.detach().clone().to(dtype).requires_grad_()
+    """Forward and backward with the same random cotangents for every backend; the result is on the CPU."""
+    device = device_of(backend)
+    leaves = cast(gaussians, dtype, requires_grad=True, device=device)
+    behind = None if background is None else background.detach().clone().to(device, dtype).requires_grad_()
     rendering = splat(leaves, view, background=behind, settings=settings, backend=backend)
     images = {"rgb": rendering.rgb, "alpha": rendering.alpha, "depth": rendering.depth}
-    torch.autograd.backward(list(images.values()), [v.to(dtype) for v in cotangents(view)])
+    torch.autograd.backward(list(images.values()), [v.to(device, dtype) for v in cotangents(view)])
     gradients = {name: getattr(leaves, name).grad for name in FIELDS} | {"screen": rendering.screen_offsets.grad}
     if behind is not None:
         gradients["background"] = behind.grad
     return Result(
-        {name: image.detach().double() for name, image in images.items()},
-        {name: gradient.double() for name, gradient in gradients.items()},
-        rendering.radii.double(),
+        {name: image.detach().double().cpu() for name, image in images.items()},
+        {name: gradient.double().cpu() for name, gradient in gradients.items()},
+        rendering.radii.double().cpu(),
     )
 
 

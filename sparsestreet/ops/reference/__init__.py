@@ -1,4 +1,4 @@
-"""The truth the fast backends are held to: dense plain torch with autograd, any float dtype."""
+"""The truth the fast backends are held to: dense plain torch with autograd, float32 or float64."""
 
 from sparsestreet.ops.reference.blend import contribution, rasterise
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows

@@ -10,13 +10,15 @@ from sparsestreet.ops.reference.projection import Splats, on_screen, visible_row
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.types import Camera, Contribution, Gaussians
 
+DTYPES = (torch.float32, torch.float64)
 _CHUNK_ELEMENTS = 1 << 20
 
 
 def rasterise(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
-    """Project all rows, sort them and blend them densely into every pixel."""
+    """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
+    _check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     offsets = screen_offsets[rows]
@@ -41,6 +43,7 @@ def rasterise(
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
+    _check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     weight = torch.zeros(len(gaussians), dtype=torch.float64, device=rows.device)
@@ -56,6 +59,14 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
         first = (weights == weights.amax(0)).to(torch.int8).cumsum(0).eq(0).sum(0)
         dominant[rows] += torch.bincount(first[touched.any(0)], minlength=len(rows))
     return Contribution(weight, pixels, dominant)
+
+
+def _check_dtype(gaussians: Gaussians) -> None:
+    if gaussians.means.dtype not in DTYPES:
+        raise ValueError(
+            f"backend 'reference' computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
+            "with dataclasses.replace and .float()"
+        )
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:

@@ -47,7 +47,8 @@ def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], cam
     steps = math.sqrt(3) * axes.mT
     points = in_camera[:, None] + torch.cat((torch.zeros_like(steps[:, :1]), steps, -steps), 1)
     normalised = points[..., :2] / points[..., 2:].clamp(min=near)
-    pixels = distort(normalised, camera.distortion) * K.diagonal()[:2] + K[:2, 2]
-    means = pixels[:, 1:].mean(1)
+    # From the principal point, whose digits the differences would lose.
+    pixels = distort(normalised, camera.distortion) * K.diagonal()[:2]
+    centres = pixels[:, 1:].mean(1)
     weights = pixels.new_tensor([2.0] + [1 / 6] * 6)
-    return means, ((pixels - means[:, None]) * weights.sqrt()[:, None]).mT
+    return centres + K[:2, 2], ((pixels - centres[:, None]) * weights.sqrt()[:, None]).mT

@@ -1,0 +1,119 @@
+"""Pixels that break the blend (docs/stability.md; the number in a name is the row there)."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from sparsestreet.ops import SplatSettings, contribution
+from sparsestreet.types import Gaussians
+from tests.ops.scenes import (
+    FIELDS,
+    cast,
+    device_of,
+    every_precision,
+    front_camera,
+    one_gaussian,
+    relative_error,
+    render,
+)
+
+Y0 = 0.28209479177387814
+
+
+@every_precision
+def test_10_one_opaque_splat_is_drawn(backend, dtype):
+    result = render(one_gaussian(opacities=[1.0]), front_camera(5, 5, 40.0), backend, dtype)
+    assert result.images["alpha"][2, 2] == pytest.approx(0.99, rel=1e-6)
+    # Exclusive stop with a limit above 0.01 drops it: that is why the default is inclusive.
+    settings = SplatSettings(stop="exclusive", transmittance_min=0.02)
+    assert (
+        render(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0), backend, dtype, settings).images["alpha"] == 0
+    )
+
+
+@every_precision
+def test_10_a_clamped_alpha_has_no_gradient(backend, dtype):
+    # In a single pixel at the peak, alpha = 1 is clamped to 0.99: opacity and shape cannot change the image.
+    result = render(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0), backend, dtype)
+    assert not any(result.gradients[name].any() for name in ("opacities", "scales", "quaternions", "screen"))
+    assert result.gradients["sh"].all()
+
+
+@every_precision
+def test_11_12_opacity_at_the_cut_off(backend, dtype):
+    view = front_camera(5, 5, 40.0)
+    edge = torch.tensor(1 / 255, dtype=dtype)
+    below = float(torch.nextafter(edge, torch.zeros_like(edge)))
+    for opacity in (0.0, 1e-8, 0.0035, below):
+        result = render(one_gaussian(opacities=[opacity]), view, backend, dtype)
+        assert result.radii[0] == 0, opacity
+        assert not result.images["alpha"].any()
+        assert not any(gradient.any() for gradient in result.gradients.values())
+        faint = cast(one_gaussian(opacities=[opacity]), dtype, device=device_of(backend))
+        counted = contribution(faint, view, backend=backend)
+        assert counted.pixels.tolist() == [0]
+    at_edge = render(one_gaussian(opacities=[float(edge)]), view, backend, dtype)
+    assert at_edge.is_finite()
+    assert at_edge.radii[0] >= 0
+
+
+@every_precision
+def test_24_expected_depth_of_a_faint_splat(backend, dtype):
+    result = render(one_gaussian(opacities=[0.5]), front_camera(5, 5, 40.0), backend, dtype)
+    assert result.images["alpha"][2, 2] == pytest.approx(0.5, rel=1e-6)
+    assert result.images["rgb"][2, 2].tolist() == pytest.approx([0.25] * 3, rel=1e-6)
+    assert result.images["depth"][2, 2] == pytest.approx(2.0, rel=1e-6)
+    corner = render(one_gaussian(scales=[[1e-3] * 3]), front_camera(5, 5, 40.0), backend, dtype)
+    assert corner.images["depth"][0, 0] == 0
+
+
+@pytest.mark.parametrize("opacities", [(0.02, 0.3), (0.9, 1.0)], ids=["translucent", "opaque"])
+def test_26_deep_stacks(opacities):
+    # 400 splats in every pixel; transmittance falls to 1e-30 where nothing stops it.
+    generator = torch.Generator().manual_seed(4)
+    n, low, high = 400, *opacities
+
+    def uniform(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    depth = 2 + uniform(n)
+    means = torch.stack(((uniform(n) - 0.5) * 0.2, (uniform(n) - 0.5) * 0.2, depth), -1)
+    parts = (
+        means,
+        uniform(n, 4) - 0.5,
+        0.4 + 0.4 * uniform(n, 3),
+        low + (high - low) * uniform(n),
+        uniform(n, 4, 3) - 0.5,
+    )
+    gaussians = Gaussians(*(part.float().double() for part in parts))
+    view = front_camera(8, 8, 10.0)
+    # The light behind a splat is the pixel's total minus a prefix: its error, 1e-7 of the total, meets
+    # alpha / (1 - alpha) <= 99 and does not fall with the transmittance. Dividing T out again would give 1e-3.
+    for settings, bar in ((SplatSettings(), 3e-5), (SplatSettings(transmittance_min=0.0), 1e-4)):
+        truth = render(gaussians, view, "reference", torch.float64, settings)
+        result = render(gaussians, view, "cpu", torch.float32, settings)
+        assert (result.images["rgb"] - truth.images["rgb"]).abs().max() < 1e-5
+        for name in FIELDS:
+            assert relative_error(result.gradients[name], truth.gradients[name]) < bar, name
+
+
+@every_precision
+def test_27_exponents_that_underflow(backend, dtype):
+    # No cut-off: pixels 1e4 standard deviations away evaluate exp(-1e8) = 0, forward and backward.
+    settings = dataclasses.replace(SplatSettings.preset("exact"), blur=1e-5)
+    tiny = one_gaussian(scales=[[1e-12] * 3])
+    result = render(tiny, front_camera(101, 1, 40.0), backend, dtype, settings)
+    assert result.is_finite()
+    assert result.images["alpha"][0, 0] == 0
+    assert result.images["alpha"][0, 50] == pytest.approx(0.8, rel=1e-6)
+
+
+@every_precision
+def test_28_bright_pixels_are_not_clamped(backend, dtype):
+    # A lamp of colour 3: clamped at 1, it could never be fitted, as nothing would flow back.
+    lamp = one_gaussian(sh=[[[2.5 / Y0] * 3]])
+    result = render(lamp, front_camera(5, 5, 40.0), backend, dtype)
+    assert result.images["rgb"][2, 2].tolist() == pytest.approx([0.8 * 3.0] * 3, rel=1e-6)
+    assert result.gradients["sh"].all()
+    assert result.gradients["opacities"].all()

@@ -1,0 +1,110 @@
+"""Culling, sorting, tile lists and memory (docs/stability.md; the number in a name is the row there)."""
+
+import pytest
+import torch
+
+from sparsestreet.ops import SplatSettings
+from sparsestreet.ops.cpu import rasteriser
+from sparsestreet.ops.cpu.workspace import idle_workspaces
+from sparsestreet.types import Gaussians
+from tests.ops.scenes import (
+    FIELDS,
+    camera,
+    every_backend,
+    every_precision,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    render,
+)
+
+Y0 = 0.28209479177387814
+
+
+@every_precision
+@pytest.mark.parametrize("width_height", [(1, 1), (17, 9)])
+def test_15_nothing_to_draw(backend, dtype, width_height):
+    view = front_camera(*width_height, 20.0)
+    background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    for gaussians in (random_gaussians(0, view), one_gaussian(means=[[0.0, 0.0, -2.0]])):
+        result = render(gaussians, view, backend, dtype, background=background)
+        behind = background.to(dtype).double().expand_as(result.images["rgb"])
+        assert torch.equal(result.images["rgb"], behind)
+        assert not result.images["alpha"].any()
+        assert not result.images["depth"].any()
+        assert result.is_finite()
+        assert all(result.gradients[name].shape == getattr(gaussians, name).shape for name in FIELDS)
+        assert result.gradients["background"].all()
+
+
+@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(stop="exclusive")], ids=["inclusive", "exclusive"])
+def test_16_nothing_is_read_before_it_is_written(settings, monkeypatch):
+    # Every buffer of the library and every tensor it fills starts as NaN; many tiles stay empty, many end early.
+    view = camera(75, 53)
+    gaussians = random_gaussians(300, view)
+    opaque = one_gaussian(scales=[[90.0] * 3], opacities=[1.0], means=[[0.0, 0.0, 1.0]])
+    scene = Gaussians.concatenate([gaussians, opaque, opaque, opaque])
+    expected = render(scene, view, "cpu", torch.float32, settings)
+    for workspace in idle_workspaces():
+        workspace.poison()
+
+    def poisoned(like):
+        return lambda *args, **kwargs: like(*args, **kwargs).fill_(float("nan"))
+
+    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
+    monkeypatch.setattr(torch, "empty_like", poisoned(torch.empty_like))
+    result = render(scene, view, "cpu", torch.float32, settings)
+    for part in ("images", "gradients"):
+        for name, value in getattr(expected, part).items():
+            assert torch.equal(value, getattr(result, part)[name]), name
+
+
+@every_precision
+def test_17_depth_ties_keep_the_row_order(backend, dtype):
+    view = front_camera(5, 5, 40.0)
+    red, green = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
+    first, second = one_gaussian(sh=red), one_gaussian(sh=green)
+    for front, back, channel in ((first, second, 0), (second, first, 1)):
+        centre = render(Gaussians.concatenate([front, back]), view, backend, dtype).images["rgb"][2, 2]
+        # 0.8 (0.5 + 1) + 0.2 * 0.8 * 0.5 in the front one's channel.
+        assert centre[channel] == pytest.approx(1.28, rel=1e-6)
+
+
+@every_precision
+def test_17_neighbouring_depths_are_told_apart(backend, dtype):
+    far = torch.tensor(731.25, dtype=dtype)
+    depths = (float(torch.nextafter(far, 2 * far)), float(far))
+    parts = [
+        one_gaussian(sh=[[[1.0 / Y0, 0.0, 0.0]]], means=[[0.0, 0.0, depths[0]]], scales=[[90.0] * 3]),
+        one_gaussian(sh=[[[0.0, 1.0 / Y0, 0.0]]], means=[[0.0, 0.0, depths[1]]], scales=[[90.0] * 3]),
+    ]
+    centre = render(Gaussians.concatenate(parts), front_camera(5, 5, 40.0), backend, dtype).images["rgb"][2, 2]
+    assert centre[1] == pytest.approx(1.28, rel=1e-5)
+
+
+@every_backend
+def test_17_the_order_of_rows_does_not_matter_without_ties(backend):
+    view = camera(37, 29)
+    gaussians = random_gaussians(80, view)
+    order = torch.randperm(80, generator=torch.Generator().manual_seed(0))
+    shuffled = Gaussians(*(getattr(gaussians, name)[order] for name in FIELDS))
+    plain, other = (render(scene, view, backend, torch.float32) for scene in (gaussians, shuffled))
+    assert torch.equal(plain.images["rgb"], other.images["rgb"])
+    for name in FIELDS:
+        torch.testing.assert_close(plain.gradients[name][order], other.gradients[name], rtol=1e-5, atol=1e-7)
+
+
+@every_backend
+def test_18_two_runs_are_bitwise_equal(backend):
+    view = camera(37, 29)
+    gaussians = random_gaussians(80, view)
+    first, second = (render(gaussians, view, backend, torch.float32) for _ in range(2))
+    for part in ("images", "gradients"):
+        for name, value in getattr(first, part).items():
+            assert torch.equal(value, getattr(second, part)[name]), name
+
+
+def test_09_a_pair_index_fits_its_type():
+    # Slots are int32: no list that is allocated may be longer. Longer ones are counted in 64 bits and refused
+    # (test_errors.py), so that no index past 2^31 can arise.
+    assert rasteriser.PAIR_LIMIT < 2**31
