@@ -1,4 +1,5 @@
-// Rows in memory to registers that hold one column each, and back: squares of LANES x LANES are transposed in registers.
+// Rows in memory to registers that hold one column each, and back: squares of LANES x LANES are transposed in
+// registers.
 #pragma once
 #include "lanes.hpp"
 

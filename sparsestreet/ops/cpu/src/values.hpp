@@ -98,7 +98,8 @@ inline Lanes<T> log2_positive(const Lanes<T>& v) {
 template <class T>
 inline Lanes<T> rounded_to_half(const Lanes<T>& given) {
   constexpr int dropped = (sizeof(T) == 4 ? 23 : 52) - 10;
-  constexpr T largest = 65504, least_normal = T(6.103515625e-5), subnormal_sum = T(int64_t(1) << (dropped + 10)) / (1 << 24);
+  constexpr T largest = 65504, least_normal = T(6.103515625e-5);  // 2^-14
+  constexpr T subnormal_sum = T(int64_t(1) << (dropped + 10)) / (1 << 24);
   Lanes<T> v;
   for (int i = 0; i < LANES<T>; ++i) v[i] = T(float(given[i]));
   v = v < largest ? v : same(largest);
