@@ -1,5 +1,7 @@
 """Memory of the C++ library: one workspace serves a rendering from forward to backward, then the next one."""
 
+import itertools
+
 import torch
 
 from sparsestreet.ops.cpu.library import STAGES, load_library
@@ -7,6 +9,7 @@ from sparsestreet.ops.cpu.library import STAGES, load_library
 FASTEST_VARIANT = -1
 _KEPT_IDLE = 2
 _idle: dict[tuple[torch.dtype, int], list["Workspace"]] = {}
+_uses = itertools.count()
 
 
 class Workspace:
@@ -18,6 +21,7 @@ class Workspace:
     def __init__(self, dtype: torch.dtype, variant: int) -> None:
         self._library = load_library()
         self.key = (dtype, variant)
+        self.last_use = 0
         self.handle = self._library.splat_create(int(dtype == torch.float64), variant)
         if not self.handle:
             raise MemoryError(
@@ -60,6 +64,7 @@ class Lease:
         workspace = getattr(self, "workspace", None)
         if workspace is None:
             return
+        workspace.last_use = next(_uses)
         idle = _idle[workspace.key]
         if len(idle) < _KEPT_IDLE:
             idle.append(workspace)
@@ -67,4 +72,5 @@ class Lease:
 
 def idle_workspaces() -> list[Workspace]:
     """Workspaces that wait for the next rendering, the last used one last."""
-    return [workspace for waiting in _idle.values() for workspace in waiting]
+    waiting = [workspace for same_key in _idle.values() for workspace in same_key]
+    return sorted(waiting, key=lambda workspace: workspace.last_use)

@@ -33,7 +33,7 @@ inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts,
 
 // Answers the index after the last pair that was looked at.
 template <class T, bool EXCLUSIVE>
-int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
+int64_t blend_tile(const Workspace<T>& ws, const Cuts<T> cuts, int64_t tile, int64_t x0, int64_t y0,
                    TileColors<T>& c, int64_t& samples) {
   const int64_t begin = ws.tile_begin[tile], end = ws.tile_begin[tile + 1];
   for (int64_t k = begin; k < end; ++k) {
@@ -41,7 +41,7 @@ int64_t blend_tile(const Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
         tile_finished(EXCLUSIVE ? c.gate : c.transmittance, cuts.transmittance_min))
       return k;
     if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
-    const Splat<T>& s = ws.splats[ws.pairs[k].row];
+    const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
     const TileSplat<T> here(s, x0, y0);
     samples += (here.last - here.first + 1) * TILE;
     for (int y = here.first; y <= here.last; ++y)

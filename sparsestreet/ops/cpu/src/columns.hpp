@@ -1,4 +1,5 @@
-// Rows in memory to registers that hold one column each, and back: squares of LANES x LANES are transposed in registers.
+// Rows in memory to registers that hold one column each, and back: squares of LANES x LANES are transposed in
+// registers.
 #pragma once
 #include "lanes.hpp"
 
@@ -38,18 +39,18 @@ inline void load_columns(RowAt row, int columns, Lanes<T>* out) {
     for (int r = 0; r < LANES<T>; ++r) out[c][r] = row(r)[c];
 }
 
-// row(r)[c] = in[c] lane r, for the first `rows` lanes.
+// row(r)[c] = in[c] lane r. Lanes may share a row if they agree.
 template <class T, class RowAt>
-inline void store_columns(const Lanes<T>* in, int columns, int rows, RowAt row) {
+inline void store_columns(const Lanes<T>* in, int columns, RowAt row) {
   int c = 0;
   for (; c + LANES<T> <= columns; c += LANES<T>) {
     Lanes<T> square[LANES<T>];
     for (int r = 0; r < LANES<T>; ++r) square[r] = in[c + r];
     transpose<T>(square);
-    for (int r = 0; r < rows; ++r) store<T>(row(r) + c, square[r]);
+    for (int r = 0; r < LANES<T>; ++r) store<T>(row(r) + c, square[r]);
   }
   for (; c < columns; ++c)
-    for (int r = 0; r < rows; ++r) row(r)[c] = in[c][r];
+    for (int r = 0; r < LANES<T>; ++r) row(r)[c] = in[c][r];
 }
 
 }  // namespace SPLAT_VARIANT

@@ -91,7 +91,7 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
   }
   color_rows(camera, in, row, p.placement.mean, s);
   Splat<T>* splats = &ws.splats[first];
-  store_columns<T>(&s.x, SPLAT_COLUMNS<T>, count, [&](int r) { return reinterpret_cast<T*>(splats + r); });
+  store_columns<T>(&s.x, SPLAT_COLUMNS<T>, [&](int r) { return reinterpret_cast<T*>(&ws.splats[row(r)]); });
   tile_sets(s, grid, seen, splats, count, &ws.tiles[first]);
   for (int r = 0; r < count; ++r) {
     ws.tiles[first + r].depth_key = depth_key(splats[r].depth, camera.depth_bits);

@@ -140,12 +140,12 @@ inline Slot<Lanes<T>> sum_slots(const Workspace<T>& ws, RowAt row) {
   return sum;
 }
 
-// `count` visible rows, at most LANES.
+// A register of visible rows, which may repeat.
 template <class E, class T>
 void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
-                    const int64_t* rows, int count) {
+                    const int64_t* rows) {
   using V = Lanes<T>;
-  const auto row = [&](int lane) { return rows[lane < count ? lane : count - 1]; };
+  const auto row = [&](int lane) { return rows[lane]; };
   const int coefficients = int(3 * in.terms);
   Splat<V> splat;
   load_columns<T>([&](int r) { return reinterpret_cast<const T*>(&ws.splats[row(r)]); }, SPLAT_COLUMNS<T>, &splat.x);
@@ -156,12 +156,12 @@ void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Input
   load_columns<T>([&](int r) { return in.sh + 3 * in.terms * row(r); }, coefficients, sh);
   const Vector<V> v_color = color_backward(camera, p.placement.mean, g.color, sh, in.terms, v_sh);
   const RowValues<V> v = row_backward(camera, values, p, g, v_color);
-  store_columns<T>(&v.mean.x, 3, count, [&](int r) { return out.means + 3 * row(r); });
-  store_columns<T>(v.quaternion, 4, count, [&](int r) { return out.quaternions + 4 * row(r); });
-  store_columns<T>(&v.scales.x, 3, count, [&](int r) { return out.scales + 3 * row(r); });
-  store_columns<T>(&v.opacity, 1, count, [&](int r) { return out.opacities + row(r); });
-  store_columns<T>(v_sh, coefficients, count, [&](int r) { return out.sh + 3 * in.terms * row(r); });
-  store_columns<T>(&g.abs_x, 2, count, [&](int r) { return out.screen + 2 * row(r); });
+  store_columns<T>(&v.mean.x, 3, [&](int r) { return out.means + 3 * row(r); });
+  store_columns<T>(v.quaternion, 4, [&](int r) { return out.quaternions + 4 * row(r); });
+  store_columns<T>(&v.scales.x, 3, [&](int r) { return out.scales + 3 * row(r); });
+  store_columns<T>(&v.opacity, 1, [&](int r) { return out.opacities + row(r); });
+  store_columns<T>(v_sh, coefficients, [&](int r) { return out.sh + 3 * in.terms * row(r); });
+  store_columns<T>(&g.abs_x, 2, [&](int r) { return out.screen + 2 * row(r); });
 }
 
 // Rows `range` of the input: culled ones get zeros, the others are gathered until they fill a register. In which lane
@@ -177,9 +177,11 @@ void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Input
       continue;
     }
     rows[count++] = i;
-    if (count == LANES<T>) backward_block<E>(ws, camera, in, out, rows, count), count = 0;
+    if (count == LANES<T>) backward_block<E>(ws, camera, in, out, rows), count = 0;
   }
-  if (count > 0) backward_block<E>(ws, camera, in, out, rows, count);
+  if (count == 0) return;
+  for (int lane = count; lane < LANES<T>; ++lane) rows[lane] = rows[count - 1];
+  backward_block<E>(ws, camera, in, out, rows);
 }
 
 template <class T>

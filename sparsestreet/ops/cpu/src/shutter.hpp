@@ -24,7 +24,8 @@ struct Motion {
     const V motion_y = moved.y - t.y - (w.z * p.mean.x - w.x * p.mean.z);
     motion_z = moved.z - t.z - (w.x * p.mean.y - w.y * p.mean.x);
     slope_x = p.mean.x * p.inverse_z, slope_y = p.mean.y * p.inverse_z;
-    velocity_x = (motion_x - slope_x * motion_z) * p.inverse_z, velocity_y = (motion_y - slope_y * motion_z) * p.inverse_z;
+    velocity_x = (motion_x - slope_x * motion_z) * p.inverse_z;
+    velocity_y = (motion_y - slope_y * motion_z) * p.inverse_z;
     V bent_x = velocity_x, bent_y = velocity_y;
     if constexpr (LENS) {
       const LensJacobian<V> j(c, slope_x, slope_y);

@@ -94,14 +94,20 @@ inline Lanes<T> log2_positive(const Lanes<T>& v) {
   return T(2.8853900817779268) * s * series + as_value(exponent);  // 2 / ln 2
 }
 
-// The nearest float16 of numbers >= 0, at most its largest finite one. Through float32, as torch does.
+// Numbers rounded to float32.
+inline Lanes<float> in_single(const Lanes<float>& v) { return v; }
+inline Lanes<double> in_single(const Lanes<double>& v) {
+  typedef float Singles __attribute__((vector_size(REGISTER_BYTES / 2)));
+  return __builtin_convertvector(__builtin_convertvector(v, Singles), Lanes<double>);
+}
+
+// The nearest float16 of numbers >= 0, at most its largest finite one; through float32, as torch goes.
 template <class T>
 inline Lanes<T> rounded_to_half(const Lanes<T>& given) {
   constexpr int dropped = (sizeof(T) == 4 ? 23 : 52) - 10;
-  constexpr T largest = 65504, least_normal = T(6.103515625e-5), subnormal_sum = T(int64_t(1) << (dropped + 10)) / (1 << 24);
-  Lanes<T> v;
-  for (int i = 0; i < LANES<T>; ++i) v[i] = T(float(given[i]));
-  v = v < largest ? v : same(largest);
+  constexpr T largest = 65504, least_normal = T(6.103515625e-5);  // 2^-14
+  constexpr T subnormal_sum = T(int64_t(1) << (dropped + 10)) / (1 << 24);
+  const Lanes<T> single = in_single(given), v = single < largest ? single : same(largest);
   const Integers<T> one = Integers<T>{} + 1, bits = as_integers<T>(v);
   const Integers<T> to_even = bits + ((one << (dropped - 1)) - 1) + ((bits >> dropped) & 1);
   // Added, the last digit of the sum is that of the subnormals, 2^-24.

@@ -34,6 +34,7 @@ struct alignas(16 * sizeof(Scalar<V>)) Splat {
 };
 template <class V>
 constexpr int SPLAT_COLUMNS = sizeof(Splat<V>) / sizeof(V);
+static_assert(SPLAT_COLUMNS<float> == 16 && SPLAT_COLUMNS<double> == 16, "records are moved as squares of registers");
 
 // Bits of a positive depth order as the depth does.
 template <class T>
