@@ -21,7 +21,7 @@ def test_every_experiment_runs(experiment, run_train, tmp_path):
 
 def test_training_improves_and_leaves_records(run_train, tmp_path):
     # A budget relative to the error would take most of a scene that is hardly trained.
-    out = run_train(tmp_path / "run", "experiment=streetgs_ours", "schedule.background_pruning_db=0")
+    out = run_train(tmp_path / "run", "experiment=streetgs_ours", "schedule.background_pruning_db=0.0")
     summary = json.loads((out / "records" / "summary.json").read_text())
     with (out / "curves" / "metrics.csv").open() as file:
         psnr = [float(row["psnr"]) for row in csv.DictReader(file) if row["psnr"]]
