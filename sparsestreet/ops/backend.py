@@ -8,7 +8,7 @@ import torch
 from sparsestreet.ops.cpu.library import find_library, remedy
 
 BACKENDS = ("reference", "cpu", "triton")
-_TRITON_REMEDY = "pip install 'sparsestreet[gpu]' (Linux)"
+TRITON_REMEDY = "pip install 'sparsestreet[gpu]' (Linux)"
 
 
 def resolve_backend(name: str, device: torch.device) -> str:
@@ -32,7 +32,7 @@ def resolve_backend(name: str, device: torch.device) -> str:
         if device.type not in ("cuda", "cpu"):
             raise ValueError(f"backend 'triton' needs tensors on a CUDA device, got {device}: move them")
         if not has_triton():
-            raise RuntimeError(f"backend 'triton' needs the package triton: {_TRITON_REMEDY}")
+            raise RuntimeError(f"backend 'triton' needs the package triton: {TRITON_REMEDY}")
         return name
     return _fastest(device)
 
@@ -50,7 +50,7 @@ def _fastest(device: torch.device) -> str:
     if device.type == "cpu":
         _warn_once(f"the C++ splat library is not built, so the dense reference renders, slowly: {remedy()}")
     elif device.type == "cuda":
-        _warn_once(f"triton is not installed, so the dense reference renders, slowly: {_TRITON_REMEDY}")
+        _warn_once(f"triton is not installed, so the dense reference renders, slowly: {TRITON_REMEDY}")
     else:
         _warn_once(f"no fast splat backend runs on {device}, so the dense reference renders, slowly: use the cpu")
     return "reference"

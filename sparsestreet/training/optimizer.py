@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from sparsestreet.training.visible_adam import VisibleAdam
+
 
 @dataclass(frozen=True)
 class Rate:
@@ -35,6 +37,8 @@ class Optimization:
     rates: Mapping[str, Rate]
     eps: float = 1e-15
     """Adam's epsilon. At torch's default of 1e-8 mask logits whose only gradient is lambda_n / K never move."""
+    visible_rows_only: bool = False
+    """True: rows whose gradient is exactly zero keep their values and moments (VisibleAdam)."""
 
     def rate_of(self, name: str) -> Rate:
         keys = [key for key in self.rates if name == key or name.endswith(f".{key}")]
@@ -44,13 +48,15 @@ class Optimization:
             )
         return self.rates[max(keys, key=len)]
 
-    def build(self, scene: nn.Module, radius: float) -> torch.optim.Adam:
+    def build(self, scene: nn.Module, radius: float) -> torch.optim.Optimizer:
         """Adam with one group per parameter, named like it; ``radius`` is the scene's, metres."""
         groups = []
         for name, parameter in scene.named_parameters():
             rate = self.rate_of(name)
             initial = rate.initial * (radius if rate.in_scene_units else 1.0)
             groups.append({"params": [parameter], "lr": initial, "initial_lr": initial, "name": name})
+        if self.visible_rows_only:
+            return VisibleAdam(groups, eps=self.eps)
         return torch.optim.Adam(groups, eps=self.eps, fused=True)
 
     def set_rates(self, optimizer: torch.optim.Optimizer, progress: float) -> None:

@@ -19,6 +19,10 @@ def test_every_experiment_runs(experiment, run_train, tmp_path):
     run_train(tmp_path, f"experiment={experiment}", "trainer.fast_dev_run=2")
 
 
+def test_adam_of_visible_rows_runs(run_train, tmp_path):
+    run_train(tmp_path, "optimization=visible_adam", "trainer.fast_dev_run=2")
+
+
 def test_training_improves_and_leaves_records(run_train, tmp_path):
     # A budget relative to the error would take most of a scene that is hardly trained.
     out = run_train(tmp_path / "run", "experiment=streetgs_ours", "schedule.background_pruning_db=0.0")

@@ -1,13 +1,14 @@
+import inspect
 from dataclasses import replace
 
 import kornia
 import pytest
 import torch
 
+from sparsestreet.ops.ssim import ssim
 from sparsestreet.scene.graph import MaskTerm
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.losses import InverseDepth, MaskSparsity, Photometric, SkyMask
-from sparsestreet.training.losses.ssim import ssim
 from sparsestreet.types import Camera, Frame, Rendering
 
 HEIGHT, WIDTH = 13, 17
@@ -51,6 +52,12 @@ def test_ssim_of_equal_images_is_one_and_small_images_are_refused(generator):
     assert float(ssim(image, image)) == pytest.approx(1.0, abs=1e-5)  # float32 variances of 121 samples
     with pytest.raises(ValueError, match="at least 11x11"):
         ssim(image[:10], image[:10])
+
+
+def test_ssim_of_images_of_different_sizes_is_an_error():
+    with pytest.raises(ValueError, match="of one shape"):
+        # Unwrapped: in tests the type checker would be first.
+        inspect.unwrap(ssim)(torch.zeros(11, 12, 3), torch.zeros(12, 11, 3))
 
 
 def test_photometric_mixes_l1_and_dissimilarity(generator):

@@ -20,8 +20,8 @@ def jit(function: Callable, **options: Any) -> KernelInterface:
     return triton.jit(inspect.unwrap(function), **options)
 
 
-def constant(value: int | float) -> int | float | tl.constexpr:
-    """A global number for kernels, wrapped as the compiler wants it.
+def constant(value: int | float | tuple[float, ...]) -> int | float | tuple[float, ...] | tl.constexpr:
+    """A global number (or tuple of numbers) for kernels, wrapped as the compiler wants it.
 
     Triton's interpreter gets it as it is: there a wrapped number times a tensor would be wrapped again, and no function
     takes that.

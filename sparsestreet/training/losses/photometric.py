@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.ops.ssim import ssim
 from sparsestreet.scene.rendering import SceneRendering
-from sparsestreet.training.losses.ssim import ssim
 from sparsestreet.types import Frame
 
 

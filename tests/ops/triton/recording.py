@@ -1,6 +1,13 @@
-"""What the op launches, written down as the compiler needs to know it."""
+"""What is launched, written down as the compiler needs to know it, and compiled in a process of its own."""
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -16,6 +23,7 @@ _POINTERS = {
     torch.int16: "*i16",
     torch.int32: "*i32",
     torch.int64: "*i64",
+    torch.uint8: "*u8",
 }
 
 
@@ -30,8 +38,10 @@ class Launch:
     options: dict[str, Any]
 
 
-def record_launches(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
-    """A list that every launch is appended to from now on."""
+def record_launches(
+    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (rasteriser, lists)
+) -> list[Launch]:
+    """A list that every launch of the modules is appended to from now on."""
     launches: list[Launch] = []
     started = package.launch
 
@@ -42,9 +52,26 @@ def record_launches(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
         launches.append(Launch(kernel.fn.__module__, kernel.fn.__name__, types, written, options or {}))
         started(kernel, items, block, *arguments, options=options, **constants)
 
-    for module in (rasteriser, lists):
+    for module in modules:
         monkeypatch.setattr(module, "launch", launch)
     return launches
+
+
+def compile_launches(launches: list[Launch], architectures: Sequence[str]) -> list[tuple[Launch, dict]]:
+    """What compile_offline.py finds of each launch, by architecture."""
+    # The interpreter replaces the compiler in this process.
+    environment = {"TRITON_CACHE_DIR": str(Path.cwd() / ".cache" / "triton")} | dict(os.environ)
+    environment.pop("TRITON_INTERPRET", None)
+    given = {
+        "archs": [int(arch) for arch in architectures],
+        "launches": [dataclasses.asdict(item) for item in launches],
+    }
+    command = [sys.executable, "-m", "tests.ops.triton.compile_offline"]
+    ended = subprocess.run(
+        command, input=json.dumps(given), env=environment, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    return list(zip(launches, json.loads(ended.stdout), strict=True))
 
 
 def _type_of(value: Any) -> str:

@@ -7,10 +7,6 @@ adds to 17.0 and 46.4: depth 1.1 instructions and 8 registers forward, 3.3 and 1
 
 import dataclasses
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,7 +15,7 @@ from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import rasteriser
 from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
-from tests.ops.triton.recording import Launch, record_launches
+from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
 ARCHITECTURES = ("80", "90")
 DEVICE = device_of("triton")
@@ -62,19 +58,7 @@ def compiled() -> list[tuple[Launch, dict]]:
         launches = launches_of_the_op(monkeypatch)
     default = [launch for launch in launches if launch.name.startswith("blend") and not launch.constants["EXCLUSIVE"]]
     launches += [bare(launch) for launch in default[:2]]
-    # The interpreter replaces the compiler in this process.
-    environment = {"TRITON_CACHE_DIR": str(Path.cwd() / ".cache" / "triton")} | dict(os.environ)
-    environment.pop("TRITON_INTERPRET", None)
-    given = {
-        "archs": [int(arch) for arch in ARCHITECTURES],
-        "launches": [dataclasses.asdict(item) for item in launches],
-    }
-    command = [sys.executable, "-m", "tests.ops.triton.compile_offline"]
-    ended = subprocess.run(
-        command, input=json.dumps(given), env=environment, capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 0, ended.stderr[-3000:]
-    return list(zip(launches, json.loads(ended.stdout), strict=True))
+    return compile_launches(launches, ARCHITECTURES)
 
 
 def test_every_kernel_is_compiled(compiled):

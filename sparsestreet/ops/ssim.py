@@ -4,19 +4,34 @@ Written here because the loss runs at every step: at 320x192 on two cores it tak
 ``kornia.losses.ssim_loss``, against which it is tested. Reported SSIM is another definition (evaluation/metrics).
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from sparsestreet.ops.fused import takes_triton
+
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2  # (k1 L)^2 and (k2 L)^2 of the paper at data range L = 1
 
 
-def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Mean SSIM over the pixels whose window lies inside the image. Raises ValueError below 11x11 pixels."""
+def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backend: str = "auto") -> Float[Tensor, ""]:
+    """Mean SSIM over the pixels whose window lies inside the image. Gradients go to the image only.
+
+    ``backend``: "torch", "triton", or "auto" for the one that suits the tensors; raises as
+    :func:`sparsestreet.ops.fused.takes_triton`, and ValueError below 11x11 pixels or for different shapes.
+    """
+    if image.shape != truth.shape:
+        raise ValueError(f"SSIM compares images of one shape, got {tuple(image.shape)} and {tuple(truth.shape)}")
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, got {tuple(image.shape[:2])}")
+    image, truth = image.contiguous(), truth.detach().contiguous()
+    if takes_triton(backend, image, truth):
+        from sparsestreet.ops.triton.ssim import mean_ssim
+
+        return mean_ssim(image, truth)
     x, y = image.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None]
     moments = _blur(torch.cat((x, y, x * x, y * y, x * y), dim=1))
     mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.chunk(5, dim=1)
@@ -26,11 +41,14 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[
     return (luminance * contrast_structure).mean()
 
 
+def window() -> tuple[float, ...]:
+    """Weights of the 11 taps along one axis; they sum to 1."""
+    taps = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(WINDOW)]
+    return tuple(tap / sum(taps) for tap in taps)
+
+
 def _blur(planes: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c i j"]:
     """Separable Gaussian window, valid pixels only."""
     channels = planes.shape[1]
-    offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
-    window = torch.exp(-offsets.square() / (2 * SIGMA**2))
-    window = (window / window.sum()).expand(channels, 1, 1, WINDOW)
-    rows = conv2d(planes, window, groups=channels)
-    return conv2d(rows, window.mT, groups=channels)
+    taps = torch.tensor(window(), dtype=planes.dtype, device=planes.device).expand(channels, 1, 1, WINDOW)
+    return conv2d(conv2d(planes, taps, groups=channels), taps.mT, groups=channels)

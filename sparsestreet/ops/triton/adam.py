@@ -1,0 +1,54 @@
+"""Adam for the rows that were seen: one lane per number, of rows not seen only the mask is read."""
+
+from functools import partial
+
+import triton.language as tl
+from torch import Tensor, uint8
+
+from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.visible_adam import AdamStep
+
+# One number per lane: whether a lane loads differs between neighbours, so that wider loads would not be merged.
+LANES = 256
+OPTIONS = {"num_warps": 8}
+
+
+def step_rows_(
+    parameter: Tensor, gradient: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, visible: Tensor, step: AdamStep
+) -> None:
+    """``sparsestreet.ops.visible_adam.adam_step_`` on contiguous float32 tensors."""
+    numbers = parameter.numel()
+    if not numbers:
+        return
+    launch(
+        step_numbers, numbers, LANES,
+        parameter, gradient, exp_avg, exp_avg_sq, visible.view(uint8), numbers,
+        1 - step.betas[0], step.betas[1], 1 - step.betas[1], step.root, step.eps, step.size,
+        ROW=numbers // len(parameter), options=OPTIONS,
+    )  # fmt: skip
+
+
+@partial(jit, do_not_specialize=["numbers"])
+def step_numbers(
+    parameter, gradient, exp_avg, exp_avg_sq, visible, numbers,
+    share, beta, square_share, root, eps, size,
+    ROW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``share`` and ``square_share``: one minus the decay of the first and of the second moment, ``beta``."""
+    first = tl.program_id(0).to(tl.int64) * BLOCK
+    lane = tl.arange(0, BLOCK)
+    # A division in 64 bits for the program, in 32 for the lanes.
+    row = first // ROW + ((first % ROW).to(tl.int32) + lane) // ROW
+    at = first + lane
+    given = at < numbers
+    seen = given & (tl.load(visible + row, given, 0) != 0)
+    g = tl.load(gradient + at, seen, 0.0)
+    m, v = tl.load(exp_avg + at, seen, 0.0), tl.load(exp_avg_sq + at, seen, 0.0)
+    m += share * (g - m)
+    v = beta * v + square_share * g * g
+    # Rounded as torch rounds: the pass waits for memory, and the approximate ones would differ by two units.
+    change = size * tl.div_rn(m, tl.div_rn(tl.sqrt_rn(v), root + tl.zeros_like(v)) + eps)
+    tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
+    tl.store(exp_avg + at, m, seen)
+    tl.store(exp_avg_sq + at, v, seen)

@@ -1,0 +1,72 @@
+"""One step of Adam for the rows that were seen, in place; all other rows keep their values and moments.
+
+A view draws a part of a scene's rows, and Adam would read and write the moments of all. That only seen rows step is
+the idea of Taming 3DGS (Mallick et al. 2024) and of gsplat's SelectiveAdam; torch.optim.SparseAdam does it for sparse
+gradients. Written from Adam's formula (Kingma & Ba 2015, algorithm 1).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sparsestreet.ops.fused import takes_triton
+
+
+@dataclass(frozen=True)
+class AdamStep:
+    """The numbers of one step."""
+
+    count: int
+    """Steps taken with this one, from 1, counted for the whole parameter: the bias corrections are those of a row that
+    was seen at every step. A row seen for the first time late so moves by (1 - beta1) / sqrt(1 - beta2) learning rates
+    (3.2 with torch's betas) where Adam's first step moves by one, as it does in dense Adam."""
+    lr: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-15
+
+    @property
+    def size(self) -> float:
+        """The learning rate over the first moment's bias correction."""
+        return self.lr / (1 - self.betas[0] ** self.count)
+
+    @property
+    def root(self) -> float:
+        """Square root of the second moment's bias correction."""
+        return math.sqrt(1 - self.betas[1] ** self.count)
+
+
+@torch.no_grad()
+def adam_step_(
+    parameter: Float[Tensor, "n ..."],
+    gradient: Float[Tensor, "n ..."],
+    exp_avg: Float[Tensor, "n ..."],
+    exp_avg_sq: Float[Tensor, "n ..."],
+    visible: Bool[Tensor, " n"],
+    step: AdamStep,
+    *,
+    backend: str = "auto",
+) -> None:
+    """Adam's update of ``parameter`` and both moments where ``visible``; other rows keep every bit.
+
+    With all rows visible it is torch.optim.Adam without weight decay. ``backend``: "torch", "triton", or "auto" for
+    the one that suits the tensors; raises as :func:`sparsestreet.ops.fused.takes_triton`, and ValueError for tensors of
+    different shapes.
+    """
+    shapes = [tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)]
+    if len(set(shapes)) != 1:
+        raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")
+    if takes_triton(backend, parameter, exp_avg, exp_avg_sq):
+        from sparsestreet.ops.triton.adam import step_rows_
+
+        step_rows_(parameter, gradient.contiguous(), exp_avg, exp_avg_sq, visible.contiguous(), step)
+        return
+    rows = visible.nonzero()[:, 0]
+    seen, value = gradient.index_select(0, rows), parameter.index_select(0, rows)
+    first = exp_avg.index_select(0, rows).lerp_(seen, 1 - step.betas[0])
+    second = exp_avg_sq.index_select(0, rows).mul_(step.betas[1]).addcmul_(seen, seen, value=1 - step.betas[1])
+    value.addcdiv_(first, second.sqrt().div_(step.root).add_(step.eps), value=-step.size)
+    for whole, part in ((parameter, value), (exp_avg, first), (exp_avg_sq, second)):
+        whole.index_copy_(0, rows, part)

@@ -1,0 +1,48 @@
+"""The fused steps of training compile for sm_80 and sm_90 without a GPU, and keep everything in registers."""
+
+import pytest
+import torch
+
+from sparsestreet.ops.ssim import ssim
+from sparsestreet.ops.triton import adam
+from sparsestreet.ops.triton import ssim as fused_ssim
+from sparsestreet.ops.visible_adam import AdamStep, adam_step_
+from tests.ops.scenes import device_of
+from tests.ops.triton.recording import Launch, compile_launches, record_launches
+
+ARCHITECTURES = ("80", "90")
+DEVICE = device_of("triton")
+# Measured with Triton 3.7.1: 22, 64 and 64. A streaming multiprocessor has 65536 registers: at 32 in each lane it holds
+# all the warps it can, at 64 half of them.
+REGISTERS = {"step_numbers": 32, "similarity": 64, "similarity_backward": 64}
+
+
+@pytest.fixture(scope="module")
+def compiled() -> list[tuple[Launch, dict]]:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        launches = record_launches(monkeypatch, (adam, fused_ssim))
+        for shape in ((2, 3), (2, 15, 3)):
+            fields = [torch.zeros(shape, device=DEVICE) for _ in range(4)]
+            adam_step_(*fields, torch.ones(2, dtype=torch.bool, device=DEVICE), AdamStep(1, 0.1), backend="triton")
+        image = torch.zeros(11, 11, 3, device=DEVICE)
+        ssim(image, image, backend="triton")
+        ssim(image.requires_grad_(), image, backend="triton").backward()
+    return compile_launches(launches, ARCHITECTURES)
+
+
+def test_every_kernel_is_compiled(compiled):
+    assert sorted(launch.name for launch, _ in compiled) == [
+        "similarity", "similarity", "similarity_backward", "step_numbers", "step_numbers"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+def test_nothing_spills_and_registers_are_few(compiled, arch):
+    for launch, found in compiled:
+        assert found[arch]["spilled"] == 0, launch
+        assert found[arch]["registers"] <= REGISTERS[launch.name], (launch, found[arch])
+
+
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+def test_no_tensor_cores_and_no_atomics(compiled, arch):
+    assert [launch for launch, found in compiled if found[arch]["tensor_core"] or found[arch]["atomics"]] == []
