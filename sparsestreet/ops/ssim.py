@@ -4,17 +4,13 @@ Written here because the loss runs at every step: at 320x192 on two cores it tak
 ``kornia.losses.ssim_loss``, against which it is tested. Reported SSIM is another definition (evaluation/metrics).
 """
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
 from sparsestreet.ops.fused import takes_triton
-
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2  # (k1 L)^2 and (k2 L)^2 of the paper at data range L = 1
+from sparsestreet.ops.window import C1, C2, WINDOW, window
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backend: str = "auto") -> Float[Tensor, ""]:
@@ -39,12 +35,6 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backen
     luminance = (2 * product + C1) / (squares + C1)
     contrast_structure = (2 * (mean_xy - product) + C2) / (mean_xx + mean_yy - squares + C2)
     return (luminance * contrast_structure).mean()
-
-
-def window() -> tuple[float, ...]:
-    """Weights of the 11 taps along one axis; they sum to 1."""
-    taps = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(WINDOW)]
-    return tuple(tap / sum(taps) for tap in taps)
 
 
 def _blur(planes: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c i j"]:

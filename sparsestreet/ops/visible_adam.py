@@ -61,7 +61,11 @@ def adam_step_(
     if takes_triton(backend, parameter, exp_avg, exp_avg_sq):
         from sparsestreet.ops.triton.adam import step_rows_
 
-        step_rows_(parameter, gradient.contiguous(), exp_avg, exp_avg_sq, visible.contiguous(), step)
+        moments = (exp_avg, exp_avg_sq)
+        step_rows_(
+            parameter, gradient.contiguous(), *moments, visible.contiguous(),
+            size=step.size, root=step.root, betas=step.betas, eps=step.eps,
+        )  # fmt: skip
         return
     rows = visible.nonzero()[:, 0]
     seen, value = gradient.index_select(0, rows), parameter.index_select(0, rows)

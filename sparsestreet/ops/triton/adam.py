@@ -7,7 +7,6 @@ from torch import Tensor, uint8
 
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.visible_adam import AdamStep
 
 # One number per lane: whether a lane loads differs between neighbours, so that wider loads would not be merged.
 LANES = 256
@@ -15,16 +14,25 @@ OPTIONS = {"num_warps": 8}
 
 
 def step_rows_(
-    parameter: Tensor, gradient: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor, visible: Tensor, step: AdamStep
+    parameter: Tensor,
+    gradient: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    visible: Tensor,
+    *,
+    size: float,
+    root: float,
+    betas: tuple[float, float],
+    eps: float,
 ) -> None:
-    """``sparsestreet.ops.visible_adam.adam_step_`` on contiguous float32 tensors."""
+    """``visible_adam.adam_step_`` on contiguous float32 tensors; ``size`` and ``root`` are those of its AdamStep."""
     numbers = parameter.numel()
     if not numbers:
         return
     launch(
         step_numbers, numbers, LANES,
         parameter, gradient, exp_avg, exp_avg_sq, visible.view(uint8), numbers,
-        1 - step.betas[0], step.betas[1], 1 - step.betas[1], step.root, step.eps, step.size,
+        1 - betas[0], betas[1], 1 - betas[1], root, eps, size,
         ROW=numbers // len(parameter), options=OPTIONS,
     )  # fmt: skip
 
