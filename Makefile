@@ -8,10 +8,15 @@ export XDG_CACHE_HOME := $(CURDIR)/.cache
 $(shell mkdir -p .cache/tmp)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
-.PHONY: test demo lint bench clean
+.PHONY: test demo lint bench clean FORCE
+
+# An editable install knows the modules it was made with: a new or renamed one calls for another.
+.cache/modules: FORCE
+	@find sparsestreet -name '*.py' | sort | cmp -s - $@ || find sparsestreet -name '*.py' | sort >$@
+FORCE:
 
 # Everything a fresh clone needs; rebuilt when the project's own files change.
-$(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt $(wildcard sparsestreet/ops/cpu/*pp)
+$(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wildcard sparsestreet/ops/cpu/src/*)
 	test -x $(BIN)/python || $(PY) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[dev]'
 	@if $(BIN)/python -m pip list 2>/dev/null | grep -q '^torchvision '; then \
