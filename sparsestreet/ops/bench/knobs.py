@@ -8,7 +8,7 @@ import torch
 from sparsestreet.ops.settings import SplatSettings
 
 DEFAULT = SplatSettings()
-PRESETS = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast")
+PRESETS = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast", "fine")
 KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
     "alpha_min": (0.0, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64),
     "box": (3.0, 3.33, 4.0, inf),

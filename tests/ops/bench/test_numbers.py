@@ -18,16 +18,19 @@ def test_line_through_points_on_it():
 
 
 def test_line_by_hand():
-    # Means 1 and 1; covariance 0*.. : sum (x-1)(y-1) = 1, sum (x-1)^2 = 2: slope 1/2, residuals 1/2, -1, 1/2.
-    line = fit_line([0.0, 1.0, 2.0], [1.0, 0.0, 2.0])
-    assert (line.slope, line.intercept) == pytest.approx((0.5, 0.5))
-    assert line.r_squared == pytest.approx(1 - 1.5 / 2)
+    # Weights 1, 1, 1/4 (of 9/4): means 2/3 and 10/9, covariance 4/27, variance of x 4/9: slope 1/3, intercept 8/9.
+    # Residuals 1/9, -2/9, 4/9: weighted (1 + 4 + 4) / 81 / (9/4) = 4/81, half of the variance of y, 8/81.
+    line = fit_line([0.0, 1.0, 2.0], [1.0, 1.0, 2.0])
+    assert (line.slope, line.intercept) == pytest.approx((1 / 3, 8 / 9))
+    assert line.r_squared == pytest.approx(1 / 2)
 
 
 def test_line_of_constant_values_and_of_one_x():
     assert fit_line([1.0, 2.0], [3.0, 3.0]).r_squared == 1
     with pytest.raises(ValueError, match=r"two different x, got \[4"):
         fit_line([4.0, 4.0], [1.0, 2.0])
+    with pytest.raises(ValueError, match=r"values > 0, got 0"):
+        fit_line([4.0, 5.0], [0.0, 2.0])
 
 
 def test_front_by_hand():
