@@ -1,16 +1,13 @@
 """Frames in the order that training and validation want them."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
 
 import torch
 from lightning import LightningDataModule
 
+from sparsestreet.data.device import to_device
 from sparsestreet.data.log import DrivingLog, split
 from sparsestreet.types import Frame
-
-T = TypeVar("T")
 
 
 class ShuffledFrames:
@@ -87,13 +84,3 @@ class StreetData(LightningDataModule):
     def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
         """The frame on the device (Lightning itself cannot move a frozen dataclass)."""
         return to_device(batch, device)
-
-
-def to_device(value: T, device: torch.device) -> T:
-    """A copy of a frozen dataclass with all tensors, nested ones too, on the device."""
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
-    if not is_dataclass(value):
-        return value
-    moved: dict[str, Any] = {field.name: to_device(getattr(value, field.name), device) for field in fields(value)}
-    return replace(value, **moved)

@@ -28,13 +28,13 @@ def splat(
 ) -> Rendering:
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
-    Differentiable in every field of ``gaussians`` (means also through the view direction of the colours) and in
-    ``background``; not in the camera. Autocast has no effect here: everything runs in the dtype of the Gaussians,
-    whatever the camera's.
+    Differentiable in every field of ``gaussians`` but ``displacements`` (in means also through the view direction of
+    the colours) and in ``background``; not in the camera. Autocast has no effect here: everything runs in the dtype of
+    the Gaussians, whatever the camera's.
 
     Args:
         gaussians: n rows in the world, metres; n = 0 gives the background.
-        camera: pinhole without skew.
+        camera: pinhole without skew, with its lens and rolling shutter where given (docs/effects.md).
         background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha.
         settings: cut-offs and filters.
         backend: "reference", "cpu", "triton" or "auto".

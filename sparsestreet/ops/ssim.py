@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from sparsestreet.ops.fused import takes_triton
-from sparsestreet.ops.window import C1, C2, WINDOW, window
+from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backend: str = "auto") -> Float[Tensor, ""]:

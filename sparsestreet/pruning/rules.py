@@ -8,13 +8,16 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from sparsestreet.data.datamodule import to_device
+from sparsestreet.data.device import to_device
 from sparsestreet.ops import SplatSettings, contribution, removal
 from sparsestreet.pruning.importance import measure_importance
 from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import backdrop, render
 from sparsestreet.types import Contribution, Frame, Removal
+
+LEAST_ERROR = 1e-12
+"""Squared error (images lie in [0, 1]) that stands for none; its inverse fits into float32."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,8 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
 
 def _removal(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], view: View) -> Removal:
     """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
-    share = torch.where(errors > 0, 1 / errors, 0.0)
+    # Where there is no error left, any change is too dear. A region that no frame marks has no pixel to weigh.
+    share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
     return removal(
         scene.gaussians_at(frame.time).gaussians,
@@ -119,7 +123,7 @@ def _removal(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], view
 
 
 def _squared_errors(scene: SceneGraph, frame: Frame, view: View) -> Float64[Tensor, "3"]:
-    """Of each region of one frame."""
+    """Sum over pixels and channels of the squared error of one frame, in each of its regions."""
     image = render(scene, frame.camera, frame.time, settings=view.settings, backend=view.backend).rgb
     squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
     return (_regions(frame).double() * squared).sum((1, 2))

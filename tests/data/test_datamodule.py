@@ -7,7 +7,8 @@ import lightning
 import pytest
 import torch
 
-from sparsestreet.data.datamodule import ShuffledFrames, StreetData, to_device
+from sparsestreet.data.datamodule import ShuffledFrames, StreetData
+from sparsestreet.data.device import to_device
 from sparsestreet.types import Frame
 from tests.data.streets import make_log
 

@@ -1,6 +1,8 @@
 """Small scenes for the tests of the op, and ways to render and differentiate them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ from torch import Tensor
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Camera, Gaussians
 
+Answer = TypeVar("Answer")
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
 CPU = torch.device("cpu")
@@ -165,3 +168,15 @@ def render(
 def relative_error(value: Tensor, truth: Tensor) -> float:
     """L2 of the difference over L2 of the truth."""
     return float((value - truth).norm() / truth.norm().clamp(min=1e-30))
+
+
+def with_threads(counts: tuple[int, ...], call: Callable[[], Answer]) -> list[Answer]:
+    """What ``call`` answers with each number of threads."""
+    before, results = torch.get_num_threads(), []
+    try:
+        for count in counts:
+            torch.set_num_threads(count)
+            results.append(call())
+    finally:
+        torch.set_num_threads(before)
+    return results

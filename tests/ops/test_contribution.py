@@ -5,7 +5,7 @@ import torch
 
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.types import Gaussians
-from tests.ops.scenes import camera, cast, front_camera, one_gaussian, random_gaussians
+from tests.ops.scenes import camera, cast, front_camera, one_gaussian, random_gaussians, with_threads
 
 BACKENDS = ["reference", "cpu"]
 
@@ -74,13 +74,6 @@ def test_no_rows(backend):
 def test_same_for_any_number_of_threads():
     view = camera(150, 90)
     gaussians = cast(random_gaussians(3000, view), torch.float32)
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            results.append(contribution(gaussians, view, backend="cpu"))
-    finally:
-        torch.set_num_threads(before)
+    results = with_threads((1, 2), lambda: contribution(gaussians, view, backend="cpu"))
     assert torch.equal(results[0].weight, results[1].weight)
     assert torch.equal(results[0].dominant, results[1].dominant)

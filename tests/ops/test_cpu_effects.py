@@ -10,7 +10,7 @@ from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.cpu import rasteriser
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.types import Camera, Gaussians, Shutter
-from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render
+from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render, with_threads
 
 
 def vector(*values: float) -> torch.Tensor:
@@ -103,13 +103,7 @@ def test_displacements_must_be_finite():
 def test_bitwise_equal_for_any_number_of_threads():
     view = view_through("folds", "rolling", 70, 50)
     gaussians = walking(3001, view)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(render(gaussians, view, "cpu", torch.float32, SETTINGS["knobs"]))
-    finally:
-        torch.set_num_threads(before)
+    results = with_threads((1, 2, 3), lambda: render(gaussians, view, "cpu", torch.float32, SETTINGS["knobs"]))
     for other in results[1:]:
         for part in ("images", "gradients"):
             for name, value in getattr(results[0], part).items():

@@ -7,7 +7,7 @@ from sparsestreet.ops import SplatSettings, resolve_backend, splat
 from sparsestreet.ops.cpu import rasteriser
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.types import Gaussians
-from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render
+from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render, with_threads
 
 SETTINGS = {
     "default": SplatSettings(),
@@ -97,14 +97,7 @@ def test_gradcheck(field):
 def test_bitwise_equal_for_one_and_two_threads():
     view = camera(70, 50)
     gaussians = random_gaussians(200_000, view, terms=1)
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(render(gaussians, view, "cpu", torch.float32))
-    finally:
-        torch.set_num_threads(before)
+    results = with_threads((1, 2, 3), lambda: render(gaussians, view, "cpu", torch.float32))
     # With fewer visible rows one thread would do all the sorting.
     assert (results[0].radii > 0).sum() > 1 << 17
     for other in results[1:]:

@@ -102,6 +102,16 @@ def test_what_shows_a_vehicle_costs_more():
         assert first.keep.tolist() == kept
 
 
+def test_a_scene_without_error_loses_nothing_that_is_seen():
+    """A budget relative to no error is no budget: an overexposed disc before a white truth stays."""
+    scene = scene_of([0.99], [2.0])
+    with torch.no_grad():
+        scene.nodes["background"].rows.sh_dc.fill_(9.0)
+    frame = frame_of(scene, 0)
+    assert (frame.image == 255).all()
+    assert RemovalRule(0.1).select(scene, [frame], {"background": 0}, VIEW)["background"].removed == 0
+
+
 def test_the_floor_holds():
     scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0])
     for rule in (RemovalRule(50.0), ImportanceRule()):

@@ -1,0 +1,18 @@
+"""Frozen values from one device to another."""
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+
+T = TypeVar("T")
+
+
+def to_device(value: T, device: torch.device) -> T:
+    """A copy of a frozen dataclass with all tensors, nested ones too, on the device."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if not is_dataclass(value):
+        return value
+    moved: dict[str, Any] = {field.name: to_device(getattr(value, field.name), device) for field in fields(value)}
+    return replace(value, **moved)
