@@ -42,6 +42,7 @@ def _in_double(backends: tuple[str, ...]) -> pytest.MarkDecorator:
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_precision = _in_every_precision(BACKENDS)
 every_double = _in_double(BACKENDS)
+every_fast_backend = pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "reference"])
 every_effect_precision = _in_every_precision(EFFECT_BACKENDS)
 every_effect_double = _in_double(EFFECT_BACKENDS)
 

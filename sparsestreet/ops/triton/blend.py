@@ -1,8 +1,9 @@
 """Forward: each tile's splats, nearest first, into its 256 pixels.
 
-One warp per tile holds 8 pixels per lane in registers and walks the splats one by one; every number of a splat is one
-load for all lanes. Pixels lie on the axes (x, y), so that a lane's pixels share y and everything that only y changes
-is computed once. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
+One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers and walks the splats one by
+one; every number of a splat is one load for all lanes. Pixels lie on the axes (x, y), so that a lane's pixels share y
+and everything that only y changes is computed once. Registers and instructions are bounded in
+tests/ops/triton/test_machine_code.py.
 """
 
 import triton.language as tl
@@ -11,8 +12,15 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.view import TILE
 
+PIXEL_COUNT = 256
+PIXELS = constant(PIXEL_COUNT)
 # Pairs between two looks at whether the whole tile is finished.
 LOOK = constant(32)
+
+
+def registers(lasts: bool, exclusive: bool) -> int:
+    """Registers of a lane: the fewest without spills, so that many tiles run at once."""
+    return 88 if lasts or exclusive else 80
 
 
 @jit
@@ -21,6 +29,20 @@ def pixels_of(tile, width, height, tiles_x):
     x = (tile % tiles_x) * TILE + tl.arange(0, TILE)[:, None]
     y = (tile // tiles_x) * TILE + tl.arange(0, TILE)[None, :]
     return x, y, (x < width) & (y < height)
+
+
+@jit
+def part_pixels(part, step):
+    """Places of a part's pixels in the layers of all parts [16, 16]; ``step`` is 1 (see blend_backward.py)."""
+    return part * PIXELS + tl.arange(0, TILE)[None, :] * TILE + tl.arange(0, TILE)[:, None] * step
+
+
+@jit
+def pairs_of(tile, begins, ends, PARTS: tl.constexpr):
+    """First pair, and the one after the last, of this program's tile or part of one."""
+    if PARTS:
+        tile = tl.program_id(0)
+    return tl.load(begins + tile), tl.load(ends + tile)
 
 
 @jit
@@ -33,66 +55,83 @@ def whitened(s, px, py):
 
 
 @jit
-def blend_weight(s, exponent, raw, transmittance, gate, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
-    """Alpha (0 below the cut-off and in finished pixels) and the gate after it.
+def blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
+    """Blend weight of a splat, the light that gets past it, and which pixels were open to it.
 
-    ``gate`` is the product that includes dropped splats; only the exclusive stop looks at it.
+    A pixel is finished for good where ``passed`` is at most ``transmittance_min``. The exclusive stop drops the splat
+    that would cross that limit and marks the pixel by the sign: the light itself stays above.
     """
-    alpha = tl.minimum(raw, alpha_max)
-    cutoff = tl.load(s + record.CUTOFF)
+    _, _, _, _, exponent = whitened(s, px, py)
+    alpha = tl.minimum(tl.exp2(exponent), alpha_max)
+    drawn = exponent >= tl.load(s + record.CUTOFF)
     if EXCLUSIVE:
-        alpha = tl.where(exponent >= cutoff, alpha, 0.0)
-        gate -= alpha * gate
-        alpha = tl.where(gate > transmittance_min, alpha, 0.0)
+        weight = tl.where(drawn, alpha, 0.0) * passed
+        rest = passed - weight
+        still = rest > transmittance_min
+        weight = tl.where(still, weight, 0.0)
+        rest = tl.where(still, rest, -tl.abs(passed))
     else:
-        alpha = tl.where((exponent >= cutoff) & (transmittance > transmittance_min), alpha, 0.0)
-    return alpha, gate
+        still = passed > transmittance_min
+        weight = tl.where(drawn & still, alpha, 0.0) * passed
+        rest = passed - weight
+    return weight, rest, still
+
+
+@jit
+def open_before(products, firsts, part, inside, PARTS: tl.constexpr):
+    """What reaches a tile, or gets past the parts of the tile before this one; pixels outside are finished at once."""
+    passed = tl.where(inside, 1.0, 0.0)
+    if PARTS:
+        for before in range(tl.load(firsts + part), part):
+            passed *= tl.load(products + part_pixels(before, 1))
+    return passed
 
 
 @jit
 def blend_tiles(
-    records, pair_rows, begins, ends, order, rgb, transmittance, depth_sum, lasts,
+    records, pair_rows, begins, ends, order, firsts, products, rgb, transmittance, depth_sum, lasts,
     width, height, tiles_x, alpha_max, transmittance_min,
-    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, BLOCK: tl.constexpr,
+    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes every pixel of one tile, and in ``lasts`` the index after the last pair that was looked at."""
+    """Writes every pixel of one tile; with PARTS of one part of a tile, into the layers of parts (parts.py).
+
+    ``lasts`` (if LASTS): the index after the last pair that a pixel was open to, where backward begins.
+    """
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    # Pixels outside are finished from the start.
-    passed = tl.where(inside, 1.0, 0.0)
-    gate = passed
+    k, end = pairs_of(tile, begins, ends, PARTS)
+    passed = open_before(products, firsts, tl.program_id(0), inside, PARTS)
     red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
-    depth = tl.zeros_like(passed)
-    k, end = tl.load(begins + tile), tl.load(ends + tile)
-    unfinished = k < end
+    depth, last = tl.zeros_like(passed), tl.zeros_like(passed).to(tl.int32) + k
+    unfinished = (k < end) & (tl.max(passed) > transmittance_min)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
             s = record.record_of(records, tl.load(pair_rows + i))
-            _, _, _, _, exponent = whitened(s, px, py)
-            alpha, gate = blend_weight(
-                s, exponent, tl.exp2(exponent), passed, gate, alpha_max, transmittance_min, EXCLUSIVE
-            )
-            weight = alpha * passed
-            passed -= weight
+            weight, passed, still = blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE)
             red += weight * tl.load(s + record.COLOR)
             green += weight * tl.load(s + record.COLOR + 1)
             blue += weight * tl.load(s + record.COLOR + 2)
             if DEPTH:
                 depth += weight * tl.load(s + record.DEPTH)
+            if LASTS:
+                last = tl.where(still, i + 1, last)
         k = stop
-        still = gate if EXCLUSIVE else passed
-        unfinished = (k < end) & (tl.max(still) > transmittance_min)
+        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
     # Volatile: the compiler must compute places anew instead of holding registers for them through the loop.
     tile = tl.load(order + tl.program_id(0), volatile=True)
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     at = y * width + x
+    if PARTS:
+        # Pixels outside have a place too, and are written, for they are read.
+        at, inside = part_pixels(tl.program_id(0), 1), inside | True
     tl.store(rgb + 3 * at, red, inside)
     tl.store(rgb + 3 * at + 1, green, inside)
     tl.store(rgb + 3 * at + 2, blue, inside)
-    tl.store(transmittance + at, passed, inside)
+    tl.store(transmittance + at, tl.abs(passed), inside)
     if DEPTH:
         tl.store(depth_sum + at, depth, inside)
-    tl.store(lasts + tile, k)
+    if LASTS:
+        tl.store(lasts + at, last, inside)

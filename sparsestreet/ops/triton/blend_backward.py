@@ -1,6 +1,8 @@
-"""Backward, front to back again: dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light still behind k), where
-f = colour and depth against the cotangents and the light behind is the pixel's total minus the prefix. Nothing is
-divided out of the transmittance, so saturated pixels keep their digits. Each pair writes its own slot: no atomics.
+"""Backward, from the last splat of a pixel to the first: dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light
+from behind k), where f = colour and depth against the cotangents. The light from behind is summed from the back, its
+small terms first, and the transmittance before a splat is that after it / (1 - alpha): both keep their relative digits
+however deep the stack. (Total minus prefix, from the front, would carry the rounding of the total to the faintest
+splat.) Each pair writes its own slot: no atomics.
 
 A slot holds, with s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d and w the blend weight, the sums over pixels of
 s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + l22 b)|; w times the cotangents.
@@ -11,7 +13,7 @@ from functools import partial
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import blend_weight, pixels_of, whitened
+from sparsestreet.ops.triton.blend import pairs_of, part_pixels, pixels_of, whitened
 from sparsestreet.ops.triton.language import constant, jit
 
 SLOT_LENGTH = 12
@@ -19,9 +21,9 @@ SLOT = constant(SLOT_LENGTH)
 ZEROED = constant(32)
 
 
-def registers(depth: bool, exclusive: bool) -> int:
+def registers(depth: bool) -> int:
     """Registers of a lane: the fewest without spills, so that many tiles run at once."""
-    return 128 if exclusive else 112 if depth else 96
+    return 112 if depth else 104
 
 
 @jit
@@ -66,16 +68,44 @@ def zero_slots(slots, pair_slots, begin, end, COUNT: tl.constexpr):
             tl.store(to + i, 0.0, pair < end)
 
 
+@jit
+def alpha_behind(s, exponent, k, last, alpha_max):
+    """Alpha, 0 where the splat was not drawn or the pixel had finished, and 1 / (1 - alpha)."""
+    raw = tl.exp2(exponent)
+    drawn = (exponent >= tl.load(s + record.CUTOFF)) & (k < last)
+    alpha = tl.where(drawn, tl.minimum(raw, alpha_max), 0.0)
+    # The device's reciprocal root is good to 2^-22.9; one Newton step, so that no drift builds up over a stack.
+    rest = 1.0 - alpha
+    root = tl.rsqrt(rest)
+    inverse = root * root
+    return raw, alpha, tl.fma(tl.fma(-rest, inverse, 1.0), inverse, inverse)
+
+
+@jit
+def from_behind(colors, depths, v_red, v_green, v_blue, v_depth, nexts, part, step, DEPTH: tl.constexpr):
+    """Light of the parts of the tile behind this one, against the cotangents."""
+    behind = tl.zeros_like(v_red)
+    for after in range(part + 1, tl.load(nexts + part)):
+        at = part_pixels(after, step)
+        behind += tl.load(colors + 3 * at) * v_red + tl.load(colors + 3 * at + 1) * v_green
+        behind += tl.load(colors + 3 * at + 2) * v_blue
+        if DEPTH:
+            behind += tl.load(depths + at) * v_depth
+    return behind
+
+
 @partial(jit, do_not_specialize=["step"])
 def blend_tiles_backward(
-    records, pair_rows, pair_slots, begins, ends, lasts, order, rgb, transmittance, depth_sum,
-    v_rgb, v_transmittance, v_depth_sum, slots, width, height, step, tiles_x, alpha_max, transmittance_min,
-    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, BLOCK: tl.constexpr,
+    records, pair_rows, pair_slots, begins, ends, order, transmittance, lasts,
+    nexts, part_rgb, part_depth, part_transmittance, part_lasts,
+    v_rgb, v_transmittance, v_depth_sum, slots, width, height, step, tiles_x, alpha_max,
+    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile. ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given.
+    """Writes the slots of all pairs of one tile, with PARTS of one part of a tile.
 
-    ``step`` is 1, and the compiler must not know: for neighbouring pixels it would load in another layout than the one
-    it sums in, and compile the loop twice into one.
+    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given. ``step`` is 1, and the compiler must not
+    know: for neighbouring pixels it would load in another layout than the one it sums in, and compile the loop twice
+    into one.
     """
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
@@ -85,34 +115,33 @@ def blend_tiles_backward(
     v_red = tl.load(v_rgb + 3 * at, inside, 0.0)
     v_green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
     v_blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
-    v_depth = v_red
-    behind = tl.load(rgb + 3 * at, inside, 0.0) * v_red + tl.load(rgb + 3 * at + 1, inside, 0.0) * v_green
-    behind += tl.load(rgb + 3 * at + 2, inside, 0.0) * v_blue
-    behind += tl.load(transmittance + at, inside, 0.0) * tl.load(v_transmittance + at, inside, 0.0)
-    if DEPTH:
-        v_depth = tl.load(v_depth_sum + at, inside, 0.0)
-        behind += tl.load(depth_sum + at, inside, 0.0) * v_depth
-    passed = tl.where(inside, 1.0, 0.0)
-    gate = passed
-    last = tl.load(lasts + tile)
-    zero_slots(slots, pair_slots, last, tl.load(ends + tile), SLOT)
-    for k in range(tl.load(begins + tile), last):
+    v_depth = tl.load(v_depth_sum + at, inside, 0.0) if DEPTH else v_red
+    passed = tl.load(transmittance + at, inside, 0.0)
+    behind = passed * tl.load(v_transmittance + at, inside, 0.0)
+    begin, end = pairs_of(tile, begins, ends, PARTS)
+    if PARTS:
+        part = tl.program_id(0)
+        behind += from_behind(part_rgb, part_depth, v_red, v_green, v_blue, v_depth, nexts, part, step, DEPTH)
+        at = part_pixels(part, step)
+        passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
+    else:
+        last = tl.load(lasts + at, inside, begin)
+    latest = tl.max(last)
+    zero_slots(slots, pair_slots, latest, end, SLOT)
+    for i in range(latest - begin):
+        k = latest - 1 - i
         s = record.record_of(records, tl.load(pair_rows + k))
         dx, dy, a, b, exponent = whitened(s, px, py)
-        raw = tl.exp2(exponent)
-        alpha, gate = blend_weight(s, exponent, raw, passed, gate, alpha_max, transmittance_min, EXCLUSIVE)
+        raw, alpha, inverse = alpha_behind(s, exponent, k, last, alpha_max)
+        passed *= inverse
         weight = alpha * passed
-        passed -= weight
         light = tl.load(s + record.COLOR) * v_red + tl.load(s + record.COLOR + 1) * v_green
         light += tl.load(s + record.COLOR + 2) * v_blue
         if DEPTH:
             light += tl.load(s + record.DEPTH) * v_depth
         blended = weight * light
-        behind -= blended
-        # 1 / (1 - alpha) without the scaling a division would take to guard its range.
-        root = tl.rsqrt(1.0 - alpha)
-        g = blended - alpha * (root * root) * behind
         # A clamped alpha has no derivative.
-        g = tl.where(raw <= alpha_max, g, 0.0)
+        g = tl.where(raw <= alpha_max, blended - alpha * inverse * behind, 0.0)
+        behind += blended
         o = slots + tl.load(pair_slots + k) * SLOT
         store_sums(o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH, ABSOLUTE)

@@ -4,7 +4,7 @@ does not pay for it; slots instead of atomics, as in backward."""
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, blend_weight, pixels_of, whitened
+from sparsestreet.ops.triton.blend import LOOK, blend_one, pixels_of
 from sparsestreet.ops.triton.blend_backward import zero_slots
 from sparsestreet.ops.triton.language import constant, jit
 
@@ -23,7 +23,6 @@ def count_tiles_pixels(
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
     passed = tl.where(inside, 1.0, 0.0)
-    gate = passed
     best, best_pair = tl.zeros_like(passed), tl.zeros_like(passed).to(tl.int32) - 1
     begin, end = tl.load(begins + tile), tl.load(ends + tile)
     k = begin
@@ -32,12 +31,7 @@ def count_tiles_pixels(
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
             s = record.record_of(records, tl.load(pair_rows + i))
-            _, _, _, _, exponent = whitened(s, px, py)
-            alpha, gate = blend_weight(
-                s, exponent, tl.exp2(exponent), passed, gate, alpha_max, transmittance_min, EXCLUSIVE
-            )
-            weight = alpha * passed
-            passed -= weight
+            weight, passed, _ = blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE)
             # Strictly more: of equal weights the nearer splat keeps the pixel.
             more = weight > best
             best, best_pair = tl.where(more, weight, best), tl.where(more, i, best_pair)
@@ -45,8 +39,7 @@ def count_tiles_pixels(
             tl.store(o, tl.sum(weight))
             tl.store(o + 1, tl.sum((weight > 0).to(tl.float32)))
         k = stop
-        still = gate if EXCLUSIVE else passed
-        unfinished = (k < end) & (tl.max(still) > transmittance_min)
+        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
     for i in range(begin, k):
         tl.store(slots + tl.load(pair_slots + i) * COUNTERS + 2, tl.sum((best_pair == i).to(tl.float32)))
     zero_slots(slots, pair_slots, k, end, COUNTERS)

@@ -17,6 +17,7 @@ from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.parts import Parts, split_tiles
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
 from sparsestreet.ops.triton.view import View
 
@@ -42,6 +43,8 @@ class Lists:
     ends: Int[Tensor, " t"]
     order: Int[Tensor, " t"]
     """Tiles, those with most pairs first: the longest must not start last."""
+    parts: Parts | None
+    """Where some tiles are so long that they are split."""
 
 
 @partial(jit, do_not_specialize=["row_count"])
@@ -107,7 +110,8 @@ def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: in
     begins = torch.searchsorted(keys, torch.arange(columns * lines, device=keys.device).to(keys.dtype), out_int32=True)
     ends = torch.cat((begins[1:], begins.new_full((1,), pairs)))
     order = torch.argsort(ends - begins, descending=True).int()
-    return Lists(rows, first_pairs, counts, unsorted_rows[slots], slots, begins, ends, order)
+    parts = split_tiles(begins, ends, pairs)
+    return Lists(rows, first_pairs, counts, unsorted_rows[slots], slots, begins, ends, order, parts)
 
 
 def _rows_by_depth(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: View) -> Tensor:

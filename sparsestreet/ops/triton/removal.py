@@ -1,13 +1,14 @@
 """How far a view moves when one row alone is taken away. A pixel is linear in the alpha of each of its splats, so the
-change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
+change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha); from the back to the front, as backward.
+"""
 
 from functools import partial
 
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import blend_weight, pixels_of, whitened
-from sparsestreet.ops.triton.blend_backward import zero_slots
+from sparsestreet.ops.triton.blend import pixels_of, whitened
+from sparsestreet.ops.triton.blend_backward import alpha_behind, zero_slots
 from sparsestreet.ops.triton.language import constant, jit
 
 CHANGE_COUNT = 2
@@ -15,26 +16,25 @@ CHANGES = constant(CHANGE_COUNT)
 
 
 @jit
-def light_over(image, background, passed, at, inside, CHANNEL: tl.constexpr, BEHIND: tl.constexpr):
-    """One channel of the tile: what was blended, over the background where there is one."""
-    light = tl.load(image + 3 * at + CHANNEL, inside, 0.0)
+def light_of(background, passed, at, inside, CHANNEL: tl.constexpr, BEHIND: tl.constexpr):
+    """One channel of what is behind everything, as it is seen."""
+    light = tl.zeros_like(passed)
     if BEHIND:
-        light += passed * tl.load(background + 3 * at + CHANNEL, inside, 0.0)
+        light = passed * tl.load(background + 3 * at + CHANNEL, inside, 0.0)
     return light
 
 
 @jit
-def change_of(light, own, through):
-    """The light still behind a splat, and the change of the channel without the splat."""
-    light -= own
-    return light, light * through - own
+def change_of(behind, own, through):
+    """The change of the channel without the splat, and the light behind the one before it."""
+    return behind * through - own, behind + own
 
 
 @partial(jit, do_not_specialize=["step"])
 def remove_from_tiles(
-    records, pair_rows, pair_slots, begins, ends, lasts, order, rgb, transmittance, background, pixel_weights, slots,
-    width, height, step, tiles_x, alpha_max, transmittance_min,
-    EXCLUSIVE: tl.constexpr, BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
+    records, pair_rows, pair_slots, begins, ends, lasts, order, transmittance, background, pixel_weights, slots,
+    width, height, step, tiles_x, alpha_max,
+    BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the slots of all pairs of one tile: largest change, sum of squares. ``step``: see blend_backward.py."""
     tl.static_assert(BLOCK == 1)
@@ -42,27 +42,25 @@ def remove_from_tiles(
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
     at = y * width + x * step
-    total = tl.load(transmittance + at, inside, 0.0)
-    red = light_over(rgb, background, total, at, inside, 0, BEHIND)
-    green = light_over(rgb, background, total, at, inside, 1, BEHIND)
-    blue = light_over(rgb, background, total, at, inside, 2, BEHIND)
+    passed = tl.load(transmittance + at, inside, 0.0)
+    red = light_of(background, passed, at, inside, 0, BEHIND)
+    green = light_of(background, passed, at, inside, 1, BEHIND)
+    blue = light_of(background, passed, at, inside, 2, BEHIND)
     counts = tl.load(pixel_weights + at, inside, 0.0) if WEIGHTED else 1.0
-    passed = tl.where(inside, 1.0, 0.0)
-    gate = passed
-    last = tl.load(lasts + tile)
-    zero_slots(slots, pair_slots, last, tl.load(ends + tile), CHANGES)
-    for k in range(tl.load(begins + tile), last):
+    begin = tl.load(begins + tile)
+    last = tl.load(lasts + at, inside, begin)
+    latest = tl.max(last)
+    zero_slots(slots, pair_slots, latest, tl.load(ends + tile), CHANGES)
+    for i in range(latest - begin):
+        k = latest - 1 - i
         s = record.record_of(records, tl.load(pair_rows + k))
         _, _, _, _, exponent = whitened(s, px, py)
-        raw = tl.exp2(exponent)
-        alpha, gate = blend_weight(s, exponent, raw, passed, gate, alpha_max, transmittance_min, EXCLUSIVE)
-        weight = alpha * passed
-        passed -= weight
-        root = tl.rsqrt(1.0 - alpha)
-        through = alpha * (root * root)
-        red, of_red = change_of(red, weight * tl.load(s + record.COLOR), through)
-        green, of_green = change_of(green, weight * tl.load(s + record.COLOR + 1), through)
-        blue, of_blue = change_of(blue, weight * tl.load(s + record.COLOR + 2), through)
+        _, alpha, inverse = alpha_behind(s, exponent, k, last, alpha_max)
+        passed *= inverse
+        weight, through = alpha * passed, alpha * inverse
+        of_red, red = change_of(red, weight * tl.load(s + record.COLOR), through)
+        of_green, green = change_of(green, weight * tl.load(s + record.COLOR + 1), through)
+        of_blue, blue = change_of(blue, weight * tl.load(s + record.COLOR + 2), through)
         largest = tl.maximum(tl.maximum(tl.abs(of_red), tl.abs(of_green)), tl.abs(of_blue))
         o = slots + tl.load(pair_slots + k) * CHANGES
         tl.store(o, tl.max(largest))

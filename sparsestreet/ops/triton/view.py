@@ -16,6 +16,8 @@ from sparsestreet.types import Camera
 
 TILE_SIZE = 16
 TILE = constant(TILE_SIZE)
+LEAST_LIGHT = 1e-30
+"""Of ops/cpu: a pixel stops there at the latest."""
 
 # Places in the table.
 ROTATION, TRANSLATION = constant(0), constant(9)
@@ -65,6 +67,11 @@ class View:
     @property
     def exclusive(self) -> bool:
         return self.settings.stop == "exclusive"
+
+    @property
+    def transmittance_min(self) -> float:
+        """Never 0: backward divides its way back from the light that is left, which must not vanish."""
+        return max(self.settings.transmittance_min, LEAST_LIGHT)
 
     def table(self, device: torch.device) -> Float[Tensor, " numbers"]:
         """The numbers on the device: one small copy, rounded from float64."""

@@ -15,7 +15,7 @@ import torch
 import triton.language as tl
 
 from sparsestreet.ops.triton import launch as package
-from sparsestreet.ops.triton import lists, rasteriser
+from sparsestreet.ops.triton import lists, pixels, rasteriser, screen
 
 _POINTERS = {
     torch.float32: "*fp32",
@@ -39,7 +39,7 @@ class Launch:
 
 
 def record_launches(
-    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (rasteriser, lists)
+    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (rasteriser, screen, lists, pixels)
 ) -> list[Launch]:
     """A list that every launch of the modules is appended to from now on."""
     launches: list[Launch] = []

@@ -147,8 +147,8 @@ def test_pairs_behind_a_stack(stop):
         for k in range(36)
     ]
     scene, settings = Gaussians.concatenate(stack), SplatSettings(stop=stop)
-    # The light behind a splat is a total minus a prefix: its error does not fall with the transmittance, as on the CPU.
-    assert_matches_reference(scene, view, settings, gradient_bar=5e-4)
+    # Colours of neighbours differ by 0.003: what an opacity changes is a small difference of two lights.
+    assert_matches_reference(scene, view, settings, gradient_bar=5e-5)
     assert render(scene, view, "triton", torch.float32, settings).images["alpha"].min() > 0.9995
 
 

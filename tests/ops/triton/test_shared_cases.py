@@ -22,6 +22,8 @@ RENDERED = (
     test_hard_blending.test_10_a_clamped_alpha_has_no_gradient,
     test_hard_blending.test_11_12_opacity_at_the_cut_off,
     test_hard_blending.test_24_expected_depth_of_a_faint_splat,
+    test_hard_blending.test_26_deep_stacks,
+    test_hard_blending.test_26_light_that_vanishes_in_float32,
     test_hard_blending.test_27_exponents_that_underflow,
     test_hard_geometry.test_03_04_needles_in_float32,
     test_hard_geometry.test_06_camera_inside_a_splat,

@@ -1,0 +1,150 @@
+"""Long tiles in parts, so that a few deep tiles do not keep the device waiting for one warp each.
+
+A part's start is what the parts before it let through. The light that a part alone lets through is computed for all
+parts at once (``thin_parts``); every part is then blended from its true start, with the stop rule of the whole tile,
+and the sums are put together (``merge_parts``). The image is that of the tile in one piece, but for the rounding of
+products and sums. Backward, the light behind a part is the sum of the parts behind it.
+
+A tile is not split before it is much longer than the device's share of all pairs: the parts' transmittance is computed
+twice, which pays only where others would wait.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.view import TILE
+
+PART_LENGTH = 256
+"""Least pairs of a part; none has twice as many."""
+PART_LIMIT = 8192
+"""Most parts of a view: about twice the warps that a large GPU runs at once (21 to 28 on each of its 108 to 132
+multiprocessors), so that no part takes longer than the device's share of the whole view. 7 kB each."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which pairs of which tile each part holds. Those beyond the last needed one are empty and nobody reads them."""
+
+    tiles: Int[Tensor, " s"]
+    begins: Int[Tensor, " s"]
+    ends: Int[Tensor, " s"]
+    firsts: Int[Tensor, " s"]
+    """First part of the same tile."""
+    nexts: Int[Tensor, " s"]
+    """The part after the last one of the same tile."""
+    whole_ends: Int[Tensor, " t"]
+    """End of each tile's pairs; their beginning where the tile is split."""
+
+    def __len__(self) -> int:
+        return len(self.tiles)
+
+
+@dataclass(frozen=True)
+class PartLayers:
+    """What each part adds to its tile's pixels, and what is left behind it."""
+
+    products: Float[Tensor, "s 256"]
+    """Light that the part alone lets through."""
+    rgb: Float[Tensor, "s 256 3"]
+    transmittance: Float[Tensor, "s 256"]
+    depth_sum: Float[Tensor, "s 256"]
+    lasts: Int[Tensor, "s 256"]
+
+    @staticmethod
+    def empty(parts: Parts, like: Tensor) -> "PartLayers":
+        """Unwritten layers on the device of ``like``."""
+        count = len(parts)
+        pixels = [like.new_empty(count, PIXEL_COUNT) for _ in range(3)]
+        rgb, lasts = like.new_empty(count, PIXEL_COUNT, 3), parts.tiles.new_empty(count, PIXEL_COUNT)
+        return PartLayers(pixels[0], rgb, pixels[1], pixels[2], lasts)
+
+
+def split_tiles(begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], pairs: int) -> Parts | None:
+    """Parts of all tiles that are long enough for two; None if no tile can be. Does not wait for the device."""
+    length = max(PART_LENGTH, -(-pairs // PART_LIMIT))
+    most = pairs // length
+    if most < 2:
+        return None
+    counts = ends - begins
+    parts = torch.where(counts >= 2 * length, counts // length, 0)
+    nexts = parts.cumsum(0, dtype=torch.int32)
+    number = torch.arange(most, dtype=torch.int32, device=begins.device)
+    tiles = torch.searchsorted(nexts, number, right=True, out_int32=True)
+    used = tiles < len(begins)
+    tiles = torch.where(used, tiles, 0)
+    firsts = torch.where(used, nexts[tiles] - parts[tiles], number)
+    share = -(-counts[tiles] // parts[tiles].clamp(min=1))
+    first_pairs = begins[tiles] + (number - firsts) * share
+    first_pairs = torch.where(used, torch.minimum(first_pairs, ends[tiles]), 0)
+    last_pairs = torch.where(used, torch.minimum(first_pairs + share, ends[tiles]), 0)
+    whole_ends = torch.where(parts > 0, begins, ends)
+    return Parts(tiles, first_pairs, last_pairs, firsts, torch.where(used, nexts[tiles], number), whole_ends)
+
+
+@jit
+def thin_parts(
+    records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the product of 1 - alpha over each part, or something below the limit where it falls there."""
+    tl.static_assert(BLOCK == 1)
+    part = tl.program_id(0)
+    x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
+    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
+    passed = tl.where(inside, 1.0, 0.0)
+    k, end = tl.load(begins + part), tl.load(ends + part)
+    unfinished = k < end
+    while unfinished:
+        stop = tl.minimum(k + LOOK, end)
+        for i in range(k, stop):
+            s = record.record_of(records, tl.load(pair_rows + i))
+            _, _, _, _, exponent = whitened(s, px, py)
+            alpha = tl.minimum(tl.exp2(exponent), alpha_max)
+            passed -= tl.where(exponent >= tl.load(s + record.CUTOFF), alpha, 0.0) * passed
+        k = stop
+        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
+    tl.store(products + part_pixels(part, 1), passed)
+
+
+@jit
+def merge_parts(
+    tiles, firsts, nexts, products, part_rgb, part_transmittance, part_depth, part_lasts,
+    rgb, transmittance, depth_sum, lasts, width, height, tiles_x, transmittance_min,
+    LASTS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes the pixels of each split tile: one program a part, of which only a tile's first one does anything."""
+    tl.static_assert(BLOCK == 1)
+    part = tl.program_id(0)
+    x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
+    end = tl.where(tl.load(firsts + part) == part, tl.load(nexts + part), part)
+    passed, rest = tl.full((TILE, TILE), 1.0, tl.float32), tl.full((TILE, TILE), 1.0, tl.float32)
+    red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
+    depth, last = tl.zeros_like(passed), tl.zeros_like(passed).to(tl.int32)
+    for i in range(part, end):
+        at = part_pixels(i, 1)
+        red += tl.load(part_rgb + 3 * at)
+        green += tl.load(part_rgb + 3 * at + 1)
+        blue += tl.load(part_rgb + 3 * at + 2)
+        depth += tl.load(part_depth + at)
+        # Parts that begin behind a pixel's end say nothing of it.
+        reached = passed > transmittance_min
+        rest = tl.where(reached, tl.load(part_transmittance + at), rest)
+        if LASTS:
+            last = tl.where(reached, tl.load(part_lasts + at), last)
+        passed *= tl.load(products + at)
+    at = y * width + x
+    written = inside & (end > part)
+    tl.store(rgb + 3 * at, red, written)
+    tl.store(rgb + 3 * at + 1, green, written)
+    tl.store(rgb + 3 * at + 2, blue, written)
+    tl.store(transmittance + at, rest, written)
+    tl.store(depth_sum + at, depth, written)
+    if LASTS:
+        tl.store(lasts + at, last, written)

@@ -1,0 +1,61 @@
+"""From a scene to what the pixel kernels take: records of the visible rows, and the tiles' lists."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sparsestreet.ops.triton import records, rows
+from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.lists import Lists, check_pairs, list_tiles
+from sparsestreet.ops.triton.view import View
+from sparsestreet.ops.validate import check_values
+from sparsestreet.types import Gaussians
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A scene on the screen of one view."""
+
+    table: Float[Tensor, " numbers"]
+    records: Float[Tensor, "n 12"]
+    tile_counts: Int[Tensor, " n"]
+    radii: Float[Tensor, " n"]
+    lists: Lists
+
+
+def project(fields: tuple[Tensor, ...], displacements: Tensor | None, view: View) -> Screen:
+    """Project the five fields of Gaussians; waits for the device once, for the numbers of rows and of pairs.
+
+    Raises ValueError for bad values, PairLimitError.
+    """
+    means, sh = fields[0], fields[4]
+    n, settings, table = len(means), view.settings, view.table(means.device)
+    splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
+    tile_counts = means.new_empty(n, dtype=torch.int32)
+    bad = means.new_empty(-(-n // rows.block_of(view)), dtype=torch.int32)
+    launch(
+        rows.project_rows, n, rows.block_of(view),
+        *fields, given_or(displacements, means), table, splats, tile_counts, radii, bad, n,
+        TERMS=sh.shape[1], ANTIALIAS=settings.antialias, HALF_COLORS=settings.half_colors, BOUNDED=view.bounded,
+        **effects(view, displacements), options={"enable_fp_fusion": False},
+    )  # fmt: skip
+    places = (tile_counts > 0).cumsum(0, dtype=torch.int32)
+    numbers = torch.stack((tile_counts.sum(dtype=torch.int64), places[-1:].sum(), bad.sum()))
+    pairs, visible, bad_blocks = numbers.tolist()
+    if bad_blocks:
+        check_values(Gaussians(*fields, displacements))
+    check_pairs(pairs, tile_counts)
+    return Screen(table, splats, tile_counts, radii, list_tiles(splats, tile_counts, places, visible, pairs, view))
+
+
+def given_or(tensor: Tensor | None, other: Tensor) -> Tensor:
+    """A tensor for a kernel that does not read it where it is missing."""
+    return other if tensor is None else tensor
+
+
+def effects(view: View, displacements: Tensor | None) -> dict[str, Any]:
+    """The switches of the row kernels."""
+    return {"DISTORTED": view.distorted, "ROLLING": view.rolling, "DISPLACED": displacements is not None}

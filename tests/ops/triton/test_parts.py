@@ -1,0 +1,150 @@
+"""Long tiles in parts: the same image and gradients as in one piece, for any length of the parts."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sparsestreet.ops import SplatSettings, contribution
+from sparsestreet.ops.triton import parts, rasteriser
+from sparsestreet.ops.triton.parts import split_tiles
+from sparsestreet.types import Gaussians
+from tests.ops.scenes import (
+    FIELDS,
+    camera,
+    cast,
+    device_of,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    relative_error,
+    render,
+)
+
+DEVICE = device_of("triton")
+STOPS = {
+    "inclusive": SplatSettings(transmittance_min=0.02),
+    "exclusive": SplatSettings(stop="exclusive", transmittance_min=0.02),
+    "never": SplatSettings(transmittance_min=0.0),
+}
+
+
+def stack(count: int, opacity: float = 0.3) -> Gaussians:
+    """Tilted splats behind each other in the left tile of two, and a single one in the right tile."""
+    rows = [
+        one_gaussian(
+            means=[[0.02 * k - 0.5, 0.01 * k, 2.0 + 0.02 * k]],
+            quaternions=[[0.9, 0.2, -0.3, 0.1 + 0.01 * k]],
+            scales=[[0.3, 0.2, 0.25]],
+            opacities=[opacity],
+            sh=[[[0.3 - 0.02 * k, 0.02 * k, 0.1]]],
+        )
+        for k in range(count)
+    ]
+    return Gaussians.concatenate([one_gaussian(means=[[0.6, 0.0, 2.0]], sh=[[[0.5, 0.2, 0.1]]]), *rows])
+
+
+VIEW = front_camera(27, 11, 22.0)
+
+
+@pytest.fixture
+def short_parts(monkeypatch):
+    monkeypatch.setattr(parts, "PART_LENGTH", 3)
+
+
+@pytest.mark.parametrize("name", STOPS)
+def test_against_the_reference(name, short_parts):
+    scene, seen = stack(13), []
+    truth = render(scene, VIEW, "reference", torch.float64, STOPS[name])
+    original = rasteriser.blend_view
+
+    def watched(*args, **kwargs):
+        seen.append(original(*args, **kwargs))
+        return seen[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rasteriser, "blend_view", watched)
+        result = render(scene, VIEW, "triton", torch.float32, STOPS[name])
+    used = seen[0].ends.parts
+    assert used is not None
+    # Some pixels end before the last part, where the stop rule has one; others reach it.
+    closed = used.lasts.amin(-1) == used.lasts.amax(-1)
+    assert not closed.all()
+    for image in ("rgb", "alpha"):
+        assert (result.images[image] - truth.images[image]).abs().max() <= 1e-6, image
+    assert relative_error(result.images["depth"], truth.images["depth"]) <= 1e-6
+    for field, gradient in truth.gradients.items():
+        assert relative_error(result.gradients[field], gradient) <= 1e-5, field
+
+
+@pytest.mark.parametrize("length", [1, 4])
+def test_any_length_draws_the_same(length, monkeypatch):
+    view = camera(19, 17)
+    scene = random_gaussians(12, view)
+    whole = render(scene, view, "triton", torch.float32)
+    monkeypatch.setattr(parts, "PART_LENGTH", length)
+    split = render(scene, view, "triton", torch.float32)
+    for name, image in whole.images.items():
+        torch.testing.assert_close(split.images[name], image, rtol=1e-6, atol=1e-6)
+    for field, gradient in whole.gradients.items():
+        assert relative_error(split.gradients[field], gradient) <= 1e-5, field
+
+
+def test_two_runs_are_bitwise_equal_and_read_nothing_unwritten(short_parts, monkeypatch):
+    scene = stack(13, 0.9)
+    plain = render(scene, VIEW, "triton", torch.float32)
+    empty = torch.Tensor.new_empty
+
+    def poisoned(*args, **kwargs):
+        tensor = empty(*args, **kwargs)
+        return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
+
+    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
+    again = render(scene, VIEW, "triton", torch.float32)
+    for name, image in plain.images.items():
+        assert torch.equal(again.images[name], image), name
+    for field in FIELDS:
+        assert torch.equal(again.gradients[field], plain.gradients[field]), field
+
+
+def test_counting_and_removal_walk_whole_tiles(short_parts):
+    scene = stack(13)
+    single = cast(scene, torch.float32, device=DEVICE)
+    truth = contribution(scene, VIEW, backend="reference")
+    counted = contribution(single, VIEW, backend="triton")
+    assert torch.equal(counted.dominant.cpu(), truth.dominant)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts, "PART_LENGTH", 256)
+        whole = rasteriser.removal(single, None, None, VIEW, SplatSettings())
+    split = rasteriser.removal(single, None, None, VIEW, SplatSettings())
+    torch.testing.assert_close(split.squared, whole.squared, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(split.largest, whole.largest, rtol=1e-5, atol=1e-7)
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.integers(0, 40), min_size=1, max_size=9), st.integers(1, 7), st.integers(2, 12))
+def test_parts_cover_long_tiles_once(counts, length, limit):
+    ends = torch.tensor(counts).cumsum(0).int()
+    begins, pairs = ends - torch.tensor(counts, dtype=torch.int32), sum(counts)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts, "PART_LENGTH", length)
+        patch.setattr(parts, "PART_LIMIT", limit)
+        found = split_tiles(begins, ends, pairs)
+    share = max(length, -(-pairs // limit))
+    long = [tile for tile, count in enumerate(counts) if count >= 2 * share]
+    if found is None:
+        assert not long
+        return
+    assert len(found) <= limit
+    listed: dict[int, list[int]] = {}
+    for part, (tile, begin, end) in enumerate(zip(found.tiles, found.begins, found.ends, strict=True)):
+        assert int(end - begin) < 2 * share
+        if found.nexts[part] > part:
+            listed.setdefault(int(tile), []).extend(range(int(begin), int(end)))
+            assert (found.tiles[found.firsts[part] : found.nexts[part]] == tile).all()
+        else:
+            assert begin == end
+    assert listed == {tile: list(range(int(begins[tile]), int(ends[tile]))) for tile in long}
+    assert [int(end) for end in found.whole_ends] == [
+        int(begins[tile] if tile in long else ends[tile]) for tile in range(len(counts))
+    ]
