@@ -76,7 +76,7 @@ class Shutter:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; lens distortion and a rolling shutter only where they are given."""
+    """A pinhole camera; lens distortion and a rolling shutter only where they are given. Its tensors are on the host."""
 
     camera_from_world: Float[Tensor, "4 4"]
     intrinsics: Float[Tensor, "3 3"]

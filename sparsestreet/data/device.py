@@ -1,18 +1,20 @@
-"""Frozen values from one device to another."""
+"""Frozen values from one device to another. Cameras stay on the host: the op and the rays read their numbers there."""
 
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
 
+from sparsestreet.types import Camera
+
 T = TypeVar("T")
 
 
 def to_device(value: T, device: torch.device) -> T:
-    """A copy of a frozen dataclass with all tensors, nested ones too, on the device."""
+    """A copy of a frozen dataclass with all tensors, nested ones too, on the device; those of a camera stay."""
     if isinstance(value, torch.Tensor):
         return value.to(device)
-    if not is_dataclass(value):
+    if isinstance(value, Camera) or not is_dataclass(value):
         return value
     moved: dict[str, Any] = {field.name: to_device(getattr(value, field.name), device) for field in fields(value)}
     return replace(value, **moved)

@@ -20,12 +20,13 @@ def project(
     return pixels, depth, inside
 
 
-def ray_directions(camera: Camera) -> Float[Tensor, "h w 3"]:
-    """Unit directions in the world through the pixel centres."""
-    like = {"dtype": camera.intrinsics.dtype, "device": camera.intrinsics.device}
-    x = (torch.arange(camera.width, **like) + 0.5 - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
-    y = (torch.arange(camera.height, **like) + 0.5 - camera.intrinsics[1, 2]) / camera.intrinsics[1, 1]
+def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[Tensor, "h w 3"]:
+    """Unit directions in the world through the pixel centres, in the camera's dtype on a device."""
+    like = {"dtype": camera.intrinsics.dtype, "device": device}
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    x = (torch.arange(camera.width, **like) + 0.5 - cx) / fx
+    y = (torch.arange(camera.height, **like) + 0.5 - cy) / fy
     y, x = torch.meshgrid(y, x, indexing="ij")
     in_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)
-    in_world = in_camera @ camera.camera_from_world[:3, :3]
+    in_world = in_camera @ camera.camera_from_world[:3, :3].to(device)
     return in_world / in_world.norm(dim=-1, keepdim=True)

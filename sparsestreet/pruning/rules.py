@@ -131,8 +131,7 @@ def _squared_errors(scene: SceneGraph, frame: Frame, view: View) -> Float64[Tens
 
 def _beside(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
     """One frame at a time on the scene's device."""
-    device = next(scene.parameters()).device
-    return (to_device(frame, device) for frame in frames)
+    return (to_device(frame, scene.device) for frame in frames)
 
 
 def _contributions(scene: SceneGraph, frames: Sequence[Frame], view: View) -> Iterator[Contribution]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import nn
 
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, MaskTerm, Node
@@ -29,6 +30,11 @@ class SceneGraph(nn.Module):
         self.nodes = nn.ModuleDict(nodes)
         self.sky = sky
         self.active_sh_degree = active_sh_degree
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
 
     def gaussians_at(self, time: float) -> SceneGaussians:
         """Activated Gaussians of all nodes in the world at a normalised time."""

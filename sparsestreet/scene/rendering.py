@@ -41,7 +41,7 @@ def render(
     backend: str = "auto",
 ) -> SceneRendering:
     """Render the scene at a normalised time in [0, 1], in full precision also under autocast."""
-    with torch.autocast(camera.intrinsics.device.type, enabled=False):
+    with torch.autocast(scene.device.type, enabled=False):
         placed = scene.gaussians_at(time)
         splats = splat(placed.gaussians, camera, settings=settings, backend=backend)
         rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, camera, settings)
@@ -50,7 +50,7 @@ def render(
 
 def backdrop(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:
     """The sky in every pixel of a camera, as it is seen where nothing stands before it; None: black, no sky."""
-    return None if scene.sky is None else scene.sky.colors(ray_directions(camera))
+    return None if scene.sky is None else scene.sky.colors(ray_directions(camera, scene.device))
 
 
 def _over_sky(splats: Rendering, sky: Sky, camera: Camera, settings: SplatSettings) -> Float[Tensor, "h w 3"]:
@@ -60,6 +60,6 @@ def _over_sky(splats: Rendering, sky: Sky, camera: Camera, settings: SplatSettin
     """
     transmittance = 1 - splats.alpha.flatten()
     seen = torch.nonzero(transmittance > settings.transmittance_min).squeeze(1)
-    colors = sky.colors(ray_directions(camera).reshape(-1, 3)[seen])
+    colors = sky.colors(ray_directions(camera, seen.device).reshape(-1, 3)[seen])
     light = transmittance[seen, None] * colors
     return splats.rgb.reshape(-1, 3).index_add(0, seen, light).reshape(splats.rgb.shape)

@@ -10,7 +10,7 @@ STAGES = {
     "blend_backward": r"(blend|raster).*backward",
     "project_backward": r"project.*backward|slots",
     "project": r"project",
-    "blend": r"blend|raster",
+    "blend": r"blend|raster|_parts",
     "sort": r"sort|radix",
     "bin": r"list_|tile|pairs|isect|scan",
 }

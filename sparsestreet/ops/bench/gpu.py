@@ -26,6 +26,7 @@ from sparsestreet.ops.bench.timing import (
     on_device,
     spread,
     time_once,
+    work_of,
 )
 from sparsestreet.ops.cpu.library import find_library
 from sparsestreet.ops.splat import splat
@@ -47,6 +48,9 @@ class GpuRecord:
     rows: int
     width: int
     height: int
+    pairs: int | None = None
+    """(splat, tile) pairs, and (splat, pixel) samples of the forward pass; None for gsplat."""
+    samples: int | None = None
     failed: str | None = None
     """Why a measurement is missing; what was measured before it stands."""
     inference: Spread | None = None
@@ -115,10 +119,19 @@ def _measure_size(
         record = measure(GpuRecord(renderer, name, size.rows, size.width, size.height), draw, view, effort)
         if isinstance(peer, ModuleType) and renderer.startswith("gsplat"):
             record = compared(record, partial(gsplat_peer.parity, peer, view.rows, view.camera, backend))
-        elif size.rows <= TRUTH_ROWS and find_library() is not None:
-            record = compared(record, partial(_against_truth, view, backend))
+        else:
+            record = _counted(record, view, backend)
+            if size.rows <= TRUTH_ROWS and find_library() is not None:
+                record = compared(record, partial(_against_truth, view, backend))
         records.append(record)
     return records
+
+
+def _counted(record: GpuRecord, view: View, backend: str) -> GpuRecord:
+    if record.failed is not None:
+        return record
+    pairs, samples = work_of(view.rows, view.camera, gsplat_peer.SETTINGS, backend)
+    return replace(record, pairs=pairs, samples=samples)
 
 
 def _ours(view: View, backend: str) -> Draw:
@@ -206,6 +219,8 @@ def line(record: GpuRecord) -> str:
     text = (
         f"{start} forward {record.forward.median:8.3f}  backward {record.backward.median:8.3f}  no grad {inference} ms"
     )
+    if record.samples is not None:
+        text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
     if record.memory_peak is not None:
         text += f"  peak {record.memory_peak:7.0f} MB"
     if record.stages:

@@ -87,7 +87,7 @@ class Cotangent:
 
 @dataclass(frozen=True)
 class OpTimes:
-    """Spread of each stage and of the whole op, and the work of its forward pass (None: the backend does not count)."""
+    """Spread of each stage and of the whole op, and the work of its forward pass (None: the dense reference)."""
 
     stages: dict[str, Spread]
     """``forward`` and ``backward`` are the whole op; what the backend reports of its stages comes beside them."""
@@ -126,7 +126,7 @@ def time_op(gaussians: Gaussians, camera: Camera, settings: SplatSettings, backe
     effort.warm_up(run)
     seconds.clear()
     effort.runs(run)
-    pairs, samples = work_of(gaussians, backend)
+    pairs, samples = work_of(gaussians, camera, settings, backend)
     return OpTimes({name: spread(values) for name, values in seconds.items()}, pairs, samples)
 
 
@@ -160,10 +160,18 @@ def stage_seconds(gaussians: Gaussians, backend: str) -> dict[str, float]:
     return {name: value for name, value in stages.items() if name != "count"}
 
 
-def work_of(gaussians: Gaussians, backend: str) -> tuple[int | None, int | None]:
-    """(splat, tile) pairs and evaluated (splat, pixel) samples of the last forward pass, where they are counted."""
-    if backend != "cpu":
+def work_of(
+    gaussians: Gaussians, camera: Camera, settings: SplatSettings, backend: str
+) -> tuple[int | None, int | None]:
+    """(splat, tile) pairs and evaluated (splat, pixel) samples of a forward pass; None for the dense reference."""
+    if backend == "reference":
         return None, None
+    if backend == "triton":
+        from sparsestreet.ops.triton.work import count_work  # Triton is imported only where it is used
+
+        return count_work(gaussians, camera, settings)
+    with torch.no_grad():
+        splat(gaussians, camera, settings=settings, backend=backend)
     workspace = _last_workspace(gaussians.means.dtype)
     return workspace.pair_count(), workspace.sample_count()
 

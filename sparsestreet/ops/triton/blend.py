@@ -15,7 +15,8 @@ from sparsestreet.ops.triton.view import TILE
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
 # Pairs between two looks at whether the whole tile is finished.
-LOOK = constant(32)
+LOOK_LENGTH = 32
+LOOK = constant(LOOK_LENGTH)
 
 
 def registers(lasts: bool, exclusive: bool) -> int:

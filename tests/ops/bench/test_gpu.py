@@ -110,6 +110,8 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
         assert record["inference"]["repeats"] == 1
         assert record["stages"] is None  # no device, no kernels
     assert [record["agrees"] for record in records] == [True, True, True] * 2
+    assert [record["pairs"] is None for record in records] == [False, True, True] * 2
+    assert records[0]["samples"] > records[0]["pairs"] >= 60
     assert any("agrees: equal" in line for line in said)
 
 
