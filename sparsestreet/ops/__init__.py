@@ -1,8 +1,18 @@
 """The splat op: one signature, a dense reference, a fast CPU backend and a Triton one."""
 
 from sparsestreet.ops.backend import resolve_backend
+from sparsestreet.ops.guards import Guards, guards
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import contribution, removal, splat
 
-__all__ = ["PairLimitError", "SplatSettings", "contribution", "removal", "resolve_backend", "splat"]
+__all__ = [
+    "Guards",
+    "PairLimitError",
+    "SplatSettings",
+    "contribution",
+    "guards",
+    "removal",
+    "resolve_backend",
+    "splat",
+]

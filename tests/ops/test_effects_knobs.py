@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops import SplatSettings, guards, splat
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -124,7 +124,9 @@ def test_half_colours_by_hand(backend, dtype):
     # Colours 0.5 + x; float16 has 11 significant bits; a value past 65504 stays there, where infinity would poison.
     colours = np.array([0.1, 1 / 3, 70000.0])
     ball = one_gaussian(sh=[[((colours - 0.5) / Y0).tolist()]])
-    centre = render(ball, front_camera(5, 5, 40.0), backend, dtype, SplatSettings(half_colors=True))
+    view, half = front_camera(5, 5, 40.0), SplatSettings(half_colors=True)
+    assert guards(cast(ball, dtype), view, settings=half).alarms == {"color_held": 1}
+    centre = render(ball, view, backend, dtype, half)
     expected = 0.8 * np.minimum(colours, 65504).astype(np.float16).astype(np.float64)
     np.testing.assert_allclose(centre.images["rgb"][2, 2].numpy(), expected, rtol=1e-6)
     assert centre.is_finite()

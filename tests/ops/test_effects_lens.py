@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from sparsestreet.geometry.quaternions import from_matrix
-from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops import SplatSettings, guards, splat
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.oracles import fitted_splat, rotation_matrix
 from tests.ops.scenes import (
     camera,
+    cast,
     every_effect_double,
     every_effect_precision,
     front_camera,
@@ -188,9 +189,11 @@ def test_what_the_lens_does_not_see_is_culled(backend, dtype):
     view = through(front_camera(41, 31, 20.0), (-0.3, 0.0, 0.0, 0.0, 0.0))
     drawn_rows = []
     for slope in (0.5, 1.05, 1.06, 1.6, 1.8, 3.0):
-        result = render(one_gaussian(means=[[2 * slope, 0.0, 2.0]]), view, backend, dtype)
+        ball = one_gaussian(means=[[2 * slope, 0.0, 2.0]])
+        result = render(ball, view, backend, dtype)
         assert result.is_finite()
         drawn_rows.append(bool(result.radii[0] > 0))
+        assert guards(cast(ball, dtype), view).past_fold == (not drawn_rows[-1])
         if not drawn_rows[-1]:
             assert not any(gradient.any() for gradient in result.gradients.values())
     assert drawn_rows == [True, True, False, False, False, False]

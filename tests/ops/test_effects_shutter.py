@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
-from sparsestreet.ops import SplatSettings, contribution, splat
+from sparsestreet.ops import SplatSettings, contribution, guards, splat
 from sparsestreet.types import Camera, Gaussians, Shutter
 from tests.ops.oracles import fitted_splat, naive_image
 from tests.ops.scenes import (
@@ -191,6 +191,7 @@ def test_rows_that_outrun_the_readout_are_culled(backend, dtype, fall, drawn):
     result = render(ball, view, backend, dtype)
     assert result.is_finite()
     assert bool(result.radii[0] > 0) == drawn
+    assert guards(cast(ball, dtype), view).outruns_shutter == (not drawn)
     assert bool(result.images["alpha"].any()) == drawn
     if not drawn:
         assert not any(gradient.any() for gradient in result.gradients.values())

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, contribution
+from sparsestreet.ops import Guards, SplatSettings, contribution, guards
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -38,6 +38,7 @@ def test_10_a_clamped_alpha_has_no_gradient(backend, dtype):
     # In a single pixel at the peak, alpha = 1 is clamped to 0.99: opacity and shape cannot change the image.
     result = render(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0), backend, dtype)
     assert not any(result.gradients[name].any() for name in ("opacities", "scales", "quaternions", "screen"))
+    assert guards(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0)) == Guards(drawn=1, alpha_clamped=1)
     assert result.gradients["sh"].all()
 
 
@@ -54,6 +55,7 @@ def test_11_12_opacity_at_the_cut_off(backend, dtype):
         faint = cast(one_gaussian(opacities=[opacity]), dtype, device=device_of(backend))
         counted = contribution(faint, view, backend=backend)
         assert counted.pixels.tolist() == [0]
+        assert guards(faint, view) == (Guards(faint=1) if opacity else Guards(masked=1))
     at_edge = render(one_gaussian(opacities=[float(edge)]), view, backend, dtype)
     assert at_edge.is_finite()
     assert at_edge.radii[0] >= 0

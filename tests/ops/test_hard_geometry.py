@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, contribution, splat
+from sparsestreet.ops import SplatSettings, contribution, guards, splat
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, idle_workspaces
 from sparsestreet.ops.reference import projection
 from sparsestreet.types import Camera, Gaussians
@@ -74,9 +74,11 @@ def test_06_through_the_near_plane(backend, dtype):
     depths = [0.2 - 1e-3, 0.2, 0.2 + 1e-6, 0.2 + 1e-3, 0.21, 0.25, 0.5]
     seen = []
     for depth in depths:
-        result = render(one_gaussian(means=[[0.01, 0.02, depth]]), view, backend, dtype)
+        ball = one_gaussian(means=[[0.01, 0.02, depth]])
+        result = render(ball, view, backend, dtype)
         assert result.is_finite()
         seen.append(bool(result.radii[0] > 0))
+        assert guards(cast(ball, dtype), view).near == (not seen[-1])
     assert seen == [False, False, True, True, True, True, True]
     near, nearer = (
         render(one_gaussian(means=[[0.01, 0.02, depth]]), view, backend, dtype) for depth in (0.25, 0.25 + 1e-6)
@@ -104,6 +106,7 @@ def test_13_antialias_of_tiny_splats(backend):
         assert (result.images["alpha"] - truth.images["alpha"]).abs().max() < 1e-5
         # 20 px/m: sigma = 20 scale; ratio = (sigma^2 / (sigma^2 + 0.3))^2, with floor 0.005^2.
         factor = max(0.005, (20 * scale) ** 2 / ((20 * scale) ** 2 + 0.3))
+        assert guards(ball, view, settings=settings).compensation_held == (factor == 0.005)
         assert float(result.images["alpha"][2, 2]) == pytest.approx(0.8 * factor, rel=1e-5)
         # Of the colours alone: depth divides by alpha = 1 - T, and this cut-off lets through alphas of 1e-6.
         gradients = []
@@ -125,6 +128,7 @@ def test_07_gradients_on_both_sides_of_the_jacobian_limit(backend, dtype, slope)
     beside = one_gaussian(means=[[2 * slope, 1.4 * slope, 2.0]], **shape)
     truth = render(beside, view, "reference", settings=settings)
     assert (truth.images["rgb"] > 0.05).any()
+    assert guards(cast(beside, dtype), view, settings=settings).slope_held == (slope > 0.65)
     for field in ("means", "quaternions", "scales"):
         values = {name: getattr(beside, name).clone() for name in FIELDS}
 

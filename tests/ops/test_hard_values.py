@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, contribution, splat
+from sparsestreet.ops import SplatSettings, contribution, guards, splat
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -26,7 +26,7 @@ from tests.ops.scenes import (
 Y0 = 0.28209479177387814
 
 
-def _extreme_gaussians(rows: int, seed: int) -> Gaussians:
+def extreme_gaussians(rows: int, seed: int) -> Gaussians:
     """Values over the whole range that float32 training can drift into; a third of them at the very edges."""
     rng = np.random.default_rng(seed)
 
@@ -47,7 +47,7 @@ def _extreme_gaussians(rows: int, seed: int) -> Gaussians:
 def test_01_no_nan_in_extreme_scenes(backend, dtype):
     for seed in range(40 if backend == "cpu" else 6):
         for settings in (SplatSettings(), SplatSettings(antialias=True, stop="exclusive", blur=0.0)):
-            result = render(_extreme_gaussians(60, seed), front_camera(19, 14, 25.0), backend, dtype, settings)
+            result = render(extreme_gaussians(60, seed), front_camera(19, 14, 25.0), backend, dtype, settings)
             assert result.is_finite(), (seed, settings)
             # Culled rows have exactly zero gradient.
             culled = result.radii == 0
@@ -66,17 +66,21 @@ def test_02_an_overflowing_row_is_culled(backend):
     assert torch.equal(alone.images["rgb"], together.images["rgb"])
     assert together.is_finite()
     assert together.radii[-1] == 0
+    assert guards(cast(both, torch.float32), view).alarms == {"overflowed": 1}
+    assert guards(both, view).alarms == {}
 
 
 @every_precision
 def test_05_zero_quaternion_is_the_identity(backend, dtype):
     view = front_camera(21, 13, 20.0)
     shape = {"scales": [[0.4, 0.1, 0.2]]}
-    zero = render(one_gaussian(quaternions=[[0.0] * 4], **shape), view, backend, dtype)
+    turned = one_gaussian(quaternions=[[0.0] * 4], **shape)
+    zero = render(turned, view, backend, dtype)
     identity = render(one_gaussian(**shape), view, backend, dtype)
     assert torch.equal(zero.images["rgb"], identity.images["rgb"])
     assert not zero.gradients["quaternions"].any()
     assert zero.is_finite()
+    assert guards(cast(turned, dtype), view).alarms == {"identity_quaternion": 1}
 
 
 @every_precision
@@ -127,12 +131,15 @@ def test_14_a_masked_row_leaves_no_trace(backend, dtype):
         torch.testing.assert_close(image, dropped.images[name], rtol=1e-6, atol=1e-6)
     assert dropped.is_finite()
     assert not dropped.gradients["opacities"][~keep].any()
+    assert guards(cast(masked, dtype), view).masked == 20
 
 
 @every_precision
 def test_25_negative_colours_are_black_without_gradient(backend, dtype):
     sh = [[[-1.5 / Y0, 0.5 / Y0, -1.5 / Y0]]]
-    result = render(one_gaussian(sh=sh), front_camera(5, 5, 40.0), backend, dtype)
+    view = front_camera(5, 5, 40.0)
+    result = render(one_gaussian(sh=sh), view, backend, dtype)
+    assert guards(cast(one_gaussian(sh=sh), dtype), view).color_cut == 1
     assert result.images["rgb"].min() == 0
     assert result.gradients["sh"][0, 0, [0, 2]].tolist() == [0.0, 0.0]
     assert result.gradients["sh"][0, 0, 1] != 0

@@ -18,7 +18,7 @@ def rasterise(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
-    _check_dtype(gaussians)
+    check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     offsets = screen_offsets[rows]
@@ -43,7 +43,7 @@ def rasterise(
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
-    _check_dtype(gaussians)
+    check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     weight = torch.zeros(len(gaussians), dtype=torch.float64, device=rows.device)
@@ -70,7 +70,7 @@ def removal(
     settings: SplatSettings,
 ) -> Removal:
     """Change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
-    _check_dtype(gaussians)
+    check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
@@ -98,10 +98,11 @@ def removal(
     return Removal(largest, squared)
 
 
-def _check_dtype(gaussians: Gaussians) -> None:
+def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
+    """Raises ValueError, saying ``who`` computes, for anything but float32 and float64."""
     if gaussians.means.dtype not in DTYPES:
         raise ValueError(
-            f"backend 'reference' computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
+            f"{who} computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
             "with dataclasses.replace and .float()"
         )
 

@@ -7,33 +7,44 @@ distortion: the unscented transform (Julier and Uhlmann 1997; for splats 3DGUT, 
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.geometry.distortion import distort
+from sparsestreet.geometry.distortion import distort, fold_radius_squared
 from sparsestreet.types import Camera
 
 Footprint = tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"]]
 
 
 def pinhole(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera) -> Footprint:
-    """Means, and V = J axes with J taken at the row's mean.
+    """Means, and V = J axes with J taken at the row's mean, its slopes held at ``slope_limits``.
 
-    There x/z is limited to [-(cx/fx + 0.3 t), (w - cx)/fx + 0.3 t], t = w / (2 fx), and y/z likewise: the limit
-    1.3 tan(fov/2) of 3DGS, moved with the principal point. Past the limit x/z has no derivative.
+    Past the limit x/z has no derivative.
     """
     K, inverse_z, zero = camera.intrinsics.to(in_camera), 1 / in_camera[:, 2], torch.zeros_like(in_camera[:, 2])
-    means = in_camera[:, :2] / in_camera[:, 2:] * K.diagonal()[:2] + K[:2, 2]
-    limited = []
-    for axis, size in ((0, camera.width), (1, camera.height)):
-        focal, centre = K[axis, axis], K[axis, 2]
-        margin = 0.3 * size / (2 * focal)
-        limited.append(
-            (in_camera[:, axis] * inverse_z).clamp(-centre / focal - margin, (size - centre) / focal + margin)
-        )
-    row_x = torch.stack((K[0, 0] * inverse_z, zero, -K[0, 0] * limited[0] * inverse_z), -1)
-    row_y = torch.stack((zero, K[1, 1] * inverse_z, -K[1, 1] * limited[1] * inverse_z), -1)
-    return means, torch.stack((row_x, row_y), 1) @ axes
+    slopes = in_camera[:, :2] / in_camera[:, 2:]
+    x, y = slopes.clamp(*slope_limits(camera, in_camera)).unbind(-1)
+    row_x = torch.stack((K[0, 0] * inverse_z, zero, -K[0, 0] * x * inverse_z), -1)
+    row_y = torch.stack((zero, K[1, 1] * inverse_z, -K[1, 1] * y * inverse_z), -1)
+    return slopes * K.diagonal()[:2] + K[:2, 2], torch.stack((row_x, row_y), 1) @ axes
+
+
+def slope_limits(camera: Camera, like: Tensor) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+    """Least and largest x/z and y/z: -(cx/fx + 0.3 t) and (w - cx)/fx + 0.3 t with t = w / (2 fx), y likewise.
+
+    It is the limit 1.3 tan(fov/2) of 3DGS, moved with the principal point.
+    """
+    K, size = camera.intrinsics.to(like), like.new_tensor([camera.width, camera.height])
+    focal, centre = K.diagonal()[:2], K[:2, 2]
+    margin = 0.3 * size / (2 * focal)
+    return -centre / focal - margin, (size - centre) / focal + margin
+
+
+def slopes_held(in_camera: Float[Tensor, "v 3"], camera: Camera) -> Bool[Tensor, " v"]:
+    """Rows whose Jacobian :func:`pinhole` takes at a limit instead of at their mean."""
+    slopes = in_camera[:, :2] / in_camera[:, 2:]
+    lowest, highest = slope_limits(camera, in_camera)
+    return ((slopes < lowest) | (slopes > highest)).any(-1)
 
 
 def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera, near: float) -> Footprint:
@@ -44,11 +55,25 @@ def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], cam
     metres is taken there, with its x and y; its depth has no derivative then.
     """
     K = camera.intrinsics.to(in_camera)
-    steps = math.sqrt(3) * axes.mT
-    points = in_camera[:, None] + torch.cat((torch.zeros_like(steps[:, :1]), steps, -steps), 1)
+    points = _sigma_points(in_camera, axes)
     normalised = points[..., :2] / points[..., 2:].clamp(min=near)
     # From the principal point, whose digits the differences would lose.
     pixels = distort(normalised, camera.distortion) * K.diagonal()[:2]
     centres = pixels[:, 1:].mean(1)
     weights = pixels.new_tensor([2.0] + [1 / 6] * 6)
     return centres + K[:2, 2], ((pixels - centres[:, None]) * weights.sqrt()[:, None]).mT
+
+
+def sigma_points_held(
+    in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera, near: float
+) -> Bool[Tensor, " v"]:
+    """Rows of which :func:`unscented` takes a point at ``near``, or past the fold where the lens is continued."""
+    points = _sigma_points(in_camera, axes)
+    slopes = points[..., :2] / points[..., 2:].clamp(min=near)
+    past_fold = slopes.square().sum(-1) > fold_radius_squared(camera.distortion)
+    return (past_fold | (points[..., 2] < near)).any(-1)
+
+
+def _sigma_points(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"]) -> Float[Tensor, "v 7 3"]:
+    steps = math.sqrt(3) * axes.mT
+    return in_camera[:, None] + torch.cat((torch.zeros_like(steps[:, :1]), steps, -steps), 1)

@@ -13,6 +13,7 @@ from torch import Tensor
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.ops.reference.footprint import pinhole, unscented
+from sparsestreet.ops.reference.reasons import Reason, first_reason
 from sparsestreet.ops.reference.shutter import read_out, screen_motion
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.spherical_harmonics import view_colors
@@ -40,9 +41,25 @@ class Splats:
     """Largest q that is drawn: where alpha falls to alpha_min or the settings' box ends, whichever is nearer."""
     half_boxes: Float[Tensor, "v 2"]
     """Half sides of the box around the ellipse q = reach, pixels; infinite where nothing ends it."""
-    usable: Bool[Tensor, " v"]
-    """False where the determinant vanished or overflowed the dtype, past the fold of the lens, and where the splat
-    outruns the shutter."""
+    ratios: Float[Tensor, " v"] | None
+    """Determinant without blur over that with blur; None without antialias."""
+    refusals: dict[Reason, Bool[Tensor, " v"]]
+    """Rows that have no shape on this screen, by what takes it from them."""
+
+
+@torch.no_grad()
+def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Int[Tensor, " n"]:
+    """For each row the first ``Reason`` why it is not drawn, or DRAWN. Comparisons are written so that NaN culls."""
+    depths = to_camera(gaussians.means, camera)[:, 2]
+    reasons = first_reason({Reason.MASKED: ~(gaussians.opacities > 0), Reason.NEAR: ~(depths > settings.near)})
+    rows = (reasons == Reason.DRAWN).nonzero().squeeze(-1)
+    splats = on_screen(gaussians, rows, camera, settings)
+    size = torch.tensor([camera.width, camera.height], dtype=depths.dtype, device=depths.device)
+    box = splats.half_boxes + BOX_MARGIN
+    inside = ((splats.means + box >= 0.5) & (splats.means - box <= size - 0.5)).all(-1)
+    faint = ~(splats.opacities >= settings.alpha_min)
+    reasons[rows] = first_reason(splats.refusals | {Reason.FAINT: faint, Reason.OUTSIDE: ~inside})
+    return reasons
 
 
 @torch.no_grad()
@@ -52,27 +69,22 @@ def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
     Found before anything is differentiated: a culled row takes no part in the graph, so no infinity of its
     intermediates can meet a zero cotangent.
     """
-    depths = _in_camera(gaussians.means, camera)[:, 2]
-    rows = ((depths > settings.near) & (gaussians.opacities > 0)).nonzero().squeeze(-1)
-    splats = on_screen(gaussians, rows, camera, settings)
-    size = torch.tensor([camera.width, camera.height], dtype=depths.dtype, device=depths.device)
-    box = splats.half_boxes + BOX_MARGIN
-    inside = ((splats.means + box >= 0.5) & (splats.means - box <= size - 0.5)).all(-1)
-    rows = rows[splats.usable & (splats.opacities >= settings.alpha_min) & inside]
+    rows = (row_reasons(gaussians, camera, settings) == Reason.DRAWN).nonzero().squeeze(-1)
+    depths = to_camera(gaussians.means, camera)[:, 2]
     return rows[torch.sort(_sort_keys(depths[rows], settings.depth_bits), stable=True).indices]
 
 
 def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings) -> Splats:
     """Project the given rows, which must lie in front of the camera."""
-    in_camera = _in_camera(gaussians.means[rows], camera)
-    means, factors, usable = _footprints(gaussians, rows, in_camera, camera, settings)
+    in_camera = to_camera(gaussians.means[rows], camera)
+    means, factors, refusals = _footprints(gaussians, rows, in_camera, camera, settings)
     determinant, bare = _determinants(factors, settings.blur)
     variances = factors.square().sum(-1) + settings.blur
     covariance, variance_y = (factors[:, 0] * factors[:, 1]).sum(-1), variances[:, 1]
     l11 = (variance_y / determinant).sqrt()
     cholesky = torch.stack((l11, -covariance / (variance_y.sqrt() * determinant.sqrt()), variance_y.rsqrt()), -1)
 
-    opacities = gaussians.opacities[rows]
+    opacities, ratio = gaussians.opacities[rows], None
     if settings.antialias:
         ratio, floor = bare / determinant, COMPENSATION_FLOOR**2
         opacities = opacities * torch.where(ratio > floor, ratio, floor).sqrt()
@@ -81,16 +93,22 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
         colors = _rounded_to_half(colors)
     reaches = _reaches(opacities.detach(), settings)
     half_boxes = (reaches[:, None] * variances.detach()).sqrt()
-    usable &= (determinant >= DETERMINANT_MIN) & torch.isfinite(determinant)
-    return Splats(means, cholesky, opacities, colors, in_camera[:, 2], reaches, half_boxes, usable)
+    refusals |= {Reason.VANISHED: determinant < DETERMINANT_MIN, Reason.OVERFLOWED: ~torch.isfinite(determinant)}
+    return Splats(means, cholesky, opacities, colors, in_camera[:, 2], reaches, half_boxes, ratio, refusals)
 
 
 def _rotation(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
     return camera.camera_from_world[:3, :3].to(like)
 
 
-def _in_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
+def to_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
     return means @ _rotation(camera, means).T + camera.camera_from_world[:3, 3].to(means)
+
+
+def axes_in_camera(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera) -> Float[Tensor, "v 3 3"]:
+    """Columns: the rows' own axes times their standard deviations, metres in the camera frame."""
+    axes = to_matrix(gaussians.quaternions[rows]) * gaussians.scales[rows][:, None]
+    return _rotation(camera, axes) @ axes
 
 
 def _footprints(
@@ -99,22 +117,20 @@ def _footprints(
     in_camera: Float[Tensor, "v 3"],
     camera: Camera,
     settings: SplatSettings,
-) -> tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"], Bool[Tensor, " v"]]:
-    """Means and screen factors, and which rows the lens and the shutter can show."""
-    axes = to_matrix(gaussians.quaternions[rows]) * gaussians.scales[rows][:, None]
-    axes = _rotation(camera, in_camera) @ axes
-    usable = torch.ones_like(rows, dtype=torch.bool)
+) -> tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"], dict[Reason, Bool[Tensor, " v"]]]:
+    """Means and screen factors, and the rows that the lens or the shutter cannot show."""
+    axes, refusals = axes_in_camera(gaussians, rows, camera), {}
     if camera.distortion is None:
         means, factors = pinhole(in_camera, axes, camera)
     else:
         means, factors = unscented(in_camera, axes, camera, settings.near)
         slopes = in_camera.detach()[:, :2] / in_camera.detach()[:, 2:]
-        usable &= slopes.square().sum(-1) <= fold_radius_squared(camera.distortion)
+        refusals[Reason.PAST_FOLD] = ~(slopes.square().sum(-1) <= fold_radius_squared(camera.distortion))
     if camera.shutter is not None:
         motion = screen_motion(gaussians, rows, in_camera, camera)
         (means, factors), read = read_out(means, factors, motion, camera.height)
-        usable &= read
-    return means, factors, usable
+        refusals[Reason.OUTRUNS_SHUTTER] = ~read
+    return means, factors, refusals
 
 
 def _determinants(factors: Float[Tensor, "v 2 k"], blur: float) -> tuple[Float[Tensor, " v"], Float[Tensor, " v"]]:

@@ -1,0 +1,129 @@
+"""Which guards of the op act on a view, counted (docs/stability.md says what each of them is for)."""
+
+from dataclasses import astuple, dataclass, replace
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from sparsestreet.ops.reference import check_dtype, on_screen
+from sparsestreet.ops.reference.footprint import sigma_points_held, slopes_held
+from sparsestreet.ops.reference.projection import COMPENSATION_FLOOR, axes_in_camera, row_reasons, to_camera
+from sparsestreet.ops.reference.reasons import Reason
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.validate import check_structure, check_values
+from sparsestreet.types import Camera, Gaussians
+
+_ALARMS = ("vanished", "overflowed", "identity_quaternion", "color_held")
+
+
+@dataclass(frozen=True)
+class Guards:
+    """Numbers of rows; views are added up with ``+``, from ``Guards()``.
+
+    Each row is in one of the first nine, by the first reason that holds in their order after ``drawn``. The others are
+    of rows that are drawn, and a row may be in several.
+    """
+
+    drawn: int = 0
+    """As ``Rendering.visible``. (A row whose alpha is the cut-off to the last bit is drawn with radius 0.)"""
+    masked: int = 0
+    """Opacity 0; nothing else of such a row is looked at."""
+    near: int = 0
+    """At the near plane, before it, or behind the camera."""
+    past_fold: int = 0
+    """Farther off the axis than the lens polynomial describes."""
+    outruns_shutter: int = 0
+    """Falls nearly as fast as the image is read."""
+    vanished: int = 0
+    """Determinant on the screen too small; only without blur. An alarm."""
+    overflowed: int = 0
+    """Determinant on the screen beyond the dtype. An alarm."""
+    faint: int = 0
+    """Peak alpha below ``alpha_min``."""
+    outside: int = 0
+    """The box holds no pixel centre of the image."""
+
+    identity_quaternion: int = 0
+    """A quaternion without length, taken as the identity. An alarm."""
+    slope_held: int = 0
+    """Without lens: the Jacobian is taken at the limit of its slope."""
+    sigma_point_held: int = 0
+    """With a lens: a sigma point is taken at the near plane, or past the fold where the lens is continued."""
+    compensation_held: int = 0
+    """The antialias compensation is at its floor."""
+    alpha_clamped: int = 0
+    """Peak alpha above ``alpha_max``."""
+    color_cut: int = 0
+    """A channel at 0 or below, which is black without gradient."""
+    color_held: int = 0
+    """``half_colors``: a channel above the largest float16. An alarm."""
+
+    def __add__(self, other: "Guards") -> "Guards":
+        return Guards(*(mine + theirs for mine, theirs in zip(astuple(self), astuple(other), strict=True)))
+
+    @property
+    def alarms(self) -> dict[str, int]:
+        """The guards that no clean scene needs, by name, as far as they acted; empty where all is well."""
+        return {name: count for name in _ALARMS if (count := getattr(self, name))}
+
+
+@torch.no_grad()
+def guards(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    settings: SplatSettings = SplatSettings(),  # noqa: B008 (frozen)
+) -> Guards:
+    """Count what :func:`splat` of the same arguments culls and limits, on any device.
+
+    It projects anew, in the dtype of the Gaussians, as the reference does: where rounding decides about a row, another
+    backend may decide otherwise. :func:`splat` itself counts nothing and pays for nothing.
+
+    Raises ValueError as :func:`splat`, but not for values of rows of opacity 0.
+    """
+    check_structure(gaussians, camera, None)
+    check_dtype(gaussians, "guards")
+    with torch.autocast(gaussians.means.device.type, enabled=False):
+        gaussians = _without_masked_values(gaussians)
+        check_values(gaussians)
+        reasons = row_reasons(gaussians, camera, settings)
+        counts = torch.bincount(reasons, minlength=len(Reason)).tolist()
+        acting = _acting(gaussians, (reasons == Reason.DRAWN).nonzero().squeeze(-1), camera, settings)
+        acted = {name: int(rows.sum()) for name, rows in acting.items()}
+    return Guards(**{reason.name.lower(): counts[reason] for reason in Reason}, **acted)
+
+
+def _without_masked_values(gaussians: Gaussians) -> Gaussians:
+    """Zeros in all rows of opacity 0: backends may leave them unread, so that anything may stand there."""
+    masked = gaussians.opacities == 0
+
+    def cleared(field: Tensor) -> Tensor:
+        return torch.where(masked.reshape(-1, *[1] * (field.dim() - 1)), 0.0, field)
+
+    return Gaussians(*(None if field is None else cleared(field) for field in vars(gaussians).values()))
+
+
+def _acting(
+    gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings
+) -> dict[str, Bool[Tensor, " v"]]:
+    """Which of the drawn rows each guard acts on."""
+    # Colours as they are before they are rounded.
+    splats = on_screen(gaussians, rows, camera, replace(settings, half_colors=False))
+    in_camera, none = to_camera(gaussians.means[rows], camera), torch.zeros_like(rows, dtype=torch.bool)
+    if camera.distortion is None:
+        slope_held, sigma_point_held = slopes_held(in_camera, camera), none
+    else:
+        axes = axes_in_camera(gaussians, rows, camera)
+        slope_held, sigma_point_held = none, sigma_points_held(in_camera, axes, camera, settings.near)
+    # As geometry/quaternions.py tells rotations from zeros.
+    squared_lengths = gaussians.quaternions[rows].square().sum(-1)
+    return {
+        "identity_quaternion": squared_lengths <= torch.finfo(squared_lengths.dtype).tiny,
+        "slope_held": slope_held,
+        "sigma_point_held": sigma_point_held,
+        "compensation_held": none if splats.ratios is None else splats.ratios <= COMPENSATION_FLOOR**2,
+        "alpha_clamped": splats.opacities > settings.alpha_max,
+        "color_cut": (splats.colors <= 0).any(-1),
+        "color_held": (splats.colors > torch.finfo(torch.float16).max).any(-1) if settings.half_colors else none,
+    }

@@ -1,0 +1,37 @@
+"""Why a row is not drawn: named, and put in an order."""
+
+from enum import IntEnum
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+
+class Reason(IntEnum):
+    """In the order in which the projection asks; of several reasons the first counts."""
+
+    DRAWN = 0
+    MASKED = 1
+    """Opacity 0."""
+    NEAR = 2
+    """At the near plane, before it, or behind the camera."""
+    PAST_FOLD = 3
+    """Farther off the axis than the lens polynomial describes."""
+    OUTRUNS_SHUTTER = 4
+    """Falls nearly as fast as the image is read."""
+    VANISHED = 5
+    """Thinner than the dtype can invert; only without blur."""
+    OVERFLOWED = 6
+    """Larger on the screen than the dtype can hold."""
+    FAINT = 7
+    """Peak alpha below the cut-off."""
+    OUTSIDE = 8
+    """The box holds no pixel centre of the image."""
+
+
+def first_reason(holds: dict[Reason, Bool[Tensor, " v"]]) -> Int[Tensor, " v"]:
+    """Per row the first reason that holds, DRAWN where none does; at least one reason must be given."""
+    reasons = torch.zeros_like(next(iter(holds.values())), dtype=torch.int64)
+    for reason in sorted(holds, reverse=True):
+        reasons[holds[reason]] = reason
+    return reasons

@@ -1,0 +1,296 @@
+"""Every guard on a row made for it, and the counts against what the backends draw."""
+
+import dataclasses
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sparsestreet.ops import Guards, SplatSettings, guards, splat
+from sparsestreet.types import Camera, Gaussians, Shutter
+from tests.ops.scenes import (
+    FIELDS,
+    cast,
+    device_of,
+    every_double,
+    every_precision,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    render,
+)
+from tests.ops.test_hard_values import extreme_gaussians
+from tests.ops.test_properties import few, scenes, with_effects
+
+Y0 = 0.28209479177387814
+REASONS = (
+    *("drawn", "masked", "near", "past_fold", "outruns_shutter"),
+    *("vanished", "overflowed", "faint", "outside"),
+)
+LENS = (-0.3, 0.0, 0.0, 0.0, 0.0)
+"""Folds at r = 1.054."""
+SHARP = SplatSettings(blur=0.0)
+every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+CASES = {
+    "default": SplatSettings(),
+    "antialias, no blur": SplatSettings(antialias=True, stop="exclusive", blur=0.0),
+    "box": SplatSettings(box=1.5, antialias=True, depth_bits=12, half_colors=True),
+    "exact": SplatSettings.preset("exact"),
+}
+
+
+def lensed(view: Camera, coefficients: tuple[float, ...] = LENS) -> Camera:
+    return dataclasses.replace(view, distortion=torch.tensor(coefficients, dtype=torch.float64))
+
+
+def rolling(view: Camera) -> Camera:
+    still = torch.zeros(3, dtype=torch.float64)
+    return dataclasses.replace(view, shutter=Shutter(still, still))
+
+
+def moved(gaussians: Gaussians, displacement: list[float]) -> Gaussians:
+    return dataclasses.replace(gaussians, displacements=torch.tensor([displacement], dtype=torch.float64))
+
+
+def rows_counted(counted: Guards) -> int:
+    return sum(getattr(counted, name) for name in REASONS)
+
+
+def huge(dtype: torch.dtype) -> list[list[float]]:
+    """Finite scales whose determinant, their fourth power, is not."""
+    return [[1e25] * 3] if dtype == torch.float32 else [[1e100] * 3]
+
+
+@every_dtype
+def test_each_reason_by_hand(dtype):
+    view, lens = front_camera(9, 10, 20.0), lensed(front_camera(41, 31, 20.0))
+    one = SplatSettings()
+    # The ball falls by 0.95 image heights during the readout: 1 - u_y / H = 0.05.
+    falling = moved(one_gaussian(), [0.0, 0.95 * 10 / 20 * 2, 0.0])
+    cases = [
+        ("drawn", one_gaussian(), view, one),
+        ("masked", one_gaussian(opacities=[0.0]), view, one),
+        ("near", one_gaussian(means=[[0.0, 0.0, 0.2]]), view, one),
+        ("near", one_gaussian(means=[[0.0, 0.0, -3.0]]), view, one),
+        ("past_fold", one_gaussian(means=[[2.12, 0.0, 2.0]]), lens, one),
+        ("outruns_shutter", falling, rolling(view), one),
+        ("drawn", falling, view, one),
+        ("vanished", one_gaussian(scales=[[1e-9] * 3]), view, SHARP),
+        ("overflowed", one_gaussian(scales=huge(dtype)), view, one),
+        ("faint", one_gaussian(opacities=[0.003]), view, one),
+        ("drawn", one_gaussian(opacities=[0.003]), view, SplatSettings(alpha_min=0.001)),
+        ("outside", one_gaussian(means=[[5.0, 0.0, 2.0]]), view, one),
+        ("outside", one_gaussian(means=[[0.0, -5.0, 2.0]]), view, one),
+    ]
+    for name, row, camera, settings in cases:
+        counted = guards(cast(row, dtype), camera, settings=settings)
+        held = {"slope_held": 0, "sigma_point_held": 0}
+        assert dataclasses.replace(counted, **held) == Guards(**{name: 1}), name
+        # What is not drawn has its reason alone.
+        assert name == "drawn" or counted == Guards(**{name: 1}), name
+
+
+@every_dtype
+def test_antialias_can_make_a_row_faint(dtype):
+    # sigma = 1e-3 px: compensated to the floor, 0.8 * 0.005 = 1 / 250; 0.7 * 0.005 = 1 / 286 is below 1 / 255.
+    view, settings = front_camera(5, 5, 20.0), SplatSettings(antialias=True)
+    seen, faint = (one_gaussian(opacities=[o], scales=[[1e-4] * 3]) for o in (0.8, 0.7))
+    assert guards(cast(seen, dtype), view, settings=settings) == Guards(drawn=1, compensation_held=1)
+    assert guards(cast(faint, dtype), view, settings=settings) == Guards(faint=1)
+
+
+@every_dtype
+def test_the_first_reason_counts(dtype):
+    # Each row has its reason and those after it, as far as a row can have both.
+    view = rolling(lensed(front_camera(21, 31, 20.0)))
+    tiny, beside, gone = [[1e-9] * 3], [1.6, 0.0, 2.0], [2.4, 0.0, 2.0]
+    # From 0.8 the lens images x at 0.646: 2.9 px outside of a 21 px wide image.
+    fast, still = [0.0, 30.0, 0.0], [0.0, 0.0, 0.0]
+    rows = [
+        ("masked", {"opacities": [0.0], "means": [[2.4, 0.0, -2.0]], "scales": tiny}, fast),
+        ("near", {"opacities": [0.003], "means": [[2.4, 0.0, -2.0]], "scales": tiny}, fast),
+        ("past_fold", {"opacities": [0.003], "means": [gone], "scales": tiny}, fast),
+        ("outruns_shutter", {"opacities": [0.003], "means": [beside], "scales": tiny}, fast),
+        ("outruns_shutter", {"opacities": [0.003], "means": [beside], "scales": huge(dtype)}, fast),
+        ("vanished", {"opacities": [0.003], "means": [beside], "scales": tiny}, still),
+        ("overflowed", {"opacities": [0.003], "means": [beside], "scales": huge(dtype)}, still),
+        ("faint", {"opacities": [0.003], "means": [beside], "scales": [[1e-2] * 3]}, still),
+        ("outside", {"opacities": [0.8], "means": [beside], "scales": [[1e-2] * 3]}, still),
+    ]
+    scene = [moved(one_gaussian(**fields), displacement) for _, fields, displacement in rows]
+    for (name, *_), row in zip(rows, scene, strict=True):
+        assert guards(cast(row, dtype), view, settings=SHARP) == Guards(**{name: 1}), name
+    together = guards(cast(Gaussians.concatenate(scene), dtype), view, settings=SHARP)
+    assert together == Guards(**({name: 1 for name, *_ in rows} | {"outruns_shutter": 2}))
+    assert together.alarms == {"vanished": 1, "overflowed": 1}
+
+
+@every_dtype
+def test_each_guard_of_drawn_rows_by_hand(dtype):
+    view = front_camera(20, 16, 20.0)
+    lens = lensed(view)
+    one, half = SplatSettings(), SplatSettings(half_colors=True)
+    bright = [[[0.0, (70000.0 - 0.5) / Y0, 0.0]]]
+    large = {"scales": [[0.7, 0.5, 0.6]]}
+    # (guard that acts or None, row, camera, settings)
+    cases = [
+        ("identity_quaternion", one_gaussian(quaternions=[[0.0] * 4]), view, one),
+        # 20 px at focal 20: half the field of view is 0.5, limits 0.65; in y 0.4 and 0.52.
+        (None, one_gaussian(means=[[1.28, 0.0, 2.0]], **large), view, one),
+        ("slope_held", one_gaussian(means=[[1.32, 0.0, 2.0]], **large), view, one),
+        ("slope_held", one_gaussian(means=[[-1.32, 0.0, 2.0]], **large), view, one),
+        (None, one_gaussian(means=[[0.0, 1.02, 2.0]], **large), view, one),
+        ("slope_held", one_gaussian(means=[[0.0, -1.06, 2.0]], **large), view, one),
+        # Sigma points at mu +- 1.73 scales. 2 - 1.73 * 1.0392 = 0.2 m; 1.73 * 1.217 / 2 is the fold.
+        (None, one_gaussian(scales=[[0.1, 0.1, 1.038]]), lens, one),
+        ("sigma_point_held", one_gaussian(scales=[[0.1, 0.1, 1.041]]), lens, one),
+        (None, one_gaussian(scales=[[0.1, 1.21, 0.1]]), lens, one),
+        ("sigma_point_held", one_gaussian(scales=[[0.1, 1.22, 0.1]]), lens, one),
+        # (sigma^2 / (sigma^2 + 0.3)) = 0.005 at sigma = 0.0388 px, with 10 px a metre at 2 m.
+        (None, one_gaussian(scales=[[3.9e-3] * 3], opacities=[0.9]), view, SplatSettings(antialias=True)),
+        (
+            "compensation_held",
+            one_gaussian(scales=[[3.8e-3] * 3], opacities=[0.9]),
+            view,
+            SplatSettings(antialias=True),
+        ),
+        (None, one_gaussian(scales=[[3.8e-3] * 3], opacities=[0.9]), view, one),
+        (None, one_gaussian(opacities=[0.98]), view, one),
+        ("alpha_clamped", one_gaussian(opacities=[1.0]), view, one),
+        ("alpha_clamped", one_gaussian(opacities=[0.98]), view, SplatSettings(alpha_max=0.9)),
+        # The compensation of sigma = 1 px is 1 / 1.3: the opacity is at most 0.77.
+        (None, one_gaussian(opacities=[1.0]), view, SplatSettings(antialias=True)),
+        (None, one_gaussian(sh=[[[0.0, -0.49 / Y0, 0.0]]]), view, one),
+        ("color_cut", one_gaussian(sh=[[[0.0, -0.51 / Y0, 0.0]]]), view, one),
+        (None, one_gaussian(sh=bright), view, one),
+        (None, one_gaussian(sh=[[[(65503.0 - 0.5) / Y0, 0.0, 0.0]]]), view, half),
+        ("color_held", one_gaussian(sh=bright), view, half),
+        # Rounded to half it is 0, but it was not cut.
+        (None, one_gaussian(sh=[[[(1e-7 - 0.5) / Y0] * 3]]) if dtype == torch.float64 else one_gaussian(), view, half),
+    ]
+    for index, (name, row, camera, settings) in enumerate(cases):
+        expected = Guards(drawn=1, **({} if name is None else {name: 1}))
+        counted = guards(cast(row, dtype), camera, settings=settings)
+        assert counted == expected, (index, name)
+        alarming = {"identity_quaternion", "color_held"} & {name}
+        assert counted.alarms == dict.fromkeys(alarming, 1)
+
+
+@every_precision
+def test_a_quaternion_counts_as_identity_where_it_gets_no_gradient(backend, dtype):
+    # On both sides of the squared length at which rotations end; squares are rounded, so not at its last bit.
+    view, seen = front_camera(21, 13, 20.0), []
+    least = torch.finfo(dtype).tiny ** 0.5
+    for length in (0.0, 0.5 * least, 0.99 * least, 1.01 * least, 2 * least, 1.0):
+        row = one_gaussian(quaternions=[[0.6 * length, 0.0, 0.8 * length, 0.0]], scales=[[0.4, 0.1, 0.2]])
+        turned = bool(render(row, view, backend, dtype).gradients["quaternions"].any())
+        seen.append(guards(cast(row, dtype), view).identity_quaternion == 0)
+        assert seen[-1] == turned, length
+    assert seen == [False] * 3 + [True] * 3
+
+
+def check_against(backend: str, gaussians: Gaussians, view: Camera, settings: SplatSettings) -> Guards:
+    counted = guards(gaussians, view, settings=settings)
+    assert rows_counted(counted) == len(gaussians)
+    drawn = splat(gaussians, view, settings=settings, backend=backend).visible
+    assert counted.drawn == int(drawn.sum())
+    return counted
+
+
+@every_double
+@few
+@given(scene=scenes(), effects=st.booleans(), case=st.sampled_from(sorted(CASES)))
+def test_what_is_counted_as_drawn_is_drawn(backend, scene, effects, case):
+    gaussians, view, noise = scene
+    if effects:
+        gaussians, view = with_effects(gaussians, view, noise, backend)
+    check_against(backend, gaussians, view, CASES[case])
+
+
+@every_precision
+@pytest.mark.parametrize("effects", [False, True], ids=["pinhole", "effects"])
+def test_a_clean_scene_fires_no_alarm(backend, dtype, effects):
+    view = front_camera(64, 48, 50.0)
+    gaussians = random_gaussians(400, view, seed=7)
+    if effects:
+        noise = torch.randn(64, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+        gaussians, view = with_effects(gaussians, view, noise, backend)
+    gaussians = cast(gaussians, dtype, device=device_of(backend))
+    for settings in CASES.values():
+        counted = check_against(backend, gaussians, view, settings)
+        assert counted.alarms == {}
+        # It is no empty scene, and where splats end not all of them are seen.
+        assert min(counted.drawn, counted.near) > 10
+        assert (counted.outside > 10) == (settings.alpha_min > 0)
+
+
+@every_precision
+def test_the_hard_scenes(backend, dtype):
+    total = Guards()
+    for seed in range(20):
+        for settings in CASES.values():
+            scene = Gaussians.concatenate([extreme_gaussians(60, seed), one_gaussian(scales=huge(dtype))])
+            scene = cast(scene, dtype, device=device_of(backend))
+            # Alpha at the cut-off to the last bit: drawn with radius 0 (Guards.drawn).
+            scene.opacities[scene.opacities == torch.tensor(1 / 255, dtype=dtype)] = 0.004
+            total += check_against(backend, scene, front_camera(19, 14, 25.0), settings)
+    # What such scenes do: no lens, no shutter, no colour above 65504.
+    unseen = {"past_fold", "outruns_shutter", "sigma_point_held", "color_held"}
+    if dtype == torch.float64:  # There a length of 1e-22 is one.
+        unseen |= {"identity_quaternion"}
+    assert {name for name, count in vars(total).items() if count == 0} == unseen
+    assert {"vanished", "overflowed"} <= set(total.alarms)
+
+
+@every_dtype
+def test_anything_may_stand_in_a_masked_row(dtype):
+    view = rolling(lensed(front_camera(21, 13, 20.0)))
+    gaussians = cast(random_gaussians(9, view), dtype)
+    gaussians = dataclasses.replace(gaussians, displacements=torch.zeros_like(gaussians.means))
+    gaussians.opacities[4] = 0
+    expected = guards(gaussians, view)
+    assert expected.masked == 1
+    for name in FIELDS:
+        if name != "opacities":
+            getattr(gaussians, name)[4] = torch.nan
+    gaussians.displacements[4] = torch.inf
+    assert guards(gaussians, view) == expected
+    assert rows_counted(expected) == 9
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_bad_values_of_other_rows_are_errors(field):
+    view = front_camera(21, 13, 20.0)
+    gaussians = random_gaussians(9, view)
+    gaussians.opacities[2] = 0
+    getattr(gaussians, field)[5].view(-1)[-1] = torch.nan
+    with pytest.raises(ValueError, match=f"{field} must be finite, but row 5 has nan"):
+        guards(gaussians, view)
+
+
+def test_half_precision_is_an_error():
+    gaussians = cast(one_gaussian(), torch.bfloat16)
+    with pytest.raises(ValueError, match=r"guards computes in float32 or float64, got torch\.bfloat16: convert"):
+        guards(gaussians, front_camera(5, 5, 20.0))
+
+
+@every_dtype
+def test_no_rows_and_the_sum_of_views(dtype):
+    view = front_camera(21, 13, 20.0)
+    assert guards(cast(random_gaussians(0, view), dtype), view) == Guards()
+    first, second = Guards(drawn=2, near=1, color_cut=2), Guards(drawn=1, overflowed=3)
+    assert first + second == Guards(drawn=3, near=1, overflowed=3, color_cut=2)
+    assert (first + second).alarms == {"overflowed": 3}
+    assert (first + Guards()).alarms == {}
+
+
+def test_counting_takes_no_part_in_training():
+    # Rows that ask for gradients, under autocast: the same counts, and nothing is recorded.
+    view = front_camera(21, 13, 20.0)
+    leaves = cast(random_gaussians(60, view), torch.float32, requires_grad=True)
+    plain = guards(leaves, view)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert guards(leaves, view) == plain
+    assert all(getattr(leaves, name).grad_fn is None for name in FIELDS)
+    assert plain == guards(cast(leaves, torch.float32), view)
