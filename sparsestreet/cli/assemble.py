@@ -14,6 +14,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import RunDescription, RunSummary
 from sparsestreet.evaluation.run import evaluate_run
+from sparsestreet.ops import guards
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.centres import node_legend, project_centres
 from sparsestreet.training.system import StreetSystem
@@ -61,6 +62,9 @@ def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seco
         held_out,
         render=system.render,
         centres=lambda frame: project_centres(scene, frame.camera, frame.time),
+        guards=lambda frame: guards(
+            scene.gaussians_at(frame.time).gaussians, frame.camera, settings=system.options.settings
+        ),
         gaussians=scene.counts(),
         bytes_by_part=scene.bytes_by_part(),
         run=RunDescription(

@@ -81,6 +81,21 @@ class RunDescription:
 
 
 @dataclass(frozen=True)
+class GuardCounts:
+    """On how many rows the guards of the splat op acted (``sparsestreet.ops.Guards``), summed over the views."""
+
+    rows: dict[str, int]
+    """Name of a guard -> rows, 0 included."""
+    alarms: dict[str, int]
+    """Those that a clean scene never needs and that acted; empty where all is well."""
+
+    def __post_init__(self) -> None:
+        for name, count in self.alarms.items():
+            if count < 1 or self.rows.get(name) != count:
+                raise ValueError(f"alarms holds {name}: {count}, rows has {self.rows.get(name)}: evaluate again")
+
+
+@dataclass(frozen=True)
 class RunSummary:
     """The content of ``summary.json``."""
 
@@ -102,6 +117,8 @@ class RunSummary:
     latency_protocol: str
     machine: Machine
     source: Source
+    guards: GuardCounts | None = None
+    """None in records from before they were counted."""
 
     def __post_init__(self) -> None:
         if self.format != FORMAT:

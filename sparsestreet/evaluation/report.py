@@ -249,7 +249,22 @@ def _notes(group: Sequence[RunSummary]) -> list[str]:
         notes.append("ms/frame were taken with different numbers of renders; see each summary.json")
     if any(run.source.dirty for run in group):
         notes.append("some runs were made from code with uncommitted changes")
+    notes.append(_guards_note(group))
     return notes
+
+
+def _guards_note(group: Sequence[RunSummary]) -> str:
+    """The alarms of every run that has any."""
+    fired = [
+        f"{run.run.method} (seed {run.run.seed}) " + ", ".join(f"{name} {count:,}" for name, count in alarms.items())
+        for run in group
+        if run.guards is not None and (alarms := run.guards.alarms)
+    ]
+    uncounted = sum(run.guards is None for run in group)
+    if uncounted == len(group):
+        return "guards: not counted"
+    note = "guards: " + ("; ".join(fired) or "none fired")
+    return note if not uncounted else f"{note} ({uncounted} of {len(group)} runs did not count them)"
 
 
 def _check_definitions(records: Sequence[RunRecord]) -> None:

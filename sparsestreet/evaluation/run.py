@@ -1,6 +1,7 @@
 """Everything that is measured of a finished run, and the files it leaves."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, summarise
 from sparsestreet.evaluation.records import (
     FORMAT,
+    GuardCounts,
+    Latency,
     RunDescription,
     RunSummary,
     quality_path,
@@ -22,10 +25,12 @@ from sparsestreet.evaluation.records import (
     write_summary,
 )
 from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.ops import Guards
 from sparsestreet.types import Frame
 
 Render = Callable[[Frame], RenderedImage]
 Centres = Callable[[Frame], Tensor]
+CountGuards = Callable[[Frame], Guards]
 
 
 def evaluate_run(
@@ -33,6 +38,7 @@ def evaluate_run(
     *,
     render: Render,
     centres: Centres,
+    guards: CountGuards,
     gaussians: dict[str, int],
     bytes_by_part: dict[str, int],
     run: RunDescription,
@@ -48,6 +54,7 @@ def evaluate_run(
         frames: held-out frames; a sequence that loads images when indexed is fine, none is kept.
         render: a frame to its rendering [h, w, 3].
         centres: a frame to a picture of the Gaussians' centres, Float [h, w, 3] in [0, 1].
+        guards: a frame to the guards of the op that its render needs.
         gaussians: node class -> number of rows.
         bytes_by_part: part of the scene -> bytes of its parameters.
         run: what identifies the run.
@@ -62,7 +69,28 @@ def evaluate_run(
         raise ValueError("there are no held-out frames to evaluate: choose a split that leaves some out")
     quality = list(evaluate_frames(render, frames))
     latency = measure_latency(render, frames, warmup=warmup, repeats=repeats)
-    summary = RunSummary(
+    summary = _summary(quality, latency, _guard_counts(guards, frames), gaussians, bytes_by_part, run)
+    chosen = [_picture(frames[index], render, centres) for index in choose_pictures(quality, pictures)]
+    _write_pictures(chosen, summary, legend, out / "pictures")
+    write_quality(quality_path(out), quality)
+    write_summary(summary_path(out), summary)
+    return summary
+
+
+def _guard_counts(guards: CountGuards, frames: Sequence[Frame]) -> GuardCounts:
+    total = sum((guards(frame) for frame in frames), Guards())
+    return GuardCounts(asdict(total), total.alarms)
+
+
+def _summary(
+    quality: Sequence[FrameQuality],
+    latency: Latency,
+    guards: GuardCounts,
+    gaussians: dict[str, int],
+    bytes_by_part: dict[str, int],
+    run: RunDescription,
+) -> RunSummary:
+    return RunSummary(
         format=FORMAT,
         run=run,
         images=len(quality),
@@ -77,12 +105,8 @@ def evaluate_run(
         latency_protocol=latency.protocol,
         machine=this_machine(),
         source=this_source(),
+        guards=guards,
     )
-    chosen = [_picture(frames[index], render, centres) for index in choose_pictures(quality, pictures)]
-    _write_pictures(chosen, summary, legend, out / "pictures")
-    write_quality(quality_path(out), quality)
-    write_summary(summary_path(out), summary)
-    return summary
 
 
 def choose_pictures(quality: Sequence[FrameQuality], count: int) -> list[int]:

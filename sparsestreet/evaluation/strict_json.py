@@ -1,4 +1,7 @@
-"""Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only (no torch)."""
+"""Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only (no torch).
+
+Only a field with a default may be missing: it is newer than some records.
+"""
 
 import json
 import math
@@ -6,7 +9,7 @@ import os
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 
 Json = None | bool | int | float | str | list | dict
@@ -100,11 +103,12 @@ def _decoded(kind: object, value: Json, where: str) -> typing.Any:
 def _decoded_dataclass(kind: type, value: Json, where: str) -> typing.Any:
     entries = _of(dict, value, where)
     hints = typing.get_type_hints(kind)
+    required = {field.name for field in fields(kind) if field.default is MISSING}
     names = {field.name for field in fields(kind)}
-    if names != set(entries):
-        missing, unknown = sorted(names - set(entries)), sorted(set(entries) - names)
+    missing, unknown = sorted(required - set(entries)), sorted(set(entries) - names)
+    if missing or unknown:
         raise RecordError(f"{where}: {kind.__name__} lacks the keys {missing} and has unknown keys {unknown}")
-    decoded = {name: _decoded(hints[name], entries[name], f"{where}: {name}") for name in names}
+    decoded = {name: _decoded(hints[name], entries[name], f"{where}: {name}") for name in names & set(entries)}
     try:
         return kind(**decoded)
     except ValueError as error:

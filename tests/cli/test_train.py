@@ -34,6 +34,8 @@ def test_training_improves_and_leaves_records(run_train, tmp_path):
     assert summary["quality"]["psnr_full"]["mean"] > start["quality"]["psnr_full"]["mean"] + 3
     assert psnr
     assert summary["gaussians_total"] == sum(summary["gaussians"].values())
+    assert summary["guards"]["alarms"] == {}
+    assert summary["guards"]["rows"]["drawn"] > 0
     assert (out / "pictures" / "sheet.png").is_file()
     assert (out / "curves" / "counts.png").is_file()
 

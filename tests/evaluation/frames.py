@@ -5,6 +5,7 @@ import torch
 from sparsestreet.evaluation.quality import MetricSummary
 from sparsestreet.evaluation.records import (
     FORMAT,
+    GuardCounts,
     Latency,
     Machine,
     RunDescription,
@@ -39,6 +40,7 @@ def make_summary(
     training_seconds: float | None = 100.0,
     split: str = "every 10th frame from 0",
     device: str = "cpu: test",
+    alarms: dict[str, int] | None = None,
 ) -> RunSummary:
     """A record as a run writes it, with the numbers that a test wants to see in the table."""
     gaussians = gaussians or {"background": 1000, "rigid": 200}
@@ -63,4 +65,5 @@ def make_summary(
         latency_protocol=latency.protocol,
         machine=Machine("test", 2, "Linux x86_64", "3.11", "2.13.0"),
         source=Source(None, None),
+        guards=GuardCounts({"drawn": 900, "overflowed": 0} | (alarms or {}), alarms or {}),
     )

@@ -8,7 +8,13 @@ import os
 import pytest
 
 from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
-from sparsestreet.evaluation.records import read_quality, read_summary, write_quality, write_summary
+from sparsestreet.evaluation.records import (
+    GuardCounts,
+    read_quality,
+    read_summary,
+    write_quality,
+    write_summary,
+)
 from sparsestreet.evaluation.strict_json import RecordError, significant, write_atomically
 from tests.evaluation.frames import make_summary
 
@@ -71,6 +77,22 @@ def test_totals_must_be_the_sum_of_their_parts():
         dataclasses.replace(make_summary(), gaussians_total=5)
 
 
+def test_alarms_are_among_the_guards():
+    with pytest.raises(ValueError, match="alarms holds vanished: 3, rows has None: evaluate again"):
+        GuardCounts({"drawn": 5}, {"vanished": 3})
+    with pytest.raises(ValueError, match="alarms holds vanished: 0, rows has 0"):
+        GuardCounts({"vanished": 0}, {"vanished": 0})
+
+
+def test_a_record_from_before_guards_were_counted_is_read(tmp_path):
+    path = tmp_path / "summary.json"
+    write_summary(path, make_summary())
+    entries = json.loads(path.read_text())
+    del entries["guards"]
+    path.write_text(json.dumps(entries))
+    assert read_summary(path) == dataclasses.replace(make_summary(), guards=None)
+
+
 def drop(entries, key):
     del entries[key]
 
@@ -87,6 +109,8 @@ def drop(entries, key):
         (lambda entries: entries["quality"]["psnr_full"].update(images=1.5), r"psnr_full: images: expected int"),
         (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
         (lambda entries: entries.update(format=99), r"format 99, this version reads 1"),
+        (lambda entries: entries["guards"]["alarms"].update(vanished=1), r"alarms holds vanished: 1, rows has N"),
+        (lambda entries: drop(entries["guards"], "alarms"), r"guards: GuardCounts lacks the keys \['alarms'\]"),
         (lambda entries: entries.update(machine=[]), r"machine: expected dict, got list"),
         (lambda entries: entries["run"].update(seed=float("nan")), r"is not strict JSON \(NaN"),
     ],

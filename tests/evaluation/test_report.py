@@ -1,5 +1,6 @@
 """The table on hand-made records, against numbers worked out by hand."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -123,6 +124,24 @@ def test_two_meanings_of_one_metric_do_not_meet_in_a_table():
     second.definitions["psnr_full"] = "something else"
     with pytest.raises(ValueError, match="psnr_full means different things in run0 and run1"):
         sections(records(first, second))
+
+
+def guards_note(*summaries):
+    (section,) = sections(records(*summaries))
+    (note,) = [note for note in section.notes if note.startswith("guards")]
+    return note
+
+
+def test_guards_that_fired_are_named():
+    calm, older = make_summary(), dataclasses.replace(make_summary(seed=2), guards=None)
+    loud = make_summary("ours", 3, alarms={"vanished": 1234, "color_held": 1})
+    assert guards_note(calm, make_summary(seed=1)) == "guards: none fired"
+    assert guards_note(calm, loud) == "guards: ours (seed 3) vanished 1,234, color_held 1"
+    assert guards_note(make_summary("plain", 1, alarms={"overflowed": 7}), loud) == (
+        "guards: plain (seed 1) overflowed 7; ours (seed 3) vanished 1,234, color_held 1"
+    )
+    assert guards_note(calm, older) == "guards: none fired (1 of 2 runs did not count them)"
+    assert guards_note(older) == "guards: not counted"
 
 
 def printed(table, width):

@@ -10,6 +10,7 @@ from PIL import Image
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.evaluation.records import RunDescription, quality_path, read_quality, read_summary, summary_path
 from sparsestreet.evaluation.run import choose_pictures, evaluate_run
+from sparsestreet.ops import Guards
 from tests.evaluation.frames import make_frame
 
 RUN = RunDescription("plain", "street", 3, "every 10th frame from 0", 12.5, "sparsestreet train")
@@ -30,6 +31,7 @@ def evaluate(out, frames, pictures=2):
         frames,
         render=darker,
         centres=dots,
+        guards=lambda frame: Guards(drawn=frame.index, near=frame.camera_index, vanished=int(frame.index == 20)),
         gaussians={"background": 30, "rigid": 12},
         bytes_by_part={"background": 300, "rigid": 120, "sky": 5},
         run=RUN,
@@ -59,6 +61,10 @@ def test_a_run_leaves_its_records(tmp_path):
     assert on_disk.resolutions == ("12x9",)
     assert (on_disk.latency.repeats, on_disk.latency.views) == (4, 5)
     assert set(on_disk.quality) == set(on_disk.definitions)
+    counted = {name: count for name, count in on_disk.guards.rows.items() if count}
+    assert counted == {"drawn": 0 + 10 + 20 + 30 + 40, "near": 2, "vanished": 1}
+    assert set(on_disk.guards.rows) == set(vars(Guards()))
+    assert on_disk.guards.alarms == {"vanished": 1}
     assert on_disk.quality["psnr_full"].mean == pytest.approx(summary.quality["psnr_full"].mean, rel=1e-5)
 
     rows = read_quality(quality_path(tmp_path))
