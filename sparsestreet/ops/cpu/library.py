@@ -11,6 +11,8 @@ from pathlib import Path
 import torch
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
+LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
+"""Environment variable that names another build of the library, for measurements and tests of it."""
 _INTERFACE_VERSION = 3
 _LOADED_IN = os.getpid()
 
@@ -93,7 +95,13 @@ def remedy() -> str:
 
 @cache
 def find_library() -> Path | None:
-    """Path of the library: beside this module, or where an editable install put it; None if it was not built."""
+    """Path of the library: the one that LIBRARY_VARIABLE names, else beside this module, else where an editable install
+    put it; None if it was not built. Raises RuntimeError if the variable names no file."""
+    named = os.environ.get(LIBRARY_VARIABLE)
+    if named is not None:
+        if not Path(named).is_file():
+            raise RuntimeError(f"{LIBRARY_VARIABLE} names no file: {named!r}; name a built library or unset it")
+        return Path(named)
     beside = Path(__file__).parent / LIBRARY_NAME
     if beside.is_file():
         return beside

@@ -1,29 +1,26 @@
 // Rows in memory to registers that hold one column each, and back: squares of LANES x LANES are transposed in
 // registers.
 #pragma once
+#include <utility>
+
 #include "lanes.hpp"
 
 namespace SPLAT_VARIANT {
 
 // One step of the butterfly: exchanges the off-diagonal halves of blocks of 2 * half rows and columns.
-template <class T, int half>
-inline void exchange(Lanes<T>* square) {
-  Integers<T> upper, lower;
-  for (int i = 0; i < LANES<T>; ++i) {
-    upper[i] = i & half ? LANES<T> + i - half : i;
-    lower[i] = i & half ? LANES<T> + i : i + half;
-  }
+template <class T, int half, int... i>
+inline void exchange(Lanes<T>* square, std::integer_sequence<int, i...>) {
   for (int r = 0; r < LANES<T>; ++r) {
     if (r & half) continue;
     const Lanes<T> a = square[r], b = square[r + half];
-    square[r] = __builtin_shuffle(a, b, upper);
-    square[r + half] = __builtin_shuffle(a, b, lower);
+    square[r] = __builtin_shufflevector(a, b, (i & half ? LANES<T> + i - half : i)...);
+    square[r + half] = __builtin_shufflevector(a, b, (i & half ? LANES<T> + i : i + half)...);
   }
 }
 
 template <class T, int half = LANES<T> / 2>
 inline void transpose(Lanes<T>* square) {
-  exchange<T, half>(square);
+  exchange<T, half>(square, std::make_integer_sequence<int, LANES<T>>{});
   if constexpr (half > 1) transpose<T, half / 2>(square);
 }
 
