@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, for measurements and tests of it."""
-_INTERFACE_VERSION = 3
+_INTERFACE_VERSION = 4
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -130,6 +130,11 @@ def load_library() -> ctypes.CDLL:
     return library
 
 
+def tile_size() -> int:
+    """Side of the square tiles for which the loaded library was built, pixels."""
+    return load_library().splat_tile_size()
+
+
 def thread_count() -> int:
     """Threads a call may use: torch's number, but one in a forked child, where the OpenMP runtime would wait for
     threads that only its parent has."""
@@ -138,6 +143,7 @@ def thread_count() -> int:
 
 def _declare(library: ctypes.CDLL) -> None:
     signatures = {
+        "splat_tile_size": (c_int32, ()),
         "splat_variant_name": (ctypes.c_char_p, (c_int32,)),
         "splat_create": (c_void_p, (c_int32, c_int32)),
         "splat_destroy": (None, (c_void_p,)),

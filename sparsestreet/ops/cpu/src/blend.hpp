@@ -1,4 +1,4 @@
-// Forward: each tile's splats, nearest first, into its 256 pixels.
+// Forward: each tile's splats, nearest first, into its pixels.
 #pragma once
 #include <omp.h>
 

@@ -4,7 +4,10 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 3;
+constexpr int32_t INTERFACE_VERSION = 4;
+
+// Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
+constexpr int TILE = SPLAT_TILE;
 
 enum Status : int32_t { OK = 0, BAD_VALUE = 1, TOO_MANY_PAIRS = 2, OUT_OF_MEMORY = 3 };
 

@@ -5,6 +5,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "interface.h"
+
 namespace SPLAT_VARIANT {
 
 #if defined(__AVX512F__)
@@ -15,25 +17,27 @@ constexpr int REGISTER_BYTES = 32;
 constexpr int REGISTER_BYTES = 16;
 #endif
 
+// No more than the pixels of a tile row. (Projecting rows with whole registers all the same would gain it a tenth.)
+template <class T>
+constexpr int LANES = REGISTER_BYTES / int(sizeof(T)) < splat::TILE ? REGISTER_BYTES / int(sizeof(T)) : splat::TILE;
+
 template <class T>
 struct LanesOf;
 template <>
 struct LanesOf<float> {
-  typedef float Values __attribute__((vector_size(REGISTER_BYTES)));
-  typedef int32_t Integers __attribute__((vector_size(REGISTER_BYTES)));
+  typedef float Values __attribute__((vector_size(LANES<float> * sizeof(float))));
+  typedef int32_t Integers __attribute__((vector_size(LANES<float> * sizeof(float))));
 };
 template <>
 struct LanesOf<double> {
-  typedef double Values __attribute__((vector_size(REGISTER_BYTES)));
-  typedef int64_t Integers __attribute__((vector_size(REGISTER_BYTES)));
+  typedef double Values __attribute__((vector_size(LANES<double> * sizeof(double))));
+  typedef int64_t Integers __attribute__((vector_size(LANES<double> * sizeof(double))));
 };
 template <class T>
 using Lanes = typename LanesOf<T>::Values;
 // An integer per lane, as wide as T; comparisons of lanes have this type, -1 for true.
 template <class T>
 using Integers = typename LanesOf<T>::Integers;
-template <class T>
-constexpr int LANES = REGISTER_BYTES / int(sizeof(T));
 
 template <class T>
 inline Lanes<T> load(const T* from) {

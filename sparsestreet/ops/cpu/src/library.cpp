@@ -80,6 +80,7 @@ int32_t guarded(Call call) {
 #define SPLAT_API extern "C" __attribute__((visibility("default")))
 
 SPLAT_API int32_t splat_interface_version() { return INTERFACE_VERSION; }
+SPLAT_API int32_t splat_tile_size() { return TILE; }
 
 // Variants: 0 baseline, 1 x86-64-v3, 2 x86-64-v4; -1 the fastest that runs here. Null if it does not run here.
 SPLAT_API const char* splat_variant_name(int32_t index) {

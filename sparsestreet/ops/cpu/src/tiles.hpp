@@ -1,4 +1,4 @@
-// Which 16x16 tiles a splat can touch: per row of tiles, the columns its ellipse alpha >= alpha_min reaches.
+// Which tiles a splat can touch: per row of tiles, the columns its ellipse alpha >= alpha_min reaches.
 #pragma once
 #include "projection.hpp"
 

@@ -97,7 +97,7 @@ inline Lanes<T> log2_positive(const Lanes<T>& v) {
 // Numbers rounded to float32.
 inline Lanes<float> in_single(const Lanes<float>& v) { return v; }
 inline Lanes<double> in_single(const Lanes<double>& v) {
-  typedef float Singles __attribute__((vector_size(REGISTER_BYTES / 2)));
+  typedef float Singles __attribute__((vector_size(LANES<double> * sizeof(float))));
   return __builtin_convertvector(__builtin_convertvector(v, Singles), Lanes<double>);
 }
 

@@ -15,8 +15,7 @@ struct Range {
   Range(int64_t count, int64_t part, int64_t parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
 };
 
-// A tile row of 16 float pixels is one AVX-512 register, two AVX2 registers, four SSE registers.
-constexpr int TILE = 16;
+// At 16, a tile row of floats is one AVX-512 register, two AVX2 registers, four SSE registers.
 constexpr int PIXELS = TILE * TILE;
 
 // One splat on the screen, 64 bytes as float, one cache line; or as many as a register has lanes.
