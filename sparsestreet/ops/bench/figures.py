@@ -28,6 +28,7 @@ _STYLES = {
     "blur": ("#999999", "h"),
     "half_colors": ("#CC79A7", "P"),
     "depth_bits": ("#E69F00", "^"),
+    "tile size": ("#8C564B", "p"),
     "preset": ("#000000", "*"),
     "backend": ("#7F3C8D", "X"),
 }

@@ -1,10 +1,11 @@
-"""The points of the sweep: one knob at a time around the default, then the presets."""
+"""The points of the sweep: one knob at a time around the default, the presets, the tile sizes, the backends."""
 
 from dataclasses import dataclass, replace
 from math import inf
 
 import torch
 
+from sparsestreet.ops.bench.tile_sizes import TILE_SIZES
 from sparsestreet.ops.settings import SplatSettings
 
 DEFAULT = SplatSettings()
@@ -22,7 +23,6 @@ KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
 BOXES_ALONE = (3.0, 3.33, 4.0)
 """Boxes without alpha_min, two knobs at once: either of them bounds a splat, so each hides what the other costs."""
 FIXED = {
-    ("tile size", "cpu"): "compiled for tiles of 16x16: a row of a tile is one AVX-512 register of float32",
     ("tile size", "reference"): "dense: it has no tiles",
     ("tile size", "triton"): "compiled for tiles of 16x16",
     ("exact tiles", "cpu"): "always exact; that this changes no pixel is measured as 'culling'",
@@ -47,6 +47,8 @@ class Point:
     """Name of the preset that has these settings."""
     backend: str = "cpu"
     dtype: torch.dtype = torch.float32
+    tile: int | None = None
+    """Side of the tiles, pixels, for which the C++ library is compiled; None: the library in use."""
 
     @property
     def other_model(self) -> bool:
@@ -67,7 +69,8 @@ class Point:
 
 
 def points() -> list[Point]:
-    """The default first, then every knob, the presets that no knob reaches, and the other backends."""
+    """The default first, then every knob, the presets that no knob reaches, the tile sizes (that of the library in use
+    as well, since a process of its own may cost something), and the other backends."""
     named = {name: SplatSettings.preset(name) for name in PRESETS}
     swept = [Point("default", "default", DEFAULT)]
     for knob, values in KNOBS.items():
@@ -79,6 +82,7 @@ def points() -> list[Point]:
     names = {settings: name for name, settings in reversed(named.items())}
     swept = [replace(point, preset=names.get(point.settings)) for point in swept]
     others = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
+    swept += [Point("tile size", str(size), DEFAULT, tile=size) for size in TILE_SIZES]
     return swept + [
         Point("backend", f"{name} {str(dtype).removeprefix('torch.')}", DEFAULT, backend=name, dtype=dtype)
         for name, dtype in others

@@ -12,8 +12,9 @@ from sparsestreet.ops.bench.culling import Culling, compare_culling
 from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point
 from sparsestreet.ops.bench.records import RecordFile
 from sparsestreet.ops.bench.scenes import BenchScene, Size
+from sparsestreet.ops.bench.tile_sizes import build, with_tiles
 from sparsestreet.ops.bench.timing import Effort, OpTimes, leaves, time_op
-from sparsestreet.ops.bench.torch_tiles import TILE
+from sparsestreet.ops.cpu.library import tile_size
 from sparsestreet.ops.settings import SplatSettings
 
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(48, 32, 200)
@@ -53,6 +54,8 @@ class KnobRecord:
     """Against this model in float64 without cut-offs (R0); None where that covers too many tiles to be held."""
     same_cutoffs: Errors | None = None
     """Against this model in float64 with the same cut-offs (R1): what rounding alone does."""
+    tiles_in_use: Errors | None = None
+    """A tile size against the library in use: the same image up to rounding, not a trade."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,8 @@ def run_sweep(
     resolve_backend(_EXACT_BACKEND, torch.device("cpu"))
     for (knob, backend), holds in FIXED.items():
         file.write("fixed", FixedRecord(knob, backend, holds))
+    for size in (point.tile for point in points if point.tile is not None):
+        say(f"tiles of {size} pixels: {build(size).missing or 'compiled'}")
     for scene in small:
         file.write("oracle", check_oracle(scene))
     for scene in scenes:
@@ -141,10 +146,12 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effor
     record = _unmeasured(scene, point)
     if record.skipped is not None:
         return record
-    device = "cuda" if point.backend == "triton" else "cpu"
-    rows = leaves(scene.gaussians, point.dtype, device)
-    times = time_op(rows, scene.camera, point.settings, point.backend, effort)
-    value = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype, device)
+    if point.tile is None:
+        times, value = time_and_answer(scene, point, effort)
+    else:
+        times, value = with_tiles(point.tile, time_and_answer, scene, point, effort)
+        in_use = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype)
+        record = replace(record, tiles_in_use=errors(value, in_use))
     record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs)))
     if not affordable(scene, point.exact):
         return record
@@ -153,6 +160,14 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effor
         return record
     default = Point("default", "default", DEFAULT).exact
     return replace(record, model_psnr=image_error(truths.of(point.exact).image, truths.of(default).image).psnr)
+
+
+def time_and_answer(scene: BenchScene, point: Point, effort: Effort) -> tuple[OpTimes, Answer]:
+    """What is timed, and what it draws."""
+    device = "cuda" if point.backend == "triton" else "cpu"
+    rows = leaves(scene.gaussians, point.dtype, device)
+    times = time_op(rows, scene.camera, point.settings, point.backend, effort)
+    return times, answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype, device)
 
 
 def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
@@ -175,7 +190,8 @@ def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
 
 def affordable(scene: BenchScene, settings: SplatSettings) -> bool:
     """Whether the pairs can be held where nothing bounds a splat, so that each covers every tile."""
-    tiles = -(-scene.camera.width // TILE) * -(-scene.camera.height // TILE)
+    side = tile_size()
+    tiles = -(-scene.camera.width // side) * -(-scene.camera.height // side)
     bounded = settings.alpha_min > 0 or settings.box < float("inf")
     return bounded or int((scene.gaussians.opacities > 0).sum()) * tiles <= UNBOUNDED_PAIRS
 
@@ -187,6 +203,8 @@ def unavailable(scene: BenchScene, point: Point) -> str | None:
         return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed"
     if not affordable(scene, point.settings):
         return f"nothing bounds a splat: more than {UNBOUNDED_PAIRS:.2g} (splat, tile) pairs"
+    if point.tile is not None:
+        return build(point.tile).missing
     if point.backend == "triton":
         if "triton" not in BACKENDS:
             return "this version has no triton backend"
@@ -220,6 +238,8 @@ def describe(record: KnobRecord) -> str:
     psnr = record.exact.image.psnr
     image = "equal" if psnr is None else f"{psnr:6.1f} dB"
     note = f"  other model ({record.model_psnr:.1f} dB)" if record.model_psnr is not None else ""
+    if record.tiles_in_use is not None:
+        note = f"  {record.tiles_in_use.image.maximum:.0e} from the tiles in use"
     return f"{times}   {image}   gradient {worst_gradient(record.exact):.1e}{note}"
 
 

@@ -13,7 +13,7 @@ POINTS = points()
 
 def test_default_first_and_no_point_twice():
     assert (POINTS[0].knob, POINTS[0].preset) == ("default", "default")
-    keys = [(point.settings, point.backend, point.dtype) for point in POINTS]
+    keys = [(point.settings, point.backend, point.dtype, point.tile) for point in POINTS]
     assert len(set(keys)) == len(keys)
 
 
@@ -30,6 +30,16 @@ def test_one_knob_at_a_time():
     for knob, values in KNOBS.items():
         assert getattr(DEFAULT, knob) in values
         assert sum(point.knob == knob for point in POINTS) == len(values) - 1
+
+
+def test_every_tile_size_at_the_default():
+    tiles = [point for point in POINTS if point.tile is not None]
+    assert [(point.knob, point.value, point.tile) for point in tiles] == [
+        ("tile size", "8", 8),
+        ("tile size", "16", 16),
+        ("tile size", "32", 32),
+    ]
+    assert {(point.settings, point.backend, point.dtype) for point in tiles} == {(DEFAULT, "cpu", torch.float32)}
 
 
 def test_every_preset_has_one_point():

@@ -1,0 +1,25 @@
+"""Which library is loaded."""
+
+import pytest
+
+from sparsestreet.ops.cpu.library import LIBRARY_VARIABLE, find_library, load_library, tile_size
+
+find = find_library.__wrapped__  # without its cache
+
+
+def test_a_variable_names_another_library(monkeypatch, tmp_path):
+    other = tmp_path / "other.so"
+    other.write_bytes(b"")
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(other))
+    assert find() == other
+
+
+def test_a_variable_that_names_no_file(monkeypatch, tmp_path):
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
+    with pytest.raises(RuntimeError, match=f"{LIBRARY_VARIABLE} names no file: .*unset it"):
+        find()
+
+
+def test_the_library_reports_its_tiles():
+    assert tile_size() == load_library().splat_tile_size()
+    assert tile_size() in (8, 16, 32)
