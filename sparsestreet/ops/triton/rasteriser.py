@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.triton import blend, blend_backward, count, rows, rows_backward, slots
+from sparsestreet.ops.triton import blend, blend_backward, count, rows_backward, slots
 from sparsestreet.ops.triton import removal as remove
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
@@ -24,7 +24,7 @@ from sparsestreet.ops.triton.pixels import (
     differentiate_view,
     pixel_arguments,
 )
-from sparsestreet.ops.triton.screen import effects, given_or, project
+from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import View
 from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 
@@ -47,9 +47,8 @@ def rasterise(
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
     _check(gaussians)
-    g, view = gaussians, View(camera, settings)
-    fields = tuple(field.contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
-    screen = project(fields, g.displacements, view)
+    view = View(camera, settings)
+    screen = project(gaussians, view)
     lists = screen.lists
     counters = screen.records.new_empty(len(lists.slots), count.COUNTER_COUNT)
     launch(
@@ -57,7 +56,7 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
         screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, lists.order, counters,
         *pixel_arguments(view), view.transmittance_min, EXCLUSIVE=view.exclusive, options=ONE_WARP,
     )  # fmt: skip
-    totals = torch.zeros(len(g), count.COUNTER_COUNT, dtype=torch.float64, device=g.means.device)
+    totals = torch.zeros(len(gaussians), count.COUNTER_COUNT, dtype=torch.float64, device=counters.device)
     _sum_slots(counters, lists, totals, 4, tl.float64)
     weight, pixels, dominant = totals.unbind(-1)
     return Contribution(weight, pixels.long(), dominant.long())
@@ -73,13 +72,12 @@ def removal(
 ) -> Removal:
     """How far the view moves when each row alone is taken away, over a background (None: black)."""
     _check(gaussians)
-    g, view = gaussians, View(camera, settings)
-    fields = tuple(field.contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
-    screen = project(fields, g.displacements, view)
+    view = View(camera, settings)
+    screen = project(gaussians, view)
     lists, layers = screen.lists, blend_view(screen, view, lasts=True)
     changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)
     width, height, *others = pixel_arguments(view)
-    behind, counts = (None if given is None else given.contiguous() for given in (background, pixel_weights))
+    behind, counts = contiguous(background), contiguous(pixel_weights)
     passed = layers.ends.transmittance
     launch(
         remove.remove_from_tiles, len(lists.order), 1,
@@ -87,7 +85,7 @@ def removal(
         passed, given_or(behind, passed), given_or(counts, passed), changes, width, height, 1, *others,
         BEHIND=behind is not None, WEIGHTED=counts is not None, options=ONE_WARP,
     )  # fmt: skip
-    totals = torch.zeros(len(g), remove.CHANGE_COUNT, dtype=torch.float64, device=g.means.device)
+    totals = torch.zeros(len(gaussians), remove.CHANGE_COUNT, dtype=torch.float64, device=changes.device)
     _sum_slots(changes, lists, totals, 2, tl.float64)
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
@@ -101,13 +99,12 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, differentiated):
         ctx.set_materialize_grads(False)
-        fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
-        displacements = None if displacements is None else displacements.contiguous()
-        screen = project(fields, displacements, view)
+        gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
+        screen = project(gaussians, view)
         layers = blend_view(screen, view, lasts=differentiated)
         ctx.mark_non_differentiable(screen.radii)
-        ctx.save_for_backward(*fields, layers.ends.transmittance)
-        ctx.screen, ctx.view, ctx.displacements = screen, view, displacements
+        ctx.save_for_backward(*fields_of(gaussians), layers.ends.transmittance)
+        ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
         ctx.lasts, ctx.parts = layers.ends.lasts, layers.ends.parts
         return layers.rgb, layers.ends.transmittance, layers.depth_sum, screen.radii
 
@@ -119,7 +116,7 @@ class _Blend(torch.autograd.Function):
         cotangents = Cotangents(
             transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous(),
             torch.zeros_like(transmittance) if v_transmittance is None else v_transmittance.contiguous(),
-            None if v_depth_sum is None else v_depth_sum.contiguous(),
+            contiguous(v_depth_sum),
         )
         ends = Ends(transmittance, ctx.lasts, ctx.parts)
         gradients = differentiate_view(screen, view, ends, cotangents, absolute=ctx.needs_input_grad[5])
@@ -128,7 +125,7 @@ class _Blend(torch.autograd.Function):
         outputs = [torch.empty_like(field) for field in fields]
         v_screen = transmittance.new_empty(len(fields[0]), 2)
         launch(
-            rows_backward.project_rows_backward, len(fields[0]), rows.block_of(view),
+            rows_backward.project_rows_backward, len(fields[0]), rows_backward.block_of(view),
             *fields, given_or(ctx.displacements, fields[0]), screen.table, screen.records, screen.tile_counts, sums,
             *outputs, v_screen, len(fields[0]),
             TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, **effects(view, ctx.displacements),

@@ -22,7 +22,12 @@ from sparsestreet.ops.triton.shape import (
 from sparsestreet.ops.triton.shutter import roll, roll_backward, velocity, velocity_backward
 from sparsestreet.ops.triton.unscented import unscented, unscented_backward
 from sparsestreet.ops.triton.vectors import plus, times, transposed_times
-from sparsestreet.ops.triton.view import ROTATION, TRANSLATION, load_matrix, load_vector
+from sparsestreet.ops.triton.view import ROTATION, TRANSLATION, View, load_matrix, load_vector
+
+
+def block_of(view: View) -> int:
+    """Rows of a program: as many lanes hold the eight points of a distorted row, so that none spills registers."""
+    return 16 if view.distorted else 128
 
 
 @jit

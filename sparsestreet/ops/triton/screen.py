@@ -26,11 +26,12 @@ class Screen:
     lists: Lists
 
 
-def project(fields: tuple[Tensor, ...], displacements: Tensor | None, view: View) -> Screen:
-    """Project the five fields of Gaussians; waits for the device once, for the numbers of rows and of pairs.
+def project(gaussians: Gaussians, view: View) -> Screen:
+    """Project all rows; waits for the device once, for the numbers of rows and of pairs.
 
     Raises ValueError for bad values, PairLimitError.
     """
+    fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
     means, sh = fields[0], fields[4]
     n, settings, table = len(means), view.settings, view.table(means.device)
     splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
@@ -46,9 +47,19 @@ def project(fields: tuple[Tensor, ...], displacements: Tensor | None, view: View
     numbers = torch.stack((tile_counts.sum(dtype=torch.int64), places[-1:].sum(), bad.sum()))
     pairs, visible, bad_blocks = numbers.tolist()
     if bad_blocks:
-        check_values(Gaussians(*fields, displacements))
+        check_values(gaussians)
     check_pairs(pairs, tile_counts)
     return Screen(table, splats, tile_counts, radii, list_tiles(splats, tile_counts, places, visible, pairs, view))
+
+
+def fields_of(gaussians: Gaussians) -> tuple[Tensor, ...]:
+    """Means, quaternions, scales, opacities and harmonics as kernels walk them."""
+    g = gaussians
+    return tuple(field.contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
+
+
+def contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()
 
 
 def given_or(tensor: Tensor | None, other: Tensor) -> Tensor:

@@ -19,8 +19,8 @@ def count_work(gaussians: Gaussians, camera: Camera, settings: SplatSettings) ->
     The walk over a tile ends with the 32 pairs in which its last pixel is finished. Long tiles are counted as if they
     were in one piece: that the light through their parts is computed twice is not in the number.
     """
-    g, view = gaussians, View(camera, settings)
-    screen = project((g.means, g.quaternions, g.scales, g.opacities, g.sh), g.displacements, view)
+    view = View(camera, settings)
+    screen = project(gaussians, view)
     lists = screen.lists
     counts, seen = lists.ends - lists.begins, _last_of_tiles(blend_view(screen, view, lasts=True).ends.lasts, view)
     seen = torch.where(counts > 0, seen - lists.begins, 0)

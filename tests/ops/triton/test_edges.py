@@ -227,6 +227,22 @@ def test_displacements_that_are_not_finite():
         splat(gaussians, VIEW, backend="triton")
 
 
+@pytest.mark.parametrize("laid_out", ["transposed", "expanded"])
+def test_displacements_in_any_layout(laid_out):
+    view = dataclasses.replace(VIEW, shutter=Shutter(torch.full((3,), 0.1), torch.zeros(3)))
+    scene = random_gaussians(6, view)
+    moved = torch.linspace(-0.5, 0.5, 18, device=DEVICE).view(3, 6).mT
+    if laid_out == "expanded":
+        moved = torch.tensor([0.3, -0.4, 0.2], device=DEVICE).expand(6, 3)
+    assert not moved.is_contiguous()
+    strided = dataclasses.replace(single(scene), displacements=moved)
+    compact = dataclasses.replace(strided, displacements=moved.contiguous())
+    assert torch.equal(splat(strided, view, backend="triton").rgb, splat(compact, view, backend="triton").rgb)
+    assert contribution(compact, view, backend="triton").weight.any()
+    assert torch.equal(*(contribution(g, view, backend="triton").weight for g in (compact, strided)))
+    assert torch.equal(*(rasteriser.removal(g, None, None, view, SplatSettings()).squared for g in (compact, strided)))
+
+
 def test_more_pairs_than_may_be_held(monkeypatch):
     view = front_camera(64, 48, 40.0)
     giant = one_gaussian(scales=[[90.0] * 3])

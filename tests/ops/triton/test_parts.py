@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.ops import SplatSettings, contribution
+from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import parts, rasteriser
 from sparsestreet.ops.triton.parts import split_tiles
 from sparsestreet.types import Gaussians
@@ -119,6 +119,19 @@ def test_counting_and_removal_walk_whole_tiles(short_parts):
     split = rasteriser.removal(single, None, None, VIEW, SplatSettings())
     torch.testing.assert_close(split.squared, whole.squared, rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(split.largest, whole.largest, rtol=1e-5, atol=1e-7)
+
+
+def test_parts_longer_than_a_look(monkeypatch):
+    # Both parts hold 35 splats and are looked at after 32, when half the light still passes.
+    monkeypatch.setattr(parts, "PART_LENGTH", 33)
+    layers = [
+        one_gaussian(means=[[0.0, 0.0, 2 + 0.1 * k]], scales=[[90.0] * 3], opacities=[0.02], sh=[[[0.01 * k] * 3]])
+        for k in range(70)
+    ]
+    scene, view = Gaussians.concatenate(layers), front_camera(3, 2, 20.0)
+    drawn = splat(cast(scene, torch.float32, device=DEVICE), view, backend="triton")
+    truth = splat(scene, view, backend="reference")
+    assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6
 
 
 @settings(deadline=None, max_examples=100)

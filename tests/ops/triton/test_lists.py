@@ -1,0 +1,124 @@
+"""The tiles' lists: brute force over pixels as the oracle, on a grid that is not square."""
+
+import math
+
+import pytest
+import torch
+
+from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops.triton.screen import Screen, project
+from sparsestreet.ops.triton.view import View
+from sparsestreet.types import Camera, Gaussians
+from tests.ops.scenes import camera, cast, device_of, front_camera, one_gaussian, random_gaussians
+
+DEVICE = device_of("triton")
+WIDTH, HEIGHT, TILE = 587, 171, 16
+COLUMNS, ROWS = 37, 11
+DEPTH = 10
+"""Place of the depth in a record."""
+
+
+def listed(screen: Screen) -> set[tuple[int, int]]:
+    """(row, tile) of every pair, as the pixel kernels walk them."""
+    lists, pairs = screen.lists, set()
+    for tile in range(len(lists.begins)):
+        rows = lists.pair_rows[int(lists.begins[tile]) : int(lists.ends[tile])].tolist()
+        pairs |= {(row, tile) for row in rows}
+    assert len(pairs) == len(lists.pair_rows)
+    return pairs
+
+
+def touched(screen: Screen, view: Camera, rows: int, margin: float = 0.0) -> set[tuple[int, int]]:
+    """Pairs with a pixel centre in the ellipse, which is widened by ``margin`` pixels; from the records, in float64."""
+    y, x = torch.meshgrid(
+        torch.arange(view.height, dtype=torch.float64) + 0.5,
+        torch.arange(view.width, dtype=torch.float64) + 0.5,
+        indexing="ij",
+    )
+    tiles = (y / TILE).floor().long() * math.ceil(view.width / TILE) + (x / TILE).floor().long()
+    found = set()
+    for row in range(rows):
+        if screen.tile_counts[row] == 0:
+            continue
+        mean_x, mean_y, l11, l21, l22, log2_opacity, cutoff = screen.records[row, :7].double().cpu().tolist()
+        dx, dy = x - mean_x, y - mean_y
+        distance = torch.hypot(l11 * dx + l21 * dy, l22 * dy)
+        # A pixel is at most so many units of L d.
+        most = float(torch.linalg.matrix_norm(torch.tensor([[l11, l21], [0, l22]]), 2))
+        inside = distance <= math.sqrt(max(log2_opacity - cutoff, 0)) + margin * most
+        found |= {(row, tile) for tile in tiles[inside].unique().tolist()}
+    return found
+
+
+def ellipses() -> Gaussians:
+    """Needles and balls all over the image and beyond its edges, two metres away."""
+    generator = torch.Generator().manual_seed(2)
+    rows = []
+    for k in range(24):
+        x, y, angle = (torch.rand(3, generator=generator, dtype=torch.float64) - 0.5).tolist()
+        sizes = (10 ** (-2.3 + 1.6 * torch.rand(2, generator=generator, dtype=torch.float64))).tolist()
+        rows.append(
+            one_gaussian(
+                means=[[3.2 * x, 1.0 * y, 2.0]],
+                scales=[[*sizes, 0.01]],
+                quaternions=[[math.cos(3 * angle), 0.0, 0.0, math.sin(3 * angle)]],
+                opacities=[0.9 if k % 3 else 0.01],
+            )
+        )
+    return Gaussians.concatenate(rows)
+
+
+@pytest.fixture(scope="module")
+def projected() -> tuple[Screen, Camera]:
+    view = front_camera(WIDTH, HEIGHT, 400.0)
+    scene = cast(ellipses(), torch.float32, device=DEVICE)
+    return project(scene, View(view, SplatSettings())), view
+
+
+def test_no_touched_tile_is_missing_and_hardly_one_is_listed_in_vain(projected):
+    screen, view = projected
+    needed = touched(screen, view, 24)
+    assert len(needed) > 150
+    assert needed <= listed(screen)
+    # The margin against rounding is a hundredth of a pixel and 1e-5 of the ellipse.
+    assert listed(screen) <= touched(screen, view, 24, margin=0.05)
+
+
+def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
+    view = camera(WIDTH, HEIGHT)
+    screen = project(cast(random_gaussians(40, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
+    lists, depths = screen.lists, screen.records[:, DEPTH]
+    for begin, end in zip(lists.begins.tolist(), lists.ends.tolist(), strict=True):
+        order = depths[lists.pair_rows[begin:end].long()]
+        assert (order[1:] >= order[:-1]).all()
+    lengths = (lists.ends - lists.begins)[lists.order.long()]
+    assert lengths[0] > lengths[-1]
+    assert (lengths[1:] <= lengths[:-1]).all()
+    assert sorted(lists.order.tolist()) == list(range(COLUMNS * ROWS))
+
+
+@pytest.mark.parametrize(("edge", "distance"), [("left", 9), ("right", 8), ("top", 9), ("bottom", 8)])
+def test_a_splat_that_ends_on_a_pixel_centre_is_listed(edge, distance):
+    # The mean is on the pixel centre (24.5, 24.5) of 3 x 3 tiles; the next tiles' nearest centres lie 9 and 8 px away.
+    # The splat ends 1e-6 before them: rounding in the pixel loop may still draw them, so they must be listed.
+    view = front_camera(48, 48, 1000.0)
+    view.intrinsics[:2, 2] = 24.5
+    sigma = distance * (1 - 1e-6) / math.sqrt(2 * math.log(0.8 * 255))
+    scene = one_gaussian(scales=[[sigma * 2 / 1000] * 3])
+    screen = project(cast(scene, torch.float32, device=DEVICE), View(view, SplatSettings(blur=1e-9)))
+    assert (0, {"left": 3, "right": 5, "top": 1, "bottom": 7}[edge]) in listed(screen)
+
+
+@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(box=2.0)], ids=["cut-off", "box"])
+def test_culling_by_tiles_changes_no_bit(settings, monkeypatch):
+    view = camera(35, 19)
+    scene = cast(random_gaussians(12, view), torch.float32, device=DEVICE)
+    culled = splat(scene, view, settings=settings, backend="triton")
+    monkeypatch.setattr(View, "bounded", False)  # every splat in every tile; the cut-offs of alpha stay
+    everywhere = splat(scene, view, settings=settings, backend="triton")
+    for name in ("rgb", "alpha", "depth"):
+        assert torch.equal(getattr(culled, name), getattr(everywhere, name)), name
+    pairs = [len(project(scene, View(view, settings)).lists.slots)]
+    monkeypatch.undo()
+    pairs.append(len(project(scene, View(view, settings)).lists.slots))
+    assert pairs[0] > pairs[1]
