@@ -4,6 +4,7 @@ Run as a script, without TRITON_INTERPRET: launches (recorded by test_machine_co
 input, what was compiled of them goes out as JSON.
 """
 
+import hashlib
 import importlib
 import json
 import re
@@ -16,13 +17,28 @@ import triton
 import triton.language as tl
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
+from triton.runtime.jit import KernelInterface
 
 _TOOLS = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
 
 
 def compile_launch(launch: dict, arch: int) -> dict:
-    """Registers, spills, instructions per sample and tensor-core instructions of one launch on one architecture."""
-    kernel = getattr(importlib.import_module(launch["module"]), launch["name"])
+    """Registers, spills, instructions per sample and tensor-core instructions of one launch on one architecture.
+
+    It is compiled while the functions ``without`` are missing from the kernel's module.
+    """
+    module = importlib.import_module(launch["module"])
+    missing = {name: getattr(module, name) for name in launch.get("without", ())}
+    for name in missing:
+        delattr(module, name)
+    triton.knobs.compilation.always_compile = bool(missing)
+    try:
+        return _compile(getattr(module, launch["name"]), launch, arch)
+    finally:
+        vars(module).update(missing)
+
+
+def _compile(kernel: KernelInterface, launch: dict, arch: int) -> dict:
     constants = {name: _constant(value) for name, value in launch["constants"].items()}
     types = {**launch["types"], **dict.fromkeys(constants, "constexpr")}
     signature = {name: types[name] for name in kernel.arg_names}
@@ -40,6 +56,7 @@ def compile_launch(launch: dict, arch: int) -> dict:
         + compiled.asm["ptx"].count("tf32"),
         "atomics": sum(text.split()[0].startswith(("ATOM", "RED.")) for _, text in instructions),
         "sample": _per_sample(instructions),
+        "code": hashlib.sha256(repr(instructions).encode()).hexdigest(),
     }
 
 

@@ -36,6 +36,8 @@ class Launch:
     types: dict[str, str]
     constants: dict[str, Any]
     options: dict[str, Any]
+    without: tuple[str, ...] = ()
+    """Functions of the kernel's module that it must compile without."""
 
 
 def record_launches(

@@ -23,30 +23,51 @@ ARCHITECTURES = ("80", "90")
 DEVICE = device_of("triton")
 
 
+STILL = camera(5, 4)
+LENS = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0])
+SHUTTER = Shutter(torch.ones(3), torch.zeros(3))
+VIEWS = {
+    "plain": STILL,
+    "lens": dataclasses.replace(STILL, distortion=LENS),
+    "shutter": dataclasses.replace(STILL, shutter=SHUTTER),
+    "both": dataclasses.replace(STILL, distortion=LENS, shutter=SHUTTER),
+}
+# Terms of harmonics, view, whether rows move, settings, what is differentiated: each switch on and off, the largest
+# case of the row kernels, and the kernels that stand beside gsplat's.
+CASES = [
+    (16, "plain", False, SplatSettings(), "rgb"),
+    (16, "plain", False, SplatSettings.preset("gsplat15"), "rgb"),
+    (1, "plain", False, SplatSettings(stop="exclusive", antialias=True), "depth"),
+    (9, "plain", False, SplatSettings(half_colors=True), "rgb"),
+    (1, "lens", False, SplatSettings(), "depth"),
+    (4, "shutter", True, SplatSettings.preset("exact"), "depth"),
+    (16, "both", True, SplatSettings(antialias=True), "rgb"),
+]
+
+
+_FORWARD = ("unscented", "within_fold", "roll", "velocity")
+_BACKWARD = ("unscented", "unscented_backward", "roll", "roll_backward", "velocity", "velocity_backward")
+EFFECTS = {"project_rows": _FORWARD, "project_rows_backward": _BACKWARD}
+
+
 def launches_of_the_op(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
-    """All kernels, with every switch on and off."""
+    """Kernels with every switch on and off."""
     launches = record_launches(monkeypatch)
-    view = camera(5, 4)
-    large, small = (
-        cast(random_gaussians(3, view, terms=terms), torch.float32, requires_grad=True, device=DEVICE)
-        for terms in (16, 1)
-    )
-    splat(large, view, backend="triton").rgb.sum().backward()
+    for terms, name, moves, settings, output in CASES:
+        scene = cast(random_gaussians(3, STILL, terms=terms), torch.float32, requires_grad=True, device=DEVICE)
+        displacements = torch.ones(3, 3, device=DEVICE) if moves else None
+        scene = dataclasses.replace(scene, displacements=displacements)
+        getattr(splat(scene, VIEWS[name], backend="triton", settings=settings), output).sum().backward()
     with torch.no_grad():
-        splat(large, view, backend="triton")
-    contribution(large, view, backend="triton")
-    rasteriser.removal(large, None, None, view, SplatSettings())
-    # One term of colour: what the other switches add compiles faster.
-    rendering = splat(small, view, backend="triton", settings=SplatSettings(stop="exclusive", antialias=True))
-    rendering.depth.sum().backward()
-    moving = dataclasses.replace(
-        view, distortion=torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0]), shutter=Shutter(torch.ones(3), torch.zeros(3))
-    )
-    splat(small, moving, backend="triton").depth.sum().backward()
-    splat(small, dataclasses.replace(moving, distortion=None), backend="triton").depth.sum().backward()
+        splat(scene, STILL, backend="triton")
+    image = torch.ones(4, 5, 3, device=DEVICE)
+    for settings in (SplatSettings(), SplatSettings(stop="exclusive")):
+        contribution(scene, STILL, settings=settings, backend="triton")
+    for background, weights in ((None, None), (image, image[..., 0])):
+        rasteriser.removal(scene, background, weights, STILL, SplatSettings())
     monkeypatch.setattr(parts, "PART_LENGTH", 1)
     for stop in ("inclusive", "exclusive"):
-        splat(small, view, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()
+        splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()
     unique = {json.dumps(dataclasses.asdict(launch), sort_keys=True): launch for launch in launches}
     return list(unique.values())
 
@@ -64,6 +85,8 @@ def compiled() -> list[tuple[Launch, dict]]:
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
     forward, backward = first["blend_tiles"], first["blend_tiles_backward"]
     launches += [bare(forward, 72, LASTS=False), bare(forward, 80), bare(backward, 104, ABSOLUTE=False)]
+    plain = [launch for launch in launches if launch.name in EFFECTS and _is_plain(launch)]
+    launches += [dataclasses.replace(launch, without=EFFECTS[launch.name]) for launch in plain]
     return compile_launches(launches, ARCHITECTURES)
 
 
@@ -119,6 +142,26 @@ def test_budget_of_the_pixel_loops(compiled, kind, arch):
 
 def _switches(constants: dict) -> str:
     return " ".join(sorted(name for name, value in constants.items() if value is True))
+
+
+@pytest.mark.parametrize("arch", ARCHITECTURES)
+@pytest.mark.parametrize("name", EFFECTS)
+def test_effects_that_are_off_are_not_in_the_row_kernels(compiled, name, arch):
+    """They are the same machine code where the functions of the effects do not exist."""
+    whole, without = (
+        [
+            found[arch]["code"]
+            for launch, found in compiled
+            if launch.name == name and bool(launch.without) == missing and _is_plain(launch)
+        ]
+        for missing in (False, True)
+    )
+    assert len(without) == 1
+    assert without[0] in whole
+
+
+def _is_plain(launch: Launch) -> bool:
+    return launch.constants["TERMS"] == 1 and not (launch.constants["DISTORTED"] or launch.constants["ROLLING"])
 
 
 def test_effects_do_not_touch_the_pixel_kernels(monkeypatch):
