@@ -14,6 +14,7 @@ from tests.ops.scenes import (
     FIELDS,
     camera,
     cast,
+    device_of,
     every_effect_double,
     every_effect_precision,
     front_camera,
@@ -197,17 +198,21 @@ def test_rows_that_outrun_the_readout_are_culled(backend, dtype, fall, drawn):
         assert not any(gradient.any() for gradient in result.gradients.values())
 
 
-@every_effect_double
-def test_cameras_and_displacements_get_no_gradient(backend):
+@every_effect_precision
+@pytest.mark.parametrize("lens", [None, (-0.1, 0.0, 0.0, 0.0, 0.0)], ids=["pinhole", "distorted"])
+def test_cameras_and_displacements_get_no_gradient(backend, dtype, lens):
     view = rolling(front_camera(9, 7, 12.0), (0.1, 0.1, 0.1), (0.01, 0.02, 0.03))
-    view = dataclasses.replace(view, distortion=vector(-0.1, 0.0, 0.0, 0.0, 0.0))
-    gaussians = moved(cast(one_gaussian(), torch.float64, requires_grad=True), [[0.1, 0.1, 0.1]])
-    given = (view.shutter.translation, view.shutter.rotation, view.distortion, gaussians.displacements)
+    view = dataclasses.replace(view, distortion=None if lens is None else vector(*lens))
+    still = cast(one_gaussian(), dtype, requires_grad=True, device=device_of(backend))
+    gaussians = dataclasses.replace(still, displacements=torch.full_like(still.means, 0.1).detach())
+    given = [view.camera_from_world, view.intrinsics, view.shutter.translation, view.shutter.rotation]
+    given += [gaussians.displacements, *([] if lens is None else [view.distortion])]
     for value in given:
         value.requires_grad_()
-    splat(gaussians, view, backend=backend).rgb.sum().backward()
+    rendering = splat(gaussians, view, backend=backend)
+    (rendering.rgb.sum() + rendering.depth.sum()).backward()
     assert gaussians.means.grad.any()
-    assert all(value.grad is None or not value.grad.any() for value in given)
+    assert all(value.grad is None for value in given)
 
 
 @every_effect_double

@@ -1,5 +1,7 @@
 """Splats blended front to back into every pixel, and what each of them adds."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,6 +21,8 @@ def rasterise(
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
     check_dtype(gaussians)
+    # The op is not differentiable in the camera, even where its tensors ask for a gradient.
+    camera = replace(camera, camera_from_world=camera.camera_from_world.detach(), intrinsics=camera.intrinsics.detach())
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     offsets = screen_offsets[rows]

@@ -38,6 +38,7 @@ RENDERED = (
     test_effects_knobs.test_box_by_hand,
     test_effects_knobs.test_depth_bits,
     test_effects_knobs.test_half_colours_by_hand,
+    test_effects_shutter.test_cameras_and_displacements_get_no_gradient,
     test_effects_shutter.test_rows_that_outrun_the_readout_are_culled,
 )
 # These hand their own tensors, on the CPU, to the op.
