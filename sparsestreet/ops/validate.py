@@ -7,6 +7,10 @@ from torch import Tensor
 
 from sparsestreet.types import Camera, Gaussians
 
+LONGEST_SIDE = 1 << 22
+"""Pixels: up to here all pixel centres, and the distances between them, are exact in float32."""
+MOST_PIXELS = 1 << 29
+"""Places in an image of three channels then fit 32 bits, in which the GPU's kernels count."""
 _SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
 
 
@@ -59,9 +63,26 @@ def _raise_at(name: str, field: Tensor, holds: Tensor, invariant: str, remedy: s
     raise ValueError(f"{name} {invariant}, but row {index[0]} has {field[tuple(index)].item()}: {remedy}")
 
 
+def _check_size(camera: Camera) -> None:
+    width, height = camera.width, camera.height
+    for name, side in (("width", width), ("height", height)):
+        if not isinstance(side, int) or isinstance(side, bool):
+            raise ValueError(f"{name} must be an int, got {side!r}: convert it with int()")
+    if width < 1 or height < 1:
+        raise ValueError(f"the image needs at least 1x1 pixels, got width {width} and height {height}")
+    if max(width, height) > LONGEST_SIDE:
+        raise ValueError(
+            f"the image may be at most {LONGEST_SIDE} pixels wide and high, got {width}x{height}: render it in parts"
+        )
+    if width * height > MOST_PIXELS:
+        raise ValueError(
+            f"the image may have at most {MOST_PIXELS} pixels, got {width}x{height}: render it in parts, each with its "
+            "own principal point"
+        )
+
+
 def _check_camera(camera: Camera) -> None:
-    if camera.width < 1 or camera.height < 1:
-        raise ValueError(f"the image needs at least 1x1 pixels, got width {camera.width} and height {camera.height}")
+    _check_size(camera)
     for name, shape in (("camera_from_world", (4, 4)), ("intrinsics", (3, 3))):
         matrix = getattr(camera, name)
         if tuple(matrix.shape) != shape:

@@ -73,6 +73,11 @@ def test_integer_fields():
     ("changes", "message"),
     [
         ({"width": 0}, "at least 1x1 pixels, got width 0"),
+        ({"height": 2**22 + 1}, "at most 4194304 pixels wide and high, got 9x4194305: render it in parts"),
+        ({"width": 2**15 + 1, "height": 2**14}, "at most 536870912 pixels, got 32769x16384: render it in parts"),
+        ({"width": 21.0}, r"width must be an int, got 21.0: convert it with int\(\)"),
+        ({"height": True}, "height must be an int, got True"),
+        ({"height": torch.tensor(7)}, r"height must be an int, got tensor\(7\)"),
         ({"camera_from_world": torch.eye(3)}, r"camera_from_world must have shape \[4, 4\]"),
         ({"camera_from_world": torch.full((4, 4), float("nan"))}, "camera_from_world must be finite"),
         ({"intrinsics": torch.tensor([[9.0, 0.5, 4], [0, 9, 3], [0, 0, 1]])}, "intrinsics must be.*skew"),
@@ -82,6 +87,22 @@ def test_integer_fields():
 def test_camera(changes, message):
     with pytest.raises(ValueError, match=message):
         check_structure(one_gaussian(), unchecked(VIEW, **changes), None)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_last_pixel_of_the_longest_image(axis, name):
+    # Its centre is exact in float32. A small splat there, and one over everything.
+    length = 2**22
+    view = front_camera(*((length, 1) if axis == 0 else (1, length)), 100.0)
+    view.intrinsics[axis, 2] = length - 0.5
+    lone = cast(one_gaussian(scales=[[0.001] * 3]), torch.float32)
+    alpha = splat(lone, view, backend=name).alpha.flatten()
+    assert float(alpha[-1]) == pytest.approx(0.8, rel=1e-6)
+    assert alpha[-2] > 0
+    assert not alpha[:-9].any()
+    wide = cast(one_gaussian(scales=[[1e7] * 3], opacities=[0.5]), torch.float32)
+    assert splat(wide, view, backend=name).alpha.min() > 0.49
 
 
 @pytest.mark.parametrize(

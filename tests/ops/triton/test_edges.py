@@ -254,11 +254,11 @@ def test_more_pairs_than_may_be_held(monkeypatch):
 
 
 def test_pairs_beyond_32_bits_are_counted_not_allocated():
-    # 2^20 tiles in one row of tiles, covered by 2100 giants of 5e8 px: more than 2^31 pairs.
+    # The largest image, 2^18 x 8 tiles, covered by 1050 giants of 5e8 px: more than 2^31 pairs.
     giant = one_gaussian(scales=[[1e7] * 3], opacities=[1.0])
-    gaussians = single(Gaussians.concatenate([giant] * 2100))
-    with pytest.raises(PairLimitError, match=f"cover {2100 * 2**20} tiles"):
-        contribution(gaussians, front_camera(2**24, 16, 100.0), backend="triton")
+    gaussians = single(Gaussians.concatenate([giant] * 1050))
+    with pytest.raises(PairLimitError, match=f"cover {1050 * 2**21} tiles"):
+        contribution(gaussians, front_camera(2**22, 128, 100.0), backend="triton")
 
 
 def test_many_tiles_take_wide_keys(monkeypatch):
