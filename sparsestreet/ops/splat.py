@@ -11,7 +11,7 @@ from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu import rasteriser as cpu
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_structure, check_values
+from sparsestreet.ops.validate import check_pixel_weights, check_structure, check_values
 from sparsestreet.types import Camera, Contribution, Gaussians, Removal, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
@@ -35,13 +35,15 @@ def splat(
     Args:
         gaussians: n rows in the world, metres; n = 0 gives the background.
         camera: pinhole without skew, with its lens and rolling shutter where given (docs/effects.md).
-        background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha.
+        background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha. On a GPU its
+            values are not looked at, which would be one more wait for the device: what is not finite shows in rgb.
         settings: cut-offs and filters.
         backend: "reference", "cpu", "triton" or "auto".
 
     Raises:
-        ValueError: wrong shapes, dtypes, devices or camera; a value that is not finite, an opacity outside [0, 1] or
-            a negative scale (named with field and row).
+        ValueError: wrong shapes, dtypes or devices; a camera whose pose is no rigid motion, whose size or lens is
+            out of range; a value that is not finite, an opacity outside [0, 1] or a negative scale (named with field
+            and row).
         RuntimeError: the backend asked for is not built.
         PairLimitError: the splats cover more tiles than can be held.
     """
@@ -88,18 +90,19 @@ def removal(
 ) -> Removal:
     """How far the view moves when each row alone is taken away, over a background (None: black). No gradients.
 
-    ``pixel_weights``, >= 0: how much the squared change of each pixel counts; None: 1.
+    ``pixel_weights``, finite and >= 0: how much the squared change of each pixel counts; None: 1.
 
     Exact for pixels that are not stopped: a pixel is linear in the alpha of each of its splats, so that the change is
     -alpha dC/dalpha. Where the stop rule hid splats behind, up to ``transmittance_min / (1 - alpha_max)`` of their
     light is missed.
 
-    Raises as :func:`splat`.
+    Raises as :func:`splat`, and ValueError for pixel weights out of range.
     """
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
-        _check_pixel_weights(pixel_weights, camera, gaussians.means)
+        if pixel_weights is not None:
+            check_pixel_weights(pixel_weights, camera, gaussians.means)
         behind = None if background is None else background.expand(camera.height, camera.width, 3)
         if chosen == "reference":
             check_values(gaussians)
@@ -114,17 +117,6 @@ def _fast(backend: str) -> ModuleType:
     from sparsestreet.ops.triton import rasteriser
 
     return rasteriser
-
-
-def _check_pixel_weights(weights: Tensor | None, camera: Camera, means: Tensor) -> None:
-    shape = (camera.height, camera.width)
-    if weights is None:
-        return
-    if tuple(weights.shape) != shape or weights.dtype != means.dtype or weights.device != means.device:
-        raise ValueError(
-            f"pixel_weights must be {list(shape)} {means.dtype} on {means.device}, got {list(weights.shape)} "
-            f"{weights.dtype} on {weights.device}: give one weight per pixel of the camera"
-        )
 
 
 def _screen_offsets(gaussians: Gaussians) -> Float[Tensor, "n 2"]:

@@ -1,6 +1,7 @@
 """What the op demands of its inputs, in one place; every message names the invariant, the value and the remedy."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -11,11 +12,19 @@ LONGEST_SIDE = 1 << 22
 """Pixels: up to here all pixel centres, and the distances between them, are exact in float32."""
 MOST_PIXELS = 1 << 29
 """Places in an image of three channels then fit 32 bits, in which the GPU's kernels count."""
+RIGID_TOLERANCE = 1e-3
+"""Largest entry of R R^T - I: poses in text files keep four digits or more; a scale, a shear or a half converted pose
+is further off, and 1e-3 moves a point at the edge of an image by a pixel."""
+LARGEST_DISTORTION = 1e12
+"""Of each coefficient: no lens comes near, and its powers stay finite in float32."""
 _SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
 
 
 def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | None) -> None:
-    """Shapes, dtypes, devices and the camera; raises ValueError. Looks at no Gaussian's value, so it costs nothing."""
+    """Shapes, dtypes, devices, the camera and a background on the host; raises ValueError.
+
+    Looks at no Gaussian's value and at nothing on a GPU, so it costs next to nothing and never waits.
+    """
     means, rows = gaussians.means, gaussians.means.shape[0]
     for name, tail in _SHAPES.items():
         field = getattr(gaussians, name)
@@ -46,6 +55,18 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
         _check_background(background, camera, means)
 
 
+def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
+    """One weight >= 0 per pixel, like the means; raises ValueError. Waits for a GPU."""
+    shape = (camera.height, camera.width)
+    if tuple(weights.shape) != shape or weights.dtype != means.dtype or weights.device != means.device:
+        raise ValueError(
+            f"pixel_weights must be {list(shape)} {means.dtype} on {means.device}, got {list(weights.shape)} "
+            f"{weights.dtype} on {weights.device}: give one weight per pixel of the camera"
+        )
+    # NaN compares false.
+    _raise_in_image("pixel_weights", weights, (weights >= 0) & (weights < math.inf), "must be finite and >= 0")
+
+
 def check_values(gaussians: Gaussians) -> None:
     """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value."""
     for name in (*_SHAPES, *(() if gaussians.displacements is None else ("displacements",))):
@@ -61,6 +82,14 @@ def _raise_at(name: str, field: Tensor, holds: Tensor, invariant: str, remedy: s
         return
     index = (~holds).nonzero()[0].tolist()
     raise ValueError(f"{name} {invariant}, but row {index[0]} has {field[tuple(index)].item()}: {remedy}")
+
+
+def _raise_in_image(name: str, image: Tensor, holds: Tensor, invariant: str) -> None:
+    if bool(holds.all()):
+        return
+    place = (~holds).nonzero()[0].tolist()
+    value = image[tuple(place)].item()
+    raise ValueError(f"{name} {invariant}, but at {place} it is {value}: find the step that made it")
 
 
 def _check_size(camera: Camera) -> None:
@@ -89,6 +118,7 @@ def _check_camera(camera: Camera) -> None:
             raise ValueError(f"{name} must have shape {list(shape)}, got {list(matrix.shape)}")
         if not all(math.isfinite(value) for row in matrix.tolist() for value in row):
             raise ValueError(f"{name} must be finite, got {matrix.tolist()}: check the pose at its source")
+    _check_pose(camera.camera_from_world.tolist())
     (fx, skew, _), (lower, fy, _), last = camera.intrinsics.tolist()
     if not (fx > 0 and fy > 0 and skew == 0 and lower == 0 and last == [0, 0, 1]):
         raise ValueError(
@@ -98,16 +128,39 @@ def _check_camera(camera: Camera) -> None:
     _check_effects(camera)
 
 
+def _check_pose(pose: list[list[float]]) -> None:
+    x, y, z = (row[:3] for row in pose[:3])
+    axes = ((x, x, 1), (y, y, 1), (z, z, 1), (x, y, 0), (x, z, 0), (y, z, 0))
+    error = max(abs(_dot(a, b) - expected) for a, b, expected in axes)
+    cross = (y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0])
+    determinant = _dot(x, cross)
+    if error <= RIGID_TOLERANCE and determinant > 0 and pose[3] == [0, 0, 0, 1]:
+        return
+    raise ValueError(
+        f"camera_from_world must be a rigid motion, R R^T = 1 within {RIGID_TOLERANCE}, det R > 0 and last row "
+        f"[0, 0, 0, 1], but R R^T is off by {error:.4g}, det R = {determinant:.4g}, last row {pose[3]}: take scale, "
+        "shear and mirroring out of the pose"
+    )
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 def _check_effects(camera: Camera) -> None:
-    parts = {"distortion": (camera.distortion, (5,))}
-    if camera.shutter is not None:
-        parts["shutter.translation"] = (camera.shutter.translation, (3,))
-        parts["shutter.rotation"] = (camera.shutter.rotation, (3,))
-    for name, (values, shape) in parts.items():
-        if values is None:
-            continue
-        if tuple(values.shape) != shape or not all(math.isfinite(value) for value in values.tolist()):
-            raise ValueError(f"camera.{name} must be {shape[0]} finite numbers, got {values.tolist()}")
+    if camera.distortion is not None:
+        given = camera.distortion.tolist()
+        if tuple(camera.distortion.shape) != (5,) or not all(abs(value) <= LARGEST_DISTORTION for value in given):
+            raise ValueError(
+                f"camera.distortion must be 5 numbers of at most {LARGEST_DISTORTION:g}, got {given}: check k1, k2, "
+                "p1, p2, k3 against the calibration"
+            )
+    if camera.shutter is None:
+        return
+    for name in ("translation", "rotation"):
+        values = getattr(camera.shutter, name)
+        if tuple(values.shape) != (3,) or not all(math.isfinite(value) for value in values.tolist()):
+            raise ValueError(f"camera.shutter.{name} must be 3 finite numbers, got {values.tolist()}")
 
 
 def _check_background(background: Tensor, camera: Camera, means: Tensor) -> None:
@@ -119,3 +172,7 @@ def _check_background(background: Tensor, camera: Camera, means: Tensor) -> None
             f"background must be {means.dtype} on {means.device} like the means, got {background.dtype} on "
             f"{background.device}: convert it with .to(means)"
         )
+    # A sum is infinite or NaN where a value is, and takes a fortieth of the time. On a GPU it would be one more wait.
+    values = background.detach()
+    if values.device.type == "cpu" and not math.isfinite(values.sum()):
+        _raise_in_image("background", values, torch.isfinite(values), "must be finite")

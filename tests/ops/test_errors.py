@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, resolve_backend, splat
+from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, removal, resolve_backend, splat
 from sparsestreet.ops.cpu import library
 from sparsestreet.ops.validate import check_structure
-from sparsestreet.types import Camera
-from tests.ops.scenes import FIELDS, camera, cast, front_camera, one_gaussian, random_gaussians
+from sparsestreet.types import Camera, Shutter
+from tests.ops.scenes import FIELDS, camera, cast, front_camera, one_gaussian, random_gaussians, render
 
 VIEW = camera(9, 7)
 BACKENDS = ["reference", "cpu"]
@@ -80,6 +80,11 @@ def test_integer_fields():
         ({"height": torch.tensor(7)}, r"height must be an int, got tensor\(7\)"),
         ({"camera_from_world": torch.eye(3)}, r"camera_from_world must have shape \[4, 4\]"),
         ({"camera_from_world": torch.full((4, 4), float("nan"))}, "camera_from_world must be finite"),
+        ({"camera_from_world": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, "must be a rigid motion.*R R.T is off by 3"),
+        ({"camera_from_world": torch.diag(torch.tensor([1.0, 1, 0.999, 1]))}, "R R.T is off by 0.001999"),
+        ({"camera_from_world": torch.diag(torch.tensor([0.0, 0, 0, 1]))}, "R R.T is off by 1"),
+        ({"camera_from_world": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, "must be a rigid motion.*det R = -1"),
+        ({"camera_from_world": torch.diag(torch.tensor([1.0, 1, 1, 2]))}, r"last row \[0.0, 0.0, 0.0, 2.0\]"),
         ({"intrinsics": torch.tensor([[9.0, 0.5, 4], [0, 9, 3], [0, 0, 1]])}, "intrinsics must be.*skew"),
         ({"intrinsics": torch.tensor([[0.0, 0, 4], [0, 9, 3], [0, 0, 1]])}, "positive focal lengths"),
     ],
@@ -87,6 +92,35 @@ def test_integer_fields():
 def test_camera(changes, message):
     with pytest.raises(ValueError, match=message):
         check_structure(one_gaussian(), unchecked(VIEW, **changes), None)
+
+
+def test_poses_with_few_digits_are_rigid():
+    # Four digits, as text files keep them: R R^T is off by 1e-4.
+    rounded = dataclasses.replace(VIEW, camera_from_world=VIEW.camera_from_world.round(decimals=4))
+    assert (rounded.camera_from_world != VIEW.camera_from_world).any()
+    check_structure(one_gaussian(), rounded, None)
+
+
+@pytest.mark.parametrize("k", [1e200, -1e200, 1e13, float("nan")])
+@pytest.mark.parametrize("place", range(5))
+def test_distortion_that_no_lens_has(place, k):
+    lens = torch.zeros(5, dtype=torch.float64)
+    lens[place] = k
+    with pytest.raises(ValueError, match=r"distortion must be 5 numbers of at most 1e\+12, got .*check k1, k2"):
+        splat(one_gaussian(), dataclasses.replace(VIEW, distortion=lens), backend="reference")
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_wildest_distortion_that_is_taken_is_finite(name, dtype):
+    generator = torch.Generator().manual_seed(0)
+    gaussians = random_gaussians(40, VIEW)
+    moving = Shutter(torch.full((3,), 0.1), torch.full((3,), 0.01))
+    for seed in range(20):
+        exponents = 16 * torch.rand(5, generator=generator, dtype=torch.float64) - 4
+        lens = 10 ** (exponents if seed else 0 * exponents + 12) * torch.randn(5, generator=generator).sign()
+        view = dataclasses.replace(VIEW, distortion=lens, shutter=moving)
+        assert render(gaussians, view, name, dtype).is_finite(), lens
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -110,11 +144,28 @@ def test_the_last_pixel_of_the_longest_image(axis, name):
     [
         (torch.zeros(4, dtype=torch.float64), r"background must have shape \[3\] or \[7, 9, 3\], got \[4\]"),
         (torch.zeros(3), "background must be torch.float64"),
+        (torch.tensor([0.0, float("nan"), 0.0]).double(), r"background must be finite, .* at \[1\] it is nan"),
+        (torch.full((7, 9, 3), float("inf")).double(), r"background must be finite, .* at \[0, 0, 0\] it is inf"),
     ],
 )
 def test_background(background, message):
     with pytest.raises(ValueError, match=message):
         check_structure(one_gaussian(), VIEW, background)
+
+
+def test_a_background_whose_sum_overflows_is_finite():
+    bright = torch.full((3,), 3e38)
+    assert torch.isinf(bright.sum())
+    check_structure(cast(one_gaussian(), torch.float32), VIEW, bright)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -0.5])
+def test_pixel_weights(value, name):
+    weights = torch.ones(7, 9, dtype=torch.float64)
+    weights[2, 3] = value
+    with pytest.raises(ValueError, match=rf"pixel_weights must be finite and >= 0, but at \[2, 3\] it is {value}: "):
+        removal(one_gaussian(), VIEW, pixel_weights=weights, backend=name)
 
 
 @pytest.mark.parametrize(
