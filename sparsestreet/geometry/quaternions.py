@@ -6,12 +6,20 @@ from torch import Tensor
 
 
 def normalized(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
-    """Unit quaternions; a zero (or subnormal) one becomes the identity and gets no gradient."""
-    squared = quaternions.square().sum(-1, keepdim=True)
-    usable = squared > torch.finfo(quaternions.dtype).tiny
-    identity = torch.zeros_like(quaternions)
+    """Unit quaternions; only an exact zero has no direction: it becomes the identity and gets no gradient.
+
+    Gradients grow as 1 / length, down to the length tiny / eps of the dtype (1e-31 in float32); there they stay, so
+    that they remain finite.
+    """
+    shortest = torch.finfo(quaternions.dtype).tiny / torch.finfo(quaternions.dtype).eps
+    values = quaternions.detach()
+    # By the largest component first: a squared length would leave the dtype's range long before the length does.
+    largest = values.abs().amax(-1, keepdim=True)
+    usable = largest > 0
+    scaled = values / torch.where(usable, largest, 1.0) + (quaternions - values) / largest.clamp(min=shortest)
+    identity = torch.zeros_like(values)
     identity[..., 0] = 1
-    safe = torch.where(usable, quaternions, identity)
+    safe = torch.where(usable, scaled, identity)
     return safe / safe.norm(dim=-1, keepdim=True)
 
 

@@ -123,10 +123,35 @@ def test_a_zero_quaternion_is_the_identity_without_gradient():
         assert (gradient == 0).all()
 
 
-def test_tiny_and_huge_quaternions_normalise():
-    for length in (1e-15, 1e15):
-        quaternion = length * torch.tensor([[1.0, -1.0, 1.0, 1.0]])
-        torch.testing.assert_close(quat.normalized(quaternion), torch.tensor([[0.5, -0.5, 0.5, 0.5]]))
+@pytest.mark.parametrize("length", [1e-44, 1e-30, 1e-15, 1e15, 1e30, 3e38])
+def test_tiny_and_huge_quaternions_normalise(length: float):
+    """In float32, from its last subnormals to its end."""
+    quaternion = length * torch.tensor([[1.0, -1.0, 1.0, 1.0]])
+    torch.testing.assert_close(quat.normalized(quaternion), torch.tensor([[0.5, -0.5, 0.5, 0.5]]))
+
+
+@pytest.mark.parametrize("length", [1e-250, 1e-30, 1.0, 1e30, 1e250])
+def test_gradient_of_a_normalised_quaternion(length: float):
+    """Central differences of relative step 1e-6 are good to 1e-9 of the gradient."""
+    generator = torch.Generator().manual_seed(0)
+    unit, cotangent = torch.randn(2, 3, 4, generator=generator, dtype=torch.float64)
+    quaternion = (length * unit).requires_grad_()
+    (gradient,) = torch.autograd.grad(quat.normalized(quaternion), quaternion, cotangent)
+    for place in np.ndindex(3, 4):
+        step = torch.zeros_like(unit)
+        step[place] = 1e-6 * length
+        ends = [(quat.normalized(quaternion.detach() + side) * cotangent).sum() for side in (step, -step)]
+        expected = float(ends[0] - ends[1]) / 2e-6
+        assert float(gradient[place]) * length == pytest.approx(expected, abs=1e-8)
+
+
+def test_gradients_of_the_shortest_quaternions_end_growing():
+    """At tiny / eps, 9.9e-32 in float32, so that they stay finite; longer ones are not touched."""
+    cotangent = torch.tensor([0.0, 100.0, 0.0, 0.0])
+    for length, expected in ((1e-44, 100 / 2**-103), (1e-31, 1e33)):
+        quaternion = torch.tensor([length, 0.0, 0.0, 0.0], requires_grad=True)
+        (gradient,) = torch.autograd.grad(quat.normalized(quaternion), quaternion, cotangent)
+        assert gradient.tolist() == pytest.approx([0.0, expected, 0.0, 0.0], rel=1e-6)
 
 
 def test_batches_and_empty_batches():

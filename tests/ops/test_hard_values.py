@@ -89,7 +89,7 @@ def test_05_length_of_quaternions_does_not_matter(backend, dtype):
     q = torch.tensor([0.4, -0.7, 0.3, 0.5], dtype=torch.float64)
     eps = torch.finfo(dtype).eps
     unit = render(one_gaussian(quaternions=[(q / q.norm()).tolist()], scales=[[0.4, 0.1, 0.2]]), view, backend, dtype)
-    for length in (1e-12, 3.0, 1e12):
+    for length in (1e-30, 1e-19, 1e-12, 3.0, 1e12, 1e20, 1e30):
         long = one_gaussian(quaternions=[(q * length).tolist()], scales=[[0.4, 0.1, 0.2]])
         result = render(long, view, backend, dtype)
         assert (result.images["rgb"] - unit.images["rgb"]).abs().max() < 50 * eps
@@ -99,6 +99,23 @@ def test_05_length_of_quaternions_does_not_matter(backend, dtype):
         assert (gradient @ q).abs() < 100 * eps * gradient.norm() * q.norm()
         expected = unit.gradients["quaternions"][0] / (length * q.norm())
         assert relative_error(gradient, expected) < 1e3 * eps
+
+
+@every_precision
+@pytest.mark.parametrize("length", [1e-44, 1e-39, 1e-35, 3e38])
+def test_05_only_zero_has_no_direction(backend, dtype, length):
+    # Down to float32's last subnormals and up to its end. 1 / length does not fit there, so gradients end growing.
+    view = front_camera(21, 13, 20.0)
+    q = torch.tensor([0.4, -0.7, 1.0, 0.5], dtype=torch.float64).to(torch.float32) * length
+    shape = {"scales": [[0.4, 0.1, 0.2]]}
+    long = one_gaussian(quaternions=[q.tolist()], **shape)
+    unit = one_gaussian(quaternions=[(q.double() / q.double().norm()).tolist()], **shape)
+    result, expected = (render(scene, view, backend, dtype) for scene in (long, unit))
+    assert (result.images["rgb"] - expected.images["rgb"]).abs().max() < 50 * torch.finfo(dtype).eps
+    assert result.is_finite()
+    gradient = result.gradients["quaternions"][0]
+    assert gradient.norm() > 0 or length > 1
+    assert (gradient @ q.double()).abs() <= 1e-4 * gradient.norm() * q.double().norm()
 
 
 @every_precision

@@ -12,7 +12,8 @@ from sparsestreet.ops.triton.view import ALPHA_MIN, BLUR, BOX_REACH, LOG2_ALPHA_
 LOG2_SCALE = constant(math.sqrt(math.log2(math.e) / 2))
 TWO_LN2 = constant(2 * math.log(2))
 HALF_LOG2_E = constant(math.log2(math.e) / 2)
-TINY = constant(1.1754943508222875e-38)
+# Of geometry/quaternions.py, in float32: the length below which gradients stop growing.
+SHORTEST = constant(2.0**-126 / 2.0**-23)
 # Of ops/reference: COMPENSATION_FLOOR squared, and DETERMINANT_MIN.
 RATIO_FLOOR = constant(2.5e-5)
 DETERMINANT_MIN = constant(1e-12)
@@ -21,11 +22,19 @@ LARGEST = constant(3.4028234663852886e38)
 
 @jit
 def unit_quaternion(q):
-    """Unit quaternion and 1 / length; a zero one (shorter than squares can tell) is the identity with 1 / length 0."""
-    squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-    usable = squared > TINY
+    """Unit quaternion and 1 / length; an exact zero is the identity with 1 / length 0.
+
+    By the largest component first: squares would leave float32's range long before the length does. 1 / length stays
+    below 1 / SHORTEST, where it would leave it.
+    """
+    largest = tl.maximum(tl.maximum(tl.abs(q[0]), tl.abs(q[1])), tl.maximum(tl.abs(q[2]), tl.abs(q[3])))
+    scale = 1.0 / tl.maximum(largest, SHORTEST)
+    w, x, y, z = q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
+    squared = w * w + x * x + y * y + z * z
+    usable = squared > 0
     inverse = tl.where(usable, 1.0 / tl.sqrt(tl.where(usable, squared, 1.0)), 0.0)
-    return (tl.where(usable, q[0] * inverse, 1.0), q[1] * inverse, q[2] * inverse, q[3] * inverse), inverse
+    unit = (tl.where(usable, w * inverse, 1.0), x * inverse, y * inverse, z * inverse)
+    return unit, tl.minimum(scale * inverse, 1.0 / SHORTEST)
 
 
 @jit

@@ -33,6 +33,7 @@ RENDERED = (
     test_hard_lists.test_17_neighbouring_depths_are_told_apart,
     test_hard_values.test_05_zero_quaternion_is_the_identity,
     test_hard_values.test_05_length_of_quaternions_does_not_matter,
+    test_hard_values.test_05_only_zero_has_no_direction,
     test_hard_values.test_14_zero_scales,
     test_hard_values.test_25_negative_colours_are_black_without_gradient,
     test_effects_knobs.test_box_by_hand,

@@ -15,7 +15,7 @@ template <class V>
 struct Placement {
   Vector<V> mean;
   V inverse_z;
-  V quaternion[4], length;      // unit; length 0: a zero quaternion, replaced by the identity
+  V quaternion[4], inverse_length;  // unit; inverse_length 0: a zero quaternion, replaced by the identity
   Matrix<V> rotation, axes;     // world from Gaussian; camera rotation times that times scales
 };
 
@@ -26,13 +26,20 @@ struct PlacementGradient {
   Matrix<V> axes;
 };
 
+// By the largest component first: a squared length would leave T's range long before the length does. 1 / length stays
+// below 1 / shortest, where it would leave it.
 template <class V>
 inline void rotation_from_quaternion(const V* given, Placement<V>& p) {
-  const V squared = given[0] * given[0] + given[1] * given[1] + given[2] * given[2] + given[3] * given[3];
-  const auto usable = squared > std::numeric_limits<Scalar<V>>::min();
-  p.length = usable ? root(squared) : V{};
-  const V inverse = 1 / p.length;
-  for (int i = 0; i < 4; ++i) p.quaternion[i] = usable ? given[i] * inverse : V{} + Scalar<V>(i == 0);
+  using Limits = std::numeric_limits<Scalar<V>>;
+  const V shortest = V{} + Limits::min() / Limits::epsilon();
+  V largest = shortest, scaled[4], squared{};
+  for (int i = 0; i < 4; ++i) largest = larger(largest, magnitude(given[i]));
+  const V scale = 1 / largest;
+  for (int i = 0; i < 4; ++i) scaled[i] = given[i] * scale, squared += scaled[i] * scaled[i];
+  const auto usable = squared > V{};
+  const V inverse = 1 / root(squared);
+  p.inverse_length = usable ? smaller(scale * inverse, 1 / shortest) : V{};
+  for (int i = 0; i < 4; ++i) p.quaternion[i] = usable ? scaled[i] * inverse : V{} + Scalar<V>(i == 0);
   const V w = p.quaternion[0], x = p.quaternion[1], y = p.quaternion[2], z = p.quaternion[3];
   p.rotation = {{{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
                  {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
@@ -61,7 +68,7 @@ inline void quaternion_backward(const Placement<V>& p, const Matrix<V>& v, V* ou
                   2 * (w * (a.z - c.x) + x * (a.y + b.x) + z * (b.z + c.y)) - 4 * y * (a.x + c.z),
                   2 * (w * (b.x - a.y) + x * (a.z + c.x) + y * (b.z + c.y)) - 4 * z * (a.x + b.y)};
   const V along = g[0] * w + g[1] * x + g[2] * y + g[3] * z;
-  for (int i = 0; i < 4; ++i) out[i] = p.length > V{} ? (g[i] - along * p.quaternion[i]) / p.length : V{};
+  for (int i = 0; i < 4; ++i) out[i] = (g[i] - along * p.quaternion[i]) * p.inverse_length;
 }
 
 // Fills the gradients of mean, quaternion and scales.
