@@ -1,11 +1,22 @@
-"""The pinhole projection outside the splat op: lidar colouring, visibility of seeds, box masks, sky rays."""
+"""The pinhole projection outside the splat op: lidar colouring, visibility of seeds, box masks, sky rays. And where the
+camera is, for both."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from sparsestreet.geometry.transforms import transform_points
 from sparsestreet.types import Camera
+
+
+def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
+    """The c in R (m - c) = R m + t, metres, in float64 whatever the pose's dtype.
+
+    Solved for, so that it holds for a rotation that is orthonormal only to its dtype's last digit: over 20 km that
+    digit of a float32 is 1 mm.
+    """
+    pose = camera.camera_from_world.detach().double()
+    return torch.linalg.solve(pose[:3, :3], -pose[:3, 3])
 
 
 def project(

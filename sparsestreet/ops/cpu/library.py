@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, for measurements and tests of it."""
-_INTERFACE_VERSION = 4
+_INTERFACE_VERSION = 5
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -25,7 +25,7 @@ class View(ctypes.Structure):
 
     _fields_ = (
         ("rotation", c_double * 9),
-        ("translation", c_double * 3),
+        ("position", c_double * 3),
         *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
         *((name, c_double) for name in ("alpha_min", "alpha_max", "transmittance_min", "blur", "near_plane")),
         ("box", c_double),

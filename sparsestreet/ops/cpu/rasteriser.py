@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
@@ -149,7 +150,7 @@ def _view(camera: Camera, settings: SplatSettings) -> native.View:
     pose, intrinsics = camera.camera_from_world.tolist(), camera.intrinsics.tolist()
     view = native.View(
         rotation=(c_double * 9)(*(value for row in pose[:3] for value in row[:3])),
-        translation=(c_double * 3)(*(row[3] for row in pose[:3])),
+        position=(c_double * 3)(*exact_position(camera).tolist()),
         fx=intrinsics[0][0],
         fy=intrinsics[1][1],
         cx=intrinsics[0][2],

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.ops.reference.footprint import pinhole, unscented
@@ -102,7 +103,14 @@ def _rotation(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
 
 
 def to_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
-    return means @ _rotation(camera, means).T + camera.camera_from_world[:3, 3].to(means)
+    """R ((m - c) - rest), where c + rest is the camera's position with twice the digits of the dtype.
+
+    A difference of neighbours far from the origin is exact; R m + t would round two numbers of the world's size.
+    """
+    position = exact_position(camera).to(means.device)
+    centre = position.to(means.dtype)
+    rest = (position - centre).to(means.dtype)
+    return ((means - centre) - rest) @ _rotation(camera, means).T
 
 
 def axes_in_camera(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera) -> Float[Tensor, "v 3 3"]:

@@ -23,16 +23,15 @@ from sparsestreet.ops.triton.shape import (
 from sparsestreet.ops.triton.shutter import ROLL_LEAST, roll, velocity
 from sparsestreet.ops.triton.tiles import BOX_MARGIN, count_tiles
 from sparsestreet.ops.triton.unscented import unscented, within_fold
-from sparsestreet.ops.triton.vectors import plus, times
+from sparsestreet.ops.triton.vectors import times
 from sparsestreet.ops.triton.view import (
     ALPHA_MIN,
     NEAR,
     ROTATION,
     SIZE,
-    TRANSLATION,
     View,
+    in_camera,
     load_matrix,
-    load_vector,
 )
 
 HALF_LARGEST = constant(65504.0)
@@ -108,7 +107,7 @@ def project_rows(
     tl.store(bad + tl.program_id(0), tl.max((alive & (good == 0)).to(tl.int32), 0))
 
     rotation = load_matrix(view + ROTATION)
-    mean = plus(times(rotation, mean), load_vector(view + TRANSLATION))
+    mean = in_camera(view, rotation, mean)
     seen = alive & (mean[2] > tl.load(view + NEAR))
     # Lanes that are not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))

@@ -22,7 +22,7 @@ from sparsestreet.ops.triton.shape import (
 from sparsestreet.ops.triton.shutter import roll, roll_backward, velocity, velocity_backward
 from sparsestreet.ops.triton.unscented import unscented, unscented_backward
 from sparsestreet.ops.triton.vectors import plus, times, transposed_times
-from sparsestreet.ops.triton.view import ROTATION, TRANSLATION, View, load_matrix, load_vector
+from sparsestreet.ops.triton.view import ROTATION, View, in_camera, load_matrix
 
 
 def block_of(view: View) -> int:
@@ -72,7 +72,7 @@ def project_rows_backward(
     given = row < rows
     seen = given & (tl.load(tile_counts + row, given, 0) > 0)
     rotation = load_matrix(view + ROTATION)
-    mean = plus(times(rotation, load_row(means, row, seen, 3)), load_vector(view + TRANSLATION))
+    mean = in_camera(view, rotation, load_row(means, row, seen, 3))
     # Lanes that were not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
     size = load_row(scales, row, seen, 3)

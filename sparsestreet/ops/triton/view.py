@@ -9,9 +9,11 @@ import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.vectors import times
 from sparsestreet.types import Camera
 
 TILE_SIZE = 16
@@ -20,13 +22,14 @@ LEAST_LIGHT = 1e-30
 """Of ops/cpu: a pixel stops there at the latest."""
 
 # Places in the table.
-ROTATION, TRANSLATION = constant(0), constant(9)
+ROTATION, POSITION = constant(0), constant(9)
 FOCAL, CENTRE = constant(12), constant(14)
 SLOPE_LEAST, SLOPE_MOST = constant(16), constant(18)
 SIZE, BLUR, NEAR = constant(20), constant(22), constant(23)
 ALPHA_MIN, LOG2_ALPHA_MIN, BOX_REACH = constant(24), constant(25), constant(26)
 DISTORTION, FOLD = constant(27), constant(32)
 SHIFT, TURN = constant(33), constant(36)
+POSITION_REST = constant(39)
 
 
 @jit
@@ -37,6 +40,13 @@ def load_vector(table):
 @jit
 def load_matrix(table):
     return load_vector(table), load_vector(table + 3), load_vector(table + 6)
+
+
+@jit
+def in_camera(view, rotation, mean):
+    """A mean in the camera. Of neighbours far from the origin the difference is exact, R m + t would round both."""
+    c, rest = load_vector(view + POSITION), load_vector(view + POSITION_REST)
+    return times(rotation, ((mean[0] - c[0]) - rest[0], (mean[1] - c[1]) - rest[1], (mean[2] - c[2]) - rest[2]))
 
 
 @dataclass(frozen=True)
@@ -81,6 +91,7 @@ class View:
     def _numbers(self) -> list[float]:
         camera, s = self.camera, self.settings
         pose, K = camera.camera_from_world.double().tolist(), camera.intrinsics.double().tolist()
+        position = exact_position(camera)
         slopes = [
             _slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))
         ]
@@ -90,7 +101,7 @@ class View:
             motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
         numbers = (
             *(value for row in pose[:3] for value in row[:3]),
-            *(row[3] for row in pose[:3]),
+            *position,
             *(K[0][0], K[1][1], K[0][2], K[1][2]),
             *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
             *(camera.width, camera.height, s.blur, s.near),
@@ -99,6 +110,8 @@ class View:
             *distortion,
             math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
             *motion,
+            # What float32 cannot hold of the position.
+            *(position - position.float().double()),
         )
         return [float(number) for number in numbers]
 

@@ -16,7 +16,7 @@ constexpr double LEAST_EXPONENT = -126;  // without a cut-off alpha still ends w
 template <class T>
 struct Camera {
   Matrix<T> rotation;
-  Vector<T> translation;
+  Vector<T> position, position_rest;  // their sum: in the world, with twice the digits of T
   T fx, fy, cx, cy, slope_min[2], slope_max[2];
   T k1, k2, p1, p2, k3, fold;  // Brown-Conrady; fold: the r^2 at which the radial polynomial turns back
   Vector<T> shutter_translation, shutter_rotation;
@@ -26,7 +26,7 @@ struct Camera {
   int depth_bits;
 
   explicit Camera(const View& v)
-      : translation(vector(v.translation)), fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy), k1(v.distortion[0]),
+      : position(vector(v.position)), position_rest(rest(v.position)), fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy), k1(v.distortion[0]),
         k2(v.distortion[1]), p1(v.distortion[2]), p2(v.distortion[3]), k3(v.distortion[4]), fold(v.fold),
         shutter_translation(vector(v.shutter_translation)), shutter_rotation(vector(v.shutter_rotation)),
         alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), blur(v.blur),
@@ -41,6 +41,7 @@ struct Camera {
 
  private:
   static Vector<T> vector(const double* v) { return {T(v[0]), T(v[1]), T(v[2])}; }
+  static Vector<T> rest(const double* v) { return {T(v[0] - T(v[0])), T(v[1] - T(v[1])), T(v[2] - T(v[2]))}; }
 };
 
 }  // namespace SPLAT_VARIANT

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 4;
+constexpr int32_t INTERFACE_VERSION = 5;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -14,7 +14,7 @@ enum Status : int32_t { OK = 0, BAD_VALUE = 1, TOO_MANY_PAIRS = 2, OUT_OF_MEMORY
 // A camera and the settings of one rendering.
 struct View {
   double rotation[9];     // camera from world
-  double translation[3];  // metres
+  double position[3];     // of the camera in the world, metres
   double fx, fy, cx, cy;  // pixels
   double alpha_min, alpha_max, transmittance_min, blur, near_plane;
   double box;             // standard deviations
