@@ -2,7 +2,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.geometry.cameras import project, ray_directions
+from sparsestreet.geometry.cameras import exact_position, project, ray_directions
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.types import Camera
 
@@ -14,6 +14,18 @@ def camera_of(seed: int, width: int = 13, height: int = 7) -> Camera:
     camera_from_world[:3, 3] = torch.randn(3, generator=generator).double()
     intrinsics = torch.tensor([[11.0, 0.0, 6.1], [0.0, 12.0, 3.7], [0.0, 0.0, 1.0]], dtype=torch.float64)
     return Camera(camera_from_world, intrinsics, width, height)
+
+
+def test_exact_position_is_where_the_pose_has_its_zero():
+    """For a rotation of four digits, as text files hold them, and 20 km away: -R^T t is metres off there."""
+    camera = camera_of(3)
+    camera.camera_from_world[:3, 3] *= 2e4
+    camera.camera_from_world[:3, :3] = camera.camera_from_world[:3, :3].round(decimals=4)
+    for dtype in (torch.float64, torch.float32):
+        pose = camera.camera_from_world.to(dtype)
+        position = exact_position(Camera(pose, camera.intrinsics, 13, 7))
+        assert (pose[:3, :3].double() @ position + pose[:3, 3].double()).abs().max() < 1e-10
+        assert (camera.position - position).abs().max() > 0.1
 
 
 def test_a_point_by_hand():
