@@ -1,5 +1,5 @@
-"""The pinhole projection outside the splat op: lidar colouring, visibility of seeds, box masks, sky rays. And where the
-camera is, for both."""
+"""The pinhole projection outside the splat op: lidar colouring, visibility of seeds, box masks, sky rays; and where
+the camera is, for both."""
 
 import torch
 from jaxtyping import Bool, Float, Float64

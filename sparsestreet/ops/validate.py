@@ -9,7 +9,7 @@ from torch import Tensor
 from sparsestreet.types import Camera, Gaussians
 
 LONGEST_SIDE = 1 << 22
-"""Pixels: up to here all pixel centres, and the distances between them, are exact in float32."""
+"""Pixels: up to here the centres of all pixels are exact in float32."""
 MOST_PIXELS = 1 << 29
 """Places in an image of three channels then fit 32 bits, in which the GPU's kernels count."""
 RIGID_TOLERANCE = 1e-3

@@ -26,8 +26,9 @@ struct Camera {
   int depth_bits;
 
   explicit Camera(const View& v)
-      : position(vector(v.position)), position_rest(rest(v.position)), fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy), k1(v.distortion[0]),
-        k2(v.distortion[1]), p1(v.distortion[2]), p2(v.distortion[3]), k3(v.distortion[4]), fold(v.fold),
+      : position(vector(v.position)), position_rest(rest(v.position)), fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy),
+        k1(v.distortion[0]), k2(v.distortion[1]), p1(v.distortion[2]), p2(v.distortion[3]), k3(v.distortion[4]),
+        fold(v.fold),
         shutter_translation(vector(v.shutter_translation)), shutter_rotation(vector(v.shutter_rotation)),
         alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), blur(v.blur),
         near_plane(v.near_plane), width(v.width), height(v.height), box_squared(T(v.box) * T(v.box)),
