@@ -76,7 +76,10 @@ class Shutter:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; lens distortion and a rolling shutter only where they are given. Its tensors are on the host."""
+    """A pinhole camera; lens distortion and a rolling shutter only where they are given.
+
+    Its tensors are on the host, where the op reads them.
+    """
 
     camera_from_world: Float[Tensor, "4 4"]
     intrinsics: Float[Tensor, "3 3"]

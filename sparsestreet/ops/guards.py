@@ -116,10 +116,8 @@ def _acting(
     else:
         axes = axes_in_camera(gaussians, rows, camera)
         slope_held, sigma_point_held = none, sigma_points_held(in_camera, axes, camera, settings.near)
-    # As geometry/quaternions.py tells rotations from zeros.
-    squared_lengths = gaussians.quaternions[rows].square().sum(-1)
     return {
-        "identity_quaternion": squared_lengths <= torch.finfo(squared_lengths.dtype).tiny,
+        "identity_quaternion": (gaussians.quaternions[rows] == 0).all(-1),
         "slope_held": slope_held,
         "sigma_point_held": sigma_point_held,
         "compensation_held": none if splats.ratios is None else splats.ratios <= COMPENSATION_FLOOR**2,

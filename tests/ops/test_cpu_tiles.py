@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.bench import sweep
 from sparsestreet.ops.bench.knobs import DEFAULT, Point
 from sparsestreet.ops.bench.scenes import Size, bench_scenes
@@ -87,8 +87,7 @@ def test_other_tiles_draw_the_same(size, variant, stop):
 def giant_pairs() -> int:
     """(splat, tile) pairs of a ball that covers the whole image."""
     giant = cast(one_gaussian(scales=[[90.0] * 3]), torch.float32)
-    splat(giant, front_camera(WIDTH, HEIGHT, 40.0), backend="cpu")
-    return work_of(giant, "cpu")[0]
+    return work_of(giant, front_camera(WIDTH, HEIGHT, 40.0), SplatSettings(), "cpu")[0]
 
 
 def test_the_library_has_the_tiles_it_was_compiled_for(size):

@@ -203,7 +203,7 @@ def test_19_projected_means(offset):
     places = []
     for dtype in (torch.float32, torch.float64):
         rows = cast(Gaussians.concatenate([one_gaussian(means=[mean]) for mean in means.tolist()]), dtype)
-        seen = (projection._in_camera(rows.means, view)[:, 2] > 1).nonzero()[:, 0]
+        seen = (projection.to_camera(rows.means, view)[:, 2] > 1).nonzero()[:, 0]
         places.append(projection.on_screen(rows, seen, view, SplatSettings()).means.double())
     assert len(places[0]) == len(places[1]) > 400
     # 500 px off the middle a float32 has a spacing of 6e-5 px, and the distance from the origin does not matter: found
