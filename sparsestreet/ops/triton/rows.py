@@ -84,6 +84,53 @@ def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: 
     return shape, sees
 
 
+@jit
+def checked_row(
+    means, quaternions, scales, opacities, coefficients, displacements, row, given,
+    TERMS: tl.constexpr, DISPLACED: tl.constexpr,
+):  # fmt: skip
+    """Opacity, mean, quaternion, scales and displacement; which rows are to be drawn, and which of those are bad.
+
+    A row of opacity 0 is not read beyond its opacity.
+    """
+    opacity = tl.load(opacities + row, given, 0.0)
+    alive = given & (opacity != 0)
+    mean, q = load_row(means, row, alive, 3), load_row(quaternions, row, alive, 4)
+    size, moved = load_row(scales, row, alive, 3), load_row(displacements, row, alive & DISPLACED, 3)
+    good = all_finite(mean, 3) & all_finite(q, 4) & all_finite(size, 3) & all_finite(moved, 3)
+    good = good & (size[0] >= 0) & (size[1] >= 0) & (size[2] >= 0) & (opacity >= 0) & (opacity <= 1)
+    good = good & finite_terms(coefficients, alive, 3 * TERMS)
+    return opacity, mean, q, size, moved, alive, alive & (good == 0)
+
+
+@jit
+def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
+    """Half sides of the box around the ellipse where a splat ends; infinite where nothing ends it."""
+    half_x, half_y = 0 * effective + float("inf"), 0 * effective + float("inf")
+    if BOUNDED:
+        reach = reach_of(view, effective)
+        half_x, half_y = tl.sqrt(reach * variance_x), tl.sqrt(reach * variance_y)
+    return half_x, half_y
+
+
+@jit
+def store_record(to, x, y, factor, log2_opacity, cutoff, color, depth, mask, HALF_COLORS: tl.constexpr):
+    tl.store(to + record.X, x, mask)
+    tl.store(to + record.Y, y, mask)
+    tl.store(to + record.L11, factor[0], mask)
+    tl.store(to + record.L21, factor[1], mask)
+    tl.store(to + record.L22, factor[2], mask)
+    tl.store(to + record.LOG2_OPACITY, log2_opacity, mask)
+    tl.store(to + record.CUTOFF, cutoff, mask)
+    for i in tl.static_range(3):
+        # As in torch.where(colour > 0, colour, 0).
+        channel = tl.where(color[i] > 0, color[i], 0.0)
+        if HALF_COLORS:
+            channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
+        tl.store(to + record.COLOR + i, channel, mask)
+    tl.store(to + record.DEPTH, depth, mask)
+
+
 @partial(jit, do_not_specialize=["rows"])
 def project_rows(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, bad, rows,
@@ -92,19 +139,14 @@ def project_rows(
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    A row of opacity 0 is not read beyond its opacity. Comparisons are written so that NaN culls.
+    Comparisons are written so that NaN culls.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    given = row < rows
-    opacity = tl.load(opacities + row, given, 0.0)
-    alive = given & (opacity != 0)
-    mean, q = load_row(means, row, alive, 3), load_row(quaternions, row, alive, 4)
-    size, moved = load_row(scales, row, alive, 3), load_row(displacements, row, alive & DISPLACED, 3)
-    coefficients = sh + row * (3 * TERMS)
-    good = all_finite(mean, 3) & all_finite(q, 4) & all_finite(size, 3) & all_finite(moved, 3)
-    good = good & (size[0] >= 0) & (size[1] >= 0) & (size[2] >= 0) & (opacity >= 0) & (opacity <= 1)
-    good = good & finite_terms(coefficients, alive, 3 * TERMS)
-    tl.store(bad + tl.program_id(0), tl.max((alive & (good == 0)).to(tl.int32), 0))
+    given, coefficients = row < rows, sh + row * (3 * TERMS)
+    opacity, mean, q, size, moved, alive, wrong = checked_row(
+        means, quaternions, scales, opacities, coefficients, displacements, row, given, TERMS, DISPLACED
+    )
+    tl.store(bad + tl.program_id(0), tl.max(wrong.to(tl.int32), 0))
 
     rotation = load_matrix(view + ROTATION)
     mean = in_camera(view, rotation, mean)
@@ -118,10 +160,8 @@ def project_rows(
     effective = opacity * compensation(shape[5], determinant, ANTIALIAS)
     seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective > 0)
 
-    x, y, half_x, half_y = shape[0], shape[1], 0 * effective + float("inf"), 0 * effective + float("inf")
-    if BOUNDED:
-        reach = reach_of(view, effective)
-        half_x, half_y = tl.sqrt(reach * variance_x), tl.sqrt(reach * variance_y)
+    x, y = shape[0], shape[1]
+    half_x, half_y = half_box(view, effective, variance_x, variance_y, BOUNDED)
     width, height = tl.load(view + SIZE), tl.load(view + SIZE + 1)
     seen = seen & (x + (half_x + BOX_MARGIN) >= 0.5) & (x - (half_x + BOX_MARGIN) <= width - 0.5)
     seen = seen & (y + (half_y + BOX_MARGIN) >= 0.5) & (y - (half_y + BOX_MARGIN) <= height - 0.5)
@@ -139,17 +179,4 @@ def project_rows(
     direction, _ = direction_of(rotation, mean)
     color = raw_color(basis(direction, TERMS), coefficients, seen, TERMS)
     to = record.record_of(records, row)
-    tl.store(to + record.X, x, seen)
-    tl.store(to + record.Y, y, seen)
-    tl.store(to + record.L11, l11, seen)
-    tl.store(to + record.L21, l21, seen)
-    tl.store(to + record.L22, l22, seen)
-    tl.store(to + record.LOG2_OPACITY, log2_opacity, seen)
-    tl.store(to + record.CUTOFF, cutoff, seen)
-    for i in tl.static_range(3):
-        # As in torch.where(colour > 0, colour, 0).
-        channel = tl.where(color[i] > 0, color[i], 0.0)
-        if HALF_COLORS:
-            channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
-        tl.store(to + record.COLOR + i, channel, seen)
-    tl.store(to + record.DEPTH, mean[2], seen)
+    store_record(to, x, y, (l11, l21, l22), log2_opacity, cutoff, color, mean[2], seen, HALF_COLORS)
