@@ -80,28 +80,17 @@ def guards(
     It projects anew, in the dtype of the Gaussians, as the reference does: where rounding decides about a row, another
     backend may decide otherwise. :func:`splat` itself counts nothing and pays for nothing.
 
-    Raises ValueError as :func:`splat`, but not for values of rows of opacity 0.
+    Raises ValueError as :func:`splat`.
     """
     check_structure(gaussians, camera, None)
     check_dtype(gaussians, "guards")
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        gaussians = _without_masked_values(gaussians)
         check_values(gaussians)
         reasons = row_reasons(gaussians, camera, settings)
         counts = torch.bincount(reasons, minlength=len(Reason)).tolist()
         acting = _acting(gaussians, (reasons == Reason.DRAWN).nonzero().squeeze(-1), camera, settings)
         acted = {name: int(rows.sum()) for name, rows in acting.items()}
     return Guards(**{reason.name.lower(): counts[reason] for reason in Reason}, **acted)
-
-
-def _without_masked_values(gaussians: Gaussians) -> Gaussians:
-    """Zeros in all rows of opacity 0: backends may leave them unread, so that anything may stand there."""
-    masked = gaussians.opacities == 0
-
-    def cleared(field: Tensor) -> Tensor:
-        return torch.where(masked.reshape(-1, *[1] * (field.dim() - 1)), 0.0, field)
-
-    return Gaussians(*(None if field is None else cleared(field) for field in vars(gaussians).values()))
 
 
 def _acting(

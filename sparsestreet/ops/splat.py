@@ -43,7 +43,7 @@ def splat(
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is no rigid motion, whose size or lens is
             out of range; a value that is not finite, an opacity outside [0, 1] or a negative scale (named with field
-            and row).
+            and row). Nothing but the opacity is looked at in a row whose opacity is 0.
         RuntimeError: the backend asked for is not built.
         PairLimitError: the splats cover more tiles than can be held.
     """

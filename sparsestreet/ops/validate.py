@@ -68,20 +68,26 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
 
 
 def check_values(gaussians: Gaussians) -> None:
-    """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value."""
+    """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value.
+
+    Rows of opacity 0 are not looked at: they are culled before anything else of them is read.
+    """
+    opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
+    masked = opacities == 0
     for name in (*_SHAPES, *(() if gaussians.displacements is None else ("displacements",))):
         field = getattr(gaussians, name).detach()
-        _raise_at(name, field, torch.isfinite(field), "must be finite", "find the step that made it")
-    opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
-    _raise_at("opacities", opacities, (opacities >= 0) & (opacities <= 1), "must lie in [0, 1]", "apply the sigmoid")
-    _raise_at("scales", scales, scales >= 0, "must be >= 0 metres", "apply the exponential")
+        _raise_at(name, field, torch.isfinite(field), masked, "must be finite", "find the step that made it")
+    inside = (opacities >= 0) & (opacities <= 1)
+    _raise_at("opacities", opacities, inside, masked, "must lie in [0, 1]", "apply the sigmoid")
+    _raise_at("scales", scales, scales >= 0, masked, "must be >= 0 metres", "apply the exponential")
 
 
-def _raise_at(name: str, field: Tensor, holds: Tensor, invariant: str, remedy: str) -> None:
+def _raise_at(name: str, field: Tensor, holds: Tensor, masked: Tensor, invariant: str, remedy: str) -> None:
     if bool(holds.all()):
         return
-    index = (~holds).nonzero()[0].tolist()
-    raise ValueError(f"{name} {invariant}, but row {index[0]} has {field[tuple(index)].item()}: {remedy}")
+    index = (~holds & ~masked.reshape(-1, *[1] * (field.dim() - 1))).nonzero()[:1].flatten().tolist()
+    if index:
+        raise ValueError(f"{name} {invariant}, but row {index[0]} has {field[tuple(index)].item()}: {remedy}")
 
 
 def _raise_in_image(name: str, image: Tensor, holds: Tensor, invariant: str) -> None:

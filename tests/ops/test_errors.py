@@ -9,7 +9,17 @@ from sparsestreet.ops import PairLimitError, SplatSettings, backend, contributio
 from sparsestreet.ops.cpu import library
 from sparsestreet.ops.validate import check_structure
 from sparsestreet.types import Camera, Shutter
-from tests.ops.scenes import FIELDS, camera, cast, front_camera, one_gaussian, random_gaussians, render
+from tests.ops.scenes import (
+    FIELDS,
+    camera,
+    cast,
+    device_of,
+    every_precision,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    render,
+)
 
 VIEW = camera(9, 7)
 BACKENDS = ["reference", "cpu"]
@@ -34,6 +44,28 @@ def test_value_that_is_not_finite(field, poison, dtype, name):
     for call in (splat, contribution):
         with pytest.raises(ValueError, match=f"{field} must be finite, but row 13 has {poison}"):
             call(gaussians, VIEW, backend=name)
+
+
+@every_precision
+def test_rows_of_opacity_0_may_hold_anything(backend, dtype):
+    gaussians = dataclasses.replace(random_gaussians(20, VIEW), displacements=torch.zeros(20, 3, dtype=torch.float64))
+    gaussians.opacities[5:9] = 0
+    view = dataclasses.replace(VIEW, distortion=torch.full((5,), 0.01), shutter=Shutter(torch.ones(3), torch.ones(3)))
+    expected = [render(gaussians, seen, backend, dtype) for seen in (VIEW, view)]
+    for field, poison in zip(
+        (*FIELDS, "displacements"), (1e38, *[float("nan")] * 2, 0.0, float("inf"), 1e38), strict=True
+    ):
+        getattr(gaussians, field)[5:9] = poison
+    gaussians.means[5:8] = float("nan")
+    for seen, plain in zip((VIEW, view), expected, strict=True):
+        result = render(gaussians, seen, backend, dtype)
+        for name, image in plain.images.items():
+            assert torch.equal(result.images[name], image), name
+        for name, gradient in plain.gradients.items():
+            assert torch.equal(result.gradients[name], gradient), name
+    cut = cast(gaussians, dtype, device=device_of(backend))
+    assert torch.isfinite(contribution(cut, VIEW, backend=backend).weight).all()
+    assert torch.isfinite(removal(cut, VIEW, backend=backend).squared).all()
 
 
 @pytest.mark.parametrize("name", BACKENDS)

@@ -32,10 +32,7 @@ from sparsestreet.types import Camera, Contribution, Gaussians, Removal
 def rasterise(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
-    """Project, sort by tile and blend, in float32. Bitwise the same in every run on one device.
-
-    Rows of opacity 0 are not read: what else they hold is not checked.
-    """
+    """Project, sort by tile and blend, in float32. Bitwise the same in every run on one device."""
     g = gaussians
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)

@@ -35,13 +35,22 @@ inline bool finite(const T* values, int64_t count) {
 }
 
 template <class T>
-inline bool valid_rows(const Inputs<T>& in, int64_t first, int64_t count) {
+inline bool sound_rows(const Inputs<T>& in, int64_t first, int64_t count) {
   bool inside = true;
   for (int64_t i = first; i < first + count; ++i) inside &= in.opacities[i] >= 0 && in.opacities[i] <= 1;
   for (int64_t i = 3 * first; i < 3 * (first + count); ++i) inside &= in.scales[i] >= 0;
   return inside && finite(in.means + 3 * first, 3 * count) && finite(in.quaternions + 4 * first, 4 * count) &&
          finite(in.scales + 3 * first, 3 * count) && finite(in.sh + 3 * in.terms * first, 3 * in.terms * count) &&
          (!in.displacements || finite(in.displacements + 3 * first, 3 * count));
+}
+
+// Rows of opacity 0 may hold anything: they are culled, whatever their lane computes.
+template <class T>
+inline bool valid_rows(const Inputs<T>& in, int64_t first, int64_t count) {
+  if (sound_rows(in, first, count)) return true;
+  for (int64_t i = first; i < first + count; ++i)
+    if (in.opacities[i] != 0 && !sound_rows(in, i, 1)) return false;
+  return true;
 }
 
 // Rows row(0), row(1), ... of the input, one per lane.
