@@ -25,9 +25,11 @@ _STYLES = {
     "box alone": ("#56B4E9", "d"),
     "transmittance_min": ("#009E73", "D"),
     "stop": ("#D55E00", "v"),
+    "exclusive stop": ("#D55E00", "<"),
     "blur": ("#999999", "h"),
     "half_colors": ("#CC79A7", "P"),
     "depth_bits": ("#E69F00", "^"),
+    "effects": ("#117733", ">"),
     "tile size": ("#8C564B", "p"),
     "preset": ("#000000", "*"),
     "backend": ("#7F3C8D", "X"),
@@ -39,8 +41,8 @@ LEAST_ERROR = 1e-8
 def draw_pareto(records: Sequence[Record], folder: Path) -> list[Path]:
     """Two figures of a panel a scene: image error against forward time, gradient error against the whole time.
 
-    Filled points are the default's model and make up the front; hollow ones are another model (blur, clamp), whose
-    error is against their own exact version. Presets carry their names.
+    Filled points are the default's model and make up the front; hollow ones are another model (blur, clamp,
+    effects), whose error is against their own exact version. Presets carry their names.
     """
     measured = [record for record in records if record["kind"] == "knob" and record["exact"] is not None]
     drawn = (

@@ -1,10 +1,11 @@
-"""The points of the sweep: one knob at a time around the default, the presets, the tile sizes, the backends."""
+"""The points of the sweep: one knob at a time around the default, the presets, effects, tile sizes and backends."""
 
 from dataclasses import dataclass, replace
 from math import inf
 
 import torch
 
+from sparsestreet.ops.bench.effects import EFFECTS, EffectsName
 from sparsestreet.ops.bench.tile_sizes import TILE_SIZES
 from sparsestreet.ops.settings import SplatSettings
 
@@ -22,6 +23,11 @@ KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
 """Fields of SplatSettings and their values."""
 BOXES_ALONE = (3.0, 3.33, 4.0)
 """Boxes without alpha_min, two knobs at once: either of them bounds a splat, so each hides what the other costs."""
+STOPS_EARLIER = (1e-3, 1e-2)
+"""transmittance_min of the exclusive stop, two knobs at once: it may lose transmittance_min / (1 - alpha_max) of a
+pixel's light where the inclusive one, which KNOBS has at these values, loses at most transmittance_min."""
+BACKENDS = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
+"""Besides the C++ backend in float32, which times all other points."""
 FIXED = {
     ("tile size", "reference"): "dense: it has no tiles",
     ("tile size", "triton"): "compiled for tiles of 16x16",
@@ -49,11 +55,14 @@ class Point:
     dtype: torch.dtype = torch.float32
     tile: int | None = None
     """Side of the tiles, pixels, for which the C++ library is compiled; None: the library in use."""
+    effects: EffectsName | None = None
+    """Lens and shutter through which the scene is seen; None: its own camera."""
 
     @property
     def other_model(self) -> bool:
-        """Whether what is drawn differs by intention: blur, clamp and compensation are model, not precision."""
-        return _model(self.settings) != _model(DEFAULT)
+        """Whether what is drawn differs by intention: blur, clamp, compensation, lens and shutter are model, not
+        precision."""
+        return _model(self.settings) != _model(DEFAULT) or self.effects not in (None, "off")
 
     @property
     def exact(self) -> SplatSettings:
@@ -69,24 +78,36 @@ class Point:
 
 
 def points() -> list[Point]:
-    """The default first, then every knob, the presets that no knob reaches, the tile sizes (that of the library in use
-    as well, since a process of its own may cost something), and the other backends."""
+    """The default first, then every knob, the presets that no knob reaches, the effects, the tile sizes (that of the
+    library in use as well, since a process of its own may cost something), and the other backends."""
+    effects = [Point("effects", name, DEFAULT, effects=name) for name in EFFECTS]
+    tiles = [Point("tile size", str(size), DEFAULT, tile=size) for size in TILE_SIZES]
+    return [*_points_of_settings(), *effects, *tiles, *backend_points()]
+
+
+def backend_points() -> list[Point]:
+    """The default's settings on the other backends and in other precision."""
+    return [
+        Point("backend", f"{name} {str(dtype).removeprefix('torch.')}", DEFAULT, backend=name, dtype=dtype)
+        for name, dtype in BACKENDS
+    ]
+
+
+def _points_of_settings() -> list[Point]:
     named = {name: SplatSettings.preset(name) for name in PRESETS}
     swept = [Point("default", "default", DEFAULT)]
     for knob, values in KNOBS.items():
         changed = [(value, replace(DEFAULT, **{knob: value})) for value in values]
         swept += [Point(knob, _text(knob, value), settings) for value, settings in changed if settings != DEFAULT]
     swept += [Point("box alone", _text("box", box), replace(DEFAULT, alpha_min=0.0, box=box)) for box in BOXES_ALONE]
+    swept += [
+        Point("exclusive stop", f"at {least:g}", replace(DEFAULT, stop="exclusive", transmittance_min=least))
+        for least in STOPS_EARLIER
+    ]
     met = [point.settings for point in swept]
     swept += [Point("preset", name, settings) for name, settings in named.items() if settings not in met]
     names = {settings: name for name, settings in reversed(named.items())}
-    swept = [replace(point, preset=names.get(point.settings)) for point in swept]
-    others = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
-    swept += [Point("tile size", str(size), DEFAULT, tile=size) for size in TILE_SIZES]
-    return swept + [
-        Point("backend", f"{name} {str(dtype).removeprefix('torch.')}", DEFAULT, backend=name, dtype=dtype)
-        for name, dtype in others
-    ]
+    return [replace(point, preset=names.get(point.settings)) for point in swept]
 
 
 def _model(settings: SplatSettings) -> tuple[float, float, bool]:

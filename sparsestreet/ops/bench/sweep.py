@@ -9,7 +9,8 @@ import torch
 from sparsestreet.ops.backend import BACKENDS, resolve_backend
 from sparsestreet.ops.bench.accuracy import Answer, Errors, answer, errors, image_error
 from sparsestreet.ops.bench.culling import Culling, compare_culling
-from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point
+from sparsestreet.ops.bench.effects import EffectsName, seen_through
+from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point, backend_points
 from sparsestreet.ops.bench.records import RecordFile
 from sparsestreet.ops.bench.scenes import BenchScene, Size
 from sparsestreet.ops.bench.tile_sizes import build, with_tiles
@@ -17,8 +18,9 @@ from sparsestreet.ops.bench.timing import Effort, OpTimes, leaves, time_op
 from sparsestreet.ops.cpu.library import tile_size
 from sparsestreet.ops.settings import SplatSettings
 
-FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(48, 32, 200)
-"""Sizes of a sweep, of a trial, and of the copies on which truths and culling are checked densely."""
+FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(64, 48, 400)
+"""Sizes of a sweep, of a trial, and of the copies that the dense reference bears: there it is timed, and is the oracle
+of truths and culling."""
 EFFORT = Effort(repeats=20, seconds=2.0, least=3)
 QUICK_EFFORT = Effort(repeats=2, seconds=0.1, least=1)
 DENSE_SAMPLES = 1 << 28
@@ -43,6 +45,9 @@ class KnobRecord:
     backend: str
     dtype: str
     settings: SplatSettings
+    distortion: list[float] | None
+    """Of the camera that was timed; the shutter's: translation, then rotation."""
+    shutter: list[float] | None
     skipped: str | None
     """Why there is no measurement; times and errors are then None."""
     other_model: bool
@@ -91,15 +96,16 @@ class Truths:
 
     def __init__(self, scene: BenchScene) -> None:
         self._scene = scene
-        self._answers: dict[SplatSettings, Answer] = {}
+        self._answers: dict[tuple[SplatSettings, EffectsName | None], Answer] = {}
 
-    def of(self, settings: SplatSettings) -> Answer:
-        near, scene = settings.near, self._scene
-        if not self._depths_between(near, DEFAULT.near):
+    def of(self, settings: SplatSettings, effects: EffectsName | None = None) -> Answer:
+        if not self._depths_between(settings.near, DEFAULT.near):
             settings = replace(settings, near=DEFAULT.near)  # the same rows, the same answer
-        if settings not in self._answers:
-            self._answers[settings] = answer(scene.gaussians, scene.camera, settings, _EXACT_BACKEND, torch.float64)
-        return self._answers[settings]
+        if (settings, effects) not in self._answers:
+            seen = seen_through(self._scene, effects)
+            truth = answer(seen.gaussians, seen.camera, settings, _EXACT_BACKEND, torch.float64)
+            self._answers[settings, effects] = truth
+        return self._answers[settings, effects]
 
     def _depths_between(self, near: float, other: float) -> bool:
         pose = self._scene.camera.camera_from_world
@@ -115,7 +121,8 @@ def run_sweep(
     file: RecordFile,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Measure all points of all scenes into ``file``; ``small`` are copies on which the truth itself is checked.
+    """Measure all points of all scenes into ``file``; ``small`` are copies on which the truth itself is checked and
+    the dense reference is timed, with the C++ backend beside it (``small`` records).
 
     Raises RuntimeError with the remedy if the C++ backend, which computes the truths, is not built.
     """
@@ -126,19 +133,30 @@ def run_sweep(
         say(f"tiles of {size} pixels: {build(size).missing or 'compiled'}")
     for scene in small:
         file.write("oracle", check_oracle(scene))
+        say(f"\nsmall copy of {title(scene)}")
+        _measure_points(scene, [Point("default", "default", DEFAULT), *backend_points()], effort, "small", file, say)
     for scene in scenes:
-        say(
-            f"\n{scene.name}: {scene.source}; {len(scene.gaussians)} splats, {scene.camera.width}x{scene.camera.height}"
-        )
-        truths = Truths(scene)
-        for point in points:
-            record = measure_point(scene, point, truths, effort)
-            file.write("knob", record)
-            say(describe(record))
+        say(f"\n{title(scene)}")
+        _measure_points(scene, points, effort, "knob", file, say)
     for scene in small:
         culling = compare_culling(scene.gaussians, scene.camera, DEFAULT)
         file.write("culling", CullingRecord(scene.name, culling))
         say(f"culling, {scene.name}: {culling}")
+
+
+def title(scene: BenchScene) -> str:
+    """What a scene is, for the terminal."""
+    return f"{scene.name}: {scene.source}; {len(scene.gaussians)} splats, {scene.camera.width}x{scene.camera.height}"
+
+
+def _measure_points(
+    scene: BenchScene, points: Sequence[Point], effort: Effort, kind: str, file: RecordFile, say: Callable[[str], None]
+) -> None:
+    truths = Truths(scene)
+    for point in points:
+        record = measure_point(scene, point, truths, effort)
+        file.write(kind, record)
+        say(describe(record))
 
 
 def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effort) -> KnobRecord:
@@ -147,19 +165,20 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effor
     if record.skipped is not None:
         return record
     if point.tile is None:
-        times, value = time_and_answer(scene, point, effort)
+        times, value = time_and_answer(seen_through(scene, point.effects), point, effort)
     else:
         times, value = with_tiles(point.tile, time_and_answer, scene, point, effort)
         in_use = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype)
         record = replace(record, tiles_in_use=errors(value, in_use))
-    record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs)))
+    record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs, point.effects)))
     if not affordable(scene, point.exact):
         return record
-    record = replace(record, exact=errors(value, truths.of(point.exact)))
+    exact = truths.of(point.exact, point.effects)
+    record = replace(record, exact=errors(value, exact))
     if not point.other_model:
         return record
-    default = Point("default", "default", DEFAULT).exact
-    return replace(record, model_psnr=image_error(truths.of(point.exact).image, truths.of(default).image).psnr)
+    default = truths.of(Point("default", "default", DEFAULT).exact)
+    return replace(record, model_psnr=image_error(exact.image, default.image).psnr)
 
 
 def time_and_answer(scene: BenchScene, point: Point, effort: Effort) -> tuple[OpTimes, Answer]:
@@ -171,6 +190,7 @@ def time_and_answer(scene: BenchScene, point: Point, effort: Effort) -> tuple[Op
 
 
 def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
+    lens, shutter = (getattr(seen_through(scene, point.effects).camera, name) for name in ("distortion", "shutter"))
     return KnobRecord(
         scene=scene.name,
         source=scene.source,
@@ -183,6 +203,8 @@ def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
         backend=point.backend,
         dtype=str(point.dtype).removeprefix("torch."),
         settings=point.settings,
+        distortion=None if lens is None else lens.tolist(),
+        shutter=None if shutter is None else [*shutter.translation.tolist(), *shutter.rotation.tolist()],
         skipped=unavailable(scene, point),
         other_model=point.other_model,
     )
@@ -200,7 +222,7 @@ def unavailable(scene: BenchScene, point: Point) -> str | None:
     """Why a point cannot be timed here; None if it can."""
     samples = len(scene.gaussians) * scene.camera.width * scene.camera.height
     if point.backend == "reference" and samples > DENSE_SAMPLES:
-        return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed"
+        return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed; see the small copies"
     if not affordable(scene, point.settings):
         return f"nothing bounds a splat: more than {UNBOUNDED_PAIRS:.2g} (splat, tile) pairs"
     if point.tile is not None:

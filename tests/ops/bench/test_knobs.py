@@ -1,6 +1,7 @@
 """One knob at a time, every preset once, and truths that belong to a point."""
 
 import dataclasses
+from dataclasses import replace
 from math import inf
 
 import torch
@@ -13,7 +14,7 @@ POINTS = points()
 
 def test_default_first_and_no_point_twice():
     assert (POINTS[0].knob, POINTS[0].preset) == ("default", "default")
-    keys = [(point.settings, point.backend, point.dtype, point.tile) for point in POINTS]
+    keys = [(point.settings, point.backend, point.dtype, point.tile, point.effects) for point in POINTS]
     assert len(set(keys)) == len(keys)
 
 
@@ -77,3 +78,24 @@ def test_truths_of_a_point():
 def test_what_a_backend_cannot_vary_has_a_reason():
     assert {knob for knob, _ in FIXED} == {"tile size", "exact tiles", "dot precision"}
     assert all(FIXED.values())
+
+
+def test_both_stops_at_every_transmittance():
+    stops = {
+        (point.settings.stop, point.settings.transmittance_min)
+        for point in POINTS
+        if point.settings
+        == replace(DEFAULT, stop=point.settings.stop, transmittance_min=point.settings.transmittance_min)
+    }
+    assert {(stop, least) for stop in ("inclusive", "exclusive") for least in (1e-4, 1e-3, 1e-2)} <= stops
+
+
+def test_effects_off_and_on():
+    seen = [(point.value, point.effects, point.other_model) for point in POINTS if point.effects is not None]
+    assert seen == [
+        ("off", "off", False),
+        ("lens", "lens", True),
+        ("shutter", "shutter", True),
+        ("lens and shutter", "lens and shutter", True),
+    ]
+    assert all(point.settings == DEFAULT for point in POINTS if point.effects is not None)

@@ -21,7 +21,9 @@ EXACT = SplatSettings.preset("exact")
 def swept(tmp_path_factory):
     file = RecordFile(tmp_path_factory.mktemp("sweep") / "knobs.jsonl", PROVENANCE)
     said: list[str] = []
-    chosen = [point for point in points() if point.knob in ("default", "alpha_min", "preset", "blur", "backend")]
+    chosen = [
+        point for point in points() if point.knob in ("default", "alpha_min", "preset", "blur", "effects", "backend")
+    ]
     sweep.run_sweep(SCENES, SCENES[:2], chosen, ONCE, file, said.append)
     return read_records(file.path), said, len(chosen)
 
@@ -29,7 +31,7 @@ def swept(tmp_path_factory):
 def test_a_record_for_every_point(swept):
     records, _, count = swept
     assert sum(record["kind"] == "knob" for record in records) == count * len(SCENES)
-    assert {record["kind"] for record in records} == {"knob", "culling", "oracle", "fixed"}
+    assert {record["kind"] for record in records} == {"knob", "small", "culling", "oracle", "fixed"}
     stages = {"forward", "backward", "project", "bin", "blend", "blend_backward", "project_backward"}
     for record in records:
         if record["kind"] == "knob" and record["backend"] == "cpu":
@@ -57,6 +59,41 @@ def test_errors_are_against_the_right_truth(swept):
     for scene in SCENES:
         by_value = {r["value"]: r["exact"]["image"]["mean"] for r in knobs if r["scene"] == scene.name}
         assert by_value["1/1024"] < by_value["default"] < by_value["1/64"]
+
+
+def test_effects_have_a_number_beside_off(swept):
+    knobs = [record for record in swept[0] if record["kind"] == "knob"]
+    for scene in SCENES:
+        default = next(r for r in knobs if r["scene"] == scene.name and r["knob"] == "default")
+        effects = {r["value"]: r for r in knobs if r["scene"] == scene.name and r["knob"] == "effects"}
+        off, lens, shutter, both = (effects[name] for name in ("off", "lens", "shutter", "lens and shutter"))
+        assert off["exact"] == default["exact"]  # the same image, timed beside the others
+        assert [(r["distortion"] is None, r["shutter"] is None) for r in (off, lens, shutter, both)] == [
+            (True, True), (False, True), (True, False), (False, False),
+        ]  # fmt: skip
+        assert off["model_psnr"] is None
+        # They move splats by a pixel or so: far more than rounding, which is past 90 dB, but not another scene.
+        assert all(15 < record["model_psnr"] < 75 for record in (lens, shutter, both))
+        assert len({record["model_psnr"] for record in (lens, shutter, both)}) == 3
+        for record in (lens, shutter, both):
+            # The error is against the exact image with the same effect: the cut-offs alone, as for the default.
+            assert record["exact"]["image"]["psnr"] > default["exact"]["image"]["psnr"] - 6
+            assert record["same_cutoffs"]["image"]["psnr"] > 60
+            assert record["times"]["stages"]["project"]["median"] > 0
+
+
+def test_the_reference_is_timed_on_small_copies_beside_the_rest(swept):
+    small = [record for record in swept[0] if record["kind"] == "small"]
+    for scene in SCENES[:2]:
+        values = [(r["value"], r["skipped"] is None) for r in small if r["scene"] == scene.name]
+        device = torch.cuda.is_available()
+        assert values == [
+            ("default", True), ("cpu float64", True), ("reference float32", True), ("triton float32", device),
+        ]  # fmt: skip
+        reference = next(r for r in small if r["scene"] == scene.name and r["backend"] == "reference")
+        assert reference["times"]["stages"]["forward"]["median"] > 0
+        assert reference["times"]["pairs"] is None
+        assert reference["same_cutoffs"]["image"]["psnr"] > 60
 
 
 def test_points_that_cannot_be_had_say_why(swept):
