@@ -1,17 +1,17 @@
-"""That leaving out the tiles a splat does not reach changes no pixel: a test of identity, not a point on a curve.
+"""That leaving out the tiles a splat does not reach changes nothing: a test of identity, not a point on a curve.
 
-Summed in one order, a term that is exactly zero changes no bit. So the blend over every splat in every tile must
-equal, bit for bit, the blend over the tiles' own lists; and a backend with tiles must touch what the dense one touches.
+The C++ backend can be told to list every splat in front of the camera in every tile, and to look at all rows of the
+tile; where a splat ends in a pixel stays. A term that is exactly zero changes no bit of a sum, so that image and
+gradients must equal those over the tiles' own lists bit for bit.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.bench.timing import leaves
-from sparsestreet.ops.bench.torch_tiles import TILE, Block, block_weights, tile_blocks
-from sparsestreet.ops.reference import Splats, on_screen, visible_rows
+from sparsestreet.ops.bench.timing import GROUPS, Cotangent, last_workspace, leaves
+from sparsestreet.ops.cpu.rasteriser import rasterise
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import contribution
 from sparsestreet.types import Camera, Gaussians
@@ -22,49 +22,69 @@ class Culling:
     """What culling left out of one view, and whether anything was missed."""
 
     pairs: int
-    """(splat, tile) pairs without culling: visible splats times tiles."""
+    """(splat, tile) pairs without culling: splats in front of the camera times tiles."""
     pairs_listed: int
-    """Pairs that remain in the tiles' lists."""
+    """Pairs in the tiles' own lists."""
     pixels_changed: int
-    """Pixels whose colour or transmittance differs in any bit between the two (vectorised torch, float64)."""
-    rows_touching_other_pixels: int
-    """Rows whose number of touched pixels differs between C++ with exact tiles and the dense reference, float64."""
+    """Pixels whose colour, transmittance or depth differs in any bit between the two (float32)."""
+    rows_changed: int
+    """Rows of which a gradient differs in any bit between the two."""
+    rows_touching_other_pixels: int | None = None
+    """Rows whose number of touched pixels differs between C++ and the dense reference (float64); None: not compared."""
 
     def __str__(self) -> str:
+        touched = self.rows_touching_other_pixels
         return (
-            f"{self.pairs_listed} of {self.pairs} pairs blended, {self.pixels_changed} pixels changed, "
-            f"{self.rows_touching_other_pixels} rows touch other pixels"
+            f"{self.pairs_listed} of {self.pairs} pairs blended, {self.pixels_changed} pixels and {self.rows_changed} "
+            f"rows changed" + ("" if touched is None else f", {touched} rows touch other pixels")
         )
 
 
-@torch.no_grad()
 def compare_culling(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Culling:
-    """Blend with and without culling; for small views: without it the memory is splats x pixels."""
-    doubled = leaves(gaussians, torch.float64)
-    splats = on_screen(doubled, visible_rows(doubled, camera, settings), camera, settings)
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    tiles = tiles_x * tiles_y
-    every = torch.arange(len(splats.means)).expand(tiles, -1)
-    whole = [Block(torch.arange(tiles), every, torch.ones_like(every, dtype=torch.bool))]
-    listed = list(tile_blocks(splats, tiles_x, tiles_y))
-    images = [_sequential_blend(splats, blocks, tiles, tiles_x, settings) for blocks in (whole, listed)]
-    touched = [contribution(doubled, camera, settings=settings, backend=name).pixels for name in ("cpu", "reference")]
+    """Draw and differentiate with the tiles' own lists, and with every splat in every tile.
+
+    Raises PairLimitError if splats times tiles are more than the op holds.
+    """
+    own, every = (_draw(gaussians, camera, settings, every_tile) for every_tile in (False, True))
     return Culling(
-        pairs=len(splats.means) * tiles,
-        pairs_listed=sum(int(block.listed.sum()) for block in listed),
-        pixels_changed=int((images[0] != images[1]).any(-1).sum()),
-        rows_touching_other_pixels=int((touched[0] != touched[1]).sum()),
+        pairs=every.pairs,
+        pairs_listed=own.pairs,
+        pixels_changed=_different(own.layers, every.layers),
+        rows_changed=_different(own.gradients, every.gradients),
     )
 
 
-def _sequential_blend(splats: Splats, blocks: list[Block], tiles: int, tiles_x: int, settings: SplatSettings) -> Tensor:
-    """Colour and transmittance of all tiles, summed splat by splat: a matrix product would reorder the sum."""
-    image = splats.means.new_zeros(tiles, TILE * TILE, 4)
-    image[..., 3] = 1
-    for block in blocks:
-        weights, transmittance = block_weights(splats, block, tiles_x, settings)
-        colors = image.new_zeros(len(block.tiles), TILE * TILE, 3)
-        for entry in range(block.splats.shape[1]):
-            colors += weights[:, entry, :, None] * splats.colors[block.splats[:, entry]][:, None]
-        image[block.tiles] = torch.cat((colors, transmittance[..., None]), -1)
-    return image
+@torch.no_grad()
+def compare_touched(culling: Culling, gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Culling:
+    """Beside it, which rows touch other pixels than in the dense reference; for small views."""
+    doubled = leaves(gaussians, torch.float64)
+    fast, dense = (contribution(doubled, camera, settings=settings, backend=name) for name in ("cpu", "reference"))
+    return replace(culling, rows_touching_other_pixels=int((fast.pixels != dense.pixels).sum()))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    layers: Tensor
+    """[pixels, 5]"""
+    gradients: Tensor
+    """[rows, all parameters and the screen]"""
+    pairs: int
+
+
+def _draw(gaussians: Gaussians, camera: Camera, settings: SplatSettings, every_tile: bool) -> _Drawn:
+    rows = leaves(gaussians, torch.float32)
+    offsets = torch.zeros(len(rows), 2, requires_grad=True)
+    raster = rasterise(rows, offsets, camera, settings, every_tile=every_tile)
+    cotangent = Cotangent.of(camera, rows.means)
+    layers = [raster.rgb, raster.transmittance, raster.depth_sum]
+    torch.autograd.backward(layers, [cotangent.rgb, cotangent.alpha, cotangent.alpha])
+    pixels = torch.cat([layer.detach().reshape(camera.height * camera.width, -1) for layer in layers], 1)
+    del raster, layers  # with the graph goes the loan of the workspace that counts pairs
+    gradients = [*(getattr(rows, name).grad for name in GROUPS), offsets.grad]
+    flat = torch.cat([gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None] for gradient in gradients], 1)
+    return _Drawn(pixels, flat, last_workspace(torch.float32).pair_count())
+
+
+def _different(own: Tensor, every: Tensor) -> int:
+    """Rows that differ in a bit; 0 and -0 are equal, NaN differs from everything."""
+    return int((own != every).any(-1).sum())

@@ -8,7 +8,7 @@ import torch
 
 from sparsestreet.ops.backend import BACKENDS, resolve_backend
 from sparsestreet.ops.bench.accuracy import Answer, Errors, answer, errors, image_error
-from sparsestreet.ops.bench.culling import Culling, compare_culling
+from sparsestreet.ops.bench.culling import Culling, compare_culling, compare_touched
 from sparsestreet.ops.bench.effects import EffectsName, seen_through
 from sparsestreet.ops.bench.knobs import DEFAULT, FIXED, Point, backend_points
 from sparsestreet.ops.bench.records import RecordFile
@@ -68,6 +68,9 @@ class CullingRecord:
     """That culling by tiles is exact on this scene: identical images, not a trade."""
 
     scene: str
+    rows: int
+    width: int
+    height: int
     culling: Culling
 
 
@@ -140,8 +143,15 @@ def run_sweep(
         _measure_points(scene, points, effort, "knob", file, say)
     for scene in small:
         culling = compare_culling(scene.gaussians, scene.camera, DEFAULT)
-        file.write("culling", CullingRecord(scene.name, culling))
-        say(f"culling, {scene.name}: {culling}")
+        _write_culling(scene, compare_touched(culling, scene.gaussians, scene.camera, DEFAULT), file, say)
+    for scene in scenes:
+        _write_culling(scene, compare_culling(scene.gaussians, scene.camera, DEFAULT), file, say)
+
+
+def _write_culling(scene: BenchScene, culling: Culling, file: RecordFile, say: Callable[[str], None]) -> None:
+    camera = scene.camera
+    file.write("culling", CullingRecord(scene.name, len(scene.gaussians), camera.width, camera.height, culling))
+    say(f"culling, {scene.name}, {camera.width}x{camera.height}: {culling}")
 
 
 def title(scene: BenchScene) -> str:

@@ -156,7 +156,7 @@ def stage_seconds(gaussians: Gaussians, backend: str) -> dict[str, float]:
     """Seconds of the stages of the last forward and backward pass; empty where the backend keeps no clock."""
     if backend != "cpu":
         return {}
-    stages = _last_workspace(gaussians.means.dtype).stage_seconds()
+    stages = last_workspace(gaussians.means.dtype).stage_seconds()
     return {name: value for name, value in stages.items() if name != "count"}
 
 
@@ -172,11 +172,12 @@ def work_of(
         return count_work(gaussians, camera, settings)
     with torch.no_grad():
         splat(gaussians, camera, settings=settings, backend=backend)
-    workspace = _last_workspace(gaussians.means.dtype)
+    workspace = last_workspace(gaussians.means.dtype)
     return workspace.pair_count(), workspace.sample_count()
 
 
-def _last_workspace(dtype: torch.dtype) -> Workspace:
+def last_workspace(dtype: torch.dtype) -> Workspace:
+    """That of the C++ rendering whose graph was dropped last."""
     return [workspace for workspace in idle_workspaces() if workspace.key == (dtype, FASTEST_VARIANT)][-1]
 
 

@@ -35,7 +35,7 @@ class View(ctypes.Structure):
         ("shutter_rotation", c_double * 3),
         *((name, c_int64) for name in ("width", "height")),
         *((name, c_int64) for name in ("exclusive_stop", "antialias", "half_colors", "depth_bits")),
-        *((name, c_int64) for name in ("has_lens", "has_shutter", "pair_limit", "threads")),
+        *((name, c_int64) for name in ("has_lens", "has_shutter", "every_tile", "pair_limit", "threads")),
     )
 
 

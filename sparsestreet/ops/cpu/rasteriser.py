@@ -27,15 +27,18 @@ def rasterise(
     camera: Camera,
     settings: SplatSettings,
     variant: int = FASTEST_VARIANT,
+    every_tile: bool = False,
 ) -> Raster:
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
     ``variant`` picks an instruction set: 0 baseline, 1 x86-64-v3, 2 x86-64-v4, -1 the fastest that runs here.
+    ``every_tile`` lists each splat in every tile and looks at all its rows, to check the lists against: slow, the same
+    layers, and radii without end.
     """
     _check_dtype(gaussians)
     g = gaussians
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
-    return Raster(*_Blend.apply(*fields, screen_offsets, _moved(g), _view(camera, settings), variant))
+    return Raster(*_Blend.apply(*fields, screen_offsets, _moved(g), _view(camera, settings, every_tile), variant))
 
 
 def contribution(
@@ -146,7 +149,7 @@ def _moved(gaussians: Gaussians) -> Tensor | None:
     return None if moved is None else moved.detach().contiguous()
 
 
-def _view(camera: Camera, settings: SplatSettings) -> native.View:
+def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> native.View:
     pose, intrinsics = camera.camera_from_world.tolist(), camera.intrinsics.tolist()
     view = native.View(
         rotation=(c_double * 9)(*(value for row in pose[:3] for value in row[:3])),
@@ -169,6 +172,7 @@ def _view(camera: Camera, settings: SplatSettings) -> native.View:
         depth_bits=settings.depth_bits,
         has_lens=camera.distortion is not None,
         has_shutter=camera.shutter is not None,
+        every_tile=every_tile,
         pair_limit=PAIR_LIMIT,
         threads=native.thread_count(),
     )

@@ -22,7 +22,7 @@ struct Camera {
   Vector<T> shutter_translation, shutter_rotation;
   T alpha_min, log2_alpha_min, blur, near_plane, width, height;
   T box_squared;  // the largest |L d|^2 that is drawn
-  bool antialias, half_colors;
+  bool antialias, half_colors, every_tile;
   int depth_bits;
 
   explicit Camera(const View& v)
@@ -32,13 +32,16 @@ struct Camera {
         shutter_translation(vector(v.shutter_translation)), shutter_rotation(vector(v.shutter_rotation)),
         alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), blur(v.blur),
         near_plane(v.near_plane), width(v.width), height(v.height), box_squared(T(v.box) * T(v.box)),
-        antialias(v.antialias), half_colors(v.half_colors), depth_bits(int(v.depth_bits)) {
+        antialias(v.antialias), half_colors(v.half_colors), every_tile(v.every_tile), depth_bits(int(v.depth_bits)) {
     for (int i = 0; i < 3; ++i) rotation.rows[i] = vector(v.rotation + 3 * i);
     const T margin_x = T(0.3) * width / (2 * fx), margin_y = T(0.3) * height / (2 * fy);
     slope_min[0] = -cx / fx - margin_x, slope_max[0] = (width - cx) / fx + margin_x;
     slope_min[1] = -cy / fy - margin_y, slope_max[1] = (height - cy) / fy + margin_y;
   }
-  bool bounded() const { return alpha_min > 0 || box_squared <= std::numeric_limits<T>::max(); }
+  // Whether boxes and lists of tiles end where splats do.
+  bool bounded() const {
+    return !every_tile && (alpha_min > 0 || box_squared <= std::numeric_limits<T>::max());
+  }
 
  private:
   static Vector<T> vector(const double* v) { return {T(v[0]), T(v[1]), T(v[2])}; }

@@ -24,6 +24,7 @@ struct View {
   int64_t width, height;
   int64_t exclusive_stop, antialias, half_colors, depth_bits;
   int64_t has_lens, has_shutter;
+  int64_t every_tile;  // lists each splat in every tile and looks at all their rows: to check the lists against
   int64_t pair_limit;  // (splat, tile) pairs that may be held
   int64_t threads;
 };

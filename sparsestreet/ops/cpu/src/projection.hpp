@@ -113,6 +113,7 @@ inline void bound(const Camera<T>& camera, const Covariance<V, K>& c, const V& o
     s.least_exponent = boxed ? end : s.least_exponent;
     reach = box < reach ? box : reach;
   }
+  if (camera.every_tile) reach = V{} + std::numeric_limits<T>::infinity();  // only of the box: the exponent stays
   s.half_x = root(reach * c.xx), s.half_y = root(reach * c.yy);
 }
 

@@ -7,7 +7,7 @@ namespace SPLAT_VARIANT {
 template <class T>
 struct Grid {
   T width, height;
-  bool bounded;  // splats end somewhere
+  bool bounded;  // lists end where splats do
   int64_t tiles_x, tiles_y;
 
   explicit Grid(const Camera<T>& c)
