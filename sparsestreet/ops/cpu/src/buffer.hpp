@@ -25,8 +25,6 @@ class Buffer {
     }
     return data_;
   }
-  Element* data() { return data_; }
-  const Element* data() const { return data_; }
   Element& operator[](int64_t i) { return data_[i]; }
   const Element& operator[](int64_t i) const { return data_[i]; }
   int64_t bytes() const { return capacity_ * int64_t(sizeof(Element)); }

@@ -14,10 +14,6 @@ template <class A, class B>
 inline auto operator*(const A& k, const Vector<B>& a) { return Vector<decltype(k * a.x)>{k * a.x, k * a.y, k * a.z}; }
 template <class A, class B>
 inline auto dot(const Vector<A>& a, const Vector<B>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-template <class V>
-inline Vector<V> cross(const Vector<V>& a, const Vector<V>& b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
 
 template <class V>
 struct Matrix {
