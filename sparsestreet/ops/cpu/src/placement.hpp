@@ -7,7 +7,7 @@ namespace SPLAT_VARIANT {
 // The parameters of a row that do not depend on the view, or their gradients.
 template <class V>
 struct RowValues {
-  Vector<V> mean, scales, displacement;
+  Vector<V> mean, scales;
   V quaternion[4], opacity;
 };
 

@@ -55,8 +55,8 @@ inline bool valid_rows(const Inputs<T>& in, int64_t first, int64_t count) {
 
 // Rows row(0), row(1), ... of the input, one per lane.
 template <class E, class T, class RowAt>
-inline RowValues<Lanes<T>> load_rows(const Inputs<T>& in, RowAt row) {
-  RowValues<Lanes<T>> v;
+inline typename E::template Row<Lanes<T>> load_rows(const Inputs<T>& in, RowAt row) {
+  typename E::template Row<Lanes<T>> v;
   load_columns<T>([&](int lane) { return in.means + 3 * row(lane); }, 3, &v.mean.x);
   load_columns<T>([&](int lane) { return in.scales + 3 * row(lane); }, 3, &v.scales.x);
   load_columns<T>([&](int lane) { return in.quaternions + 4 * row(lane); }, 4, v.quaternion);
@@ -87,7 +87,7 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
                    int count, T* radii, int64_t* counts) {
   // The lanes of a last, partial block repeat its last row.
   const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
-  const RowValues<Lanes<T>> values = load_rows<E>(in, row);
+  const auto values = load_rows<E>(in, row);
   const Projection<E, Lanes<T>> p(camera, values);
   Splat<Lanes<T>> s{};
   const Integers<T> seen = project(camera, values, p, s);

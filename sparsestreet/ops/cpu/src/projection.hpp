@@ -13,12 +13,18 @@ constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: th
 constexpr double LOG2_SCALE = 0.84932180028801907;  // sqrt(log2(e) / 2)
 constexpr double TWO_LN2 = 1.3862943611198906;
 
+struct Nothing {};
+
 // What an image is taken through. Without a part, nothing of it is compiled in.
 template <bool WITH_LENS, bool WITH_SHUTTER>
 struct Effects {
   static constexpr bool LENS = WITH_LENS, SHUTTER = WITH_SHUTTER;
   template <class V>
   using Model = std::conditional_t<LENS, Distorted<V>, Pinhole<V>>;
+  template <class V>
+  using Row = std::conditional_t<SHUTTER, MovingRow<V>, RowValues<V>>;
+  template <class V>
+  using Moves = std::conditional_t<SHUTTER, Motion<V, LENS>, Nothing>;
 };
 
 // The covariance C = F F^T + blur of a footprint, and its determinant.
@@ -49,11 +55,11 @@ struct Projection {
   static constexpr int K = Model::COLUMNS;
   Placement<V> placement;
   Model model;
-  Motion<V, E::LENS> motion;
+  typename E::template Moves<V> motion;
   Footprint<V, K> footprint;
   Index<V> seen;  // in front of the camera, and shown by lens and shutter
 
-  Projection(const Camera<T>& camera, const RowValues<V>& row) : placement(place(camera, row)) {
+  Projection(const Camera<T>& camera, const typename E::template Row<V>& row) : placement(place(camera, row)) {
     footprint = model.forward(camera, placement);
     seen = placement.mean.z > camera.near_plane;
     if constexpr (E::LENS) seen = seen && model.sees(camera, placement);

@@ -149,7 +149,7 @@ void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Input
   const int coefficients = int(3 * in.terms);
   Splat<V> splat;
   load_columns<T>([&](int r) { return reinterpret_cast<const T*>(&ws.splats[row(r)]); }, SPLAT_COLUMNS<T>, &splat.x);
-  const RowValues<V> values = load_rows<E>(in, row);
+  const auto values = load_rows<E>(in, row);
   const Projection<E, V> p(camera, values);
   const ScreenGradient<V> g = screen_gradient(sum_slots(ws, row), splat);
   V sh[3 * 16], v_sh[3 * 16];

@@ -8,6 +8,12 @@ namespace SPLAT_VARIANT {
 
 constexpr double SLOWEST_READOUT = 0.1;  // least 1 - u_y / H: at 0 the splat falls as fast as the readout
 
+// A row that moves while the image is read out.
+template <class V>
+struct MovingRow : RowValues<V> {
+  Vector<V> displacement;
+};
+
 // u, pixels per readout: the motion of the mean in the camera frame times the exact derivative of its pixel.
 template <class V, bool LENS>
 struct Motion {
