@@ -6,6 +6,8 @@ from collections.abc import Callable
 import torch
 from torch.profiler import DeviceType, ProfilerActivity, profile
 
+from sparsestreet.ops.bench.timing import Spread, spread
+
 STAGES = {
     "blend_backward": r"(blend|raster).*backward",
     "project_backward": r"project.*backward|slots",
@@ -22,19 +24,26 @@ def stage_of(kernel: str) -> str:
     return next((stage for stage, pattern in STAGES.items() if re.search(pattern, kernel.lower())), "other")
 
 
-def kernel_milliseconds(run: Callable[[], None], repeats: int = 5) -> dict[str, float]:
-    """Mean milliseconds of device time of each stage in one ``run``, copies and fills of memory under ``other``."""
-    run()
+def kernel_milliseconds(run: Callable[[], None], repeats: int = 7) -> dict[str, Spread]:
+    """Device time of each stage in one ``run``, over repeats that are profiled one by one; copies and fills of memory
+    under ``other``. A stage that a repeat does not have takes no time in it."""
+    _stages_of(run)  # does not count: the profiler starts, kernels are compiled
+    taken = [_stages_of(run) for _ in range(repeats)]
+    names = dict.fromkeys(name for stages in taken for name in stages)
+    return {name: spread([stages.get(name, 0.0) for stages in taken]) for name in names}
+
+
+def _stages_of(run: Callable[[], None]) -> dict[str, float]:
+    """Seconds of each stage's kernels in one run."""
     torch.cuda.synchronize()
     with profile(activities=[ProfilerActivity.CUDA, ProfilerActivity.CPU]) as profiler:
-        for _ in range(repeats):
-            run()
+        run()
         torch.cuda.synchronize()
     stages: dict[str, float] = {}
     for kernel in profiler.key_averages():
         if kernel.device_type == DeviceType.CUDA:
             stage = stage_of(kernel.key)
-            stages[stage] = stages.get(stage, 0.0) + 1e-3 * kernel.self_device_time_total / repeats
+            stages[stage] = stages.get(stage, 0.0) + 1e-6 * kernel.self_device_time_total
     return stages
 
 

@@ -57,7 +57,7 @@ class GpuRecord:
     """Forward without gradients."""
     forward: Spread | None = None
     backward: Spread | None = None
-    stages: dict[str, float] | None = None
+    stages: dict[str, Spread] | None = None
     """Device time of the kernels of one forward and backward by stage; None without a CUDA device."""
     memory_before: float | None = None
     memory_peak: float | None = None
@@ -211,21 +211,23 @@ def _reason(error: Exception) -> str:
 
 
 def line(record: GpuRecord) -> str:
-    """One row of the table."""
+    """One row of the table: medians, and how far apart the quartiles are."""
     start = f"{record.renderer:<24}{record.rows:>9} {record.width}x{record.height:<6}"
     if record.forward is None or record.backward is None:
         return f"{start} FAILED: {record.failed}"
-    inference = f"{record.inference.median:8.3f}" if record.inference else "       -"
-    text = (
-        f"{start} forward {record.forward.median:8.3f}  backward {record.backward.median:8.3f}  no grad {inference} ms"
-    )
+    inference = _short(record.inference) if record.inference else "-"
+    text = f"{start} forward {_short(record.forward)}  backward {_short(record.backward)}  no grad {inference} ms"
     if record.samples is not None:
         text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
     if record.memory_peak is not None:
         text += f"  peak {record.memory_peak:7.0f} MB"
     if record.stages:
-        text += "  [" + ", ".join(f"{name} {value:.3f}" for name, value in record.stages.items()) + "]"
+        text += "  [" + ", ".join(f"{name} {_short(value)}" for name, value in record.stages.items()) + "]"
     if record.parity is not None:
         psnr = record.parity.image.psnr
         text += f"  {'agrees' if record.agrees else 'DISAGREES'}: {'equal' if psnr is None else f'{psnr:.1f} dB'}"
     return text + (f"  FAILED: {record.failed}" if record.failed else "")
+
+
+def _short(value: Spread) -> str:
+    return f"{value.median:.3f}" + ("" if value.iqr is None else f" (iqr {value.iqr:.3f})")

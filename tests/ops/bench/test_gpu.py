@@ -1,5 +1,6 @@
 """The plumbing of device timings and of gsplat beside them, with a stand-in for gsplat: no device needed."""
 
+import dataclasses
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -11,9 +12,10 @@ from sparsestreet.ops.bench import device_profile, gpu, gsplat_peer
 from sparsestreet.ops.bench.accuracy import Errors, GradientError, ImageError
 from sparsestreet.ops.bench.device_profile import stage_of
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.ops.bench.gpu import GpuRecord
 from sparsestreet.ops.bench.records import RecordFile, read_records
 from sparsestreet.ops.bench.scenes import Size
-from sparsestreet.ops.bench.timing import Effort, leaves
+from sparsestreet.ops.bench.timing import Effort, Spread, leaves
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.bench.test_records import PROVENANCE
 
@@ -156,18 +158,16 @@ def test_kernels_belong_to_stages(kernel, stage):
     assert stage_of(kernel) == stage
 
 
-def test_device_time_is_the_mean_of_the_kernels_of_a_stage(monkeypatch):
+def test_device_time_of_the_stages_and_its_spread(monkeypatch):
     def kernel(name: str, microseconds: float, device: DeviceType) -> SimpleNamespace:
         return SimpleNamespace(key=name, self_device_time_total=microseconds, device_type=device)
 
+    runs: list[int] = []
+
     class Profiler:
-        def __init__(self, activities: list) -> None:
-            self.kernels = [
-                kernel("blend_tiles", 3000.0, DeviceType.CUDA),
-                kernel("raster_more", 1000.0, DeviceType.CUDA),
-                kernel("project_rows", 500.0, DeviceType.CUDA),
-                kernel("blend_tiles", 9000.0, DeviceType.CPU),  # the launch: not a time of the device
-            ]
+        """One run each: the first a second, then 2, 4, 3 and 9 ms, of which 1 ms is another kernel's."""
+
+        def __init__(self, activities: list) -> None: ...
 
         def __enter__(self) -> "Profiler":
             return self
@@ -175,14 +175,33 @@ def test_device_time_is_the_mean_of_the_kernels_of_a_stage(monkeypatch):
         def __exit__(self, *error: object) -> None: ...
 
         def key_averages(self) -> list[SimpleNamespace]:
-            return self.kernels
+            milliseconds = [1000.0, 2.0, 4.0, 3.0, 9.0][len(runs) - 1]
+            return [
+                kernel("blend_tiles", 1000.0 * (milliseconds - 1), DeviceType.CUDA),
+                kernel("raster_more", 1000.0, DeviceType.CUDA),
+                *([kernel("project_rows", 500.0, DeviceType.CUDA)] if len(runs) > 2 else []),
+                kernel("blend_tiles", 9000.0, DeviceType.CPU),  # the launch: not a time of the device
+            ]
 
-    runs: list[int] = []
     monkeypatch.setattr(device_profile, "profile", Profiler)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
-    stages = device_profile.kernel_milliseconds(lambda: runs.append(1), repeats=2)
-    assert stages == pytest.approx({"blend": 2.0, "project": 0.25})
-    assert len(runs) == 3  # one before: kernels are compiled
+    stages = device_profile.kernel_milliseconds(lambda: runs.append(1), repeats=4)
+    assert len(runs) == 5  # the first does not count: kernels are compiled
+    assert list(stages) == ["blend", "project"]
+    # Quartiles of 2, 3, 4, 9, linear between samples: 2.75 and 5.25.
+    assert (stages["blend"].median, stages["blend"].minimum, stages["blend"].iqr) == pytest.approx((3.5, 2.0, 2.5))
+    # A run without the kernel counts as zero: 0, 0.5, 0.5, 0.5.
+    assert (stages["project"].median, stages["project"].minimum) == pytest.approx((0.5, 0.0))
+    assert stages["project"].repeats == 4
+
+
+def test_a_line_has_medians_and_spreads():
+    value, single = Spread(1.25, 1.0, 0.125, 20), Spread(3.0, 3.0, None, 1)
+    record = GpuRecord("sparsestreet triton", "a device", 7, 8, 9, forward=value, backward=single)
+    record = dataclasses.replace(record, inference=value, stages={"sort": value, "other": single})
+    text = gpu.line(record)
+    assert "forward 1.250 (iqr 0.125)  backward 3.000  no grad 1.250 (iqr 0.125) ms" in text
+    assert "[sort 1.250 (iqr 0.125), other 3.000]" in text
 
 
 def test_a_device_without_a_fast_backend_is_not_measured(tmp_path, monkeypatch):
