@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class PairLimitError(RuntimeError):
-    """The splats of one view cover more 16x16 tiles than may be held in memory."""
+    """The splats of one view cover more (splat, tile) pairs than may be held in memory."""
 
     @staticmethod
     def of(pairs: int, limit: int, worst: list[tuple[int, int]]) -> "PairLimitError":
