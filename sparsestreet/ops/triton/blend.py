@@ -1,8 +1,9 @@
 """Forward: each tile's splats, nearest first, into its 256 pixels.
 
 One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers and walks the splats one by
-one; every number of a splat is one load for all lanes. Pixels lie on the axes (x, y), so that a lane's pixels share y
-and everything that only y changes is computed once. Registers and instructions are bounded in
+one; every number of a splat is one load for all lanes. A lane's pixels lie in one line, so that everything that only y
+changes is computed once. They are one axis of 256: of two axes each version of the compiler would choose the lanes'
+pixels for itself, and some choose columns. Registers and instructions are bounded in
 tests/ops/triton/test_machine_code.py.
 """
 
@@ -14,6 +15,7 @@ from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
+WARP = constant(32)
 # Pairs between two looks at whether the whole tile is finished.
 LOOK_LENGTH = 32
 LOOK = constant(LOOK_LENGTH)
@@ -26,16 +28,21 @@ def registers(lasts: bool, exclusive: bool) -> int:
 
 @jit
 def pixels_of(tile, width, height, tiles_x):
-    """Columns [16, 1] and lines [1, 16] of a tile, and which of its pixels lie in the image [16, 16]."""
-    x = (tile % tiles_x) * TILE + tl.arange(0, TILE)[:, None]
-    y = (tile // tiles_x) * TILE + tl.arange(0, TILE)[None, :]
+    """Columns and lines of a tile's pixels, and which of them lie in the image; all [256].
+
+    Of 32 neighbours each lane gets one: its 8 pixels lie in one line, two columns apart.
+    """
+    p = tl.arange(0, PIXELS)
+    x = (tile % tiles_x) * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
+    y = (tile // tiles_x) * TILE + p % TILE
     return x, y, (x < width) & (y < height)
 
 
 @jit
-def part_pixels(part, step):
-    """Places of a part's pixels in the layers of all parts [16, 16]; ``step`` is 1 (see blend_backward.py)."""
-    return part * PIXELS + tl.arange(0, TILE)[None, :] * TILE + tl.arange(0, TILE)[:, None] * step
+def part_pixels(part):
+    """Places of a part's pixels in the layers of all parts [256]: line by line, as in the image."""
+    p = tl.arange(0, PIXELS)
+    return part * PIXELS + p % TILE * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
 
 
 @jit
@@ -48,7 +55,7 @@ def pairs_of(tile, begins, ends, PARTS: tl.constexpr):
 
 @jit
 def whitened(s, px, py):
-    """d = pixel - mean along both axes, L d, and log2 of alpha before the clamp, all over [16, 16] or broadcast."""
+    """d = pixel - mean along both axes, L d, and log2 of alpha before the clamp; all [256]."""
     dx, dy = px - tl.load(s + record.X), py - tl.load(s + record.Y)
     b = tl.load(s + record.L22) * dy
     a = tl.load(s + record.L11) * dx + tl.load(s + record.L21) * dy
@@ -84,7 +91,7 @@ def open_before(products, firsts, part, inside, PARTS: tl.constexpr):
     passed = tl.where(inside, 1.0, 0.0)
     if PARTS:
         for before in range(tl.load(firsts + part), part):
-            passed *= tl.load(products + part_pixels(before, 1))
+            passed *= tl.load(products + part_pixels(before))
     return passed
 
 
@@ -127,7 +134,7 @@ def blend_tiles(
     at = y * width + x
     if PARTS:
         # Pixels outside have a place too, and are written, for they are read.
-        at, inside = part_pixels(tl.program_id(0), 1), inside | True
+        at, inside = part_pixels(tl.program_id(0)), inside | True
     tl.store(rgb + 3 * at, red, inside)
     tl.store(rgb + 3 * at + 1, green, inside)
     tl.store(rgb + 3 * at + 2, blue, inside)

@@ -8,12 +8,10 @@ A slot holds, with s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d and w the b
 s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + l22 b)|; w times the cotangents.
 """
 
-from functools import partial
-
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import pairs_of, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.blend import PIXELS, WARP, pairs_of, part_pixels, pixels_of, whitened
 from sparsestreet.ops.triton.language import constant, jit
 
 SLOT_LENGTH = 12
@@ -27,28 +25,38 @@ def registers(depth: bool) -> int:
 
 
 @jit
+def in_lane(values):
+    """Sums over the pixels of each lane [32]."""
+    return tl.sum(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+
+
+@jit
+def of_lane(values):
+    """What the pixels of each lane share [32]."""
+    return tl.max(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+
+
+@jit
 def store_sums(
     o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr
 ):
-    """Sums over the tile: first along x, within a lane, then over y what only y changes."""
+    """Sums over the tile: first within a lane, whose pixels share y, then over what y alone changes."""
     ga = g * a
-    line_g, line_ga = tl.sum(g, 0), tl.sum(ga, 0)
-    line_b, line_dy = tl.sum(b, 0), tl.sum(dy, 0)
+    lane_g, lane_ga, lane_b, lane_dy = in_lane(g), in_lane(ga), of_lane(b), of_lane(dy)
     sums = (
-        tl.sum(line_g), tl.sum(line_ga), tl.sum(line_g * line_b),
-        tl.sum(tl.sum(ga * dx, 0)), tl.sum(line_ga * line_dy), tl.sum(line_g * line_b * line_dy),
+        tl.sum(lane_g), tl.sum(lane_ga), tl.sum(lane_g * lane_b),
+        tl.sum(in_lane(ga * dx)), tl.sum(lane_ga * lane_dy), tl.sum(lane_g * lane_b * lane_dy),
     )  # fmt: skip
     absolute_x, absolute_y, depth = 0.0, 0.0, 0.0
     if ABSOLUTE:
-        absolute_x = tl.sum(tl.sum(tl.abs(ga), 0))
+        absolute_x = tl.sum(in_lane(tl.abs(ga)))
         l21, l22 = tl.load(s + record.L21), tl.load(s + record.L22)
-        absolute_y = tl.sum(tl.sum(tl.abs(l21 * ga + l22 * (g * b)), 0))
+        absolute_y = tl.sum(in_lane(tl.abs(l21 * ga + l22 * (g * b))))
     if DEPTH:
-        depth = tl.sum(tl.sum(weight * v_depth, 0))
+        depth = tl.sum(in_lane(weight * v_depth))
     sums += (
         absolute_x, absolute_y,
-        tl.sum(tl.sum(weight * v_red, 0)), tl.sum(tl.sum(weight * v_green, 0)), tl.sum(tl.sum(weight * v_blue, 0)),
-        depth,
+        tl.sum(in_lane(weight * v_red)), tl.sum(in_lane(weight * v_green)), tl.sum(in_lane(weight * v_blue)), depth,
     )  # fmt: skip
     # One store for all: as many as there are sums would each take an address of its own.
     field = tl.arange(0, 16)
@@ -82,11 +90,11 @@ def alpha_behind(s, exponent, k, last, alpha_max):
 
 
 @jit
-def from_behind(colors, depths, v_red, v_green, v_blue, v_depth, nexts, part, step, DEPTH: tl.constexpr):
+def from_behind(colors, depths, v_red, v_green, v_blue, v_depth, nexts, part, DEPTH: tl.constexpr):
     """Light of the parts of the tile behind this one, against the cotangents."""
     behind = tl.zeros_like(v_red)
     for after in range(part + 1, tl.load(nexts + part)):
-        at = part_pixels(after, step)
+        at = part_pixels(after)
         behind += tl.load(colors + 3 * at) * v_red + tl.load(colors + 3 * at + 1) * v_green
         behind += tl.load(colors + 3 * at + 2) * v_blue
         if DEPTH:
@@ -94,24 +102,22 @@ def from_behind(colors, depths, v_red, v_green, v_blue, v_depth, nexts, part, st
     return behind
 
 
-@partial(jit, do_not_specialize=["step"])
+@jit
 def blend_tiles_backward(
     records, pair_rows, pair_slots, begins, ends, order, transmittance, lasts,
     nexts, part_rgb, part_depth, part_transmittance, part_lasts,
-    v_rgb, v_transmittance, v_depth_sum, slots, width, height, step, tiles_x, alpha_max,
+    v_rgb, v_transmittance, v_depth_sum, slots, width, height, tiles_x, alpha_max,
     DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the slots of all pairs of one tile, with PARTS of one part of a tile.
 
-    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given. ``step`` is 1, and the compiler must not
-    know: for neighbouring pixels it would load in another layout than the one it sums in, and compile the loop twice
-    into one.
+    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given.
     """
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    at = y * width + x * step
+    at = y * width + x
     v_red = tl.load(v_rgb + 3 * at, inside, 0.0)
     v_green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
     v_blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
@@ -121,8 +127,8 @@ def blend_tiles_backward(
     begin, end = pairs_of(tile, begins, ends, PARTS)
     if PARTS:
         part = tl.program_id(0)
-        behind += from_behind(part_rgb, part_depth, v_red, v_green, v_blue, v_depth, nexts, part, step, DEPTH)
-        at = part_pixels(part, step)
+        behind += from_behind(part_rgb, part_depth, v_red, v_green, v_blue, v_depth, nexts, part, DEPTH)
+        at = part_pixels(part)
         passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
     else:
         last = tl.load(lasts + at, inside, begin)

@@ -17,9 +17,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
 from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.view import TILE
 
 PART_LENGTH = 256
 """Least pairs of a part; none has twice as many."""
@@ -110,7 +109,7 @@ def thin_parts(
             passed -= tl.where(exponent >= tl.load(s + record.CUTOFF), alpha, 0.0) * passed
         k = stop
         unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    tl.store(products + part_pixels(part, 1), passed)
+    tl.store(products + part_pixels(part), passed)
 
 
 @jit
@@ -124,11 +123,11 @@ def merge_parts(
     part = tl.program_id(0)
     x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
     end = tl.where(tl.load(firsts + part) == part, tl.load(nexts + part), part)
-    passed, rest = tl.full((TILE, TILE), 1.0, tl.float32), tl.full((TILE, TILE), 1.0, tl.float32)
+    passed, rest = tl.full((PIXELS,), 1.0, tl.float32), tl.full((PIXELS,), 1.0, tl.float32)
     red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
     depth, last = tl.zeros_like(passed), tl.zeros_like(passed).to(tl.int32)
     for i in range(part, end):
-        at = part_pixels(i, 1)
+        at = part_pixels(i)
         red += tl.load(part_rgb + 3 * at)
         green += tl.load(part_rgb + 3 * at + 1)
         blue += tl.load(part_rgb + 3 * at + 2)

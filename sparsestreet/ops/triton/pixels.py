@@ -83,13 +83,12 @@ def differentiate_view(screen: Screen, view: View, ends: Ends, v: Cotangents, ab
     """A slot of gradients for each pair; ``absolute``: those of the screen means' magnitudes as well."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
     slots = passed.new_empty(len(lists.slots), blend_backward.SLOT_LENGTH)
-    width, height, *others = pixel_arguments(view)
 
     def differentiate_each(begins: Tensor, stops: Tensor, tiles: Tensor, *part: Tensor, split: bool) -> None:
         launch(
             blend_backward.blend_tiles_backward, len(begins), 1,
             screen.records, lists.pair_rows, lists.slots, begins, stops, tiles, passed, ends.lasts, *part,
-            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, width, height, 1, *others,
+            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, *pixel_arguments(view),
             DEPTH=depth, ABSOLUTE=absolute, PARTS=split,
             options=ONE_WARP | {"maxnreg": blend_backward.registers(depth)},
         )  # fmt: skip

@@ -73,13 +73,12 @@ def removal(
     screen = project(gaussians, view)
     lists, layers = screen.lists, blend_view(screen, view, lasts=True)
     changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)
-    width, height, *others = pixel_arguments(view)
     behind, counts = contiguous(background), contiguous(pixel_weights)
     passed = layers.ends.transmittance
     launch(
         remove.remove_from_tiles, len(lists.order), 1,
         screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, layers.ends.lasts, lists.order,
-        passed, given_or(behind, passed), given_or(counts, passed), changes, width, height, 1, *others,
+        passed, given_or(behind, passed), given_or(counts, passed), changes, *pixel_arguments(view),
         BEHIND=behind is not None, WEIGHTED=counts is not None, options=ONE_WARP,
     )  # fmt: skip
     totals = torch.zeros(len(gaussians), remove.CHANGE_COUNT, dtype=torch.float64, device=changes.device)

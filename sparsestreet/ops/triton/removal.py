@@ -2,8 +2,6 @@
 change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha); from the back to the front, as backward.
 """
 
-from functools import partial
-
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
@@ -30,18 +28,18 @@ def change_of(behind, own, through):
     return behind * through - own, behind + own
 
 
-@partial(jit, do_not_specialize=["step"])
+@jit
 def remove_from_tiles(
     records, pair_rows, pair_slots, begins, ends, lasts, order, transmittance, background, pixel_weights, slots,
-    width, height, step, tiles_x, alpha_max,
+    width, height, tiles_x, alpha_max,
     BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile: largest change, sum of squares. ``step``: see blend_backward.py."""
+    """Writes the slots of all pairs of one tile: largest change, sum of squares."""
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    at = y * width + x * step
+    at = y * width + x
     passed = tl.load(transmittance + at, inside, 0.0)
     red = light_of(background, passed, at, inside, 0, BEHIND)
     green = light_of(background, passed, at, inside, 1, BEHIND)

@@ -1,8 +1,8 @@
 """Every kernel compiles for sm_80 and sm_90 without a GPU, and the pixel loops stay within their budgets.
 
-Budgets are what was measured with Triton 3.7.1. The bars the design was held to are those of a serial one-warp kernel
-for RGB alone that goes front to back in both directions: 72 registers and 20.8 instructions per (splat, pixel) sample
-forward, 96 and 59.1 backward. Ours goes backward from the last splat of each pixel, for the accuracy: its index takes
+Budgets are what was measured with Triton 3.7.1; 3.6.0 made the same code of the pixel kernels. The bars the design was
+held to are those of a serial one-warp kernel for RGB alone that goes front to back in both directions: 72 registers and
+20.8 instructions per (splat, pixel) sample forward, 96 and 59.1 backward. Ours goes backward from the last splat of each pixel, for the accuracy: its index takes
 one instruction and 8 registers forward (only where a backward pass follows), and 8 of the 104 registers backward. What
 the op adds to that: depth 1.1 instructions forward and 3.3 backward; absolute gradients 7.6.
 """
@@ -111,18 +111,18 @@ def test_no_tensor_cores_and_no_atomics(compiled, arch):
 # Switches that are on: registers, instructions per sample.
 FORWARD = {
     "": (72, 17.0),
-    "LASTS": (80, 18.0),
+    "LASTS": (80, 18.2),
     "DEPTH": (80, 18.2),
-    "DEPTH LASTS": (88, 19.2),
-    "DEPTH LASTS PARTS": (88, 19.3),
-    "DEPTH EXCLUSIVE LASTS": (88, 21.0),
-    "DEPTH EXCLUSIVE LASTS PARTS": (88, 21.0),
+    "DEPTH LASTS": (88, 19.5),
+    "DEPTH LASTS PARTS": (88, 19.5),
+    "DEPTH EXCLUSIVE LASTS": (88, 21.3),
+    "DEPTH EXCLUSIVE LASTS PARTS": (88, 21.3),
 }
 BACKWARD = {
-    "": (104, 50.3),
-    "ABSOLUTE": (104, 57.9),
-    "ABSOLUTE DEPTH": (112, 61.2),
-    "ABSOLUTE DEPTH PARTS": (112, 61.2),
+    "": (104, 51.0),
+    "ABSOLUTE": (104, 58.7),
+    "ABSOLUTE DEPTH": (112, 61.9),
+    "ABSOLUTE DEPTH PARTS": (112, 61.9),
 }
 BUDGETS = {
     **{("blend_tiles", switches): budget for switches, budget in FORWARD.items()},
