@@ -19,8 +19,6 @@ _ON_A_GPU = ("triton",) if torch.cuda.is_available() else ()
 BACKENDS = ("reference", "cpu", *_ON_A_GPU)
 """Every implementation of the op that is fast enough for all tests: what is tested for all of them takes the list from
 here. Triton's interpreter bears only small scenes (triton/test_shared_cases.py)."""
-EFFECT_BACKENDS = BACKENDS
-"""Those with lens, shutter, box, depth bits and half colours."""
 SINGLE_PRECISION = ("triton",)
 """Those that compute in float32 only; tests whose oracle needs float64 leave them out."""
 
@@ -35,16 +33,12 @@ def _in_every_precision(backends: tuple[str, ...]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("backend", "dtype"), pairs, ids=names)
 
 
-def _in_double(backends: tuple[str, ...]) -> pytest.MarkDecorator:
-    return pytest.mark.parametrize("backend", [name for name in backends if torch.float64 in _dtypes(name)])
-
-
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_precision = _in_every_precision(BACKENDS)
-every_double = _in_double(BACKENDS)
-every_fast_backend = pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "reference"])
-every_effect_precision = _in_every_precision(EFFECT_BACKENDS)
-every_effect_double = _in_double(EFFECT_BACKENDS)
+every_double = pytest.mark.parametrize("backend", [name for name in BACKENDS if torch.float64 in _dtypes(name)])
+_FAST_BACKENDS = tuple(name for name in BACKENDS if name != "reference")
+every_fast_backend = pytest.mark.parametrize("backend", _FAST_BACKENDS)
+every_fast_precision = _in_every_precision(_FAST_BACKENDS)
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:

@@ -150,21 +150,6 @@ def test_auto_takes_the_library():
     assert resolve_backend("auto", torch.device("cpu")) == "cpu"
 
 
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_autocast_changes_nothing(backend, dtype):
-    view = camera(21, 13)
-    gaussians = random_gaussians(60, view)
-    results = []
-    for enabled in (False, True):
-        leaves = cast(gaussians, torch.float32, requires_grad=True)
-        with torch.autocast("cpu", dtype=dtype, enabled=enabled):
-            rendering = splat(leaves, view, backend=backend, background=torch.ones(3))
-        rendering.rgb.backward(cotangents(view)[0].float())
-        results.append([rendering.rgb, rendering.alpha, *(getattr(leaves, name).grad for name in FIELDS)])
-    assert all(torch.equal(plain, inside) for plain, inside in zip(*results, strict=True))
-
-
 def test_no_graph_without_grad():
     view = camera(21, 13)
     leaves = cast(random_gaussians(60, view), torch.float32, requires_grad=True)

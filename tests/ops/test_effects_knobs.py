@@ -12,8 +12,8 @@ from tests.ops.scenes import (
     FIELDS,
     camera,
     cast,
-    every_effect_double,
-    every_effect_precision,
+    every_double,
+    every_precision,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -25,7 +25,7 @@ Y0 = 0.28209479177387814
 RED, GREEN = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
 
 
-@every_effect_precision
+@every_precision
 @pytest.mark.parametrize("alpha_min", [0.0, 1 / 255])
 def test_box_by_hand(backend, dtype, alpha_min):
     # 0.1 m at 2 m with focal 40: variance 4 + 0.3. Two standard deviations: squared distance up to 17.2.
@@ -38,7 +38,7 @@ def test_box_by_hand(backend, dtype, alpha_min):
     assert float(result.radii[0]) == pytest.approx(2 * math.sqrt(4.3), rel=1e-6)
 
 
-@every_effect_double
+@every_double
 def test_the_nearer_of_box_and_cut_off_ends_a_splat(backend):
     # Opacity 0.05 falls to 1/255 at q = 2 ln 12.75 = 5.09: a box of 2.25 (5.06) acts, one of 2.26 (5.11) does not.
     view = front_camera(13, 13, 40.0)
@@ -51,7 +51,7 @@ def test_the_nearer_of_box_and_cut_off_ends_a_splat(backend):
     )
 
 
-@every_effect_precision
+@every_precision
 def test_a_box_that_ends_nothing_changes_no_bit(backend, dtype):
     view = camera(21, 13)
     gaussians = random_gaussians(60, view)
@@ -63,7 +63,7 @@ def test_a_box_that_ends_nothing_changes_no_bit(backend, dtype):
                 assert torch.equal(value, getattr(boxed, part)[name]), name
 
 
-@every_effect_double
+@every_double
 def test_gradients_inside_the_box_are_right(backend):
     # Pixels at a distance from the box's edge: there the image is smooth.
     view = front_camera(6, 5, 14.0)
@@ -81,7 +81,7 @@ def test_gradients_inside_the_box_are_right(backend):
         assert torch.autograd.gradcheck(image, values[field].requires_grad_(), fast_mode=True)
 
 
-@every_effect_precision
+@every_precision
 @pytest.mark.parametrize(
     ("bits", "far", "first_row_in_front"),
     [
@@ -109,7 +109,7 @@ def test_depth_bits(backend, dtype, bits, far, first_row_in_front):
     assert float(centre[back]) == pytest.approx(0.8 * 0.5 + 0.2 * 0.8 * 1.5, rel=1e-5)
 
 
-@every_effect_double
+@every_double
 def test_float64_depths_that_round_to_one_float32_are_tied(backend):
     view = front_camera(5, 5, 40.0)
     far, near = one_gaussian(sh=RED), one_gaussian(sh=GREEN, means=[[0.0, 0.0, 2.0 - 1e-9]])
@@ -119,7 +119,7 @@ def test_float64_depths_that_round_to_one_float32_are_tied(backend):
         assert float(centre[front]) == pytest.approx(1.28, rel=1e-6)
 
 
-@every_effect_precision
+@every_precision
 def test_half_colours_by_hand(backend, dtype):
     # Colours 0.5 + x; float16 has 11 significant bits; a value past 65504 stays there, where infinity would poison.
     colours = np.array([0.1, 1 / 3, 70000.0])
@@ -132,7 +132,7 @@ def test_half_colours_by_hand(backend, dtype):
     assert centre.is_finite()
 
 
-@every_effect_double
+@every_double
 def test_half_colours_over_their_range(backend):
     # Subnormal numbers of float16 among them; in float64, where 0.5 + Y0 sh still has the digits of 1e-7.
     colours = np.array([2e-8, 4e-8, 3.3e-7, 5.9e-5, 6.2e-5, 1e-3, 0.2, 0.9999, 1.7, 33.3, 2047.7, 65503.0])
@@ -142,7 +142,7 @@ def test_half_colours_over_their_range(backend):
         np.testing.assert_allclose(seen.rgb[0, 0].numpy(), 0.8 * triple.astype(np.float16).astype(float), rtol=1e-9)
 
 
-@every_effect_precision
+@every_precision
 def test_half_colours_in_a_scene(backend, dtype):
     view = camera(21, 13)
     gaussians = random_gaussians(60, view)
@@ -151,8 +151,9 @@ def test_half_colours_in_a_scene(backend, dtype):
     )
     difference = plain.images["rgb"] - rounded.images["rgb"]
     assert difference.any()
-    # Half an ulp of float16 is 2.4e-4 below 1: 80 dB after blending.
-    assert -10 * math.log10(float(difference.square().mean())) > 75
+    # Half an ulp of float16 is 2.4e-4 below 1; evenly spread errors have a root mean square of 1.4e-4 (77 dB), and a
+    # pixel's blend averages several and is darker.
+    assert -10 * math.log10(float(difference.square().mean())) > 80
     # Straight through: the harmonics' gradient does not know about the rounding at all.
     assert torch.equal(plain.gradients["sh"], rounded.gradients["sh"])
     for name in FIELDS:

@@ -15,8 +15,8 @@ from tests.ops.oracles import fitted_splat, rotation_matrix
 from tests.ops.scenes import (
     camera,
     cast,
-    every_effect_double,
-    every_effect_precision,
+    every_double,
+    every_precision,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -105,7 +105,7 @@ def drawn(gaussians: Gaussians, view: Camera, backend: str) -> tuple[np.ndarray,
     return fitted_splat(splat(gaussians, view, settings=FITTED, backend=backend).alpha.detach())
 
 
-@every_effect_double
+@every_double
 @pytest.mark.parametrize("coefficients", [WIDE, (0.1, 0.02, 0.0, 0.0, 0.0), (0.0,) * 5], ids=["wide", "pin", "zero"])
 def test_against_the_text_book(backend, coefficients):
     view = through(camera(33, 25), coefficients)
@@ -125,7 +125,7 @@ def test_against_the_text_book(backend, coefficients):
     assert compared > 10
 
 
-@every_effect_double
+@every_double
 def test_sigma_points_past_the_fold_and_behind_the_near_plane(backend):
     # 40 degrees off the axis and as large as its distance: sigma points lie past the fold and behind the camera.
     view = through(front_camera(40, 30, 14.0), WIDE)
@@ -143,7 +143,7 @@ def test_sigma_points_past_the_fold_and_behind_the_near_plane(backend):
         assert render(ball, view, backend, torch.float32).is_finite()
 
 
-@every_effect_double
+@every_double
 @pytest.mark.parametrize("off_axis", [0.0, 0.4, 0.8])
 def test_closer_to_the_imaged_gaussian_than_its_linearisation(backend, off_axis):
     # Gaussians of 5 to 10 % of their distance seen through a wide lens.
@@ -164,7 +164,7 @@ def test_closer_to_the_imaged_gaussian_than_its_linearisation(backend, off_axis)
     assert wasserstein(ours, spread, centre, covariance) < 0.5 * wasserstein(linear_mean, linear, centre, covariance)
 
 
-@every_effect_double
+@every_double
 def test_zero_coefficients_tend_to_the_pinhole_with_size(backend):
     # The transform adds second derivatives times covariance: a quarter for half the size.
     view = front_camera(15, 13, 14.0)
@@ -183,7 +183,7 @@ def test_zero_coefficients_tend_to_the_pinhole_with_size(backend):
     assert differences[1] / differences[2] == pytest.approx(4, rel=0.03)
 
 
-@every_effect_precision
+@every_precision
 def test_what_the_lens_does_not_see_is_culled(backend, dtype):
     # k1 = -0.3 folds at r = 1.054: from there on the polynomial comes back towards the middle and would draw again.
     view = through(front_camera(41, 31, 20.0), (-0.3, 0.0, 0.0, 0.0, 0.0))
@@ -199,7 +199,7 @@ def test_what_the_lens_does_not_see_is_culled(backend, dtype):
     assert drawn_rows == [True, True, False, False, False, False]
 
 
-@every_effect_double
+@every_double
 def test_float32(backend):
     # An image of real width: pixels are known to 1e-4, of which the covariance takes differences.
     view = through(front_camera(640, 8, 500.0), WIDE)

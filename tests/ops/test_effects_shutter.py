@@ -15,8 +15,8 @@ from tests.ops.scenes import (
     camera,
     cast,
     device_of,
-    every_effect_double,
-    every_effect_precision,
+    every_double,
+    every_precision,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -77,7 +77,7 @@ def flat_cards(generator_seed: int = 2) -> Gaussians:
     )
 
 
-@every_effect_double
+@every_double
 @pytest.mark.parametrize(
     ("translation", "displacement"),
     [((0.3, 0.0, 0.0), None), ((0.0, -0.25, 0.0), None), ((-0.2, 0.3, 0.0), (0.1, 0.3, 0.0))],
@@ -96,7 +96,7 @@ def test_cards_moving_in_their_planes_are_exact(backend, translation, displaceme
     np.testing.assert_allclose(image.numpy(), expected, atol=1e-11)
 
 
-@every_effect_double
+@every_double
 def test_ball_on_the_axis_is_exact_to_first_order(backend):
     # Sideways motion and yaw leave the shape of a ball on the optical axis alone, to first order; half, then a quarter.
     ball = one_gaussian(scales=[[0.25] * 3])
@@ -111,7 +111,7 @@ def test_ball_on_the_axis_is_exact_to_first_order(backend):
     assert errors[1] / errors[2] == pytest.approx(4, rel=0.03)
 
 
-@every_effect_double
+@every_double
 @pytest.mark.parametrize("lens", [None, (-0.25, 0.08, 2e-3, -1e-3, -0.01)], ids=["pinhole", "distorted"])
 def test_mean_follows_any_motion_to_first_order(backend, lens):
     # A long lens shifted off the axis shows 20 x 40 pixels; the ball, 1.5 px in size, is read late.
@@ -149,7 +149,7 @@ def test_mean_follows_any_motion_to_first_order(backend, lens):
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
 
 
-@every_effect_double
+@every_double
 def test_most_of_a_moving_scene_is_right(backend):
     # Tilted ellipsoids everywhere, a camera that drives, yaws and bumps, rows that walk: their shapes change during the
     # readout, which one Gaussian cannot follow. That is a seventh of the effect here.
@@ -165,7 +165,7 @@ def test_most_of_a_moving_scene_is_right(backend):
     assert np.linalg.norm(image - expected) < 0.2 * effect
 
 
-@every_effect_precision
+@every_precision
 def test_no_motion_is_no_shutter_bit_for_bit(backend, dtype):
     view = camera(21, 13)
     gaussians = random_gaussians(60, view)
@@ -182,7 +182,7 @@ def test_no_motion_is_no_shutter_bit_for_bit(backend, dtype):
         torch.testing.assert_close(gradient, resting.gradients[name], rtol=50 * torch.finfo(dtype).eps, atol=1e-6)
 
 
-@every_effect_precision
+@every_precision
 @pytest.mark.parametrize(("fall", "drawn"), [(-20.0, True), (0.85, True), (0.95, False), (1.0, False), (20.0, False)])
 def test_rows_that_outrun_the_readout_are_culled(backend, dtype, fall, drawn):
     # The ball falls by `fall` image heights during the readout, so 1 - u_y / H = 1 - fall; culled below 0.1. Its peak
@@ -198,7 +198,7 @@ def test_rows_that_outrun_the_readout_are_culled(backend, dtype, fall, drawn):
         assert not any(gradient.any() for gradient in result.gradients.values())
 
 
-@every_effect_precision
+@every_precision
 @pytest.mark.parametrize("lens", [None, (-0.1, 0.0, 0.0, 0.0, 0.0)], ids=["pinhole", "distorted"])
 def test_cameras_and_displacements_get_no_gradient(backend, dtype, lens):
     view = rolling(front_camera(9, 7, 12.0), (0.1, 0.1, 0.1), (0.01, 0.02, 0.03))
@@ -215,7 +215,7 @@ def test_cameras_and_displacements_get_no_gradient(backend, dtype, lens):
     assert all(value.grad is None for value in given)
 
 
-@every_effect_double
+@every_double
 def test_contribution_sees_what_is_drawn(backend):
     view = rolling(camera(13, 11), (0.15, -0.5, 0.3), (0.02, 0.04, 0.02))
     view = dataclasses.replace(view, distortion=vector(-0.2, 0.05, 0.0, 0.0, 0.0))
@@ -227,7 +227,7 @@ def test_contribution_sees_what_is_drawn(backend):
     assert int(counters.dominant.sum()) == int((alpha > 0).sum())
 
 
-@every_effect_double
+@every_double
 @pytest.mark.parametrize("lens", [None, (-0.25, 0.08, 2e-3, -1e-3, -0.01)], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("field", FIELDS)
 def test_gradient_of_each_field(backend, field, lens):

@@ -203,11 +203,11 @@ def check_against(backend: str, gaussians: Gaussians, view: Camera, settings: Sp
 
 @every_double
 @few
-@given(scene=scenes(), effects=st.booleans(), case=st.sampled_from(sorted(CASES)))
+@given(scene=scenes, effects=st.booleans(), case=st.sampled_from(sorted(CASES)))
 def test_what_is_counted_as_drawn_is_drawn(backend, scene, effects, case):
     gaussians, view, noise = scene
     if effects:
-        gaussians, view = with_effects(gaussians, view, noise, backend)
+        gaussians, view = with_effects(gaussians, view, noise)
     check_against(backend, gaussians, view, CASES[case])
 
 
@@ -218,7 +218,7 @@ def test_a_clean_scene_fires_no_alarm(backend, dtype, effects):
     gaussians = random_gaussians(400, view, seed=7)
     if effects:
         noise = torch.randn(64, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-        gaussians, view = with_effects(gaussians, view, noise, backend)
+        gaussians, view = with_effects(gaussians, view, noise)
     gaussians = cast(gaussians, dtype, device=device_of(backend))
     for settings in CASES.values():
         counted = check_against(backend, gaussians, view, settings)

@@ -1,6 +1,7 @@
 """Pixels that break the blend (docs/stability.md; the number in a name is the row there)."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
     cast,
+    cotangents,
     device_of,
     every_fast_backend,
     every_precision,
@@ -24,22 +26,25 @@ Y0 = 0.28209479177387814
 
 @every_precision
 def test_10_one_opaque_splat_is_drawn(backend, dtype):
-    result = render(one_gaussian(opacities=[1.0]), front_camera(5, 5, 40.0), backend, dtype)
+    opaque = one_gaussian(opacities=[1.0])
+    result = render(opaque, front_camera(5, 5, 40.0), backend, dtype)
     assert result.images["alpha"][2, 2] == pytest.approx(0.99, rel=1e-6)
-    # Exclusive stop with a limit above 0.01 drops it: that is why the default is inclusive.
-    settings = SplatSettings(stop="exclusive", transmittance_min=0.02)
-    assert (
-        render(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0), backend, dtype, settings).images["alpha"] == 0
-    )
+    # It leaves 0.01. With a limit above that the exclusive stop drops it: that is why the default is inclusive.
+    for stop, alpha in (("inclusive", 0.99), ("exclusive", 0.0)):
+        settings = SplatSettings(stop=stop, transmittance_min=0.02)
+        result = render(opaque, front_camera(1, 1, 40.0), backend, dtype, settings)
+        assert result.images["alpha"][0, 0] == pytest.approx(alpha, rel=1e-6)
 
 
 @every_precision
 def test_10_a_clamped_alpha_has_no_gradient(backend, dtype):
     # In a single pixel at the peak, alpha = 1 is clamped to 0.99: opacity and shape cannot change the image.
-    result = render(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0), backend, dtype)
+    opaque, view = one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0)
+    result = render(opaque, view, backend, dtype)
     assert not any(result.gradients[name].any() for name in ("opacities", "scales", "quaternions", "screen"))
-    assert guards(one_gaussian(opacities=[1.0]), front_camera(1, 1, 40.0)) == Guards(drawn=1, alpha_clamped=1)
-    assert result.gradients["sh"].all()
+    assert guards(opaque, view) == Guards(drawn=1, alpha_clamped=1)
+    # The clamp holds backward as well: 1 / (1 - alpha) is 100.
+    torch.testing.assert_close(result.gradients["sh"][0, 0], 0.99 * Y0 * cotangents(view)[0][0, 0], rtol=1e-6, atol=0)
 
 
 @every_precision
@@ -56,9 +61,27 @@ def test_11_12_opacity_at_the_cut_off(backend, dtype):
         counted = contribution(faint, view, backend=backend)
         assert counted.pixels.tolist() == [0]
         assert guards(faint, view) == (Guards(faint=1) if opacity else Guards(masked=1))
-    at_edge = render(one_gaussian(opacities=[float(edge)]), view, backend, dtype)
-    assert at_edge.is_finite()
-    assert at_edge.radii[0] >= 0
+
+
+@every_precision
+def test_11_12_opacity_at_and_just_above_the_cut_off(backend, dtype):
+    # At 1/255 itself the ellipse is the pixel centre on the mean; one ulp more, and it has a size: sqrt(2 eps' 4.3) px
+    # with eps' the relative step of the opacity, between eps / 2 and eps.
+    view = front_camera(5, 5, 40.0)
+    edge = torch.tensor(1 / 255, dtype=dtype)
+    for opacity in (edge, torch.nextafter(edge, torch.ones_like(edge))):
+        faint = one_gaussian(opacities=[float(opacity)])
+        result = render(faint, view, backend, dtype)
+        drawn = result.images["alpha"].nonzero()
+        assert drawn.tolist() == [[2, 2]]
+        # 1 - T is known to eps.
+        assert float(result.images["alpha"][2, 2]) == pytest.approx(1 / 255, rel=255 * torch.finfo(dtype).eps)
+        assert result.is_finite()
+        assert result.gradients["opacities"].all()
+        counted = contribution(cast(faint, dtype, device=device_of(backend)), view, backend=backend)
+        assert counted.pixels.tolist() == [1]
+    eps = torch.finfo(dtype).eps
+    assert math.sqrt(0.9 * eps * 4.3) < float(result.radii[0]) < math.sqrt(2.1 * eps * 4.3)
 
 
 @every_precision

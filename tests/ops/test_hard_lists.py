@@ -1,16 +1,20 @@
 """Culling, sorting, tile lists and memory (docs/stability.md; the number in a name is the row there)."""
 
+import math
+
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings
-from sparsestreet.ops.cpu import rasteriser
+from sparsestreet.ops import SplatSettings, contribution, removal, splat
 from sparsestreet.ops.cpu.workspace import idle_workspaces
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
     camera,
+    cast,
+    device_of,
     every_backend,
+    every_fast_precision,
     every_precision,
     front_camera,
     one_gaussian,
@@ -37,26 +41,63 @@ def test_15_nothing_to_draw(backend, dtype, width_height):
         assert result.gradients["background"].all()
 
 
-@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(stop="exclusive")], ids=["inclusive", "exclusive"])
-def test_16_nothing_is_read_before_it_is_written(settings, monkeypatch):
-    # Every buffer of the library and every tensor it fills starts as NaN; many tiles stay empty, many end early.
-    view = camera(75, 53)
-    gaussians = random_gaussians(300, view)
-    opaque = one_gaussian(scales=[[90.0] * 3], opacities=[1.0], means=[[0.0, 0.0, 1.0]])
-    scene = Gaussians.concatenate([gaussians, opaque, opaque, opaque])
-    expected = render(scene, view, "cpu", torch.float32, settings)
-    for workspace in idle_workspaces():
-        workspace.poison()
+def _poison(patch: pytest.MonkeyPatch) -> None:
+    """Every buffer of the library and every tensor that a backend fills starts as NaN, or as the largest integer."""
 
     def poisoned(like):
-        return lambda *args, **kwargs: like(*args, **kwargs).fill_(float("nan"))
+        def filled(*args, **kwargs):
+            tensor = like(*args, **kwargs)
+            return tensor.fill_(math.nan if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
 
-    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
-    monkeypatch.setattr(torch, "empty_like", poisoned(torch.empty_like))
-    result = render(scene, view, "cpu", torch.float32, settings)
+        return filled
+
+    for workspace in idle_workspaces():
+        workspace.poison()
+    patch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
+    for name in ("empty", "empty_like"):
+        patch.setattr(torch, name, poisoned(getattr(torch, name)))
+
+
+@every_fast_precision
+@pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
+def test_16_nothing_is_read_before_it_is_written(backend, dtype, stop):
+    # Many tiles stay empty, many end early.
+    view, settings = camera(75, 53), SplatSettings(stop=stop)
+    opaque = one_gaussian(scales=[[90.0] * 3], opacities=[1.0], means=[[0.0, 0.0, 1.0]])
+    scene = Gaussians.concatenate([random_gaussians(300, view), opaque, opaque, opaque])
+    expected = render(scene, view, backend, dtype, settings)
+    with pytest.MonkeyPatch.context() as patch:
+        _poison(patch)
+        result = render(scene, view, backend, dtype, settings)
     for part in ("images", "gradients"):
         for name, value in getattr(expected, part).items():
             assert torch.equal(value, getattr(result, part)[name]), name
+    assert torch.equal(expected.radii, result.radii)
+
+
+@every_fast_precision
+def test_16_numbers_of_every_row_are_written(backend, dtype):
+    # The third tile is empty, the stack closes the first one, and the rows at both ends are culled.
+    view = front_camera(33, 5, 20.0)
+    stack = [
+        one_gaussian(scales=[[0.6, 0.4, 0.1]], opacities=[1.0], means=[[-0.85, 0.0, 2.0 + 0.002 * k]])
+        for k in range(34)
+    ]
+    rows = [one_gaussian(means=[[0.0, 0.0, -2.0]]), *stack, one_gaussian(opacities=[0.0])]
+    scene = cast(Gaussians.concatenate(rows), dtype, device=device_of(backend))
+
+    def counted() -> dict[str, torch.Tensor]:
+        counters = [vars(count(scene, view, backend=backend)) for count in (contribution, removal)]
+        return counters[0] | counters[1] | {"radii": splat(scene, view, backend=backend).radii}
+
+    expected = counted()
+    with pytest.MonkeyPatch.context() as patch:
+        _poison(patch)
+        result = counted()
+    for name, value in expected.items():
+        assert torch.equal(value, result[name]), name
+        assert value[1:-1].any(), f"{name}: the scene tests nothing"
+        assert not value[[0, -1]].any()
 
 
 @every_precision
@@ -102,9 +143,3 @@ def test_18_two_runs_are_bitwise_equal(backend):
     for part in ("images", "gradients"):
         for name, value in getattr(first, part).items():
             assert torch.equal(value, getattr(second, part)[name]), name
-
-
-def test_09_a_pair_index_fits_its_type():
-    # Slots are int32: no list that is allocated may be longer. Longer ones are counted in 64 bits and refused
-    # (test_errors.py), so that no index past 2^31 can arise.
-    assert rasteriser.PAIR_LIMIT < 2**31

@@ -15,6 +15,7 @@ from tests.ops.scenes import (
     cotangents,
     device_of,
     every_backend,
+    every_fast_precision,
     every_precision,
     front_camera,
     one_gaussian,
@@ -43,31 +44,68 @@ def extreme_gaussians(rows: int, seed: int) -> Gaussians:
     return Gaussians(*(torch.tensor(part, dtype=torch.float32).double() for part in parts))
 
 
+# Without a pixel that two opaque splats bring to 0.01^2 = 1e-4, the default's limit, exactly: rounding would decide.
+EXTREME_SETTINGS = (
+    SplatSettings(transmittance_min=3e-5),
+    SplatSettings(transmittance_min=3e-5, antialias=True, stop="exclusive", blur=0.0),
+)
+
+
 @every_precision
 def test_01_no_nan_in_extreme_scenes(backend, dtype):
-    for seed in range(40 if backend == "cpu" else 6):
-        for settings in (SplatSettings(), SplatSettings(antialias=True, stop="exclusive", blur=0.0)):
-            result = render(extreme_gaussians(60, seed), front_camera(19, 14, 25.0), backend, dtype, settings)
-            assert result.is_finite(), (seed, settings)
-            # Culled rows have exactly zero gradient.
-            culled = result.radii == 0
-            assert culled.any()
-            assert not any(result.gradients[name][culled].any() for name in FIELDS)
+    # 10,000 rows in small scenes: in large ones the opaque rows in front hide the others.
+    for seed in range(100 if backend == "cpu" else 10):
+        settings = EXTREME_SETTINGS[seed % 2]
+        result = render(extreme_gaussians(100, seed), front_camera(19, 14, 25.0), backend, dtype, settings)
+        assert result.is_finite(), (seed, settings)
+        # Culled rows have exactly zero gradient.
+        culled = result.radii == 0
+        assert culled.any()
+        assert not any(result.gradients[name][culled].any() for name in FIELDS)
+
+
+@every_fast_precision
+def test_01_extreme_scenes_are_right(backend, dtype):
+    # In float64 all backends agree. What float32 costs such rows depends on the scene, from nothing to all digits: the
+    # same formulas as they are written, in plain float32, tell how much. A backend may lose three times that in the
+    # image and ten times in the gradients, besides its own bars.
+    image_bar, gradient_bar = (1e-5, 5e-4) if dtype == torch.float32 else (1e-12, 1e-6)
+    view, accurate = front_camera(19, 14, 25.0), 0
+    scenes, rows = (2, 25) if backend == "triton" else (10, 100)
+    for seed in range(scenes):
+        gaussians, settings = extreme_gaussians(rows, seed), EXTREME_SETTINGS[seed % 2]
+        truth = render(gaussians, view, "reference", torch.float64, settings)
+        plain = truth if dtype == torch.float64 else render(gaussians, view, "reference", dtype, settings)
+        result = render(gaussians, view, backend, dtype, settings)
+        for name, image in truth.images.items():
+            lost, expected = ((other.images[name] - image).abs().max() / image.abs().max() for other in (result, plain))
+            assert lost <= image_bar + 3 * expected, (seed, name)
+            accurate += expected < image_bar
+        for name, gradient in truth.gradients.items():
+            lost, expected = (relative_error(other.gradients[name], gradient) for other in (result, plain))
+            assert lost <= gradient_bar + 10 * expected, (seed, name)
+            accurate += expected < gradient_bar
+    # Of nine images and gradients.
+    assert accurate > 4 * scenes
 
 
 @every_backend
-def test_02_an_overflowing_row_is_culled(backend):
-    # 1e25 m is finite, but its variance on the screen is not, in float32: it must vanish, not poison its neighbours.
-    view = front_camera(21, 13, 20.0)
-    good = random_gaussians(30, view)
-    bad = one_gaussian(scales=[[1e25, 1e25, 1e25]])
+@pytest.mark.parametrize(("size", "antialias"), [(1e12, True), (1e12, False), (1e25, False)])
+def test_02_an_overflowing_row_is_culled(backend, size, antialias):
+    # 1e12 m and 1e25 m are finite, but not the determinant of the one nor the variance of the other on the screen, in
+    # float32: they must vanish, not poison their neighbours.
+    view, settings = front_camera(21, 13, 20.0), SplatSettings(antialias=antialias)
+    good = random_gaussians(10, view)
+    bad = one_gaussian(scales=[[size] * 3])
     both = Gaussians.concatenate([good, bad])
-    alone, together = (render(scene, view, backend, torch.float32) for scene in (good, both))
-    assert torch.equal(alone.images["rgb"], together.images["rgb"])
+    alone, together = (render(scene, view, backend, torch.float32, settings) for scene in (good, both))
+    for name, image in alone.images.items():
+        assert torch.equal(image, together.images[name]), name
     assert together.is_finite()
     assert together.radii[-1] == 0
-    assert guards(cast(both, torch.float32), view).alarms == {"overflowed": 1}
-    assert guards(both, view).alarms == {}
+    assert not any(gradient[-1].any() for gradient in together.gradients.values())
+    assert guards(cast(both, torch.float32), view, settings=settings).alarms == {"overflowed": 1}
+    assert guards(both, view, settings=settings).alarms == {}
 
 
 @every_precision
@@ -128,27 +166,34 @@ def test_14_zero_scales(backend, dtype, antialias, flat):
     result = render(gaussians, front_camera(9, 9, 20.0), backend, dtype, settings)
     assert result.is_finite()
     truth = render(gaussians, front_camera(9, 9, 20.0), "reference", torch.float64, settings)
-    assert (result.images["rgb"] - truth.images["rgb"]).abs().max() < 1e-5
+    bar = 1e-5 if dtype == torch.float32 else 1e-12
+    assert (result.images["rgb"] - truth.images["rgb"]).abs().max() < bar
+    for name, gradient in truth.gradients.items():
+        if gradient.any():
+            assert relative_error(result.gradients[name], gradient) < 10 * bar, name
+        else:  # A flat axis with compensation at its floor, or a ball: there is nothing to turn or to grow.
+            assert not result.gradients[name].any(), name
 
 
 @every_precision
-def test_14_a_masked_row_leaves_no_trace(backend, dtype):
-    view = camera(21, 13)
-    gaussians = random_gaussians(60, view)
-    keep = torch.arange(60) % 3 > 0
+@pytest.mark.parametrize("preset", ["default", "exact", "fine"])
+def test_14_a_masked_row_leaves_no_trace(backend, dtype, preset):
+    # "exact" and "fine" draw down to an alpha of 0: there only the cull of opacity 0 itself keeps the rows out.
+    view, settings = camera(21, 13), SplatSettings.preset(preset)
+    gaussians = random_gaussians(18 if backend == "triton" else 60, view)
+    keep = torch.arange(len(gaussians)) % 3 > 0
     without = Gaussians(*(getattr(gaussians, name)[keep] for name in FIELDS))
     masked = dataclasses.replace(
         gaussians, opacities=gaussians.opacities * keep, scales=gaussians.scales * keep[:, None]
     )
-    plain, dropped = (render(scene, view, backend, dtype) for scene in (without, masked))
+    plain, dropped = (render(scene, view, backend, dtype, settings) for scene in (without, masked))
     for name, image in plain.images.items():
-        if backend == "cpu":
-            assert torch.equal(image, dropped.images[name])
-        # The reference's matrix products may sum in another order for another number of rows.
-        torch.testing.assert_close(image, dropped.images[name], rtol=1e-6, atol=1e-6)
-    assert dropped.is_finite()
-    assert not dropped.gradients["opacities"][~keep].any()
-    assert guards(cast(masked, dtype), view).masked == 20
+        assert torch.equal(image, dropped.images[name]), name
+    for name, gradient in plain.gradients.items():
+        assert torch.equal(gradient, dropped.gradients[name][keep]), name
+        assert not dropped.gradients[name][~keep].any(), name
+    assert not dropped.radii[~keep].any()
+    assert guards(cast(masked, dtype), view, settings=settings).masked == len(gaussians) // 3
 
 
 @every_precision
@@ -185,7 +230,8 @@ def test_20_half_precision(backend, half):
 @pytest.mark.parametrize("field", FIELDS)
 def test_22_every_parameter_alone(backend, dtype, field):
     # Each number of each row by central differences, the other fields without gradient: a factor that is missing from
-    # one chain shows here. Differences of step 1e-5 are good to 1e-9 of the largest gradient.
+    # one chain shows here, in one number as well: each is held to the bar in units of what the field's numbers usually
+    # have. Differences of step 1e-5 are good to 1e-9 of the largest gradient.
     view = camera(6, 5)
     gaussians = random_gaussians(4, view, terms=4, seed=8)
     settings = SplatSettings(alpha_min=1e-9, antialias=True)
@@ -206,7 +252,8 @@ def test_22_every_parameter_alone(backend, dtype, field):
             moved[index] += step
             sides.append(loss(moved, "reference"))
         expected[index] = (sides[0] - sides[1]) / 2e-5
-    assert (expected.reshape(4, -1).norm(dim=1) > 0).any()
     value = start.to(device_of(backend), dtype).clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(value, backend), value)
-    assert relative_error(gradient.double().cpu(), expected) < (1e-7 if dtype == torch.float64 else 1e-4)
+    usual = expected.square().mean().sqrt()
+    assert usual > 0
+    assert (gradient.double().cpu() - expected).abs().max() < (1e-7 if dtype == torch.float64 else 1e-4) * usual
