@@ -22,6 +22,9 @@ from sparsestreet.types import Camera, Contribution, Gaussians
 NOTICEABLE = 1 / 255
 """One step of an 8-bit image: what no screen shows is not seen."""
 
+PROPOSALS = 6
+"""Places that are tried for each useless row: a pixel here and there shows what was to be hidden."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -121,13 +124,13 @@ def plant(
     views = Views(activated(rows), cameras, backend, backdrops)
     # Three proposals for each row wanted: some places turn out to be seen from elsewhere.
     proposals = [
-        _propose_hidden(rows, views, 3 * hidden, generator),
-        _propose_copies(rows, views, 3 * copies, generator),
+        _propose_hidden(rows, views, PROPOSALS * hidden, generator),
+        _propose_copies(rows, views, PROPOSALS * copies, generator),
     ]
     candidates = _resized(rows, _append(rows, proposals))
     means = candidates.means.detach()[len(rows) :]
     possible = torch.stack([project(camera, means)[2] for camera in cameras]).any(0)
-    is_hidden = torch.arange(len(means)) < 3 * hidden
+    is_hidden = torch.arange(len(means)) < PROPOSALS * hidden
     while True:
         chosen = _first(possible & is_hidden, hidden) | _first(possible & ~is_hidden, copies)
         keep = torch.cat((torch.ones(len(rows), dtype=torch.bool), chosen))

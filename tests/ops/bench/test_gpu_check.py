@@ -17,6 +17,8 @@ def test_files_without_their_packages_are_left_out_and_named(tmp_path):
     }
     for name, text in files.items():
         (tmp_path / f"test_{name}.py").write_text(f"{text}\ndef test_it(): pass\n", encoding="utf-8")
+    # Names of files are relative to the folder of the settings.
+    (tmp_path / "pytest.ini").write_text("[pytest]\n", encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "leave_out_missing", "-p", "no:cacheprovider"]
     path = os.pathsep.join([str(SCRIPTS), os.environ.get("PYTHONPATH", "")])
     for more, broken in (([], 0), (["--continue-on-collection-errors"], 2)):
