@@ -27,7 +27,7 @@ test: $(VENV)/.ok
 	$(BIN)/python -m ruff check
 	$(BIN)/lint-imports
 	# One thread a process: tests are small, and threads that wait for each other cost more than they bring.
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
 demo: $(VENV)/.ok
 	$(BIN)/sparsestreet demo

@@ -24,6 +24,8 @@ from sparsestreet.training.optimizer import Optimization, Rate
 from sparsestreet.training.schedule import Window
 from tests.pruning.planted import Views, activated, judge, plant
 
+# One process trains for all tests.
+pytestmark = pytest.mark.xdist_group("planted street")
 STEPS = 600
 FEW_VISIBLE = 300
 """Rows whose visibility is measured; each costs about one rendering of a few views."""

@@ -35,7 +35,8 @@ IMAGE_BAR = {torch.float32: 1e-6, torch.float64: 1e-14}
 ROW_BAR = {torch.float32: 1e-5, torch.float64: 1e-13}
 WIDTH, HEIGHT = 75, 53
 
-pytestmark = pytest.mark.slow
+# One process compiles for all tests.
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiles")]
 
 
 @pytest.fixture(params=[8, 32])

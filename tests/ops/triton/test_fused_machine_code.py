@@ -10,6 +10,8 @@ from sparsestreet.ops.visible_adam import AdamStep, adam_step_
 from tests.ops.scenes import device_of
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
+# One process compiles for all tests.
+pytestmark = pytest.mark.xdist_group("machine code")
 ARCHITECTURES = ("80", "90")
 DEVICE = device_of("triton")
 # Measured with Triton 3.7.1: 22, 64 and 64. A streaming multiprocessor has 65536 registers: at 32 in each lane it holds

@@ -20,6 +20,8 @@ from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
+# One process compiles for all tests.
+pytestmark = pytest.mark.xdist_group("machine code")
 ARCHITECTURES = ("80", "90")
 DEVICE = device_of("triton")
 
