@@ -61,6 +61,7 @@ def launches_of_the_op(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
         displacements = torch.ones(3, 3, device=DEVICE) if moves else None
         scene = dataclasses.replace(scene, displacements=displacements)
         getattr(splat(scene, VIEWS[name], backend="triton", settings=settings), output).sum().backward()
+    scene = cast(random_gaussians(3, STILL, terms=1), torch.float32, requires_grad=True, device=DEVICE)
     with torch.no_grad():
         splat(scene, STILL, backend="triton")
     image = torch.ones(4, 5, 3, device=DEVICE)
