@@ -44,7 +44,7 @@ class Lists:
     order: Int[Tensor, " t"]
     """Tiles, those with most pairs first: the longest must not start last."""
     parts: Parts | None
-    """Where some tiles are so long that they are split."""
+    """Room for the parts of long tiles, empty where there are none; None where no tile can be long."""
 
 
 @partial(jit, do_not_specialize=["row_count"])

@@ -21,7 +21,7 @@ from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels
 from sparsestreet.ops.triton.language import jit
 
 PART_LENGTH = 256
-"""Least pairs of a part; none has twice as many."""
+"""Least pairs of a part; none has more than one and a half times as many."""
 PART_LIMIT = 8192
 """Most parts of a view: about twice the warps that a large GPU runs at once (21 to 28 on each of its 108 to 132
 multiprocessors), so that no part takes longer than the device's share of the whole view. 7 kB each."""
@@ -47,7 +47,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class PartLayers:
-    """What each part adds to its tile's pixels, and what is left behind it."""
+    """What each part adds to its tile's pixels (as in ``Raster``), and what is left behind it."""
 
     products: Float[Tensor, "s 256"]
     """Light that the part alone lets through."""
@@ -55,6 +55,7 @@ class PartLayers:
     transmittance: Float[Tensor, "s 256"]
     depth_sum: Float[Tensor, "s 256"]
     lasts: Int[Tensor, "s 256"]
+    """Index after the last pair of the part that each pixel was open to."""
 
     @staticmethod
     def empty(parts: Parts, like: Tensor) -> "PartLayers":
@@ -66,7 +67,10 @@ class PartLayers:
 
 
 def split_tiles(begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], pairs: int) -> Parts | None:
-    """Parts of all tiles that are long enough for two; None if no tile can be. Does not wait for the device."""
+    """Parts of all tiles that are long enough for two; None if the pairs are too few for one.
+
+    Does not wait for the device: there is room for the most parts that so many pairs could need.
+    """
     length = max(PART_LENGTH, -(-pairs // PART_LIMIT))
     most = pairs // length
     if most < 2:

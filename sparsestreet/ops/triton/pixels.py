@@ -1,4 +1,4 @@
-"""Which pixel kernels run for a view: one over whole tiles, and where there are long ones, some over their parts."""
+"""Which pixel kernels run for a view: one over whole tiles, and where there may be long ones, some over parts."""
 
 from dataclasses import dataclass
 
