@@ -40,7 +40,7 @@ export PYTHONUNBUFFERED=1
 export TORCH_EXTENSIONS_DIR="$WORK/extensions"
 export MPLCONFIGDIR="$WORK/matplotlib"
 
-export SUMMARISE='
+export SUMMARIZE='
 import json, sys
 
 record = json.load(open(sys.argv[1]))
@@ -164,7 +164,7 @@ run_training() {
   local steps=400 trainer=gpu
   [ "$DRY" = 0 ] || { steps=20 trainer=cpu; }
   run_part train 75 "$OUT/train.log" bash -c '"$@" && cp "$0/train/records/summary.json" "$0/train.json" &&
-    "$1" -c "$SUMMARISE" "$0/train.json"' "$WORK" "$PYTHON" -m sparsestreet train "trainer=$trainer" \
+    "$1" -c "$SUMMARIZE" "$0/train.json"' "$WORK" "$PYTHON" -m sparsestreet train "trainer=$trainer" \
     "schedule.max_steps=$steps" data.log.settings.width=160 data.log.settings.height=96 \
     data.log.settings.num_frames=10 "data.log.root=$WORK/street" "hydra.run.dir=$WORK/train"
   [ ! -f "$WORK/train.json" ] || cp "$WORK/train.json" "$OUT/train.json"

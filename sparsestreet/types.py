@@ -1,8 +1,8 @@
 """The frozen values that the wings of the package hand to each other.
 
-Conventions, everywhere: world frame metric and right-handed, re-centred at load; camera frame as in
+Conventions, everywhere: world frame metric and right-handed, re-centerd at load; camera frame as in
 OpenCV (x right, y down, z forward); quaternions wxyz; ``a_from_b`` maps points of frame b to frame a;
-pixel centres at +0.5; time in [0, 1] beside the integer frame; images float32 in [0, 1] at the splat
+pixel centers at +0.5; time in [0, 1] beside the integer frame; images float32 in [0, 1] at the splat
 op and uint8 in storage.
 """
 
@@ -18,17 +18,17 @@ class Gaussians:
     """Activated 3D Gaussians in the world frame (quaternions need not be unit)."""
 
     means: Float[Tensor, "n 3"]
-    """Centres, metres."""
+    """Centers, meters."""
     quaternions: Float[Tensor, "n 4"]
     """Rotation world_from_gaussian, wxyz, any non-zero length."""
     scales: Float[Tensor, "n 3"]
-    """Standard deviations along the Gaussian's own axes, metres, >= 0."""
+    """Standard deviations along the Gaussian's own axes, meters, >= 0."""
     opacities: Float[Tensor, " n"]
     """Peak alpha in [0, 1]; a row with opacity 0 is culled before projection."""
     sh: Float[Tensor, "n k 3"]
-    """Spherical harmonics, k in {1, 4, 9, 16}; colour = max(0, 0.5 + sum_i basis_i(direction) sh_i)."""
+    """Spherical harmonics, k in {1, 4, 9, 16}; color = max(0, 0.5 + sum_i basis_i(direction) sh_i)."""
     displacements: Float[Tensor, "n 3"] | None = None
-    """How far each row moves while an image is read out, metres in the world; None: nothing moves. Used only with
+    """How far each row moves while an image is read out, meters in the world; None: nothing moves. Used only with
     ``Camera.shutter``; it gets no gradient."""
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ class Shutter:
     """Motion of a camera while its rows are read from the first to the last; its pose is that of the middle row."""
 
     translation: Float[Tensor, "3"]
-    """Displacement of the camera over the whole readout, metres, in the camera frame."""
+    """Displacement of the camera over the whole readout, meters, in the camera frame."""
     rotation: Float[Tensor, "3"]
     """Rotation vector of the camera over the whole readout, radians, in the camera frame."""
 
@@ -83,7 +83,7 @@ class Camera:
 
     camera_from_world: Float[Tensor, "4 4"]
     intrinsics: Float[Tensor, "3 3"]
-    """Pixels; the top left pixel's centre is at (0.5, 0.5)."""
+    """Pixels; the top left pixel's center is at (0.5, 0.5)."""
     width: int
     height: int
     distortion: Float[Tensor, "5"] | None = None
@@ -93,43 +93,50 @@ class Camera:
 
     @property
     def position(self) -> Float[Tensor, "3"]:
-        """Camera centre in the world, metres."""
+        """Camera center in the world, meters."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         return -rotation.T @ translation
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One image of one camera at one instant, with what is known about its pixels."""
+class View:
+    """From where and when a scene is seen."""
 
-    index: int
-    """Integer frame of the log; all cameras of one instant share it."""
-    time: float
-    """Normalised time in [0, 1]."""
-    camera_index: int
     camera: Camera
+    time: float
+    """Normalized time in [0, 1]."""
+    frame_index: int | None = None
+    """Integer frame of the log; all cameras of one instant share it. None: between or beside the recorded frames."""
+    camera_index: int | None = None
+    """Which camera of the log's rig; None: none of them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame(View):
+    """A recorded view: its image, and what is known about its pixels. Both of a view's numbers are given."""
+
     image: UInt8[Tensor, "h w 3"]
     sky: Bool[Tensor, "h w"] | None = None
     human: Bool[Tensor, "h w"] | None = None
     vehicle: Bool[Tensor, "h w"] | None = None
     depth: Float[Tensor, "h w"] | None = None
-    """Lidar depth along the optical axis, metres; 0 where no return fell into the pixel."""
+    """Lidar depth along the optical axis, meters; 0 where no return fell into the pixel."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Lidar points of one instant in the world frame, coloured where a camera of that instant sees them."""
+    """Lidar points of one instant in the world frame, colored where a camera of that instant sees them."""
 
     index: int
     points: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
-    """RGB in [0, 1]; rows without ``colored`` are grey 0.5."""
+    """RGB in [0, 1]; rows without ``colored`` are gray 0.5."""
     colored: Bool[Tensor, " n"]
 
 
 @dataclass(frozen=True)
 class Track:
-    """One annotated object. Box frame: x along the length (heading), y left, z up, origin at the box centre."""
+    """One annotated object. Box frame: x along the length (heading), y left, z up, origin at the box center."""
 
     name: str
     class_name: str
@@ -137,11 +144,11 @@ class Track:
     """Annotated integer frames, strictly increasing, not necessarily without gaps."""
     world_from_object: Float64[Tensor, "f 4 4"]
     size: Float[Tensor, "3"]
-    """Length, width, height, metres (mean over the annotated frames)."""
+    """Length, width, height, meters (mean over the annotated frames)."""
 
     @property
-    def travel(self) -> float:
-        """Length of the path of the box centre over the annotated frames, metres."""
+    def path_length(self) -> float:
+        """Length of the path of the box center over the annotated frames, meters."""
         steps = self.world_from_object[1:, :3, 3] - self.world_from_object[:-1, :3, 3]
         return float(steps.norm(dim=-1).sum())
 
@@ -151,11 +158,11 @@ class Rendering:
     """What the splat op returns. Row-wise fields have one entry per input Gaussian, drawn or not."""
 
     rgb: Float[Tensor, "h w 3"]
-    """Blended colour over the background given to the op (premultiplied by alpha where none was given)."""
+    """Blended color over the background given to the op (premultiplied by alpha where none was given)."""
     alpha: Float[Tensor, "h w"]
     """1 - transmittance behind the last splat."""
     depth: Float[Tensor, "h w"]
-    """Expected depth along the optical axis, metres: sum(w z) / max(alpha, 1e-6)."""
+    """Expected depth along the optical axis, meters: sum(w z) / max(alpha, 1e-6)."""
     radii: Float[Tensor, " n"]
     """Half the longer side of the splat's pixel box, pixels; 0 where the row was culled."""
     screen_offsets: Float[Tensor, "n 2"]
@@ -180,10 +187,10 @@ class Contribution:
 
 
 @dataclass(frozen=True)
-class Removal:
+class LeaveOneOut:
     """How far one view moves when each row alone is taken away, the others staying as they are."""
 
-    largest: Float64[Tensor, " n"]
+    max_abs_change: Float64[Tensor, " n"]
     """Largest absolute change of a channel of a pixel."""
-    squared: Float64[Tensor, " n"]
+    squared_change: Float64[Tensor, " n"]
     """Sum over pixels and channels of the squared change, each pixel times its weight."""

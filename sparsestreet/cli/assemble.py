@@ -16,7 +16,7 @@ from sparsestreet.evaluation.records import RunDescription, RunSummary
 from sparsestreet.evaluation.run import evaluate_run
 from sparsestreet.ops import guards
 from sparsestreet.scene.build import build_scene
-from sparsestreet.scene.centres import node_legend, project_centres
+from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.training.system import StreetSystem
 
 
@@ -35,7 +35,7 @@ def assemble(cfg: DictConfig) -> Assembly:
     scene = build_scene(
         log,
         split.train,
-        frozenset(frame.index for frame in split.held_out),
+        frozenset(frame.frame_index for frame in split.held_out),
         instantiate(cfg.node, _convert_="all"),
         instantiate(cfg.sky) if cfg.sky else None,
         cfg.seed,
@@ -61,7 +61,7 @@ def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seco
     summary = evaluate_run(
         held_out,
         render=system.render,
-        centres=lambda frame: project_centres(scene, frame.camera, frame.time),
+        centers=lambda frame: project_centers(scene, frame.camera, frame.time),
         guards=lambda frame: guards(
             scene.gaussians_at(frame.time).gaussians, frame.camera, settings=system.options.settings
         ),

@@ -16,7 +16,7 @@ examples:
   sparsestreet bench                            knobs, on five scenes; the street is a stand-in made of numbers
   sparsestreet bench knobs --street RUN         the street of a run that train wrote; its exact images take minutes
   sparsestreet bench knobs --quick              the same at sizes that take seconds: to see that it runs
-  sparsestreet bench blend                      stages of the C++ backend beside vectorised torch, and the floor
+  sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -129,7 +129,7 @@ def trained_street(run: Path) -> BenchScene:
     with torch.no_grad():
         gaussians = parts.system.eval().scene.gaussians_at(frame.time).gaussians
     steps = checkpoint["global_step"]
-    source = f"trained: {cfg.name} on {parts.log.name}, seed {cfg.seed}, {steps} steps, frame {frame.index}"
+    source = f"trained: {cfg.name} on {parts.log.name}, seed {cfg.seed}, {steps} steps, frame {frame.frame_index}"
     return BenchScene("trained street", source, gaussians, frame.camera)
 
 

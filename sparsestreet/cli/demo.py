@@ -8,7 +8,7 @@ from pathlib import Path
 from sparsestreet.cli.report import report
 from sparsestreet.evaluation.compare import compare_runs
 from sparsestreet.evaluation.records import read_summary, summary_path
-from sparsestreet.scene.centres import node_legend
+from sparsestreet.scene.centers import node_legend
 
 USAGE = "sparsestreet demo [key=value ...]    the overrides go to both trainings (schedule.max_steps=500, seed=1 ...)"
 EXPERIMENTS = ("streetgs", "streetgs_ours")

@@ -38,7 +38,7 @@ def app(cfg: DictConfig) -> float:
     parts = assemble(cfg)
     clock = Clock()
     trainer = build_trainer(cfg, clock, out)
-    # A checkpoint holds the state of callbacks and optimiser as well, so it is no file of weights only.
+    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
     resume_options = {"ckpt_path": cfg.resume, "weights_only": False} if cfg.resume else {}
     trainer.fit(parts.system, datamodule=parts.datamodule, **resume_options)
     if trainer.fast_dev_run:

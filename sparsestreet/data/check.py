@@ -55,5 +55,5 @@ def _track_table(log: DrivingLog) -> Table:
     for name in sorted({track.class_name for track in log.tracks}):
         tracks = [track for track in log.tracks if track.class_name == name]
         boxes = sum(len(track.frames) for track in tracks)
-        table.add_row(escape(name), str(len(tracks)), str(boxes), f"{max(track.travel for track in tracks):.1f}")
+        table.add_row(escape(name), str(len(tracks)), str(boxes), f"{max(track.path_length for track in tracks):.1f}")
     return table

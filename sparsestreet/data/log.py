@@ -14,14 +14,14 @@ from sparsestreet.types import Frame, Sweep, Track
 _QUANTILES = (0.02, 0.98)
 _MARGIN = 1.1
 _SEEN_AHEAD = 50.0
-"""Metres a camera is taken to see where no lidar says so."""
+"""Meters a camera is taken to see where no lidar says so."""
 _QUANTILE_POINTS = 1_000_000
 """Quantiles of this many points are as good as of all of them, and take a tenth of a second."""
 
 
 @dataclass(frozen=True)
 class DrivingLog:
-    """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centred near its start."""
+    """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centerd near its start."""
 
     name: str
     frames: tuple[Frame, ...]
@@ -29,18 +29,18 @@ class DrivingLog:
     sweeps: tuple[Sweep, ...]
     """Ordered by index; empty where the log has no lidar."""
     tracks: tuple[Track, ...]
-    """Objects annotated in at least one of the frames; poses are in the re-centred world."""
+    """Objects annotated in at least one of the frames; poses are in the re-centerd world."""
     num_frames: int
     """Instants, not images: frame indices run over 0 .. num_frames - 1."""
     num_cameras: int
     dataset_from_world: Float64[Tensor, "4 4"]
-    """Adds back what re-centring took away: maps the log's world to the data set's own."""
+    """Adds back what re-centering took away: maps the log's world to the data set's own."""
     notes: tuple[str, ...] = ()
     """What is absent, and what a run does without it, one sentence each."""
 
     @cached_property
     def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Corners of the box around the camera centres and the 2 % to 98 % quantiles of the lidar points.
+        """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.
 
         Points that some camera sees count (DriveStudio's rule); without lidar, what lies 50 m ahead of each camera.
         """
@@ -58,13 +58,13 @@ class DrivingLog:
 
     @property
     def center(self) -> Float[Tensor, "3"]:
-        """Middle of the scene's box in the world, metres."""
+        """Middle of the scene's box in the world, meters."""
         low, high = self._bounds
         return torch.from_numpy((low + high) / 2).float()
 
     @property
     def radius(self) -> float:
-        """Size of the scene in metres: 1.1 times half the longest side of its box (DriveStudio's scene radius)."""
+        """Size of the scene in meters: 1.1 times half the longest side of its box (DriveStudio's scene radius)."""
         low, high = self._bounds
         return _MARGIN * float((high - low).max()) / 2
 
@@ -88,8 +88,8 @@ def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:
         raise ValueError(
             f"a split needs 0 <= offset < stride, got offset {offset} and stride {stride}: lower the offset"
         )
-    held_out = tuple(frame for frame in log.frames if frame.index % stride == offset)
-    train = tuple(frame for frame in log.frames if frame.index % stride != offset)
+    held_out = tuple(frame for frame in log.frames if frame.frame_index % stride == offset)
+    train = tuple(frame for frame in log.frames if frame.frame_index % stride != offset)
     if not train:
         raise ValueError(f"stride {stride} holds out all {log.num_frames} frames of {log.name!r}: take a larger stride")
     if not held_out:

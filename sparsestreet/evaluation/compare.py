@@ -7,12 +7,12 @@ from sparsestreet.evaluation.records import RunSummary, read_summary, summary_pa
 
 
 def compare_runs(plain: Path, ours: Path, sheet: Path, *, legend: Legend | None = None) -> None:
-    """Write the comparison sheet of two run folders: truth, renders, errors, centres before and after pruning.
+    """Write the comparison sheet of two run folders: truth, renders, errors, centers before and after pruning.
 
     Args:
         plain, ours: run folders with records and pictures of the same held-out images.
         sheet: PNG to write.
-        legend: node class -> RGB of its centres, drawn on the sheet.
+        legend: node class -> RGB of its centers, drawn on the sheet.
 
     Raises RecordError for malformed records, ValueError if the runs show other images or another scene.
     """

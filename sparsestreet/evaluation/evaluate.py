@@ -30,8 +30,8 @@ def clamped_render(render: Callable[[Frame], RenderedImage], frame: Frame) -> Fl
     finite = torch.isfinite(rgb)
     if not bool(finite.all()):
         raise ValueError(
-            f"the render of frame {frame.index}, camera {frame.camera_index} has {int((~finite).sum())} values that "
-            "are not finite: look for rows with NaN parameters in the scene"
+            f"the render of frame {frame.frame_index}, camera {frame.camera_index} has {int((~finite).sum())} values "
+            "that are not finite: look for rows with NaN parameters in the scene"
         )
     return rgb.clamp(0, 1)
 
@@ -57,7 +57,7 @@ def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame) -> FrameQuality:
     height, width = frame.image.shape[:2]
     full = RegionQuality(height * width, error, metrics.psnr_of_mse(error), metrics.ssim_of_map(similarity))
     return FrameQuality(
-        frame.index,
+        frame.frame_index,
         frame.camera_index,
         width,
         height,

@@ -1,4 +1,4 @@
-"""Pictures that let a person judge a run: truth, render, error and Gaussian centres side by side (no torch).
+"""Pictures that let a person judge a run: truth, render, error and Gaussian centers side by side (no torch).
 
 All images are uint8 [h, w, 3]. Errors share one fixed scale, written on every sheet, so that two sheets compare.
 """
@@ -12,12 +12,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 ERROR_SCALE = 0.2
-"""Mean absolute difference over RGB, in [0, 1], at which the error picture reaches its brightest colour."""
+"""Mean absolute difference over RGB, in [0, 1], at which the error picture reaches its brightest color."""
 
-KINDS = ("truth", "render", "error", "centres")
+KINDS = ("truth", "render", "error", "centers")
 
 Legend = Mapping[str, tuple[int, int, int]]
-"""Node class -> RGB in [0, 255] of its centres."""
+"""Node class -> RGB in [0, 255] of its centers."""
 
 # Perceptually uniform dark-to-bright map: 17 equally spaced samples of "inferno" (van der Walt and Smith, CC0).
 _INFERNO = np.array(
@@ -41,12 +41,12 @@ class Picture:
     camera: int
     truth: UInt8[np.ndarray, "h w 3"]
     render: UInt8[np.ndarray, "h w 3"]
-    centres: UInt8[np.ndarray, "h w 3"]
-    """The Gaussians' centres, projected."""
+    centers: UInt8[np.ndarray, "h w 3"]
+    """The Gaussians' centers, projected."""
 
     @property
     def error(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The coloured absolute difference of render and truth, on the common scale."""
+        """The colored absolute difference of render and truth, on the common scale."""
         return error_picture(self.render, self.truth)
 
 
@@ -58,8 +58,8 @@ class Tile:
     image: UInt8[np.ndarray, "h w 3"]
 
 
-def colour_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
-    """Values in [0, 1] (clipped) as colours from black through red to pale yellow."""
+def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
+    """Values in [0, 1] (clipped) as colors from black through red to pale yellow."""
     position = np.clip(values, 0, 1) * (len(_INFERNO) - 1)
     knots = np.arange(len(_INFERNO))
     channels = [np.interp(position, knots, _INFERNO[:, channel]) for channel in range(3)]
@@ -69,23 +69,23 @@ def colour_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape
 def error_picture(
     render: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], scale: float = ERROR_SCALE
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Mean absolute difference over RGB in [0, 1], divided by ``scale`` and coloured."""
+    """Mean absolute difference over RGB in [0, 1], divided by ``scale`` and colored."""
     difference = np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1) / 255
-    return colour_map(difference / scale)
+    return color_map(difference / scale)
 
 
 def picture_sheet(
     pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = 480
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """A sheet with one line per picture and the columns truth, render, error, centres.
+    """A sheet with one line per picture and the columns truth, render, error, centers.
 
     Args:
         pictures: at least one.
         title: printed on top, e.g. method, scene and PSNR.
-        legend: node class -> its colour in the centres, drawn at the foot.
+        legend: node class -> its color in the centers, drawn at the foot.
         tile_width: pixels of each column; images are scaled to it.
     """
-    headings = ("render", "error", "Gaussian centres")
+    headings = ("render", "error", "Gaussian centers")
     lines = [
         [
             Tile(f"truth: {_view(picture)}", picture.truth),
@@ -108,17 +108,17 @@ def comparison_sheet(
     legend: Legend | None = None,
     tile_width: int = 480,
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Two runs on the same images, one below the other: truth, renders, errors, centres before and after pruning.
+    """Two runs on the same images, one below the other: truth, renders, errors, centers before and after pruning.
 
-    Each picture takes two lines, so that the two renders (errors, centres) stand above each other at readable size.
+    Each picture takes two lines, so that the two renders (errors, centers) stand above each other at readable size.
     Raises ValueError if the two runs show different images.
     """
     views, other_views = ([(picture.frame, picture.camera) for picture in run] for run in (plain, ours))
     if views != other_views:
         raise ValueError(f"the runs show different images, (frame, camera) {views} and {other_views}: evaluate alike")
     kept = f"{ours_count:,} Gaussians ({100 * ours_count / max(plain_count, 1):.0f} %)"
-    headings = (f"render: {plain_label}", f"error: {plain_label}", f"centres before: {plain_count:,} Gaussians")
-    our_headings = (f"render: {ours_label}", f"error: {ours_label}", f"centres after: {kept}")
+    headings = (f"render: {plain_label}", f"error: {plain_label}", f"centers before: {plain_count:,} Gaussians")
+    our_headings = (f"render: {ours_label}", f"error: {ours_label}", f"centers after: {kept}")
     lines = []
     for before, after in zip(plain, ours, strict=True):
         tiles = [Tile(*pair) for pair in zip(headings, _outcome(before), strict=True)]
@@ -139,8 +139,8 @@ def picture_path(folder: Path, frame: int, camera: int, kind: str) -> Path:
 
 
 def write_picture(folder: Path, picture: Picture) -> None:
-    """Write truth, render, error and centres as single PNGs in their own resolution."""
-    images = (picture.truth, picture.render, picture.error, picture.centres)
+    """Write truth, render, error and centers as single PNGs in their own resolution."""
+    images = (picture.truth, picture.render, picture.error, picture.centers)
     for kind, image in zip(KINDS, images, strict=True):
         write_png(picture_path(folder, picture.frame, picture.camera, kind), image)
 
@@ -148,7 +148,7 @@ def write_picture(folder: Path, picture: Picture) -> None:
 def read_pictures(folder: Path) -> list[Picture]:
     """The pictures that a run left in its folder, in order of frame and camera.
 
-    Raises FileNotFoundError if there are none, or one lacks its render or centres.
+    Raises FileNotFoundError if there are none, or one lacks its render or centers.
     """
     suffix = "_truth.png"
     keys = sorted(
@@ -174,7 +174,7 @@ def _view(picture: Picture) -> str:
 
 
 def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return picture.render, picture.error, picture.centres
+    return picture.render, picture.error, picture.centers
 
 
 def _sheet(
@@ -202,20 +202,20 @@ def _sheet(
 
 
 def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int) -> None:
-    """The error colours with their values."""
+    """The error colors with their values."""
     x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
-    bar = colour_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
+    bar = color_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
     paper.paste(Image.fromarray(bar), (x, y))
     draw.rectangle((x - 1, y - 1, x + 160, y + 16), outline=_QUIET)
     _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13)
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:
-    """The node classes in the colours of their centres."""
+    """The node classes in the colors of their centers."""
     if legend:
-        x = _write(draw, (x, y), "centres:", _QUIET, 13) + 12
-    for name, colour in legend.items():
-        draw.rectangle((x, y + 3, x + 10, y + 13), fill=colour)
+        x = _write(draw, (x, y), "centers:", _QUIET, 13) + 12
+    for name, color in legend.items():
+        draw.rectangle((x, y + 3, x + 10, y + 13), fill=color)
         x = _write(draw, (x + 16, y), name, _QUIET, 13) + 20
 
 
@@ -230,14 +230,14 @@ def _write(
     draw: ImageDraw.ImageDraw,
     position: tuple[int, int],
     text: str,
-    colour: tuple[int, int, int],
+    color: tuple[int, int, int],
     size: int,
     room: int | None = None,
 ) -> int:
     """Write a line and return where it ends; short of room the type shrinks (not below 8 pixels)."""
     while room is not None and size > 8 and draw.textlength(text, font=_font(size)) > room:
         size -= 1
-    draw.text(position, text, fill=colour, font=_font(size))
+    draw.text(position, text, fill=color, font=_font(size))
     return position[0] + round(draw.textlength(text, font=_font(size)))
 
 

@@ -10,8 +10,8 @@ from matplotlib.ticker import FuncFormatter
 
 from sparsestreet.evaluation.records import RunSummary
 
-# Okabe and Ito's palette: distinguishable with any colour vision.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+# Okabe and Ito's palette: distinguishable with any color vision.
+_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _MARKERS = "osD^vP*X"
 
 
@@ -28,7 +28,7 @@ def plot_counts(
         path: PNG to write.
         steps: training steps of the samples, increasing.
         counts: node class -> number of rows at each step (logarithmic axis; zeros are not drawn).
-        events: (step, what happened), e.g. (2800, "background prune"); events of one name share a colour.
+        events: (step, what happened), e.g. (2800, "background prune"); events of one name share a color.
     """
     for name, values in counts.items():
         if len(values) != len(steps):
@@ -68,7 +68,7 @@ def plot_runs(path: Path, summaries: Sequence[RunSummary], title: str = "Quality
         axes.scatter(
             [summary.gaussians_total for summary in runs],
             [summary.quality["psnr_full"].mean for summary in runs],
-            color=_COLOURS[index % len(_COLOURS)],
+            color=_COLORS[index % len(_COLORS)],
             marker=_MARKERS[index % len(_MARKERS)],
             s=46,
             alpha=0.85,
@@ -94,7 +94,7 @@ def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 
 def _line(index: int) -> dict[str, str | float]:
-    return {"color": _COLOURS[index % len(_COLOURS)], "linewidth": 1.6}
+    return {"color": _COLORS[index % len(_COLORS)], "linewidth": 1.6}
 
 
 def _short(value: float) -> str:

@@ -57,7 +57,7 @@ class MetricSummary:
     """Number of images whose PSNR was cut off at the cap (0 for other metrics)."""
 
 
-def summarise(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
+def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
     """Id of each metric of ``DEFINITIONS`` -> its mean over the images that have the region."""
     images = list(quality)
     summaries = {}

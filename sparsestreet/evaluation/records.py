@@ -42,7 +42,7 @@ class Latency:
         """How the numbers were taken, in words."""
         return (
             f"{self.repeats} renders cycling through {self.views} views after {self.warmup} warm-up renders, batch 1, "
-            "device synchronised, scene assembly to RGB, without loading and metrics"
+            "device synchronized, scene assembly to RGB, without loading and metrics"
         )
 
 

@@ -12,7 +12,7 @@ from sparsestreet.evaluation.evaluate import RenderedImage, clamped_render, eval
 from sparsestreet.evaluation.metrics.definitions import DEFINITIONS
 from sparsestreet.evaluation.pictures import KINDS, Legend, Picture, picture_sheet, write_picture, write_png
 from sparsestreet.evaluation.provenance import this_machine, this_source
-from sparsestreet.evaluation.quality import FrameQuality, summarise
+from sparsestreet.evaluation.quality import FrameQuality, summarize
 from sparsestreet.evaluation.records import (
     FORMAT,
     GuardCounts,
@@ -29,7 +29,7 @@ from sparsestreet.ops import Guards
 from sparsestreet.types import Frame
 
 Render = Callable[[Frame], RenderedImage]
-Centres = Callable[[Frame], Tensor]
+Centers = Callable[[Frame], Tensor]
 CountGuards = Callable[[Frame], Guards]
 
 
@@ -37,7 +37,7 @@ def evaluate_run(
     frames: Sequence[Frame],
     *,
     render: Render,
-    centres: Centres,
+    centers: Centers,
     guards: CountGuards,
     gaussians: dict[str, int],
     bytes_by_part: dict[str, int],
@@ -53,13 +53,13 @@ def evaluate_run(
     Args:
         frames: held-out frames; a sequence that loads images when indexed is fine, none is kept.
         render: a frame to its rendering [h, w, 3].
-        centres: a frame to a picture of the Gaussians' centres, Float [h, w, 3] in [0, 1].
+        centers: a frame to a picture of the Gaussians' centers, Float [h, w, 3] in [0, 1].
         guards: a frame to the guards of the op that its render needs.
         gaussians: node class -> number of rows.
         bytes_by_part: part of the scene -> bytes of its parameters.
         run: what identifies the run.
         out: the run's folder.
-        legend: node class -> RGB in [0, 255] of its centres, for the picture sheet.
+        legend: node class -> RGB in [0, 255] of its centers, for the picture sheet.
         pictures: how many held-out images become pictures.
         warmup, repeats: of the latency protocol.
 
@@ -70,7 +70,7 @@ def evaluate_run(
     quality = list(evaluate_frames(render, frames))
     latency = measure_latency(render, frames, warmup=warmup, repeats=repeats)
     summary = _summary(quality, latency, _guard_counts(guards, frames), gaussians, bytes_by_part, run)
-    chosen = [_picture(frames[index], render, centres) for index in choose_pictures(quality, pictures)]
+    chosen = [_picture(frames[index], render, centers) for index in choose_pictures(quality, pictures)]
     _write_pictures(chosen, summary, legend, out / "pictures")
     write_quality(quality_path(out), quality)
     write_summary(summary_path(out), summary)
@@ -95,7 +95,7 @@ def _summary(
         run=run,
         images=len(quality),
         resolutions=tuple(sorted({f"{image.width}x{image.height}" for image in quality})),
-        quality=summarise(quality),
+        quality=summarize(quality),
         definitions=DEFINITIONS,
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
@@ -153,13 +153,13 @@ def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Lege
     write_png(folder / "sheet.png", picture_sheet(chosen, title=title, legend=legend))
 
 
-def _picture(frame: Frame, render: Render, centres: Centres) -> Picture:
+def _picture(frame: Frame, render: Render, centers: Centers) -> Picture:
     return Picture(
-        frame.index,
+        frame.frame_index,
         frame.camera_index,
         frame.image.cpu().numpy(),
         _uint8(clamped_render(render, frame)),
-        _uint8(centres(frame)),
+        _uint8(centers(frame)),
     )
 
 

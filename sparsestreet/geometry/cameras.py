@@ -1,4 +1,4 @@
-"""The pinhole projection outside the splat op: lidar colouring, visibility of seeds, box masks, sky rays; and where
+"""The pinhole projection outside the splat op: lidar coloring, visibility of seeds, box masks, sky rays; and where
 the camera is, for both."""
 
 import torch
@@ -10,7 +10,7 @@ from sparsestreet.types import Camera
 
 
 def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
-    """The c in R (m - c) = R m + t, metres, in float64 whatever the pose's dtype.
+    """The c in R (m - c) = R m + t, meters, in float64 whatever the pose's dtype.
 
     Solved for, so that it holds for a rotation that is orthonormal only to its dtype's last digit: over 20 km that
     digit of a float32 is 1 mm.
@@ -22,7 +22,7 @@ def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
 def project(
     camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Pixel coordinates, depth along the optical axis (metres) and whether each world point is in the image."""
+    """Pixel coordinates, depth along the optical axis (meters) and whether each world point is in the image."""
     in_camera = transform_points(camera.camera_from_world.to(points.dtype), points)
     depth = in_camera[:, 2]
     safe = depth.clamp(min=near)
@@ -32,7 +32,7 @@ def project(
 
 
 def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[Tensor, "h w 3"]:
-    """Unit directions in the world through the pixel centres, in the camera's dtype on a device."""
+    """Unit directions in the world through the pixel centers, in the camera's dtype on a device."""
     like = {"dtype": camera.intrinsics.dtype, "device": device}
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     x = (torch.arange(camera.width, **like) + 0.5 - cx) / fx

@@ -1,4 +1,4 @@
-"""Brown-Conrady lens distortion of normalised image points (x = X/Z, y = Y/Z), with OpenCV's order of coefficients.
+"""Brown-Conrady lens distortion of normalized image points (x = X/Z, y = Y/Z), with OpenCV's order of coefficients.
 
 With r2 = x^2 + y^2 and radial = 1 + k1 r2 + k2 r2^2 + k3 r2^3 (Brown, "Close-range camera calibration", 1971):
 
@@ -8,7 +8,7 @@ With r2 = x^2 + y^2 and radial = 1 + k1 r2 + k2 r2^2 + k3 r2^3 (Brown, "Close-ra
 A polynomial that was fitted inside an image does not describe the lens far outside of it. The radius r radial(r2) of
 the distorted point grows only up to a certain r2, where it folds back; or it grows with r^7, beyond what float32 can
 carry. From where its slope leaves (0, 4), here called the fold in both cases, the map is continued along each ray from
-the centre in proportion to the radius, D(x) = D(s x) / s with s x at the fold: it stays continuous, no point from far
+the center in proportion to the radius, D(x) = D(s x) / s with s x at the fold: it stays continuous, no point from far
 outside lands in the image, and none lands more than 4 times as far out as a pinhole would put it.
 """
 
@@ -34,7 +34,7 @@ def fold_radius_squared(distortion: Float[Tensor, "5"]) -> float:
 
 
 def distort(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> Float[Tensor, "*b 2"]:
-    """Where the lens images normalised points; differentiable in the points, not in the coefficients."""
+    """Where the lens images normalized points; differentiable in the points, not in the coefficients."""
     fold = fold_radius_squared(distortion)
     if math.isinf(fold):
         return _brown_conrady(points, distortion)

@@ -91,7 +91,7 @@ def slerp(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"], fraction: Float[Te
     b = torch.where(dot < 0, -b, b)
     dot = dot.abs().clamp(max=1.0)
     fraction = fraction[..., None]
-    near = dot > 0.9995  # below 1.8 degrees a normalised lerp differs from slerp by less than 1e-6
+    near = dot > 0.9995  # below 1.8 degrees a normalized lerp differs from slerp by less than 1e-6
     theta = torch.acos(torch.where(near, torch.zeros_like(dot), dot))
     sine = torch.sin(theta)
     weight_a = torch.where(near, 1 - fraction, torch.sin((1 - fraction) * theta) / sine)

@@ -4,7 +4,7 @@ from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.guards import Guards, guards
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.splat import contribution, removal, splat
+from sparsestreet.ops.splat import contribution, leave_one_out, splat
 
 __all__ = [
     "Guards",
@@ -12,7 +12,7 @@ __all__ = [
     "SplatSettings",
     "contribution",
     "guards",
-    "removal",
+    "leave_one_out",
     "resolve_backend",
     "splat",
 ]

@@ -42,7 +42,7 @@ class Guards:
     faint: int = 0
     """Peak alpha below ``alpha_min``."""
     outside: int = 0
-    """The box holds no pixel centre of the image."""
+    """The box holds no pixel center of the image."""
 
     identity_quaternion: int = 0
     """A quaternion without length, taken as the identity. An alarm."""
@@ -97,14 +97,14 @@ def _acting(
     gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings
 ) -> dict[str, Bool[Tensor, " v"]]:
     """Which of the drawn rows each guard acts on."""
-    # Colours as they are before they are rounded.
+    # Colors as they are before they are rounded.
     splats = on_screen(gaussians, rows, camera, replace(settings, half_colors=False))
     in_camera, none = to_camera(gaussians.means[rows], camera), torch.zeros_like(rows, dtype=torch.bool)
     if camera.distortion is None:
         slope_held, sigma_point_held = slopes_held(in_camera, camera), none
     else:
         axes = axes_in_camera(gaussians, rows, camera)
-        slope_held, sigma_point_held = none, sigma_points_held(in_camera, axes, camera, settings.near)
+        slope_held, sigma_point_held = none, sigma_points_held(in_camera, axes, camera, settings.near_plane)
     return {
         "identity_quaternion": (gaussians.quaternions[rows] == 0).all(-1),
         "slope_held": slope_held,

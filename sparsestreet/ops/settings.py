@@ -23,17 +23,17 @@ class SplatSettings:
     stop: StopRule = "inclusive"
     """``inclusive``: the splat that crosses transmittance_min is still blended (error <= transmittance_min);
     ``exclusive``: it is dropped, as in 3DGS and gsplat."""
-    blur: float = 0.3
+    eps2d: float = 0.3
     """Low-pass added to both diagonal entries of the screen covariance, px^2, >= 0 (3DGS, screen-space dilation)."""
-    near: float = 0.2
-    """Rows at this depth or nearer are culled, metres, > 0."""
-    box: float = inf
+    near_plane: float = 0.2
+    """Rows at this depth or nearer are culled, meters, > 0."""
+    max_sigma: float = inf
     """A splat ends this many standard deviations from its mean, > 0, besides at ``alpha_min`` (gsplat: 3.33)."""
     depth_bits: int = 32
     """Upper bits of the float32 depth that are sorted, 9 to 32 (9: powers of two of the depth); fewer order near ties
     by row."""
     half_colors: bool = False
-    """Round colours to float16 before blending (gradient as if not rounded)."""
+    """Round colors to float16 before blending (gradient as if not rounded)."""
     antialias: bool = False
     """Multiply opacity by sqrt(det / det_blurred), so that blur does not brighten small splats (Mip-Splatting)."""
 
@@ -42,10 +42,10 @@ class SplatSettings:
         _require(0 <= self.alpha_min < self.alpha_max, "alpha_min must lie in [0, alpha_max)", self.alpha_min)
         _require(0 <= self.transmittance_min < 1, "transmittance_min must lie in [0, 1)", self.transmittance_min)
         _require(self.stop in ("inclusive", "exclusive"), "stop must be 'inclusive' or 'exclusive'", self.stop)
-        _require(0 <= self.blur < float("inf"), "blur must be finite and >= 0 px^2", self.blur)
-        _require(self.box > 0, "box must be > 0 standard deviations", self.box)
+        _require(0 <= self.eps2d < float("inf"), "eps2d must be finite and >= 0 px^2", self.eps2d)
+        _require(self.max_sigma > 0, "max_sigma must be > 0 standard deviations", self.max_sigma)
         _require(9 <= self.depth_bits <= 32, "depth_bits must lie in [9, 32]", self.depth_bits)
-        _require(0 < self.near < float("inf"), "near must be finite and > 0 m", self.near)
+        _require(0 < self.near_plane < float("inf"), "near_plane must be finite and > 0 m", self.near_plane)
 
     @staticmethod
     def preset(name: str) -> "SplatSettings":
@@ -67,12 +67,12 @@ _PRESETS = {
     "default": SplatSettings(),
     # The clamp of alpha is part of the model, not a cut-off: it stays.
     "exact": SplatSettings(alpha_min=0.0, transmittance_min=0.0),
-    "gsplat15": SplatSettings(alpha_max=0.999, stop="exclusive", near=0.01),
-    "gsplat16": SplatSettings(stop="exclusive", near=0.01),
+    "gsplat15": SplatSettings(alpha_max=0.999, stop="exclusive", near_plane=0.01),
+    "gsplat16": SplatSettings(stop="exclusive", near_plane=0.01),
     "inria": SplatSettings(stop="exclusive"),
     # Splats end at 4 standard deviations instead of at an alpha: 20 dB and more nearer to "exact" than the default,
     # for little more time where stacks are shallow (docs/scaling.md).
-    "fine": SplatSettings(alpha_min=0.0, box=4.0),
+    "fine": SplatSettings(alpha_min=0.0, max_sigma=4.0),
     # About 50 dB against "exact"; fewer pixels per splat and earlier stops.
     "fast": SplatSettings(alpha_min=1 / 128, transmittance_min=1e-3),
 }

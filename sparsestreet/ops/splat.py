@@ -8,11 +8,11 @@ from torch import Tensor
 
 from sparsestreet.ops import reference
 from sparsestreet.ops.backend import resolve_backend
-from sparsestreet.ops.cpu import rasteriser as cpu
+from sparsestreet.ops.cpu import rasterizer as cpu
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_pixel_weights, check_structure, check_values
-from sparsestreet.types import Camera, Contribution, Gaussians, Removal, Rendering
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
 _LEAST_ALPHA = 1e-6
@@ -29,11 +29,11 @@ def splat(
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
     Differentiable in every field of ``gaussians`` but ``displacements`` (in means also through the view direction of
-    the colours) and in ``background``; not in the camera. Autocast has no effect here: everything runs in the dtype of
+    the colors) and in ``background``; not in the camera. Autocast has no effect here: everything runs in the dtype of
     the Gaussians, whatever the camera's.
 
     Args:
-        gaussians: n rows in the world, metres; n = 0 gives the background.
+        gaussians: n rows in the world, meters; n = 0 gives the background.
         camera: pinhole without skew, with its lens and rolling shutter where given (docs/effects.md).
         background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha. On a GPU its
             values are not looked at, which would be one more wait for the device: what is not finite shows in rgb.
@@ -53,9 +53,9 @@ def splat(
         offsets = _screen_offsets(gaussians)
         if chosen == "reference":
             check_values(gaussians)
-            raster = reference.rasterise(gaussians, offsets, camera, settings)
+            raster = reference.rasterize(gaussians, offsets, camera, settings)
         else:
-            raster = _fast(chosen).rasterise(gaussians, offsets, camera, settings)
+            raster = _fast(chosen).rasterize(gaussians, offsets, camera, settings)
         return _compose(raster, offsets, background)
 
 
@@ -79,7 +79,7 @@ def contribution(
         return _fast(chosen).contribution(gaussians, camera, settings)
 
 
-def removal(
+def leave_one_out(
     gaussians: Gaussians,
     camera: Camera,
     *,
@@ -87,7 +87,7 @@ def removal(
     pixel_weights: Float[Tensor, "h w"] | None = None,
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
-) -> Removal:
+) -> LeaveOneOut:
     """How far the view moves when each row alone is taken away, over a background (None: black). No gradients.
 
     ``pixel_weights``, finite and >= 0: how much the squared change of each pixel counts; None: 1.
@@ -106,17 +106,17 @@ def removal(
         behind = None if background is None else background.expand(camera.height, camera.width, 3)
         if chosen == "reference":
             check_values(gaussians)
-            return reference.removal(gaussians, behind, pixel_weights, camera, settings)
-        return _fast(chosen).removal(gaussians, behind, pixel_weights, camera, settings)
+            return reference.leave_one_out(gaussians, behind, pixel_weights, camera, settings)
+        return _fast(chosen).leave_one_out(gaussians, behind, pixel_weights, camera, settings)
 
 
 def _fast(backend: str) -> ModuleType:
     """The module of a backend that checks values itself. Triton is imported only here, when it is first used."""
     if backend == "cpu":
         return cpu
-    from sparsestreet.ops.triton import rasteriser
+    from sparsestreet.ops.triton import rasterizer
 
-    return rasteriser
+    return rasterizer
 
 
 def _screen_offsets(gaussians: Gaussians) -> Float[Tensor, "n 2"]:

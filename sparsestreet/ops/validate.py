@@ -9,7 +9,7 @@ from torch import Tensor
 from sparsestreet.types import Camera, Gaussians
 
 LONGEST_SIDE = 1 << 22
-"""Pixels: up to here the centres of all pixels are exact in float32."""
+"""Pixels: up to here the centers of all pixels are exact in float32."""
 MOST_PIXELS = 1 << 29
 """Places in an image of three channels then fit 32 bits, in which the GPU's kernels count."""
 RIGID_TOLERANCE = 1e-3
@@ -49,7 +49,7 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
     if moved is not None and (moved.shape != means.shape or moved.dtype != means.dtype or moved.device != means.device):
         raise ValueError(
             f"displacements must be {list(means.shape)} {means.dtype} on {means.device} like the means, got "
-            f"{list(moved.shape)} {moved.dtype} on {moved.device}: give one row of metres per Gaussian"
+            f"{list(moved.shape)} {moved.dtype} on {moved.device}: give one row of meters per Gaussian"
         )
     if background is not None:
         _check_background(background, camera, means)
@@ -79,7 +79,7 @@ def check_values(gaussians: Gaussians) -> None:
         _raise_at(name, field, torch.isfinite(field), masked, "must be finite", "find the step that made it")
     inside = (opacities >= 0) & (opacities <= 1)
     _raise_at("opacities", opacities, inside, masked, "must lie in [0, 1]", "apply the sigmoid")
-    _raise_at("scales", scales, scales >= 0, masked, "must be >= 0 metres", "apply the exponential")
+    _raise_at("scales", scales, scales >= 0, masked, "must be >= 0 meters", "apply the exponential")
 
 
 def _raise_at(name: str, field: Tensor, holds: Tensor, masked: Tensor, invariant: str, remedy: str) -> None:

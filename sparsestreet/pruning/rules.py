@@ -9,12 +9,12 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
-from sparsestreet.ops import SplatSettings, contribution, removal
+from sparsestreet.ops import SplatSettings, contribution, leave_one_out
 from sparsestreet.pruning.importance import measure_importance
 from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import backdrop, render
-from sparsestreet.types import Contribution, Frame, Removal
+from sparsestreet.scene.rendering import render, sky_image
+from sparsestreet.types import Contribution, Frame, LeaveOneOut
 
 LEAST_ERROR = 1e-12
 """Squared error (images lie in [0, 1]) that stands for none; its inverse fits into float32."""
@@ -30,10 +30,10 @@ class View:
 
 @runtime_checkable
 class PruningRule(Protocol):
-    """Answers, for the nodes in ``minimum_rows`` (name -> K_min), which rows stay. Without gradients."""
+    """Answers, for the nodes in ``min_gaussians`` (name -> K_min), which rows stay. Without gradients."""
 
     def select(
-        self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
+        self, scene: SceneGraph, frames: Sequence[Frame], min_gaussians: dict[str, int], view: View
     ) -> dict[str, Selection]: ...
 
 
@@ -49,15 +49,15 @@ class ImportanceRule:
 
     @torch.no_grad()
     def select(
-        self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
+        self, scene: SceneGraph, frames: Sequence[Frame], min_gaussians: dict[str, int], view: View
     ) -> dict[str, Selection]:
         scores = measure_importance(_contributions(scene, frames, view), gate=self.gate)
         spans = scene.gaussians_at(frames[0].time).rows
-        return {name: keep_by_importance(scores[spans[name]], floor) for name, floor in minimum_rows.items()}
+        return {name: keep_by_importance(scores[spans[name]], floor) for name, floor in min_gaussians.items()}
 
 
 @dataclass(frozen=True)
-class RemovalRule:
+class LeaveOneOutRule:
     """Rows go that the training images miss least, as many as cost ``allowed_db`` of their PSNR.
 
     The cost of a row is the sum over views, pixels and channels of the squared change when it alone is taken away,
@@ -84,7 +84,7 @@ class RemovalRule:
 
     @torch.no_grad()
     def select(
-        self, scene: SceneGraph, frames: Sequence[Frame], minimum_rows: dict[str, int], view: View
+        self, scene: SceneGraph, frames: Sequence[Frame], min_gaussians: dict[str, int], view: View
     ) -> dict[str, Selection]:
         errors = sum(_squared_errors(scene, frame, view) for frame in _beside(scene, frames))
         spans = scene.gaussians_at(frames[0].time).rows
@@ -92,10 +92,10 @@ class RemovalRule:
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
         for frame in _beside(scene, frames):
             change = _removal(scene, frame, errors, view)
-            largest, squared = torch.maximum(largest, change.largest), squared + change.squared
+            largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         costs = torch.where(largest > self.noticeable, squared, 0.0)
         return keep_by_cost(
-            {name: costs[spans[name]] for name in minimum_rows}, 10 ** (self.allowed_db / 10) - 1, minimum_rows
+            {name: costs[spans[name]] for name in min_gaussians}, 10 ** (self.allowed_db / 10) - 1, min_gaussians
         )
 
 
@@ -107,15 +107,15 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
     return torch.stack([everywhere, *marked]).float()
 
 
-def _removal(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], view: View) -> Removal:
+def _removal(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], view: View) -> LeaveOneOut:
     """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
     # Where there is no error left, any change is too dear. A region that no frame marks has no pixel to weigh.
     share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
-    return removal(
+    return leave_one_out(
         scene.gaussians_at(frame.time).gaussians,
         frame.camera,
-        background=backdrop(scene, frame.camera),
+        background=sky_image(scene, frame.camera),
         pixel_weights=weights,
         settings=view.settings,
         backend=view.backend,

@@ -9,7 +9,7 @@ import torch
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.node import Node
-from sparsestreet.scene.seeds import BackgroundSeeds, RigidSeeds
+from sparsestreet.scene.seeds import BackgroundSettings, RigidSettings
 from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import Frame
 
@@ -20,7 +20,7 @@ def build_scene(
     log: DrivingLog,
     train_frames: Sequence[Frame],
     held_out: frozenset[int],
-    nodes: Mapping[str, BackgroundSeeds | RigidSeeds],
+    nodes: Mapping[str, BackgroundSettings | RigidSettings],
     sky: SkySettings | None,
     seed: int,
 ) -> SceneGraph:
@@ -28,7 +28,7 @@ def build_scene(
 
     Args:
         log: the drive.
-        train_frames: views that random points are placed in and coloured by.
+        train_frames: views that random points are placed in and colored by.
         held_out: integer frames whose sweeps and boxes must not be used.
         nodes: name of the node class -> its seeds. A class without any instance is left out, and the log says so.
         sky: settings of the cube map; None for a scene without sky.

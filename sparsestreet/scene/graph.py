@@ -37,7 +37,7 @@ class SceneGraph(nn.Module):
         return next(self.parameters()).device
 
     def gaussians_at(self, time: float) -> SceneGaussians:
-        """Activated Gaussians of all nodes in the world at a normalised time."""
+        """Activated Gaussians of all nodes in the world at a normalized time."""
         parts, rows, start = [], {}, 0
         for name, node in self.nodes.items():
             part = node.gaussians_at(time, self.active_sh_degree)

@@ -19,11 +19,11 @@ class SceneRendering:
     """An image of the scene and what losses, density control and pruning need to know about it."""
 
     rgb: Float[Tensor, "h w 3"]
-    """Colour over the sky (over black without one), not clamped."""
+    """Color over the sky (over black without one), not clamped."""
     alpha: Float[Tensor, "h w"]
     """Coverage by Gaussians; the sky does not count."""
     depth: Float[Tensor, "h w"]
-    """Expected depth of the Gaussians along the optical axis, metres."""
+    """Expected depth of the Gaussians along the optical axis, meters."""
     splats: Rendering
     """The op's answer, row-wise fields included."""
     rows: dict[str, slice]
@@ -40,7 +40,7 @@ def render(
     settings: SplatSettings = SplatSettings(),  # noqa: B008 (frozen)
     backend: str = "auto",
 ) -> SceneRendering:
-    """Render the scene at a normalised time in [0, 1], in full precision also under autocast."""
+    """Render the scene at a normalized time in [0, 1], in full precision also under autocast."""
     with torch.autocast(scene.device.type, enabled=False):
         placed = scene.gaussians_at(time)
         splats = splat(placed.gaussians, camera, settings=settings, backend=backend)
@@ -48,7 +48,7 @@ def render(
         return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.rows, scene.mask_terms())
 
 
-def backdrop(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:
+def sky_image(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:
     """The sky in every pixel of a camera, as it is seen where nothing stands before it; None: black, no sky."""
     return None if scene.sky is None else scene.sky.colors(ray_directions(camera, scene.device))
 

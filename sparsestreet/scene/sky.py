@@ -1,4 +1,4 @@
-"""The sky: a colour for every direction, at infinity."""
+"""The sky: a color for every direction, at infinity."""
 
 from dataclasses import dataclass
 
@@ -43,7 +43,7 @@ class Sky(nn.Module):
         self.register_buffer("bordered", _bordered_texels(side), persistent=False)
 
     def colors(self, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Colour seen along world directions of any non-zero length; gradients go to the texels only."""
+        """Color seen along world directions of any non-zero length; gradients go to the texels only."""
         corners, weights = self._corners(directions.detach().reshape(-1, 3).to(self.texels.dtype))
         # gather, because of the ways to read rows its backward is the fast one on the CPU.
         index = corners.reshape(-1, 1).expand(-1, 3)
@@ -68,7 +68,7 @@ class Sky(nn.Module):
 def _face_coordinates(
     directions: Float[Tensor, "p 3"], side: int
 ) -> tuple[Int[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
-    """Face, column and row of directions, in texels with centres at whole numbers: both in [-0.5, side - 0.5]."""
+    """Face, column and row of directions, in texels with centers at whole numbers: both in [-0.5, side - 0.5]."""
     largest = directions.abs().argmax(1, keepdim=True)
     component = directions.gather(1, largest)
     on_cube = directions / component.abs()
@@ -82,11 +82,11 @@ def _face_coordinates(
 def _bordered_texels(side: int) -> Int[Tensor, " n"]:
     """Flat texel index for every entry of the faces with a border of one texel, flattened [6, side + 2, side + 2].
 
-    A border entry is the texel of the neighbouring face that its direction hits: bilinear interpolation then mixes
+    A border entry is the texel of the neighboring face that its direction hits: bilinear interpolation then mixes
     the same two texels on either side of an edge, and the sky has no seams.
     """
-    centres = (torch.arange(-1, side + 1, dtype=torch.float64) + 0.5) * (2 / side) - 1
-    row, column = torch.meshgrid(centres, centres, indexing="ij")
+    centers = (torch.arange(-1, side + 1, dtype=torch.float64) + 0.5) * (2 / side) - 1
+    row, column = torch.meshgrid(centers, centers, indexing="ij")
     on_face = torch.stack((torch.ones_like(row), column, row), dim=-1)
     directions = torch.einsum("rca,fab->frcb", on_face, _FACES)
     face, column, row = _face_coordinates(directions.reshape(-1, 3), side)

@@ -10,14 +10,14 @@ from sparsestreet.training.visible_adam import VisibleAdam
 
 
 @dataclass(frozen=True)
-class Rate:
+class LearningRate:
     """A learning rate that decays log-linearly from ``initial`` to ``final`` over the run."""
 
     initial: float
     final: float | None = None
     """None: constant."""
-    in_scene_units: bool = False
-    """True: multiplied by the scene radius (metres), as 3DGS does for the means."""
+    scale_by_scene_radius: bool = False
+    """True: multiplied by the scene radius (meters), as 3DGS does for the means."""
 
     def factor(self, progress: float) -> float:
         """Multiplier of the initial rate at a progress in [0, 1]."""
@@ -27,20 +27,20 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Optimization:
+class OptimizerSettings:
     """Which rate each parameter of the scene takes.
 
     A key is the end of a parameter's dotted name (``means``, ``rigid.rows.means``, ``sky.texels``); the longest key
     that matches wins. A parameter without a key is an error.
     """
 
-    rates: Mapping[str, Rate]
+    rates: Mapping[str, LearningRate]
     eps: float = 1e-15
     """Adam's epsilon. At torch's default of 1e-8 mask logits whose only gradient is lambda_n / K never move."""
-    visible_rows_only: bool = False
+    visible_only: bool = False
     """True: rows whose gradient is exactly zero keep their values and moments (VisibleAdam)."""
 
-    def rate_of(self, name: str) -> Rate:
+    def rate_of(self, name: str) -> LearningRate:
         keys = [key for key in self.rates if name == key or name.endswith(f".{key}")]
         if not keys:
             raise ValueError(
@@ -49,13 +49,13 @@ class Optimization:
         return self.rates[max(keys, key=len)]
 
     def build(self, scene: nn.Module, radius: float) -> torch.optim.Optimizer:
-        """Adam with one group per parameter, named like it; ``radius`` is the scene's, metres."""
+        """Adam with one group per parameter, named like it; ``radius`` is the scene's, meters."""
         groups = []
         for name, parameter in scene.named_parameters():
             rate = self.rate_of(name)
-            initial = rate.initial * (radius if rate.in_scene_units else 1.0)
+            initial = rate.initial * (radius if rate.scale_by_scene_radius else 1.0)
             groups.append({"params": [parameter], "lr": initial, "initial_lr": initial, "name": name})
-        if self.visible_rows_only:
+        if self.visible_only:
             return VisibleAdam(groups, eps=self.eps)
         return torch.optim.Adam(groups, eps=self.eps, fused=True)
 

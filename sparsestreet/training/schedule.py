@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Window:
+class Interval:
     """A recurring event between two fractions of the run.
 
     Fractions rather than steps, so that a run of 2,000 steps has the shape of one of 30,000; only ``every`` counts
@@ -25,7 +25,7 @@ class Window:
             raise ValueError(f"a window needs every >= 1 step, got {self.every}")
 
     def due(self, step: int, max_steps: int) -> bool:
-        """Whether the event happens after ``step`` (1 is the first) of ``max_steps`` optimiser steps."""
+        """Whether the event happens after ``step`` (1 is the first) of ``max_steps`` optimizer steps."""
         return self.start * max_steps < step <= self.stop * max_steps and step % self.every == 0
 
     def closes(self, step: int, max_steps: int) -> bool:
@@ -36,7 +36,7 @@ class Window:
         return int(self.stop * max_steps)
 
 
-def moment(fraction: float, max_steps: int) -> int:
+def milestone(fraction: float, max_steps: int) -> int:
     """The step (at least 1) of a single event at a fraction of the run."""
     if not 0 <= fraction <= 1:
         raise ValueError(f"a moment of the run is a fraction in [0, 1], got {fraction}")

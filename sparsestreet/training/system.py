@@ -15,7 +15,7 @@ from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering, render
 from sparsestreet.training.losses import Loss
-from sparsestreet.training.optimizer import Optimization
+from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.types import Frame
 
 
@@ -38,7 +38,7 @@ class StreetSystem(LightningModule):
         self,
         scene: SceneGraph,
         losses: Mapping[str, Loss],
-        optimization: Optimization,
+        optimization: OptimizerSettings,
         *,
         radius: float,
         options: RenderOptions = RenderOptions(),

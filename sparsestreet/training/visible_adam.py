@@ -15,7 +15,7 @@ class VisibleAdam(Optimizer):
 
     A row is an entry of a parameter's first dimension: a Gaussian, of the sky a face, of the poses an object. The splat
     op writes exactly zero for rows that were not drawn, so that the gradient itself says what was seen and no list of
-    rows needs to reach the optimiser. It says so per parameter: where a regulariser gives every mask logit a gradient,
+    rows needs to reach the optimizer. It says so per parameter: where a regularizer gives every mask logit a gradient,
     every mask logit steps as in Adam, while the means of the same hidden rows rest. A row that was drawn but hidden by
     others to the last bit rests as well. A gradient that is not a number is not zero: it shows, as in Adam.
 

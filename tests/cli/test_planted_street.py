@@ -13,15 +13,15 @@ from torch import Tensor
 from sparsestreet.cli.assemble import Assembly, assemble
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.train import train
-from sparsestreet.pruning import ImportanceRule, RemovalRule, View
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, View
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes.background import Background
-from sparsestreet.scene.rendering import backdrop
+from sparsestreet.scene.rendering import sky_image
 from sparsestreet.training.callbacks import BackgroundPruning, MaskTraining
 from sparsestreet.training.losses import MaskSparsity
-from sparsestreet.training.optimizer import Optimization, Rate
-from sparsestreet.training.schedule import Window
+from sparsestreet.training.optimizer import LearningRate, OptimizerSettings
+from sparsestreet.training.schedule import Interval
 from tests.pruning.planted import Views, activated, judge, plant
 
 # One process trains for all tests.
@@ -35,14 +35,14 @@ FEW_VISIBLE = 300
 def planted_street(tiny_street, tmp_path_factory):
     """A trained background, what was planted into it, and which of its own rows a view would miss."""
     out = tmp_path_factory.mktemp("planted")
-    few = ("schedule.max_steps=300", "node=[background]", "scale.background.maximum_rows=2500")
+    few = ("schedule.max_steps=300", "node=[background]", "scale.background.max_gaussians=2500")
     assert train([*tiny_street, f"hydra.run.dir={out}", *few]) == 0
     parts = _trained(out)
     cameras = [frame.camera for frame in parts.datamodule.split.train]
     generator = torch.Generator().manual_seed(0)
     background = parts.system.scene.nodes["background"]
-    sky = [backdrop(parts.system.scene, camera).detach() for camera in cameras]
-    rows, planted = plant(background.rows, cameras, generator, hidden=60, copies=12, backend="cpu", backdrops=sky)
+    sky = [sky_image(parts.system.scene, camera).detach() for camera in cameras]
+    rows, planted = plant(background.rows, cameras, generator, hidden=60, copies=12, backend="cpu", sky_images=sky)
     sample = torch.randperm(int((~planted).sum()), generator=generator)[:FEW_VISIBLE]
     visible = Views(activated(rows), cameras, "cpu", sky).visible(sample)
     return out, rows, planted, visible
@@ -65,7 +65,7 @@ def test_a_budget_takes_what_is_missed_least(planted_street):
     out, rows, planted, _ = planted_street
     parts = _trained(out)
     cameras = [frame.camera for frame in parts.datamodule.split.train]
-    sky = [backdrop(parts.system.scene, camera).detach() for camera in cameras]
+    sky = [sky_image(parts.system.scene, camera).detach() for camera in cameras]
     keep = _prune_by_removal(parts, rows, allowed_db=0.01)
     assert int(keep.sum()) < int(_prune_by_removal(_trained(out), rows, allowed_db=0.0).sum())
     lost = torch.nonzero(~keep & ~planted).squeeze(-1)[::4]
@@ -97,7 +97,7 @@ def _prune_by_removal(parts: Assembly, rows: Rows, *, allowed_db: float) -> Bool
     parts.system.scene.nodes["background"] = Background(rows, None)
     view = View(parts.system.options.settings, "cpu")
     frames = parts.datamodule.split.train
-    return RemovalRule(allowed_db).select(parts.system.scene, frames, {"background": 0}, view)["background"].keep
+    return LeaveOneOutRule(allowed_db).select(parts.system.scene, frames, {"background": 0}, view)["background"].keep
 
 
 def _prune(parts: Assembly, rows: Rows, *, mask_weight: float, gated: bool) -> Bool[Tensor, " n"]:
@@ -105,19 +105,19 @@ def _prune(parts: Assembly, rows: Rows, *, mask_weight: float, gated: bool) -> B
 
     A buffer of row numbers follows every plan.
     """
-    mask = StaticMask(weight=2.5e-3, minimum_rows=200)
+    mask = StaticMask(weight=2.5e-3, min_gaussians=200)
     columns = dict(rows.named_parameters()) | {"mask_logits": mask.initial_logits(len(rows))}
     node = Background(Rows(columns, {"numbers": torch.arange(len(rows))}), mask)
     system = parts.system
     system.scene.nodes["background"] = node
     system.losses["mask_sparsity"] = MaskSparsity(mask_weight)
-    system.optimization = Optimization({**system.optimization.rates, "mask_logits": Rate(0.05)})
+    system.optimization = OptimizerSettings({**system.optimization.rates, "mask_logits": LearningRate(0.05)})
     trainer = Trainer(
         accelerator="cpu",
         max_steps=STEPS,
         max_epochs=-1,
         callbacks=[
-            MaskTraining(Window(0.0, 0.8, 50)),
+            MaskTraining(Interval(0.0, 0.8, 50)),
             *([BackgroundPruning([0.8], ImportanceRule(), {"background": 200})] if gated else []),
         ],
         logger=False,

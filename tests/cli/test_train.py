@@ -30,7 +30,7 @@ def test_training_improves_and_leaves_records(run_train, tmp_path):
     with (out / "curves" / "metrics.csv").open() as file:
         psnr = [float(row["psnr"]) for row in csv.DictReader(file) if row["psnr"]]
     start = json.loads((run_train(tmp_path / "start", "schedule.max_steps=1") / "records" / "summary.json").read_text())
-    # 60 steps from grey random rotations: several dB; noise between runs is zero on the CPU.
+    # 60 steps from gray random rotations: several dB; noise between runs is zero on the CPU.
     assert summary["quality"]["psnr_full"]["mean"] > start["quality"]["psnr_full"]["mean"] + 3
     assert psnr
     assert summary["gaussians_total"] == sum(summary["gaussians"].values())

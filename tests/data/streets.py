@@ -18,5 +18,5 @@ def make_log(num_frames: int = 12, num_cameras: int = 2, sweeps: tuple[Sweep, ..
             image = torch.full((3, 5, 3), (10 * index + number) % 256, dtype=torch.uint8)
             camera = Camera(camera_from_world, INTRINSICS, 5, 3)
             sky = torch.zeros(3, 5, dtype=torch.bool)
-            frames.append(Frame(index, index / max(num_frames - 1, 1), number, camera, image, sky=sky))
+            frames.append(Frame(camera, index / max(num_frames - 1, 1), index, number, image=image, sky=sky))
     return DrivingLog("tiny", tuple(frames), sweeps, (), num_frames, num_cameras, torch.eye(4, dtype=torch.float64))

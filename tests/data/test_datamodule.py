@@ -14,7 +14,7 @@ from tests.data.streets import make_log
 
 
 def keys(frames) -> list[tuple[int, int]]:
-    return [(frame.index, frame.camera_index) for frame in frames]
+    return [(frame.frame_index, frame.camera_index) for frame in frames]
 
 
 def test_an_epoch_is_every_training_frame_once_in_a_new_order():
@@ -72,7 +72,7 @@ def test_a_frame_moves_with_its_tensors_but_the_camera_stays():
     assert isinstance(moved, Frame)
     assert {moved.image.device, moved.sky.device} == {torch.device("meta")}
     assert moved.camera is frame.camera
-    assert (moved.depth, moved.index, moved.time, moved.camera.width) == (None, 0, 0.0, 5)
+    assert (moved.depth, moved.frame_index, moved.time, moved.camera.width) == (None, 0, 0.0, 5)
     assert frame.image.device == torch.device("cpu")
 
 

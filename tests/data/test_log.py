@@ -22,13 +22,13 @@ def test_a_split_takes_every_frame_once_and_all_cameras_of_an_instant_together(n
     offset = data.draw(st.integers(0, min(stride, num_frames) - 1))
     log = make_log(num_frames, num_cameras)
     parts = split(log, stride=stride, offset=offset)
-    held_out = [frame.index for frame in parts.held_out]
+    held_out = [frame.frame_index for frame in parts.held_out]
     assert held_out == [index for index in range(offset, num_frames, stride) for _ in range(num_cameras)]
     order = {id(frame): place for place, frame in enumerate(log.frames)}
     places = [[order[id(frame)] for frame in part] for part in (parts.train, parts.held_out)]
     assert sorted(places[0] + places[1]) == list(range(len(log.frames)))
     assert all(place == sorted(place) for place in places)
-    assert not set(held_out) & {frame.index for frame in parts.train}
+    assert not set(held_out) & {frame.frame_index for frame in parts.train}
 
 
 def test_stride_zero_holds_out_nothing():

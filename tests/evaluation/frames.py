@@ -26,7 +26,7 @@ def make_frame(
     generator = torch.Generator().manual_seed(100 * index + camera_index)
     image = torch.randint(0, 256, (*size, 3), generator=generator, dtype=torch.uint8)
     camera = Camera(torch.eye(4), torch.eye(3), size[1], size[0])
-    return Frame(index, index / 10, camera_index, camera, image, human=human, vehicle=vehicle)
+    return Frame(camera, index / 10, index, camera_index, image=image, human=human, vehicle=vehicle)
 
 
 def make_summary(

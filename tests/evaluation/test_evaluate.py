@@ -11,13 +11,13 @@ from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.metrics.definitions import DEFINITIONS
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality, summarise
+from sparsestreet.evaluation.quality import FrameQuality, RegionQuality, summarize
 from tests.evaluation.frames import make_frame
 
 
 def noisy(frame):
     """A render that leaves [0, 1] on both sides."""
-    generator = torch.Generator().manual_seed(frame.index)
+    generator = torch.Generator().manual_seed(frame.frame_index)
     noise = 0.3 * torch.randn(frame.image.shape, generator=generator)
     return SimpleNamespace(rgb=frame.image.float() / 255 + noise)
 
@@ -100,7 +100,7 @@ def test_summary_takes_means_over_the_images_that_have_the_region():
         image(1, 100.0, RegionQuality(0, None, None, None)),
         image(2, 27.0, RegionQuality(1000, 0.001, 30.0, 0.6)),
     ]
-    summary = summarise(quality)
+    summary = summarize(quality)
     assert list(summary) == list(DEFINITIONS)
     assert summary["psnr_full"].mean == pytest.approx(49)
     assert summary["psnr_full"].sd == pytest.approx(statistics.stdev([20, 100, 27]))
@@ -111,6 +111,6 @@ def test_summary_takes_means_over_the_images_that_have_the_region():
 
 
 def test_summary_of_one_image_has_no_spread_and_of_none_no_mean():
-    one = summarise([FrameQuality(0, 0, 8, 8, RegionQuality(64, 0.01, 20.0, 0.5))])
+    one = summarize([FrameQuality(0, 0, 8, 8, RegionQuality(64, 0.01, 20.0, 0.5))])
     assert (one["psnr_full"].mean, one["psnr_full"].sd) == (20.0, None)
-    assert summarise([])["psnr_full"].images == 0
+    assert summarize([])["psnr_full"].images == 0

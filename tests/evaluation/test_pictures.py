@@ -1,4 +1,4 @@
-"""Sheets: what is where, in which colours, and what is written to disk."""
+"""Sheets: what is where, in which colors, and what is written to disk."""
 
 import matplotlib
 import numpy as np
@@ -9,7 +9,7 @@ from sparsestreet.evaluation.compare import compare_runs
 from sparsestreet.evaluation.pictures import (
     ERROR_SCALE,
     Picture,
-    colour_map,
+    color_map,
     comparison_sheet,
     error_picture,
     picture_path,
@@ -21,37 +21,37 @@ from sparsestreet.evaluation.pictures import (
 from sparsestreet.evaluation.records import summary_path, write_summary
 from tests.evaluation.frames import make_summary
 
-COLOURS = {"truth": (200, 10, 10), "render": (10, 200, 10), "centres": (10, 10, 200)}
+COLORS = {"truth": (200, 10, 10), "render": (10, 200, 10), "centers": (10, 10, 200)}
 
 
-def flat(colour: tuple[int, int, int], height: int = 9, width: int = 13) -> np.ndarray:
-    return np.full((height, width, 3), colour, dtype=np.uint8)
+def flat(color: tuple[int, int, int], height: int = 9, width: int = 13) -> np.ndarray:
+    return np.full((height, width, 3), color, dtype=np.uint8)
 
 
-def make_picture(frame: int = 3, camera: int = 1, render: tuple[int, int, int] = COLOURS["render"]) -> Picture:
-    return Picture(frame, camera, flat(COLOURS["truth"]), flat(render), flat(COLOURS["centres"]))
+def make_picture(frame: int = 3, camera: int = 1, render: tuple[int, int, int] = COLORS["render"]) -> Picture:
+    return Picture(frame, camera, flat(COLORS["truth"]), flat(render), flat(COLORS["centers"]))
 
 
 def order_of(sheet: np.ndarray, row: int) -> list[tuple[int, int, int]]:
-    """Colours met along a row of pixels, without repeats and without the paper between tiles."""
+    """Colors met along a row of pixels, without repeats and without the paper between tiles."""
     paper = tuple(int(value) for value in sheet[-1, -1])
-    colours = [tuple(int(value) for value in pixel) for pixel in sheet[row]]
-    met = [colour for index, colour in enumerate(colours) if index == 0 or colour != colours[index - 1]]
-    return [colour for colour in met if colour != paper]
+    colors = [tuple(int(value) for value in pixel) for pixel in sheet[row]]
+    met = [color for index, color in enumerate(colors) if index == 0 or color != colors[index - 1]]
+    return [color for color in met if color != paper]
 
 
-def row_within(sheet: np.ndarray, colour: tuple[int, int, int]) -> int:
-    """Middle row of the rows in which a colour fills a tile."""
-    rows = np.flatnonzero((sheet == colour).all(-1).sum(1) >= 100)
+def row_within(sheet: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Middle row of the rows in which a color fills a tile."""
+    rows = np.flatnonzero((sheet == color).all(-1).sum(1) >= 100)
     return int(rows[len(rows) // 2])
 
 
-def test_colour_map_is_inferno():
+def test_color_map_is_inferno():
     values = np.linspace(-0.2, 1.2, 301)
     expected = matplotlib.colormaps["inferno"](np.clip(values, 0, 1))[:, :3] * 255
     # 17 samples joined by straight lines cut the corner of blue near 0.8 by 7 of 255 levels, less elsewhere.
-    assert np.abs(colour_map(values).astype(float) - expected).max() <= 7.5
-    luminance = colour_map(np.linspace(0, 1, 50)) @ np.array([0.2126, 0.7152, 0.0722])
+    assert np.abs(color_map(values).astype(float) - expected).max() <= 7.5
+    luminance = color_map(np.linspace(0, 1, 50)) @ np.array([0.2126, 0.7152, 0.0722])
     assert (np.diff(luminance) > 0).all()
 
 
@@ -60,21 +60,21 @@ def test_error_is_the_mean_absolute_difference_on_the_common_scale():
     render[0, 0] = (70, 130, 100)  # 20 levels on average, in either direction
     render[0, 1] = (255, 255, 255)
     picture = error_picture(render, truth)
-    assert tuple(picture[5, 5]) == tuple(colour_map(np.array([0.0]))[0])
-    assert tuple(picture[0, 0]) == tuple(colour_map(np.array([20 / 255 / ERROR_SCALE]))[0])
-    assert tuple(picture[0, 1]) == tuple(colour_map(np.array([1.0]))[0])
+    assert tuple(picture[5, 5]) == tuple(color_map(np.array([0.0]))[0])
+    assert tuple(picture[0, 0]) == tuple(color_map(np.array([20 / 255 / ERROR_SCALE]))[0])
+    assert tuple(picture[0, 1]) == tuple(color_map(np.array([1.0]))[0])
     assert (error_picture(truth, render) == picture).all()
 
 
-def test_sheet_columns_are_truth_render_error_centres():
+def test_sheet_columns_are_truth_render_error_centers():
     sheet = picture_sheet([make_picture()], title="a title", tile_width=120)
     error = tuple(int(value) for value in make_picture().error[0, 0])
-    expected = [COLOURS["truth"], COLOURS["render"], error, COLOURS["centres"]]
-    assert order_of(sheet, row_within(sheet, COLOURS["truth"])) == expected
+    expected = [COLORS["truth"], COLORS["render"], error, COLORS["centers"]]
+    assert order_of(sheet, row_within(sheet, COLORS["truth"])) == expected
 
 
 def test_images_of_several_sizes_share_a_sheet():
-    tall = Picture(4, 0, flat(COLOURS["truth"], 40), flat(COLOURS["render"], 40), flat(COLOURS["centres"], 40))
+    tall = Picture(4, 0, flat(COLORS["truth"], 40), flat(COLORS["render"], 40), flat(COLORS["centers"], 40))
     one = picture_sheet([make_picture()], title="t", tile_width=120)
     both = picture_sheet([make_picture(), tall], title="t", tile_width=120)
     assert both.shape[1] == one.shape[1]
@@ -84,14 +84,14 @@ def test_images_of_several_sizes_share_a_sheet():
 
 
 def test_comparison_sets_the_runs_below_each_other():
-    ours_colour = (60, 180, 60)
-    plain, ours = make_picture(), make_picture(render=ours_colour)
+    ours_color = (60, 180, 60)
+    plain, ours = make_picture(), make_picture(render=ours_color)
     sheet = compare([plain], [ours])
-    upper, lower = row_within(sheet, COLOURS["render"]), row_within(sheet, ours_colour)
+    upper, lower = row_within(sheet, COLORS["render"]), row_within(sheet, ours_color)
     errors = [tuple(int(value) for value in picture.error[0, 0]) for picture in (plain, ours)]
     assert upper < lower
-    assert order_of(sheet, upper) == [COLOURS["truth"], COLOURS["render"], errors[0], COLOURS["centres"]]
-    assert order_of(sheet, lower) == [ours_colour, errors[1], COLOURS["centres"]]
+    assert order_of(sheet, upper) == [COLORS["truth"], COLORS["render"], errors[0], COLORS["centers"]]
+    assert order_of(sheet, lower) == [ours_color, errors[1], COLORS["centers"]]
     with pytest.raises(ValueError, match=r"different images, \(frame, camera\) \[\(3, 1\)\] and \[\(4, 1\)\]"):
         compare([plain], [make_picture(4)])
 
@@ -127,7 +127,7 @@ def test_pictures_on_disk_round_trip(tmp_path):
     found = read_pictures(tmp_path)
     assert [(picture.frame, picture.camera) for picture in found] == [(3, 0), (3, 1), (12, 0)]
     assert (found[2].render == pictures[0].render).all()
-    assert (found[2].centres == pictures[0].centres).all()
+    assert (found[2].centers == pictures[0].centers).all()
 
 
 def test_missing_pictures_are_named(tmp_path):

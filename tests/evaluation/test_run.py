@@ -30,8 +30,10 @@ def evaluate(out, frames, pictures=2):
     return evaluate_run(
         frames,
         render=darker,
-        centres=dots,
-        guards=lambda frame: Guards(drawn=frame.index, near=frame.camera_index, vanished=int(frame.index == 20)),
+        centers=dots,
+        guards=lambda frame: Guards(
+            drawn=frame.frame_index, near=frame.camera_index, vanished=int(frame.frame_index == 20)
+        ),
         gaussians={"background": 30, "rigid": 12},
         bytes_by_part={"background": 300, "rigid": 120, "sky": 5},
         run=RUN,
@@ -83,7 +85,7 @@ def test_a_run_leaves_pictures_in_full_resolution(tmp_path):
     (tmp_path / "pictures" / "mine.png").write_bytes(b"not ours")
     evaluate(tmp_path, frames)
     found = sorted(path.name for path in (tmp_path / "pictures").iterdir())
-    kinds = ("centres", "error", "render", "truth")
+    kinds = ("centers", "error", "render", "truth")
     views = ("020_0", "040_0")  # the middle of the others, and the one with most vehicle pixels
     assert found == sorted([f"{view}_{kind}.png" for view in views for kind in kinds] + ["mine.png", "sheet.png"])
     with Image.open(tmp_path / "pictures" / "040_0_truth.png") as image:
@@ -91,7 +93,7 @@ def test_a_run_leaves_pictures_in_full_resolution(tmp_path):
     with Image.open(tmp_path / "pictures" / "040_0_render.png") as image:
         rounded = (frames[4].image.double() * 0.9).numpy()
         assert np.abs(np.asarray(image) - rounded).max() <= 0.5 + 1e-4  # rounded, not truncated
-    with Image.open(tmp_path / "pictures" / "040_0_centres.png") as image:
+    with Image.open(tmp_path / "pictures" / "040_0_centers.png") as image:
         assert tuple(np.asarray(image)[0, 0]) == (51, 102, 255)
 
 

@@ -28,7 +28,7 @@ def test_percentiles_of_known_durations(monkeypatch):
     durations = np.random.default_rng(0).gamma(2, 5, 60)
 
     def render(frame):
-        calls.append(frame.index)
+        calls.append(frame.frame_index)
         # Warm-up renders are slow: one of them in the statistics would show.
         clock.now += 5.0 if len(calls) <= 7 else durations[len(calls) - 8] / 1000
         return SimpleNamespace(rgb=torch.zeros(2, 2, 3))

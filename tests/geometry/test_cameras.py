@@ -17,7 +17,7 @@ def camera_of(seed: int, width: int = 13, height: int = 7) -> Camera:
 
 
 def test_exact_position_is_where_the_pose_has_its_zero():
-    """For a rotation of four digits, as text files hold them, and 20 km away: -R^T t is metres off there."""
+    """For a rotation of four digits, as text files hold them, and 20 km away: -R^T t is meters off there."""
     camera = camera_of(3)
     camera.camera_from_world[:3, 3] *= 2e4
     camera.camera_from_world[:3, :3] = camera.camera_from_world[:3, :3].round(decimals=4)
@@ -44,7 +44,7 @@ def test_the_image_ends_before_its_width():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.5, 100.0))
-def test_rays_project_onto_their_pixel_centres(seed: int, distance: float):
+def test_rays_project_onto_their_pixel_centers(seed: int, distance: float):
     camera = camera_of(seed)
     directions = ray_directions(camera)
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(7, 13, dtype=torch.float64))

@@ -93,7 +93,7 @@ def test_past_the_fold_it_is_proportional_to_the_radius():
 def test_derivative_in_the_points(reach):
     points = reach * (torch.rand(9, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 0.5)
     assert torch.autograd.gradcheck(lambda value: distort(value, FULL), points.requires_grad_())
-    # The centre, where the radius has no derivative.
+    # The center, where the radius has no derivative.
     assert torch.autograd.gradcheck(lambda value: distort(value, FULL), torch.zeros(1, 2).double().requires_grad_())
 
 

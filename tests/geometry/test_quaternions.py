@@ -80,7 +80,7 @@ def test_slerp_is_scipys_whatever_the_sign(u: Tensor, v: Tensor, fraction: float
     rotations = Rotation.concatenate([scipy_of(a), scipy_of(b)])
     expected = torch.from_numpy(Slerp([0, 1], rotations)(fraction).as_quat()).roll(1)
     result = quat.slerp(a, -b if flip else b, torch.tensor(fraction, dtype=torch.float64))
-    # Below 1.8 degrees (half angle) a normalised lerp stands in, which differs by less than 1e-6.
+    # Below 1.8 degrees (half angle) a normalized lerp stands in, which differs by less than 1e-6.
     assert_same_rotation(result, expected, 1e-6)
     assert abs(float(result.norm()) - 1) < 1e-12
 
@@ -124,14 +124,14 @@ def test_a_zero_quaternion_is_the_identity_without_gradient():
 
 
 @pytest.mark.parametrize("length", [1e-44, 1e-30, 1e-15, 1e15, 1e30, 3e38])
-def test_tiny_and_huge_quaternions_normalise(length: float):
+def test_tiny_and_huge_quaternions_normalize(length: float):
     """In float32, from its last subnormals to its end."""
     quaternion = length * torch.tensor([[1.0, -1.0, 1.0, 1.0]])
     torch.testing.assert_close(quat.normalized(quaternion), torch.tensor([[0.5, -0.5, 0.5, 0.5]]))
 
 
 @pytest.mark.parametrize("length", [1e-250, 1e-30, 1.0, 1e30, 1e250])
-def test_gradient_of_a_normalised_quaternion(length: float):
+def test_gradient_of_a_normalized_quaternion(length: float):
     """Central differences of relative step 1e-6 are good to 1e-9 of the gradient."""
     generator = torch.Generator().manual_seed(0)
     unit, cotangent = torch.randn(2, 3, 4, generator=generator, dtype=torch.float64)

@@ -13,7 +13,7 @@ from tests.ops.scenes import FIELDS
 def naive_image(
     gaussians: Gaussians, view: Camera, settings: SplatSettings, rows: Iterable[int] | None = None
 ) -> np.ndarray:
-    """Per pixel, from the textbook: matrix inverse of the covariance, no tricks; pinhole, degree 0 colours.
+    """Per pixel, from the textbook: matrix inverse of the covariance, no tricks; pinhole, degree 0 colors.
 
     Image rows that are not asked for stay black.
     """
@@ -22,12 +22,12 @@ def naive_image(
     for row in range(view.height) if rows is None else rows:
         for column in range(view.width):
             passed = 1.0
-            for _, mean, conic, opacity, colour in splats:
+            for _, mean, conic, opacity, color in splats:
                 d = np.array([column + 0.5, row + 0.5]) - mean
                 alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
                 if alpha < settings.alpha_min or passed <= settings.transmittance_min:
                     continue
-                image[row, column] += passed * alpha * colour
+                image[row, column] += passed * alpha * color
                 passed *= 1 - alpha
     return image
 
@@ -38,16 +38,16 @@ def _naive_splats(gaussians: Gaussians, view: Camera, settings: SplatSettings) -
     splats = []
     for mean, q, scale, opacity, sh in zip(*(getattr(gaussians, name).numpy() for name in FIELDS), strict=True):
         x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
-        if z <= settings.near:
+        if z <= settings.near_plane:
             continue
         margin_x, margin_y = 0.15 * view.width / fx, 0.15 * view.height / fy
         u = np.clip(x / z, -cx / fx - margin_x, (view.width - cx) / fx + margin_x)
         v = np.clip(y / z, -cy / fy - margin_y, (view.height - cy) / fy + margin_y)
         jacobian = np.array([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
         half = jacobian @ pose[:3, :3] @ rotation_matrix(q) @ np.diag(scale)
-        conic = np.linalg.inv(half @ half.T + settings.blur * np.eye(2))
-        colour = np.maximum(0, 0.5 + sh[0] / (2 * np.sqrt(np.pi)))
-        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, colour))
+        conic = np.linalg.inv(half @ half.T + settings.eps2d * np.eye(2))
+        color = np.maximum(0, 0.5 + sh[0] / (2 * np.sqrt(np.pi)))
+        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, color))
     return splats
 
 

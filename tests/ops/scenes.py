@@ -42,7 +42,7 @@ every_fast_precision = _in_every_precision(_FAST_BACKENDS)
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:
-    """A turned and shifted camera, its principal point off the centre."""
+    """A turned and shifted camera, its principal point off the center."""
     focal = float(width) if focal is None else focal
     intrinsics = torch.tensor([[focal, 0, 0.47 * width], [0, 1.1 * focal, 0.54 * height], [0, 0, 1]], dtype=dtype)
     angle = torch.tensor(0.3, dtype=torch.float64)
@@ -84,7 +84,7 @@ def random_gaussians(rows: int, view: Camera, terms: int = 4, seed: int = 0) -> 
 
 
 def one_gaussian(**fields: list) -> Gaussians:
-    """A grey ball of 0.1 m two metres ahead, with fields replaced; float64."""
+    """A gray ball of 0.1 m two meters ahead, with fields replaced; float64."""
     values = {
         "means": [[0.0, 0.0, 2.0]],
         "quaternions": [[1.0, 0.0, 0.0, 0.0]],
@@ -113,7 +113,7 @@ def device_of(backend: str) -> torch.device:
 
 
 def cotangents(view: Camera, seed: int = 5) -> tuple[Tensor, Tensor, Tensor]:
-    """Random upstream gradients of rgb, alpha and depth; the depth's smaller, as metres are larger than colours."""
+    """Random upstream gradients of rgb, alpha and depth; the depth's smaller, as meters are larger than colors."""
     generator = torch.Generator().manual_seed(seed)
     shape = (view.height, view.width)
     rgb = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)

@@ -12,7 +12,7 @@ BACKENDS = ["reference", "cpu"]
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_two_balls_by_hand(backend):
-    # Nine metres at 2 m: the pixel sees the peak. Weights 0.4 and 0.6 * 0.8.
+    # Nine meters at 2 m: the pixel sees the peak. Weights 0.4 and 0.6 * 0.8.
     near = one_gaussian(opacities=[0.4], scales=[[9.0] * 3])
     far = one_gaussian(opacities=[0.8], scales=[[9.0] * 3], means=[[0.0, 0.0, 3.0]])
     hidden = one_gaussian(means=[[0.0, 0.0, -3.0]])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.ops.cpu import rasteriser
+from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.types import Camera, Gaussians, Shutter
 from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render, with_threads
@@ -21,8 +21,8 @@ LENSES = {"pinhole": None, "folds": vector(-0.25, 0.08, 2e-3, -1e-3, -0.05), "op
 SHUTTERS = {"global": None, "rolling": Shutter(vector(0.15, -0.3, 0.3), vector(0.02, 0.04, 0.02))}
 SETTINGS = {
     "default": SplatSettings(),
-    "knobs": SplatSettings(box=1.7, depth_bits=14, half_colors=True, antialias=True, stop="exclusive"),
-    "box alone": SplatSettings(box=2.5, alpha_min=0.0, transmittance_min=0.0),
+    "knobs": SplatSettings(max_sigma=1.7, depth_bits=14, half_colors=True, antialias=True, stop="exclusive"),
+    "box alone": SplatSettings(max_sigma=2.5, alpha_min=0.0, transmittance_min=0.0),
 }
 
 
@@ -86,7 +86,7 @@ def test_every_instruction_set(variant):
     for dtype, bar in ((torch.float64, 1e-9), (torch.float32, 1e-4)):
         leaves = cast(gaussians, dtype, requires_grad=True)
         offsets = torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)
-        raster = rasteriser.rasterise(leaves, offsets, view, SETTINGS["knobs"], variant)
+        raster = rasterizer.rasterize(leaves, offsets, view, SETTINGS["knobs"], variant)
         raster.rgb.backward(cotangents(view)[0].to(dtype))
         for name in FIELDS:
             assert relative_error(getattr(leaves, name).grad.double(), getattr(truth, name).grad) < bar, name

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, resolve_backend, splat
-from sparsestreet.ops.cpu import rasteriser
+from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render, with_threads
@@ -26,7 +26,7 @@ def assert_matches_reference(gaussians, view, dtype, settings=SETTINGS["default"
     result = render(gaussians, view, "cpu", dtype, settings, background)
     for name in ("rgb", "alpha"):
         assert (result.images[name] - truth.images[name]).abs().max() <= IMAGE_BAR[dtype], name
-    # Depth is in metres (here up to 22) and divided by alpha, so its error is relative.
+    # Depth is in meters (here up to 22) and divided by alpha, so its error is relative.
     assert relative_error(result.images["depth"], truth.images["depth"]) <= IMAGE_BAR[dtype]
     torch.testing.assert_close(result.radii, truth.radii, rtol=1e-5, atol=0)
     for name, gradient in truth.gradients.items():
@@ -115,7 +115,7 @@ def test_every_instruction_set(variant):
     truth = render(gaussians, view, "reference", torch.float64)
     leaves = cast(gaussians, torch.float32, requires_grad=True)
     offsets = torch.zeros(len(gaussians), 2, requires_grad=True)
-    raster = rasteriser.rasterise(leaves, offsets, view, SplatSettings(), variant)
+    raster = rasterizer.rasterize(leaves, offsets, view, SplatSettings(), variant)
     assert (raster.rgb.detach().double() - truth.images["rgb"]).abs().max() < 1e-5
     reference_leaves = cast(gaussians, torch.float64, requires_grad=True)
     splat(reference_leaves, view, backend="reference").rgb.backward(cotangents(view)[0])

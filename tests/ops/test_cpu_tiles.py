@@ -13,7 +13,7 @@ from sparsestreet.ops.bench.knobs import DEFAULT, Point
 from sparsestreet.ops.bench.scenes import Size, bench_scenes
 from sparsestreet.ops.bench.tile_sizes import build, with_tiles
 from sparsestreet.ops.bench.timing import Effort, work_of
-from sparsestreet.ops.cpu import rasteriser
+from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.ops.cpu.library import load_library, tile_size
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -29,7 +29,7 @@ from tests.ops.scenes import (
 )
 
 ONCE = Effort(repeats=2, seconds=0.0, least=1)
-# Not the order in which a pixel blends, only where a distance is rounded depends on the tile: images of colours below
+# Not the order in which a pixel blends, only where a distance is rounded depends on the tile: images of colors below
 # about 2. Gradients are summed tile by tile, in another order.
 IMAGE_BAR = {torch.float32: 1e-6, torch.float64: 1e-14}
 ROW_BAR = {torch.float32: 1e-5, torch.float64: 1e-13}
@@ -57,15 +57,15 @@ def drawn(dtype: torch.dtype, variant: int, settings: SplatSettings) -> tuple[di
     gaussians = Gaussians.concatenate([random_gaussians(250, view), giants])
     leaves = cast(gaussians, dtype, requires_grad=True)
     offsets = torch.zeros(len(gaussians), 2, dtype=dtype, requires_grad=True)
-    raster = rasteriser.rasterise(leaves, offsets, view, settings, variant)
+    raster = rasterizer.rasterize(leaves, offsets, view, settings, variant)
     layers = {"rgb": raster.rgb, "transmittance": raster.transmittance, "depth": raster.depth_sum / 30}
     torch.autograd.backward(list(layers.values()), [v.to(dtype) for v in cotangents(view)])
     plain = cast(gaussians, dtype)
-    counted = rasteriser.contribution(plain, view, settings, variant)
-    changes = rasteriser.removal(plain, None, None, view, settings, variant)
+    counted = rasterizer.contribution(plain, view, settings, variant)
+    changes = rasterizer.leave_one_out(plain, None, None, view, settings, variant)
     rows = {name: getattr(leaves, name).grad for name in FIELDS} | {"screen": offsets.grad}
     rows |= {"weight": counted.weight, "pixels": counted.pixels.double(), "dominant": counted.dominant.double()}
-    rows |= {"largest": changes.largest, "squared": changes.squared}
+    rows |= {"largest": changes.max_abs_change, "squared": changes.squared_change}
     return {name: layer.detach() for name, layer in layers.items()}, rows
 
 

@@ -1,4 +1,4 @@
-"""The box, the bits of the depth that are sorted, and half-precision colours, against hand-computed pixels."""
+"""The box, the bits of the depth that are sorted, and half-precision colors, against hand-computed pixels."""
 
 import math
 
@@ -30,7 +30,7 @@ RED, GREEN = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
 def test_box_by_hand(backend, dtype, alpha_min):
     # 0.1 m at 2 m with focal 40: variance 4 + 0.3. Two standard deviations: squared distance up to 17.2.
     view = front_camera(13, 13, 40.0)
-    result = render(one_gaussian(), view, backend, dtype, SplatSettings(alpha_min=alpha_min, box=2.0))
+    result = render(one_gaussian(), view, backend, dtype, SplatSettings(alpha_min=alpha_min, max_sigma=2.0))
     for row, column in np.ndindex(13, 13):
         squared = (row - 6) ** 2 + (column - 6) ** 2
         expected = 0.8 * math.exp(-0.5 * squared / 4.3) if squared <= 17.2 else 0.0
@@ -45,8 +45,8 @@ def test_the_nearer_of_box_and_cut_off_ends_a_splat(backend):
     faint = one_gaussian(opacities=[0.05])
     plain = render(faint, view, backend)
     assert float(plain.radii[0]) == pytest.approx(math.sqrt(2 * math.log(12.75) * 4.3), rel=1e-12)
-    assert torch.equal(render(faint, view, backend, settings=SplatSettings(box=2.26)).radii, plain.radii)
-    assert float(render(faint, view, backend, settings=SplatSettings(box=2.25)).radii[0]) == pytest.approx(
+    assert torch.equal(render(faint, view, backend, settings=SplatSettings(max_sigma=2.26)).radii, plain.radii)
+    assert float(render(faint, view, backend, settings=SplatSettings(max_sigma=2.25)).radii[0]) == pytest.approx(
         2.25 * math.sqrt(4.3), rel=1e-12
     )
 
@@ -57,7 +57,7 @@ def test_a_box_that_ends_nothing_changes_no_bit(backend, dtype):
     gaussians = random_gaussians(60, view)
     # 1/255 of opacity 1 lies at 3.33 standard deviations; the square of 1e200 is no number.
     for box in (3.34, 1e200):
-        plain, boxed = (render(gaussians, view, backend, dtype, SplatSettings(box=b)) for b in (math.inf, box))
+        plain, boxed = (render(gaussians, view, backend, dtype, SplatSettings(max_sigma=b)) for b in (math.inf, box))
         for part in ("images", "gradients"):
             for name, value in getattr(plain, part).items():
                 assert torch.equal(value, getattr(boxed, part)[name]), name
@@ -72,7 +72,7 @@ def test_gradients_inside_the_box_are_right(backend):
         values = {name: getattr(ball, name).clone() for name in FIELDS}
 
         def image(value, field=field, values=values):
-            settings = SplatSettings(box=1.0, alpha_min=0.0)
+            settings = SplatSettings(max_sigma=1.0, alpha_min=0.0)
             return splat(Gaussians(**(values | {field: value})), view, settings=settings, backend=backend).rgb
 
         alpha = image(values[field])
@@ -102,11 +102,11 @@ def test_depth_bits(backend, dtype, bits, far, first_row_in_front):
     wide = {"scales": [[90.0] * 3]}
     behind, before = one_gaussian(sh=RED, means=[[0.0, 0.0, far]], **wide), one_gaussian(sh=GREEN, **wide)
     rows = Gaussians.concatenate([behind, before])
-    centre = render(rows, view, backend, dtype, SplatSettings(depth_bits=bits)).images["rgb"][2, 2]
+    center = render(rows, view, backend, dtype, SplatSettings(depth_bits=bits)).images["rgb"][2, 2]
     front, back = (0, 1) if first_row_in_front else (1, 0)
     # 0.8 (0.5 + 1) + 0.2 * 0.8 * 0.5 in the front one's channel.
-    assert float(centre[front]) == pytest.approx(1.28, rel=1e-5)
-    assert float(centre[back]) == pytest.approx(0.8 * 0.5 + 0.2 * 0.8 * 1.5, rel=1e-5)
+    assert float(center[front]) == pytest.approx(1.28, rel=1e-5)
+    assert float(center[back]) == pytest.approx(0.8 * 0.5 + 0.2 * 0.8 * 1.5, rel=1e-5)
 
 
 @every_double
@@ -115,35 +115,35 @@ def test_float64_depths_that_round_to_one_float32_are_tied(backend):
     far, near = one_gaussian(sh=RED), one_gaussian(sh=GREEN, means=[[0.0, 0.0, 2.0 - 1e-9]])
     for bits, front in ((32, 1), (31, 0)):
         settings = SplatSettings(depth_bits=bits)
-        centre = render(Gaussians.concatenate([far, near]), view, backend, settings=settings).images["rgb"][2, 2]
-        assert float(centre[front]) == pytest.approx(1.28, rel=1e-6)
+        center = render(Gaussians.concatenate([far, near]), view, backend, settings=settings).images["rgb"][2, 2]
+        assert float(center[front]) == pytest.approx(1.28, rel=1e-6)
 
 
 @every_precision
-def test_half_colours_by_hand(backend, dtype):
-    # Colours 0.5 + x; float16 has 11 significant bits; a value past 65504 stays there, where infinity would poison.
-    colours = np.array([0.1, 1 / 3, 70000.0])
-    ball = one_gaussian(sh=[[((colours - 0.5) / Y0).tolist()]])
+def test_half_colors_by_hand(backend, dtype):
+    # Colors 0.5 + x; float16 has 11 significant bits; a value past 65504 stays there, where infinity would poison.
+    colors = np.array([0.1, 1 / 3, 70000.0])
+    ball = one_gaussian(sh=[[((colors - 0.5) / Y0).tolist()]])
     view, half = front_camera(5, 5, 40.0), SplatSettings(half_colors=True)
     assert guards(cast(ball, dtype), view, settings=half).alarms == {"color_held": 1}
-    centre = render(ball, view, backend, dtype, half)
-    expected = 0.8 * np.minimum(colours, 65504).astype(np.float16).astype(np.float64)
-    np.testing.assert_allclose(centre.images["rgb"][2, 2].numpy(), expected, rtol=1e-6)
-    assert centre.is_finite()
+    center = render(ball, view, backend, dtype, half)
+    expected = 0.8 * np.minimum(colors, 65504).astype(np.float16).astype(np.float64)
+    np.testing.assert_allclose(center.images["rgb"][2, 2].numpy(), expected, rtol=1e-6)
+    assert center.is_finite()
 
 
 @every_double
-def test_half_colours_over_their_range(backend):
+def test_half_colors_over_their_range(backend):
     # Subnormal numbers of float16 among them; in float64, where 0.5 + Y0 sh still has the digits of 1e-7.
-    colours = np.array([2e-8, 4e-8, 3.3e-7, 5.9e-5, 6.2e-5, 1e-3, 0.2, 0.9999, 1.7, 33.3, 2047.7, 65503.0])
-    for triple in colours.reshape(-1, 3):
+    colors = np.array([2e-8, 4e-8, 3.3e-7, 5.9e-5, 6.2e-5, 1e-3, 0.2, 0.9999, 1.7, 33.3, 2047.7, 65503.0])
+    for triple in colors.reshape(-1, 3):
         ball = one_gaussian(sh=[[((triple - 0.5) / Y0).tolist()]])
         seen = splat(ball, front_camera(1, 1, 40.0), settings=SplatSettings(half_colors=True), backend=backend)
         np.testing.assert_allclose(seen.rgb[0, 0].numpy(), 0.8 * triple.astype(np.float16).astype(float), rtol=1e-9)
 
 
 @every_precision
-def test_half_colours_in_a_scene(backend, dtype):
+def test_half_colors_in_a_scene(backend, dtype):
     view = camera(21, 13)
     gaussians = random_gaussians(60, view)
     plain, rounded = (

@@ -24,7 +24,7 @@ from tests.ops.scenes import (
     render,
 )
 
-FITTED = SplatSettings(blur=0.0, alpha_min=0.0, transmittance_min=0.0)
+FITTED = SplatSettings(eps2d=0.0, alpha_min=0.0, transmittance_min=0.0)
 WIDE = (-0.25, 0.08, 2e-3, -1e-3, -0.012)
 """Folds at r2 = 1.79, 53 degrees off the axis."""
 
@@ -79,9 +79,9 @@ def unscented(mean: np.ndarray, axes: np.ndarray, view: Camera, near: float) -> 
     weight_covariance[0] += 1 - alpha**2 + beta
     sigma = [mean] + [mean + sign * math.sqrt(spread) * axes[:, k] for k in range(n) for sign in (1, -1)]
     pixels = np.stack([imaged(point, view, near) for point in sigma])
-    centre = weight_mean @ pixels
-    apart = pixels - centre
-    return centre, np.einsum("i,ia,ib->ab", weight_covariance, apart, apart)
+    center = weight_mean @ pixels
+    apart = pixels - center
+    return center, np.einsum("i,ia,ib->ab", weight_covariance, apart, apart)
 
 
 def quadrature(mean: np.ndarray, axes: np.ndarray, view: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -90,8 +90,8 @@ def quadrature(mean: np.ndarray, axes: np.ndarray, view: Camera) -> tuple[np.nda
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
     weight = np.einsum("i,j,k->ijk", weights, weights, weights).ravel() / weights.sum() ** 3
     pixels = imaged(mean + grid @ axes.T, view, 1e-9)
-    centre = weight @ pixels
-    return centre, np.einsum("i,ia,ib->ab", weight, pixels - centre, pixels - centre)
+    center = weight @ pixels
+    return center, np.einsum("i,ia,ib->ab", weight, pixels - center, pixels - center)
 
 
 def wasserstein(mean: np.ndarray, covariance: np.ndarray, other: np.ndarray, spread: np.ndarray) -> float:
@@ -117,9 +117,9 @@ def test_against_the_text_book(backend, coefficients):
         mean, axes = in_camera(gaussians, row, view)
         if mean[2] < 2 or (splat(one, view, settings=FITTED, backend=backend).alpha > 1e-3).sum() < 30:
             continue
-        centre, covariance = drawn(one, view, backend)
-        expected_centre, expected = unscented(mean, axes, view, FITTED.near)
-        np.testing.assert_allclose(centre, expected_centre, atol=1e-6)
+        center, covariance = drawn(one, view, backend)
+        expected_center, expected = unscented(mean, axes, view, FITTED.near)
+        np.testing.assert_allclose(center, expected_center, atol=1e-6)
         np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-6)
         compared += 1
     assert compared > 10
@@ -136,16 +136,16 @@ def test_sigma_points_past_the_fold_and_behind_the_near_plane(backend):
         slopes = np.hypot(points[:, 0], points[:, 1]) / np.maximum(points[:, 2], FITTED.near)
         assert (slopes**2 > fold(WIDE)).any()
         assert (points[:, 2] < FITTED.near).any() == (scales[2] > 1)
-        centre, covariance = drawn(ball, view, backend)
-        expected_centre, expected = unscented(mean, axes, view, FITTED.near)
-        np.testing.assert_allclose(centre, expected_centre, rtol=1e-5)
+        center, covariance = drawn(ball, view, backend)
+        expected_center, expected = unscented(mean, axes, view, FITTED.near)
+        np.testing.assert_allclose(center, expected_center, rtol=1e-5)
         np.testing.assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5)
         assert render(ball, view, backend, torch.float32).is_finite()
 
 
 @every_double
 @pytest.mark.parametrize("off_axis", [0.0, 0.4, 0.8])
-def test_closer_to_the_imaged_gaussian_than_its_linearisation(backend, off_axis):
+def test_closer_to_the_imaged_gaussian_than_its_linearization(backend, off_axis):
     # Gaussians of 5 to 10 % of their distance seen through a wide lens.
     view = through(front_camera(48, 40, 25.0), WIDE)
     turned = from_matrix(torch.from_numpy(rotation_matrix(np.array([0.8, 0.3, -0.2, 0.4]))))
@@ -153,15 +153,15 @@ def test_closer_to_the_imaged_gaussian_than_its_linearisation(backend, off_axis)
         means=[[2 * off_axis, -off_axis, 2.0]], scales=[[0.2, 0.1, 0.15]], quaternions=[turned.tolist()]
     )
     mean, axes = in_camera(ball, 0, view)
-    centre, covariance = quadrature(mean, axes, view)
+    center, covariance = quadrature(mean, axes, view)
     step = 1e-5 * np.eye(3)
     jacobian = np.stack([(imaged(mean + d, view, 0.2) - imaged(mean - d, view, 0.2)) / 2e-5 for d in step], -1)
     linear = jacobian @ axes @ axes.T @ jacobian.T
     ours, spread = drawn(ball, view, backend)
     linear_mean = imaged(mean, view, 0.2)
-    assert np.linalg.norm(ours - centre) < 0.05 * np.linalg.norm(linear_mean - centre)
+    assert np.linalg.norm(ours - center) < 0.05 * np.linalg.norm(linear_mean - center)
     # The covariances alone are about equally far off, 1 % here.
-    assert wasserstein(ours, spread, centre, covariance) < 0.5 * wasserstein(linear_mean, linear, centre, covariance)
+    assert wasserstein(ours, spread, center, covariance) < 0.5 * wasserstein(linear_mean, linear, center, covariance)
 
 
 @every_double

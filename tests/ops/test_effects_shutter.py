@@ -24,8 +24,8 @@ from tests.ops.scenes import (
 )
 
 # The low-pass belongs to the sensor and does not move with the splat, so the moving-Gaussian identity is exact without.
-SHARP = SplatSettings(blur=0.0)
-FITTED = SplatSettings(blur=0.0, alpha_min=0.0, transmittance_min=0.0)
+SHARP = SplatSettings(eps2d=0.0)
+FITTED = SplatSettings(eps2d=0.0, alpha_min=0.0, transmittance_min=0.0)
 
 
 def vector(*values: float) -> torch.Tensor:
@@ -220,7 +220,7 @@ def test_contribution_sees_what_is_drawn(backend):
     view = rolling(camera(13, 11), (0.15, -0.5, 0.3), (0.02, 0.04, 0.02))
     view = dataclasses.replace(view, distortion=vector(-0.2, 0.05, 0.0, 0.0, 0.0))
     gaussians = random_gaussians(60, view)
-    settings = SplatSettings(box=1.5, depth_bits=12)
+    settings = SplatSettings(max_sigma=1.5, depth_bits=12)
     counters = contribution(gaussians, view, settings=settings, backend=backend)
     alpha = splat(gaussians, view, settings=settings, backend=backend).alpha
     assert float(counters.weight.sum()) == pytest.approx(float(alpha.sum()), rel=1e-10)

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, removal, resolve_backend, splat
+from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, leave_one_out, resolve_backend, splat
 from sparsestreet.ops.cpu import library
 from sparsestreet.ops.validate import check_structure
 from sparsestreet.types import Camera, Shutter
@@ -65,7 +65,7 @@ def test_rows_of_opacity_0_may_hold_anything(backend, dtype):
             assert torch.equal(result.gradients[name], gradient), name
     cut = cast(gaussians, dtype, device=device_of(backend))
     assert torch.isfinite(contribution(cut, VIEW, backend=backend).weight).all()
-    assert torch.isfinite(removal(cut, VIEW, backend=backend).squared).all()
+    assert torch.isfinite(leave_one_out(cut, VIEW, backend=backend).squared_change).all()
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -75,7 +75,7 @@ def test_values_out_of_range(name):
     negative.scales[7, 1] = -0.5
     with pytest.raises(ValueError, match=r"opacities must lie in \[0, 1\], but row 3 has 1.5"):
         splat(opaque, VIEW, backend=name)
-    with pytest.raises(ValueError, match=r"scales must be >= 0 metres, but row 7 has -0.5"):
+    with pytest.raises(ValueError, match=r"scales must be >= 0 meters, but row 7 has -0.5"):
         splat(negative, VIEW, backend=name)
 
 
@@ -158,7 +158,7 @@ def test_the_wildest_distortion_that_is_taken_is_finite(name, dtype):
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_last_pixel_of_the_longest_image(axis, name):
-    # Its centre is exact in float32. A small splat there, and one over everything.
+    # Its center is exact in float32. A small splat there, and one over everything.
     length = 2**22
     view = front_camera(*((length, 1) if axis == 0 else (1, length)), 100.0)
     view.intrinsics[axis, 2] = length - 0.5
@@ -197,7 +197,7 @@ def test_pixel_weights(value, name):
     weights = torch.ones(7, 9, dtype=torch.float64)
     weights[2, 3] = value
     with pytest.raises(ValueError, match=rf"pixel_weights must be finite and >= 0, but at \[2, 3\] it is {value}: "):
-        removal(one_gaussian(), VIEW, pixel_weights=weights, backend=name)
+        leave_one_out(one_gaussian(), VIEW, pixel_weights=weights, backend=name)
 
 
 @pytest.mark.parametrize(
@@ -208,8 +208,8 @@ def test_pixel_weights(value, name):
         ("alpha_min", -0.1),
         ("transmittance_min", 1.0),
         ("stop", "sometimes"),
-        ("blur", float("nan")),
-        ("near", 0.0),
+        ("eps2d", float("nan")),
+        ("near_plane", 0.0),
     ],
 )
 def test_settings(field, value):
@@ -266,7 +266,7 @@ def test_more_pairs_than_may_be_held(monkeypatch):
     gaussians = type(giant).concatenate([one_gaussian(means=[[0.0, 0.0, -2.0]]), giant, one_gaussian()])
     # The ball of 0.1 m lies in the middle and reaches 7 px: tiles 1, 2 of rows 1; and the giant covers all 4 x 3.
     for limit, fits in ((14, True), (13, False)):
-        monkeypatch.setattr("sparsestreet.ops.cpu.rasteriser.PAIR_LIMIT", limit)
+        monkeypatch.setattr("sparsestreet.ops.cpu.rasterizer.PAIR_LIMIT", limit)
         if fits:
             splat(gaussians, view, backend="cpu")
             continue

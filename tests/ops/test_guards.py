@@ -30,12 +30,12 @@ REASONS = (
 )
 LENS = (-0.3, 0.0, 0.0, 0.0, 0.0)
 """Folds at r = 1.054."""
-SHARP = SplatSettings(blur=0.0)
+SHARP = SplatSettings(eps2d=0.0)
 every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 CASES = {
     "default": SplatSettings(),
-    "antialias, no blur": SplatSettings(antialias=True, stop="exclusive", blur=0.0),
-    "box": SplatSettings(box=1.5, antialias=True, depth_bits=12, half_colors=True),
+    "antialias, no blur": SplatSettings(antialias=True, stop="exclusive", eps2d=0.0),
+    "max_sigma": SplatSettings(max_sigma=1.5, antialias=True, depth_bits=12, half_colors=True),
     "exact": SplatSettings.preset("exact"),
 }
 
@@ -157,12 +157,12 @@ def test_each_guard_of_shapes_by_hand(dtype):
 
 
 @every_dtype
-def test_each_guard_of_alpha_and_colour_by_hand(dtype):
+def test_each_guard_of_alpha_and_color_by_hand(dtype):
     view, one, half = front_camera(20, 16, 20.0), SplatSettings(), SplatSettings(half_colors=True)
     antialias, tiny = SplatSettings(antialias=True), one_gaussian(scales=[[3.8e-3] * 3], opacities=[0.9])
     bright = one_gaussian(sh=[[[0.0, (70000.0 - 0.5) / Y0, 0.0]]])
     cases = [
-        # sigma^2 / (sigma^2 + 0.3) = 0.005 at sigma = 0.0388 px, with 10 px a metre at 2 m.
+        # sigma^2 / (sigma^2 + 0.3) = 0.005 at sigma = 0.0388 px, with 10 px a meter at 2 m.
         (None, one_gaussian(scales=[[3.9e-3] * 3], opacities=[0.9]), view, antialias),
         ("compensation_held", tiny, view, antialias),
         (None, tiny, view, one),
@@ -239,7 +239,7 @@ def test_the_hard_scenes(backend, dtype):
             # Alpha at the cut-off to the last bit: drawn with radius 0 (Guards.drawn).
             scene.opacities[scene.opacities == torch.tensor(1 / 255, dtype=dtype)] = 0.004
             total += check_against(backend, scene, front_camera(19, 14, 25.0), settings)
-    # What such scenes do: no lens, no shutter, no colour above 65504.
+    # What such scenes do: no lens, no shutter, no color above 65504.
     unseen = {"past_fold", "outruns_shutter", "sigma_point_held", "color_held"}
     assert {name for name, count in vars(total).items() if count == 0} == unseen
     assert {"vanished", "overflowed", "identity_quaternion"} <= set(total.alarms)

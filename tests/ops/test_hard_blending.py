@@ -65,7 +65,7 @@ def test_11_12_opacity_at_the_cut_off(backend, dtype):
 
 @every_precision
 def test_11_12_opacity_at_and_just_above_the_cut_off(backend, dtype):
-    # At 1/255 itself the ellipse is the pixel centre on the mean; one ulp more, and it has a size: sqrt(2 eps' 4.3) px
+    # At 1/255 itself the ellipse is the pixel center on the mean; one ulp more, and it has a size: sqrt(2 eps' 4.3) px
     # with eps' the relative step of the opacity, between eps / 2 and eps.
     view = front_camera(5, 5, 40.0)
     edge = torch.tensor(1 / 255, dtype=dtype)
@@ -144,7 +144,7 @@ def test_26_light_that_vanishes_in_float32(backend):
 @every_precision
 def test_27_exponents_that_underflow(backend, dtype):
     # No cut-off: pixels 1e4 standard deviations away evaluate exp(-1e8) = 0, forward and backward.
-    settings = dataclasses.replace(SplatSettings.preset("exact"), blur=1e-5)
+    settings = dataclasses.replace(SplatSettings.preset("exact"), eps2d=1e-5)
     tiny = one_gaussian(scales=[[1e-12] * 3])
     result = render(tiny, front_camera(101, 1, 40.0), backend, dtype, settings)
     assert result.is_finite()
@@ -154,7 +154,7 @@ def test_27_exponents_that_underflow(backend, dtype):
 
 @every_precision
 def test_28_bright_pixels_are_not_clamped(backend, dtype):
-    # A lamp of colour 3: clamped at 1, it could never be fitted, as nothing would flow back.
+    # A lamp of color 3: clamped at 1, it could never be fitted, as nothing would flow back.
     lamp = one_gaussian(sh=[[[2.5 / Y0] * 3]])
     result = render(lamp, front_camera(5, 5, 40.0), backend, dtype)
     assert result.images["rgb"][2, 2].tolist() == pytest.approx([0.8 * 3.0] * 3, rel=1e-6)

@@ -76,7 +76,7 @@ def test_03_04_needles_in_float32(backend, ratio, orientation):
 
 @every_backend
 def test_04_exponent_far_along_a_needle(backend):
-    # 350 px from the centre the conic form subtracts terms of 1e5 to find a squared distance below 10.
+    # 350 px from the center the conic form subtracts terms of 1e5 to find a squared distance below 10.
     view = front_camera(512, 512, 400.0)
     needle = one_gaussian(quaternions=[[0.93, 0.05, -0.02, 0.36]], scales=[[10.0, 1e-4, 1e-4]])
     truth = splat(needle, view, backend="reference")
@@ -113,7 +113,7 @@ def test_06_camera_inside_a_splat(backend, dtype):
 
 @every_backend
 def test_13_antialias_of_tiny_splats(backend):
-    # Scales of 1e-6 m two metres ahead: det / det_blurred = 2e-18, far below where float32 has correct digits.
+    # Scales of 1e-6 m two meters ahead: det / det_blurred = 2e-18, far below where float32 has correct digits.
     view = front_camera(5, 5, 40.0)
     settings = SplatSettings(antialias=True, alpha_min=1e-6)
     for scale in (1e-2, 1e-4, 1e-6, 1e-20, 0.0):
@@ -140,7 +140,7 @@ def _check_compensation(backend: str, scale: float, factor: float, view: Camera,
     assert (result.images["alpha"] - truth.images["alpha"]).abs().max() < 1e-6
     assert float(result.images["alpha"][2, 2]) == pytest.approx(0.8 * factor, rel=1e-5)
     assert guards(ball, view, settings=settings).compensation_held == (factor == 0.005)
-    # Of the colours alone: depth divides by alpha = 1 - T, and this cut-off lets through alphas of 1e-6.
+    # Of the colors alone: depth divides by alpha = 1 - T, and this cut-off lets through alphas of 1e-6.
     gradients = []
     for name, dtype in (("reference", torch.float64), (backend, torch.float32)):
         device = device_of(name)
@@ -192,7 +192,7 @@ def test_07_the_limit_acts_and_is_continuous(backend, dtype):
     assert (strip(0.8, view) - strip(0.8, wide)).abs().max() > 1e-3
 
 
-# Metres from the origin: a drive, the edge of what DrivingLog takes, and a map's easting and northing.
+# Meters from the origin: a drive, the edge of what DrivingLog takes, and a map's easting and northing.
 FAR = {"2 km": (1.7e3, -1e3, 40.0), "20 km": (17e3, -1e4, 100.0), "map": (4.5e5, 5.4e6, 100.0)}
 far_away = pytest.mark.parametrize("offset", FAR.values(), ids=FAR)
 
@@ -216,9 +216,9 @@ def test_19_a_splat_far_from_the_origin(backend, dtype, offset):
     ball = one_gaussian(means=[mean.tolist()], scales=[[0.03] * 3])
     alpha = render(ball, view, backend, dtype, SplatSettings.preset("exact")).images["alpha"]
     places = torch.arange(40, dtype=torch.float64) + 0.5
-    centre = torch.stack((alpha.sum(0) @ places, alpha.sum(1) @ places)) / alpha.sum()
+    center = torch.stack((alpha.sum(0) @ places, alpha.sum(1) @ places)) / alpha.sum()
     # R m + t is off by 0.002, 0.02 and 2 px here in float32.
-    error = (centre - torch.tensor([21.0, 22.0])).abs().max()
+    error = (center - torch.tensor([21.0, 22.0])).abs().max()
     assert error < (1e-4 if dtype == torch.float32 else 1e-6)
 
 
@@ -257,7 +257,7 @@ def test_19_a_scene_far_from_the_origin(backend, offset, effects):
     truth = render(scene, view, "reference", torch.float64, exact)
     result = render(scene, view, backend, torch.float32, exact)
     assert (truth.images["alpha"] > 0.5).any()
-    # As near as at the origin: found 3e-7 (depth, in metres, 1e-6) and 1e-5.
+    # As near as at the origin: found 3e-7 (depth, in meters, 1e-6) and 1e-5.
     for name, image in truth.images.items():
         assert (result.images[name] - image).abs().max() < 3e-6, name
     for name in FIELDS:
@@ -269,7 +269,7 @@ def test_19_a_scene_far_from_the_origin(backend, offset, effects):
 def test_21_brightness_of_a_sub_pixel_splat(backend, dtype, axis):
     # Sigma 0.05 px moves over a pixel. Its light is that of its own ellipse, o 2 pi sigma^2, wherever it is: pixel sums
     # of the blurred splat (sigma 0.55) are constant to 2 exp(-2 pi^2 0.3025) = 0.5 % along one axis; along the other it
-    # stays a quarter off a pixel centre, where they have no error.
+    # stays a quarter off a pixel center, where they have no error.
     view = front_camera(11, 11, 20.0)
     settings = SplatSettings(antialias=True, alpha_min=1e-5)
     light, plain = [], []
@@ -286,7 +286,7 @@ def test_21_brightness_of_a_sub_pixel_splat(backend, dtype, axis):
 
 
 def _card(mean: np.ndarray, sides: np.ndarray, turn: float, width: int, height: int) -> Gaussians:
-    """A flat card parallel to the image, 1 m ahead of a camera of focal length 100: 100 px a metre."""
+    """A flat card parallel to the image, 1 m ahead of a camera of focal length 100: 100 px a meter."""
     x, y = (mean - np.array([width, height]) / 2) / 100
     return one_gaussian(
         means=[[x, y, 1.0]],
@@ -302,10 +302,10 @@ def _squared_distances(x: np.ndarray, y: np.ndarray, mean: np.ndarray, conic: np
 
 
 def _nearest_of_tiles(mean: np.ndarray, conic: np.ndarray, width: int, height: int, cut: bool) -> np.ndarray:
-    """Least q on the vertical lines through each tile's pixel centres, first to last centre; ``cut`` at the image.
+    """Least q on the vertical lines through each tile's pixel centers, first to last center; ``cut`` at the image.
 
-    A row of tiles is listed over the columns that the ellipse passes through between its first and its last centres, so
-    this is what decides whether a tile is listed, not its pixel centres alone.
+    A row of tiles is listed over the columns that the ellipse passes through between its first and its last centers, so
+    this is what decides whether a tile is listed, not its pixel centers alone.
     """
     tiles_x, tiles_y = -(-width // 16), -(-height // 16)
     x, top = np.arange(width)[None] + 0.5, 16.0 * np.arange(tiles_y)[:, None] + 0.5

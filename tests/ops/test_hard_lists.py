@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, contribution, removal, splat
+from sparsestreet.ops import SplatSettings, contribution, leave_one_out, splat
 from sparsestreet.ops.cpu.workspace import idle_workspaces
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -87,7 +87,7 @@ def test_16_numbers_of_every_row_are_written(backend, dtype):
     scene = cast(Gaussians.concatenate(rows), dtype, device=device_of(backend))
 
     def counted() -> dict[str, torch.Tensor]:
-        counters = [vars(count(scene, view, backend=backend)) for count in (contribution, removal)]
+        counters = [vars(count(scene, view, backend=backend)) for count in (contribution, leave_one_out)]
         return counters[0] | counters[1] | {"radii": splat(scene, view, backend=backend).radii}
 
     expected = counted()
@@ -106,21 +106,21 @@ def test_17_depth_ties_keep_the_row_order(backend, dtype):
     red, green = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
     first, second = one_gaussian(sh=red), one_gaussian(sh=green)
     for front, back, channel in ((first, second, 0), (second, first, 1)):
-        centre = render(Gaussians.concatenate([front, back]), view, backend, dtype).images["rgb"][2, 2]
+        center = render(Gaussians.concatenate([front, back]), view, backend, dtype).images["rgb"][2, 2]
         # 0.8 (0.5 + 1) + 0.2 * 0.8 * 0.5 in the front one's channel.
-        assert centre[channel] == pytest.approx(1.28, rel=1e-6)
+        assert center[channel] == pytest.approx(1.28, rel=1e-6)
 
 
 @every_precision
-def test_17_neighbouring_depths_are_told_apart(backend, dtype):
+def test_17_neighboring_depths_are_told_apart(backend, dtype):
     far = torch.tensor(731.25, dtype=dtype)
     depths = (float(torch.nextafter(far, 2 * far)), float(far))
     parts = [
         one_gaussian(sh=[[[1.0 / Y0, 0.0, 0.0]]], means=[[0.0, 0.0, depths[0]]], scales=[[90.0] * 3]),
         one_gaussian(sh=[[[0.0, 1.0 / Y0, 0.0]]], means=[[0.0, 0.0, depths[1]]], scales=[[90.0] * 3]),
     ]
-    centre = render(Gaussians.concatenate(parts), front_camera(5, 5, 40.0), backend, dtype).images["rgb"][2, 2]
-    assert centre[1] == pytest.approx(1.28, rel=1e-5)
+    center = render(Gaussians.concatenate(parts), front_camera(5, 5, 40.0), backend, dtype).images["rgb"][2, 2]
+    assert center[1] == pytest.approx(1.28, rel=1e-5)
 
 
 @every_backend

@@ -47,7 +47,7 @@ def extreme_gaussians(rows: int, seed: int) -> Gaussians:
 # Without a pixel that two opaque splats bring to 0.01^2 = 1e-4, the default's limit, exactly: rounding would decide.
 EXTREME_SETTINGS = (
     SplatSettings(transmittance_min=3e-5),
-    SplatSettings(transmittance_min=3e-5, antialias=True, stop="exclusive", blur=0.0),
+    SplatSettings(transmittance_min=3e-5, antialias=True, stop="exclusive", eps2d=0.0),
 )
 
 
@@ -93,7 +93,7 @@ def test_01_extreme_scenes_are_right(backend, dtype):
 @pytest.mark.parametrize(("size", "antialias"), [(1e12, True), (1e12, False), (1e25, False)])
 def test_02_an_overflowing_row_is_culled(backend, size, antialias):
     # 1e12 m and 1e25 m are finite, but not the determinant of the one nor the variance of the other on the screen, in
-    # float32: they must vanish, not poison their neighbours.
+    # float32: they must vanish, not poison their neighbors.
     view, settings = front_camera(21, 13, 20.0), SplatSettings(antialias=antialias)
     good = random_gaussians(10, view)
     bad = one_gaussian(scales=[[size] * 3])
@@ -197,7 +197,7 @@ def test_14_a_masked_row_leaves_no_trace(backend, dtype, preset):
 
 
 @every_precision
-def test_25_negative_colours_are_black_without_gradient(backend, dtype):
+def test_25_negative_colors_are_black_without_gradient(backend, dtype):
     sh = [[[-1.5 / Y0, 0.5 / Y0, -1.5 / Y0]]]
     view = front_camera(5, 5, 40.0)
     result = render(one_gaussian(sh=sh), view, backend, dtype)

@@ -15,7 +15,7 @@ from tests.ops.scenes import DEFAULT, FIELDS, camera, cast, device_of, every_bac
 few = settings(max_examples=12, derandomize=True, database=None, deadline=None)
 """The same examples in every run: a failure in CI is the failure at home."""
 BAR = {torch.float64: 1e-11, torch.float32: 1e-5}
-"""Found 7e-15 and 3e-6: coordinates of 30 m, 2e-6 m apart in float32, at 40 px a metre and less."""
+"""Found 7e-15 and 3e-6: coordinates of 30 m, 2e-6 m apart in float32, at 40 px a meter and less."""
 SHIFT_BAR = {torch.float64: 1e-12, torch.float32: 4e-6}
 """Of images of the same rows elsewhere on the image plane: 41 px are known to 2e-6 px in float32, and alpha changes by
 at most 1.1 per pixel (a blur of 0.55 px)."""
@@ -147,7 +147,7 @@ def test_another_unit_of_length(backend, dtype, scene, unit):
     shutter = view.shutter and Shutter(unit * view.shutter.translation, view.shutter.rotation)
     elsewhere = dataclasses.replace(view, camera_from_world=pose, shutter=shutter)
     expected = seen_by(backend, dtype, gaussians, view, SMOOTH)
-    near = dataclasses.replace(SMOOTH, near=unit * SMOOTH.near)
+    near = dataclasses.replace(SMOOTH, near_plane=unit * SMOOTH.near_plane)
     seen = seen_by(backend, dtype, scaled, elsewhere, near)
     assert_same(seen, expected, dtype)
     # Depth is divided by alpha, of which float32 keeps no digits where it is faint.

@@ -17,7 +17,7 @@ LOOSE = SplatSettings(alpha_min=1e-9)
 
 
 def test_one_ball_by_hand():
-    # 0.1 m at 2 m with focal 40: sigma = 2 px, variance 4 + 0.3 blur. A 5x5 image: the centre pixel is (2.5, 2.5).
+    # 0.1 m at 2 m with focal 40: sigma = 2 px, variance 4 + 0.3 blur. A 5x5 image: the center pixel is (2.5, 2.5).
     rendering = splat(one_gaussian(), front_camera(5, 5, 40.0), backend="reference")
     for (row, column), squared in {(2, 2): 0.0, (2, 3): 1.0, (1, 3): 2.0, (0, 4): 8.0}.items():
         alpha = 0.8 * math.exp(-0.5 * squared / 4.3)
@@ -57,7 +57,7 @@ def test_stop_rule_by_hand(stop):
     settings = SplatSettings(transmittance_min=0.05, stop=stop)
     rendering = splat(Gaussians.concatenate(layers), front_camera(1, 1, 40.0), settings=settings, backend="reference")
     expected = 0.99 if stop == "inclusive" else 0.9
-    # 9 m at 2 m with focal 40 is 180 px: half a pixel off the centre changes nothing; the pixel is at the centre.
+    # 9 m at 2 m with focal 40 is 180 px: half a pixel off the center changes nothing; the pixel is at the center.
     assert rendering.alpha.item() == pytest.approx(expected, rel=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""The tile-vectorised torch blend against the reference: an oracle is worth as much as its own test."""
+"""The tile-vectorized torch blend against the reference: an oracle is worth as much as its own test."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ SETTINGS = SplatSettings()
     [
         SETTINGS,
         SplatSettings(stop="exclusive", transmittance_min=0.1),
-        SplatSettings(box=1.5),
+        SplatSettings(max_sigma=1.5),
         SplatSettings(half_colors=True, depth_bits=12),
     ],
 )

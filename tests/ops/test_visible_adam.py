@@ -1,4 +1,4 @@
-"""One step of Adam for visible rows, in torch and in Triton, against torch's own optimisers."""
+"""One step of Adam for visible rows, in torch and in Triton, against torch's own optimizers."""
 
 import pytest
 import torch

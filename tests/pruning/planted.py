@@ -52,7 +52,7 @@ def judge(keep: Bool[Tensor, " n"], planted: Bool[Tensor, " n"], visible: Bool[T
 
 
 def activated(rows: Rows) -> Gaussians:
-    """Rows in the world frame as the rasteriser takes them, unmasked."""
+    """Rows in the world frame as the rasterizer takes them, unmasked."""
     columns = {name: column.detach() for name, column in rows.columns().items()}
     return Gaussians(
         columns["means"],
@@ -71,11 +71,11 @@ class Views:
         gaussians: Gaussians,
         cameras: Sequence[Camera],
         backend: str = "auto",
-        backdrops: Sequence[Tensor] | None = None,
+        sky_images: Sequence[Tensor] | None = None,
     ) -> None:
-        """``backdrops``: what stands behind the Gaussians in each view; None: black."""
+        """``sky_images``: what stands behind the Gaussians in each view; None: black."""
         self.gaussians, self.cameras, self.backend = gaussians, cameras, backend
-        self.backdrops = [None] * len(cameras) if backdrops is None else backdrops
+        self.sky_images = [None] * len(cameras) if sky_images is None else sky_images
         self.images = [self._image(gaussians, index) for index in range(len(cameras))]
         self.contributions = [contribution(gaussians, camera, backend=backend) for camera in cameras]
 
@@ -98,10 +98,10 @@ class Views:
 
     @torch.no_grad()
     def _image(self, gaussians: Gaussians, index: int) -> Tensor:
-        return splat(gaussians, self.cameras[index], background=self.backdrops[index], backend=self.backend).rgb
+        return splat(gaussians, self.cameras[index], background=self.sky_images[index], backend=self.backend).rgb
 
     def visible(self, rows: Int[Tensor, " k"], more_than: float = NOTICEABLE) -> Bool[Tensor, " n"]:
-        """Marks those of the given rows whose removal moves a view by more than ``more_than``."""
+        """Marks those of the given rows whose leave_one_out moves a view by more than ``more_than``."""
         marked = torch.zeros(len(self.gaussians), dtype=torch.bool)
         for row in rows.tolist():
             marked[row] = self.movement(row, enough=more_than) > more_than
@@ -115,13 +115,13 @@ def plant(
     hidden: int,
     copies: int,
     backend: str = "auto",
-    backdrops: Sequence[Tensor] | None = None,
+    sky_images: Sequence[Tensor] | None = None,
 ) -> tuple[Rows, Bool[Tensor, " n"]]:
     """A table of the old rows followed by ``hidden`` + ``copies`` useless ones, and which these are.
 
     ``rows`` are in the world frame (a background node). Raises ValueError if the scene has too few opaque places.
     """
-    views = Views(activated(rows), cameras, backend, backdrops)
+    views = Views(activated(rows), cameras, backend, sky_images)
     # Three proposals for each row wanted: some places turn out to be seen from elsewhere.
     proposals = [
         _propose_hidden(rows, views, PROPOSALS * hidden, generator),
@@ -135,7 +135,7 @@ def plant(
         chosen = _first(possible & is_hidden, hidden) | _first(possible & ~is_hidden, copies)
         keep = torch.cat((torch.ones(len(rows), dtype=torch.bool), chosen))
         planted = _resized(candidates, RowPlan.keep(keep))
-        moving = _moving(Views(activated(planted), cameras, backend, backdrops), len(rows))
+        moving = _moving(Views(activated(planted), cameras, backend, sky_images), len(rows))
         if not moving.any():
             return planted, torch.arange(len(planted)) >= len(rows)
         possible[torch.nonzero(chosen).squeeze(-1)[moving]] = False
@@ -212,7 +212,7 @@ def _resized(rows: Rows, plan: RowPlan) -> Rows:
 def _moving(views: Views, old: int) -> Bool[Tensor, " m"]:
     """Which of the rows from ``old`` on move some view."""
     largest = torch.stack([view.weight for view in views.contributions]).amax(0)
-    # A weight below NOTICEABLE in sum over all pixels moves no pixel by more (colours differ by at most about 1); the
+    # A weight below NOTICEABLE in sum over all pixels moves no pixel by more (colors differ by at most about 1); the
     # others are tested one by one.
     unclear = (largest > NOTICEABLE) & (torch.arange(len(views.gaussians)) >= old)
     return views.visible(torch.nonzero(unclear).squeeze(-1))[old:]

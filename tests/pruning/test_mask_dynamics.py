@@ -9,7 +9,7 @@ from torch import nn
 from sparsestreet.pruning import keep_by_mask
 from sparsestreet.scene.masks import StaticMask
 
-MASK = StaticMask(weight=1.0, minimum_rows=0)
+MASK = StaticMask(weight=1.0, min_gaussians=0)
 LEARNING_RATE = 0.01
 WEIGHTS = torch.tensor([2.5e-3, 1e-4, 1e-5])  # the paper's lambda_n: background, rigid, people
 ROWS_IN_SCENE = 1_500_000
@@ -26,7 +26,7 @@ def steps_to_removal(epsilon: float, limit: int) -> list[int]:
         loss = (WEIGHTS * MASK.scores(logits)).sum() / ROWS_IN_SCENE
         loss.backward()
         adam.step()
-        keep = keep_by_mask(MASK.scores(logits.detach()), MASK.threshold, MASK.minimum_rows).keep
+        keep = keep_by_mask(MASK.scores(logits.detach()), MASK.threshold, MASK.min_gaussians).keep
         removed_at = [min(at, step) if not kept else at for at, kept in zip(removed_at, keep.tolist(), strict=True)]
         if not keep.any():
             break

@@ -19,7 +19,7 @@ RECALL, VISIBLE_LOST = 0.95, 0.02
 
 
 def wall(generator: torch.Generator) -> Rows:
-    """8 x 6 tiles of 0.4 m before three layers of a dark opaque slab at 5 m (metres, z forward)."""
+    """8 x 6 tiles of 0.4 m before three layers of a dark opaque slab at 5 m (meters, z forward)."""
     x, y = torch.meshgrid(torch.arange(8) * 0.4 - 1.4, torch.arange(6) * 0.4 - 1.0, indexing="ij")
     tiles = torch.stack((x, y, torch.full_like(x, 5.0)), dim=-1).reshape(-1, 3)
     slab = torch.tensor([[0.0, 0.0, 5.2], [0.0, 0.0, 5.3], [0.0, 0.0, 5.4]])
@@ -87,7 +87,7 @@ def test_zero_importance_removes_what_was_planted_and_nothing_visible(planted_wa
     rows, planted = planted_wall
     visible = Views(activated(rows), cameras(), BACKEND).visible(torch.nonzero(~planted).squeeze(-1))
     scores = measure_importance(contributions_of(rows, cameras(), BACKEND))
-    verdict = judge(keep_by_importance(scores, minimum_rows=0).keep, planted, visible)
+    verdict = judge(keep_by_importance(scores, min_gaussians=0).keep, planted, visible)
     assert verdict.num_visible == 49  # every tile and the front of the slab
     assert verdict.recall >= RECALL
     assert verdict.visible_lost <= VISIBLE_LOST
@@ -99,7 +99,7 @@ def test_trained_masks_remove_what_was_planted_and_nothing_visible(planted_wall)
     views = Views(activated(rows), cameras(), BACKEND)
     visible = views.visible(torch.nonzero(~planted).squeeze(-1))
     generator = torch.Generator().manual_seed(1)
-    mask = StaticMask(weight=2.5e-3, minimum_rows=0)
+    mask = StaticMask(weight=2.5e-3, min_gaussians=0)
     logits = torch.nn.Parameter(mask.initial_logits(len(rows)))
     # Ten times the learning rate of a real run: unseen rows cross the threshold after about 141 steps, not 1410.
     adam = torch.optim.Adam([logits], lr=0.1, eps=1e-15)
@@ -117,7 +117,7 @@ def test_trained_masks_remove_what_was_planted_and_nothing_visible(planted_wall)
         adam.zero_grad()
         loss.backward()
         adam.step()
-    keep = keep_by_mask(mask.scores(logits.detach()), mask.threshold, mask.minimum_rows).keep
+    keep = keep_by_mask(mask.scores(logits.detach()), mask.threshold, mask.min_gaussians).keep
     verdict = judge(keep, planted, visible)
     assert verdict.recall >= RECALL
     assert verdict.visible_lost <= VISIBLE_LOST
@@ -127,7 +127,7 @@ def test_without_the_gate_most_of_them_stay(planted_wall):
     """The test above can fail: touching one pixel faintly is enough to score."""
     rows, planted = planted_wall
     scores = measure_importance(contributions_of(rows, cameras(), BACKEND), gate=False)
-    keep = keep_by_importance(scores, minimum_rows=0).keep
+    keep = keep_by_importance(scores, min_gaussians=0).keep
     assert float((planted & ~keep).sum()) / 50 < RECALL
 
 

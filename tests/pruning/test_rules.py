@@ -1,4 +1,4 @@
-"""The removal rule on a scene whose answer is known, and both rules' errors."""
+"""The leave_one_out rule on a scene whose answer is known, and both rules' errors."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings
-from sparsestreet.pruning import ImportanceRule, RemovalRule, View
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, View
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.background import Background
@@ -35,7 +35,7 @@ def scene_of(opacities: list[float], depths: list[float]) -> SceneGraph:
 def frame_of(scene: SceneGraph, offset: int) -> Frame:
     """What the scene shows, off by ``offset`` 8-bit steps in every channel: so much is the present error."""
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 4.5], [0, 40.0, 3.5], [0, 0, 1]]), 9, 7)
-    blank = Frame(0, 0.0, 0, camera, torch.zeros(7, 9, 3, dtype=torch.uint8))
+    blank = Frame(camera, 0.0, 0, 0, image=torch.zeros(7, 9, 3, dtype=torch.uint8))
     with torch.no_grad():
         rgb = render(scene, camera, 0.0, backend="reference").rgb.clamp(0, 1)
     return replace(blank, image=((rgb * 255).round() - offset).clamp(0, 255).to(torch.uint8))
@@ -60,16 +60,16 @@ def test_a_budget_buys_the_cheapest_rows_and_no_more():
         (0.98 * (costs[0] + costs[2]), [False, True, True]),
     ):
         allowed_db = float(10 * torch.log10(torch.tensor(1 + allowed / error)))
-        rule = RemovalRule(allowed_db, noticeable=0.0)
+        rule = LeaveOneOutRule(allowed_db, noticeable=0.0)
         assert rule.select(scene, [frame], {"background": 0}, VIEW)["background"].keep.tolist() == kept
 
 
 def test_without_a_budget_only_what_nobody_sees_goes():
     # Two discs behind an opaque one: 0.01 of the light gets through, and of that 0.3 and 0.7 * 0.5: 0.9 steps of 255.
     scene = scene_of([0.99, 0.3, 0.5], [2.0, 3.0, 4.0])
-    selection = RemovalRule(0.0).select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"]
+    selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"]
     assert selection.keep.tolist() == [True, False, False]
-    strict = RemovalRule(0.0, noticeable=0.0)
+    strict = LeaveOneOutRule(0.0, noticeable=0.0)
     assert strict.select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"].removed == 0
 
 
@@ -80,7 +80,7 @@ def test_a_row_seen_in_one_view_of_two_stays():
     pose = torch.eye(4)
     pose[2, 3] = -2.5
     behind = replace(front, camera=replace(front.camera, camera_from_world=pose))
-    rule = RemovalRule(0.0)
+    rule = LeaveOneOutRule(0.0)
     assert rule.select(scene, [front], {"background": 0}, VIEW)["background"].keep.tolist() == [True, False]
     assert rule.select(scene, [front, behind], {"background": 0}, VIEW)["background"].removed == 0
 
@@ -96,7 +96,7 @@ def test_what_shows_a_vehicle_costs_more():
     halves[:, 5:] = True
     for vehicle, kept in ((halves, [False, True]), (halves.flip(1), [True, False])):
         marked = replace(frame, vehicle=vehicle)
-        budgets = [RemovalRule(db, noticeable=0.0) for db in torch.linspace(0.1, 25, 250).tolist()]
+        budgets = [LeaveOneOutRule(db, noticeable=0.0) for db in torch.linspace(0.1, 25, 250).tolist()]
         selections = [rule.select(scene, [marked], {"background": 0}, VIEW)["background"] for rule in budgets]
         first = next(selection for selection in selections if selection.removed)
         assert first.keep.tolist() == kept
@@ -109,16 +109,16 @@ def test_a_scene_without_error_loses_nothing_that_is_seen():
         scene.nodes["background"].rows.sh_dc.fill_(9.0)
     frame = frame_of(scene, 0)
     assert (frame.image == 255).all()
-    assert RemovalRule(0.1).select(scene, [frame], {"background": 0}, VIEW)["background"].removed == 0
+    assert LeaveOneOutRule(0.1).select(scene, [frame], {"background": 0}, VIEW)["background"].removed == 0
 
 
 def test_the_floor_holds():
     scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0])
-    for rule in (RemovalRule(50.0), ImportanceRule()):
+    for rule in (LeaveOneOutRule(50.0), ImportanceRule()):
         assert int(rule.select(scene, [frame_of(scene, 5)], {"background": 2}, VIEW)["background"].keep.sum()) >= 2
 
 
 @pytest.mark.parametrize(("allowed_db", "noticeable"), [(-0.1, 0.0), (float("nan"), 0.0), (0.1, -1.0)])
 def test_bad_settings_are_refused(allowed_db, noticeable):
     with pytest.raises(ValueError, match="must be >= 0"):
-        RemovalRule(allowed_db, noticeable)
+        LeaveOneOutRule(allowed_db, noticeable)

@@ -56,8 +56,8 @@ def test_plan_keeps_survivors_in_order_with_their_moments(scores, floor):
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-8, 2, width=32), max_size=12, unique=True), st.integers(0, 14))
 def test_rows_dropped_are_exactly_those_the_mask_has_closed(logits, floor):
-    """Removal loses nothing: the rasteriser drew exactly the rows that are kept (scores without ties)."""
-    mask = StaticMask(weight=1.0, minimum_rows=floor)
+    """LeaveOneOut loses nothing: the rasterizer drew exactly the rows that are kept (scores without ties)."""
+    mask = StaticMask(weight=1.0, min_gaussians=floor)
     scores = mask.scores(torch.tensor(logits))
     if len(set(scores.tolist())) == len(logits):
         assert keep_by_mask(scores, mask.threshold, floor).keep.tolist() == (mask.multipliers(scores) == 1).tolist()
@@ -67,7 +67,7 @@ def test_score_at_the_threshold_is_closed_in_the_dtype_of_the_mask():
     # float32(0.1) is above 0.1 in float64, so that widening the scores would open the row.
     score = torch.tensor([0.1], dtype=torch.float32)
     assert not keep_by_mask(score, 0.1, 0).keep.item()
-    assert StaticMask(weight=1.0, minimum_rows=0, threshold=0.1).multipliers(score).item() == 0.0
+    assert StaticMask(weight=1.0, min_gaussians=0, threshold=0.1).multipliers(score).item() == 0.0
 
 
 def test_all_scores_equal():
@@ -105,7 +105,7 @@ def test_nan_scores_are_refused():
 
 
 def test_impossible_inputs_are_refused():
-    with pytest.raises(ValueError, match="minimum_rows"):
+    with pytest.raises(ValueError, match="min_gaussians"):
         keep_by_mask(torch.zeros(2), 0.01, -1)
     with pytest.raises(ValueError, match=">= 0"):
         keep_by_importance(torch.tensor([-0.1, 0.2]), 0)

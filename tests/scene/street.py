@@ -10,7 +10,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes.knots import Knots
+from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.types import Camera, Frame, Sweep, Track
 
 
@@ -23,7 +23,7 @@ def random_rows(
     instances: Tensor | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Rows:
-    """Rows with different values in every entry, a few metres around the origin."""
+    """Rows with different values in every entry, a few meters around the origin."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -43,7 +43,7 @@ def random_rows(
 
 
 def pose(yaw: float, translation: tuple[float, float, float]) -> Float[Tensor, "4 4"]:
-    """World-from-box: a turn about z (radians), then a shift (metres); float64."""
+    """World-from-box: a turn about z (radians), then a shift (meters); float64."""
     matrix = torch.eye(4, dtype=torch.float64)
     cosine, sine = math.cos(yaw), math.sin(yaw)
     matrix[:2, :2] = torch.tensor([[cosine, -sine], [sine, cosine]], dtype=torch.float64)
@@ -61,11 +61,11 @@ def track(
     return Track(name, class_name, torch.tensor(frames), torch.stack(poses), torch.tensor(size))
 
 
-def knots(
+def keyframes(
     tracks: list[Track], num_frames: int, held_out: frozenset[int] = frozenset(), dtype: torch.dtype = torch.float32
-) -> Knots:
-    made = Knots.from_tracks(tracks, held_out, num_frames)
-    return Knots(
+) -> Trajectories:
+    made = Trajectories.from_tracks(tracks, held_out, num_frames)
+    return Trajectories(
         made.times.to(dtype),
         made.quaternions.to(dtype),
         made.translations.to(dtype),
@@ -102,11 +102,11 @@ def frame_at(index: int) -> Frame:
     image[:, camera.width // 2 :, 2] = 255
     sky = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     sky[:5] = True
-    return Frame(index, index / (NUM_FRAMES - 1), 0, camera, image, sky=sky)
+    return Frame(camera, index / (NUM_FRAMES - 1), index, 0, image=image, sky=sky)
 
 
 def sweep_at(index: int, car_points: int) -> Sweep:
-    """Points on the road ahead and inside the moving car, in their colours; the last point has no colour."""
+    """Points on the road ahead and inside the moving car, in their colors; the last point has no color."""
     generator = torch.Generator().manual_seed(index)
     road = torch.rand(50, 3, generator=generator) * torch.tensor([25.0, 8.0, 0.0]) + torch.tensor([3.0, -10.0, 0.0])
     in_box = (torch.rand(car_points, 3, generator=generator) - 0.5) * torch.tensor([3.9, 1.9, 1.4])

@@ -5,14 +5,14 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.sky import Sky, SkySettings
-from tests.scene.street import knots, pose, random_rows, track
+from tests.scene.street import keyframes, pose, random_rows, track
 
-MASK = StaticMask(weight=0.25, minimum_rows=0)
+MASK = StaticMask(weight=0.25, min_gaussians=0)
 
 
 def rigid(count: int) -> Rigid:
     rows = random_rows(count, 1, instances=torch.zeros(count, dtype=torch.int64))
-    return Rigid(rows, knots([track("car", [0, 1], [pose(0, (5.0, 0, 0))] * 2)], 2), torch.ones(1, 3), maximum_gap=1.0)
+    return Rigid(rows, keyframes([track("car", [0, 1], [pose(0, (5.0, 0, 0))] * 2)], 2), torch.ones(1, 3), max_gap=1.0)
 
 
 def test_nodes_in_their_order():
@@ -73,7 +73,7 @@ def test_bytes_of_every_part():
 
 
 def test_names_of_the_parameters():
-    """The optimiser's groups and checkpoints go by these."""
+    """The optimizer's groups and checkpoints go by these."""
     scene = SceneGraph({"road": Background(random_rows(1, 0), None), "cars": rigid(1)}, Sky(SkySettings(2)))
     names = {name for name, _ in scene.named_parameters()}
     assert {"sky.texels", "nodes.road.rows.means", "nodes.cars.rotation_deltas"} <= names

@@ -7,18 +7,18 @@ from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.rendering import SceneRendering, render
 from sparsestreet.scene.sky import Sky, SkySettings
-from tests.scene.street import camera_at, knots, pose, random_rows, track
+from tests.scene.street import camera_at, keyframes, pose, random_rows, track
 
-MASK = StaticMask(weight=0.1, minimum_rows=0)
+MASK = StaticMask(weight=0.1, min_gaussians=0)
 CAMERA = camera_at(-6.0, width=17, height=11)
 
 
 def scene_of(road_rows: int = 9, car_rows: int = 5, mask: StaticMask | None = MASK, dtype=torch.float32) -> SceneGraph:
-    """A road about the origin, 6 m before the camera, a car that moves across, a sky of many colours."""
+    """A road about the origin, 6 m before the camera, a car that moves across, a sky of many colors."""
     instances = torch.zeros(car_rows, dtype=torch.int64)
     car = track("car", [0, 1], [pose(0.0, (0.0, -1.0, 1.0)), pose(0.4, (0.0, 1.0, 1.0))])
     rows = random_rows(car_rows, 1, instances=instances, mask=mask, dtype=dtype)
-    cars = Rigid(rows, knots([car], 2, dtype=dtype), torch.ones(1, 3, dtype=dtype), mask, maximum_gap=1.0)
+    cars = Rigid(rows, keyframes([car], 2, dtype=dtype), torch.ones(1, 3, dtype=dtype), mask, max_gap=1.0)
     sky = Sky(SkySettings(4)).to(dtype)
     with torch.no_grad():
         sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))

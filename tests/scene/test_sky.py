@@ -15,7 +15,7 @@ def random_sky(side: int, dtype: torch.dtype = torch.float64) -> Sky:
 
 
 def directions_of(side: int) -> torch.Tensor:
-    """Texel centres [6, side, side, 3] by hand: columns along y on x faces, else x; rows along y on z faces, else z."""
+    """Texel centers [6, side, side, 3] by hand: columns along y on x faces, else x; rows along y on z faces, else z."""
     grid = (torch.arange(side).double() + 0.5) / side * 2 - 1
     result = torch.empty(6, side, side, 3, dtype=torch.float64)
     for face in range(6):
@@ -26,7 +26,7 @@ def directions_of(side: int) -> torch.Tensor:
     return result
 
 
-def test_the_start_is_grey():
+def test_the_start_is_gray():
     assert Sky().texels.shape == (6, 128, 128, 3)
     colors = Sky().colors(torch.randn(3, 4, 3, generator=torch.Generator().manual_seed(0)))
     torch.testing.assert_close(colors, torch.full((3, 4, 3), 0.5))  # four weights that sum to 1, rounded
@@ -55,7 +55,7 @@ def test_halfway_between_two_texels():
 
 
 def test_no_seam_along_the_edges():
-    """Stepping 2e-9 across any edge must not change the colour of a random cube map beyond that step's slope."""
+    """Stepping 2e-9 across any edge must not change the color of a random cube map beyond that step's slope."""
     sky, side = random_sky(8), 8
     generator = torch.Generator().manual_seed(1)
     for _ in range(200):
@@ -63,7 +63,7 @@ def test_no_seam_along_the_edges():
         first, second, along = torch.randperm(3, generator=generator).tolist()
         signs = torch.randint(0, 2, (2,), generator=generator) * 2 - 1
         edge[first], edge[second] = signs[0], signs[1]
-        # Up to the last texel centre; at the very corner three faces meet and nothing bilinear is continuous.
+        # Up to the last texel center; at the very corner three faces meet and nothing bilinear is continuous.
         edge[along] = (torch.rand((), generator=generator, dtype=torch.float64) * 2 - 1) * (1 - 1 / side)
         step = torch.zeros(3, dtype=torch.float64)
         step[first] = 1e-9 * signs[0]
@@ -72,7 +72,7 @@ def test_no_seam_along_the_edges():
 
 
 def test_near_a_corner_the_jump_is_less_than_a_texel():
-    """A smooth map (the direction itself): neighbouring directions across a corner differ by less than one texel."""
+    """A smooth map (the direction itself): neighboring directions across a corner differ by less than one texel."""
     side = 16
     sky = random_sky(side)
     with torch.no_grad():

@@ -17,7 +17,7 @@ HEIGHT, WIDTH = 13, 17
 def frame(generator, **known) -> Frame:
     camera = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
     image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), dtype=torch.uint8, generator=generator)
-    return Frame(index=0, time=0.0, camera_index=0, camera=camera, image=image, **known)
+    return Frame(frame_index=0, time=0.0, camera_index=0, camera=camera, image=image, **known)
 
 
 def rendering(rgb=None, alpha=None, depth=None, rows=None, mask_terms=None) -> SceneRendering:
@@ -64,16 +64,16 @@ def test_photometric_mixes_l1_and_dissimilarity(generator):
     seen = frame(generator)
     truth = seen.image.float() / 255
     rgb = truth + 0.1
-    l1_only = Photometric(weight=2.0, ssim_share=0.0)(rendering(rgb), seen)
+    l1_only = Photometric(weight=2.0, lambda_dssim=0.0)(rendering(rgb), seen)
     assert float(l1_only) == pytest.approx(0.2, abs=1e-6)
-    mixed = Photometric(weight=1.0, ssim_share=0.25)(rendering(rgb), seen)
+    mixed = Photometric(weight=1.0, lambda_dssim=0.25)(rendering(rgb), seen)
     assert float(mixed) == pytest.approx(0.75 * 0.1 + 0.25 * (1 - float(ssim(rgb, truth))), abs=1e-6)
 
 
 def test_saturated_pixels_keep_their_gradient(generator):
     seen = frame(generator)
     rgb = torch.full((HEIGHT, WIDTH, 3), 1.5, requires_grad=True)
-    Photometric(ssim_share=0.0)(rendering(rgb), seen).backward()
+    Photometric(lambda_dssim=0.0)(rendering(rgb), seen).backward()
     assert bool((rgb.grad > 0).all())
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from sparsestreet.training.optimizer import Optimization, Rate
+from sparsestreet.training.optimizer import LearningRate, OptimizerSettings
 
 
 class Scene(nn.Module):
@@ -14,7 +14,9 @@ class Scene(nn.Module):
 
 
 def test_rates_scale_with_the_scene_and_decay_log_linearly():
-    optimization = Optimization({"means": Rate(1.6e-4, 1.6e-6, in_scene_units=True), "texels": Rate(1e-2)})
+    optimization = OptimizerSettings(
+        {"means": LearningRate(1.6e-4, 1.6e-6, scale_by_scene_radius=True), "texels": LearningRate(1e-2)}
+    )
     scene = Scene()
     optimizer = optimization.build(scene, radius=10.0)
     by_name = {group["name"]: group for group in optimizer.param_groups}
@@ -26,13 +28,13 @@ def test_rates_scale_with_the_scene_and_decay_log_linearly():
 
 def test_the_groups_hold_every_parameter_once():
     scene = Scene()
-    optimizer = Optimization({"means": Rate(1.0), "texels": Rate(1.0)}).build(scene, 1.0)
+    optimizer = OptimizerSettings({"means": LearningRate(1.0), "texels": LearningRate(1.0)}).build(scene, 1.0)
     held = [id(parameter) for group in optimizer.param_groups for parameter in group["params"]]
     assert sorted(held) == sorted(id(parameter) for parameter in scene.parameters())
 
 
 def test_the_longest_name_wins_and_a_missing_one_is_an_error():
-    optimization = Optimization({"means": Rate(1.0), "rigid.rows.means": Rate(2.0)})
+    optimization = OptimizerSettings({"means": LearningRate(1.0), "rigid.rows.means": LearningRate(2.0)})
     assert optimization.rate_of("nodes.rigid.rows.means").initial == 2.0
     assert optimization.rate_of("nodes.background.rows.means").initial == 1.0
     with pytest.raises(ValueError, match="log_scales' has no learning rate"):
@@ -42,5 +44,5 @@ def test_the_longest_name_wins_and_a_missing_one_is_an_error():
 
 
 def test_adams_epsilon_is_small_enough_for_mask_logits():
-    optimizer = Optimization({"means": Rate(1.0), "texels": Rate(1.0)}).build(Scene(), 1.0)
+    optimizer = OptimizerSettings({"means": LearningRate(1.0), "texels": LearningRate(1.0)}).build(Scene(), 1.0)
     assert optimizer.defaults["eps"] == 1e-15

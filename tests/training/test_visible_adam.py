@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from sparsestreet.cli.compose import CONF
 from sparsestreet.ops import splat
 from sparsestreet.scene.gaussians import RowPlan, Rows
-from sparsestreet.training.optimizer import Optimization, Rate
+from sparsestreet.training.optimizer import LearningRate, OptimizerSettings
 from sparsestreet.training.visible_adam import VisibleAdam, seen_rows
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import camera, cast, random_gaussians
@@ -27,10 +27,10 @@ def generator() -> torch.Generator:
 
 
 def table(generator: torch.Generator, number: int = 9) -> tuple[Rows, torch.optim.Optimizer]:
-    """Rows in float64 under the optimiser that the configuration chooses."""
+    """Rows in float64 under the optimizer that the configuration chooses."""
     rows = make_rows(number, generator).double()
-    rates = {name: Rate(LR) for name, _ in rows.named_parameters()}
-    return rows, Optimization(rates, visible_rows_only=True).build(rows, 1.0)
+    rates = {name: LearningRate(LR) for name, _ in rows.named_parameters()}
+    return rows, OptimizerSettings(rates, visible_only=True).build(rows, 1.0)
 
 
 def give_gradients(rows: nn.Module, seen: Tensor, generator: torch.Generator) -> None:
@@ -87,7 +87,7 @@ def test_rows_without_gradient_keep_every_bit(generator):
     before = {name: parameter.detach().clone() for name, parameter in rows.named_parameters()}
     moments = {name: optimizer.state[parameter]["exp_avg"].clone() for name, parameter in rows.named_parameters()}
     give_gradients(rows, seen, generator)
-    rows.mask_logits.grad.fill_(1e-9)  # a regulariser of every mask
+    rows.mask_logits.grad.fill_(1e-9)  # a regularizer of every mask
     optimizer.step()
     for name, parameter in rows.named_parameters():
         stepped = torch.ones(9, dtype=torch.bool) if name == "mask_logits" else seen
@@ -129,8 +129,8 @@ def test_it_goes_on_from_its_own_checkpoint_and_from_adams(generator):
     for first, second in (("adam", "adam"), ("adam", "visible"), ("visible", "visible")):
         generator.manual_seed(4)
         rows = make_rows(5, generator).double()
-        rates = {name: Rate(LR) for name, _ in rows.named_parameters()}
-        kinds = {kind: Optimization(rates, visible_rows_only=kind == "visible") for kind in ("adam", "visible")}
+        rates = {name: LearningRate(LR) for name, _ in rows.named_parameters()}
+        kinds = {kind: OptimizerSettings(rates, visible_only=kind == "visible") for kind in ("adam", "visible")}
         state = None
         for kind in (first, second):
             optimizer = kinds[kind].build(rows, 1.0)

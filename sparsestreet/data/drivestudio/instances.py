@@ -38,7 +38,7 @@ def read_instances(layout: Layout) -> list[Track]:
 
 
 def window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -> Track | None:
-    """The track inside the window, frames counted from its start, in the re-centred world; None where it is absent.
+    """The track inside the window, frames counted from its start, in the re-centerd world; None where it is absent.
 
     The size stays the mean over all of the log: an object does not change with the window.
     """
@@ -72,7 +72,7 @@ def _read_track(key: str, entry: Any, layout: Layout) -> Track:
     _check_frames(frames, path, name, layout.num_frames_on_disk)
     if not (sizes > 0).all() or not np.isfinite(sizes).all():
         message = f"{name} has a box of {sizes.min(axis=0).round(3).tolist()} m (smallest length, width, height)"
-        raise fault(path, message, "write positive lengths in metres, or drop the box")
+        raise fault(path, message, "write positive lengths in meters, or drop the box")
     for frame, pose in zip(frames.astype(int), torch.from_numpy(poses), strict=True):
         check_rigid(pose, path, f"the pose of {name} at frame {frame}")
     size = torch.from_numpy(sizes).mean(0).float()

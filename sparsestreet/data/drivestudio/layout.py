@@ -23,7 +23,7 @@ class Layout:
     """Frames of the window, in the folder's own numbers."""
     cameras: tuple[int, ...]
     front: int
-    """Lowest camera number in the folder: the re-centred world starts there, whichever cameras are read."""
+    """Lowest camera number in the folder: the re-centerd world starts there, whichever cameras are read."""
     num_frames_on_disk: int
 
     @property
@@ -99,7 +99,7 @@ MASK_KINDS = ("sky", "human", "vehicle")
 def find_layout(
     root: Path, *, cameras: Sequence[int] | None = None, first_frame: int = 0, last_frame: int = -1
 ) -> Layout:
-    """Recognise the flavour by its files and choose cameras and frames (last_frame is included; -1: to the end).
+    """Recognize the flavour by its files and choose cameras and frames (last_frame is included; -1: to the end).
 
     Raises LogError where the folder is no such log, ValueError where cameras or frames are asked for that it lacks.
     """

@@ -1,4 +1,4 @@
-"""Lidar sweeps: points in the world, their colours, and the depth they give to pixels."""
+"""Lidar sweeps: points in the world, their colors, and the depth they give to pixels."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from sparsestreet.geometry.transforms import transform_points
 from sparsestreet.types import Camera
 
 _FARTHEST = 1000.0
-"""Metres: no street lidar reaches this far, so a point beyond it is not a point."""
+"""Meters: no street lidar reaches this far, so a point beyond it is not a point."""
 
 
 def check_sweep_size(layout: Layout, frame: int) -> None:
@@ -31,7 +31,7 @@ def check_sweep_size(layout: Layout, frame: int) -> None:
 
 
 def read_sweep(layout: Layout, frame: int) -> Float64[Tensor, "n 3"]:
-    """Points of one instant in the data set's world, metres; raises LogError for broken rows or a broken pose."""
+    """Points of one instant in the data set's world, meters; raises LogError for broken rows or a broken pose."""
     check_sweep_size(layout, frame)
     path = layout.sweep(frame)
     rows = np.fromfile(path, dtype="<f4").reshape(-1, layout.sweep_columns)
@@ -43,7 +43,7 @@ def read_sweep(layout: Layout, frame: int) -> Float64[Tensor, "n 3"]:
 def color_points(
     points: Float[Tensor, "n 3"], views: Sequence[tuple[Camera, UInt8[Tensor, "_ _ 3"]]]
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
-    """RGB in [0, 1] from the pixel each point falls into, and which points any camera sees; the others are grey.
+    """RGB in [0, 1] from the pixel each point falls into, and which points any camera sees; the others are gray.
 
     Where several cameras see a point the first one counts. As in DriveStudio nothing tests whether the camera's view
     of the point is blocked: lidar and cameras sit close together.
@@ -59,7 +59,7 @@ def color_points(
 
 
 def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Depth along the optical axis in metres of the nearest point in each pixel; 0 where there is none."""
+    """Depth along the optical axis in meters of the nearest point in each pixel; 0 where there is none."""
     _, pixels, depths = visible_pixels(camera, points)
     nearest = torch.full((camera.height * camera.width,), torch.inf)
     nearest.scatter_reduce_(0, pixels, depths.float(), "amin")
@@ -69,7 +69,7 @@ def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "
 def visible_pixels(
     camera: Camera, points: Float[Tensor, "n 3"]
 ) -> tuple[Int[Tensor, " v"], Int[Tensor, " v"], Float[Tensor, " v"]]:
-    """For the points inside the image: their rows, the pixel (row-major) each falls into, and its depth in metres."""
+    """For the points inside the image: their rows, the pixel (row-major) each falls into, and its depth in meters."""
     positions, depths, inside = project(camera, points)
     rows = torch.nonzero(inside).squeeze(-1)
     column, line = positions[rows].long().unbind(-1)

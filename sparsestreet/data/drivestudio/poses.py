@@ -35,7 +35,7 @@ def check_rigid(pose: Float64[Tensor, "4 4"], path: Path, what: str) -> None:
     error = rigidity_error(pose)
     if error > RIGIDITY_TOLERANCE:
         message = f"{what} is no rigid transform: R^T R, det R or the last row is off by {error:.2g}"
-        raise fault(path, message, f"write a rotation and a translation in metres, to {RIGIDITY_TOLERANCE:g} or better")
+        raise fault(path, message, f"write a rotation and a translation in meters, to {RIGIDITY_TOLERANCE:g} or better")
 
 
 def read_intrinsics(path: Path) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, "5"]]:
@@ -60,7 +60,7 @@ def world_from_camera(layout: Layout, frame: int, camera: int) -> Float64[Tensor
 
 
 def world_origin(layout: Layout) -> Float64[Tensor, "3"]:
-    """The point of the data set's world that the log is re-centred on; the axes are kept.
+    """The point of the data set's world that the log is re-centerd on; the axes are kept.
 
     Position of the vehicle (Waymo) or the front camera (nuScenes) at the first frame read.
     """

@@ -24,7 +24,7 @@ _ABSENT = {
     "human": "no human masks: there are no metrics of human pixels",
     "vehicle": "no vehicle masks: there are no metrics of vehicle pixels",
     "lidar": "no lidar: Gaussians start from random points, and there is no depth term in the loss",
-    "boxes": "no boxes: nothing is modelled as moving, whatever moves becomes part of the background",
+    "boxes": "no boxes: nothing is modeled as moving, whatever moves becomes part of the background",
 }
 
 
@@ -49,7 +49,7 @@ def read_drivestudio(
 ) -> DrivingLog:
     """Read frames first_frame .. last_frame (included; -1: to the end) of some cameras (None: all).
 
-    Both flavours are recognised by their files. The world keeps the data set's axes and is shifted, in float64, so
+    Both flavours are recognized by their files. The world keeps the data set's axes and is shifted, in float64, so
     that the vehicle (Waymo) or the front camera (nuScenes) starts at the origin. Frames are counted from the window's
     start, cameras by their place in ``cameras``. ``width`` in pixels scales every image to that width at its own
     aspect, and the intrinsics with it. Time is frame / (frames - 1), 0 in a log of one frame.
@@ -96,7 +96,7 @@ def _read(layout: Layout, width: int | None) -> DrivingLog:
 
 
 def _read_mount(layout: Layout, index: int, number: int, width: int | None) -> _Mount:
-    """Size after scaling, and intrinsics scaled per axis with it: pixel centres lie at +0.5, so cx and cy scale too."""
+    """Size after scaling, and intrinsics scaled per axis with it: pixel centers lie at +0.5, so cx and cy scale too."""
     full_width, full_height = image_size(layout.image(layout.frames[0], number))
     if width is not None and not 0 < width <= full_width:
         raise ValueError(f"width must be within 1 to {full_width}, the images of camera {number}, got {width}")
@@ -119,7 +119,7 @@ def _read_frame(
         for kind, path in mask_paths.items()
     }
     return Frame(
-        index=index,
+        frame_index=index,
         time=index / max(len(layout.frames) - 1, 1),
         camera_index=mount.index,
         camera=camera,

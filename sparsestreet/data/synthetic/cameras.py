@@ -12,7 +12,7 @@ from sparsestreet.data.synthetic.tracer import Rays
 _EGO_AXES_FROM_CAMERA = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
 """Columns: camera x (right), y (down), z (forward) in ego axes (x forward, y left, z up)."""
 _MOUNT = (1.6, 0.0, 1.65)
-"""Camera position on the ego car, metres."""
+"""Camera position on the ego car, meters."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class StreetCamera:
     height: int
 
     def rays(self, supersampling: int) -> Rays:
-        """supersampling x supersampling rays per pixel, evenly spread; one ray goes through the pixel's centre."""
+        """supersampling x supersampling rays per pixel, evenly spread; one ray goes through the pixel's center."""
         local = self._directions(supersampling)
         world = np.einsum("ij,jhw->ihw", self.world_from_camera[:3, :3], local)
         return Rays(self.world_from_camera[:3, 3].astype(np.float32), np.ascontiguousarray(world, np.float32))
 
     def axis_cosines(self) -> Float64[np.ndarray, "h w"]:
-        """Depth along the optical axis per metre along the ray through each pixel's centre."""
+        """Depth along the optical axis per meter along the ray through each pixel's center."""
         return self._directions(1)[2]
 
     def _directions(self, supersampling: int) -> Float64[np.ndarray, "3 a b"]:

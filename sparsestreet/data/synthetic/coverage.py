@@ -1,4 +1,4 @@
-"""How much of a pixel a stripe covers: textures filtered analytically, so that far ones turn grey instead of noisy."""
+"""How much of a pixel a stripe covers: textures filtered analytically, so that far ones turn gray instead of noisy."""
 
 import numpy as np
 from jaxtyping import Float32

@@ -19,7 +19,7 @@ MAXIMUM_RANGE = 75.0
 @dataclass(frozen=True)
 class StreetSweep:
     points: Float32[np.ndarray, "n 4"]
-    """x, y, z (metres, lidar frame: x forward, y left, z up) and intensity in [0, 1]; first returns with noise."""
+    """x, y, z (meters, lidar frame: x forward, y left, z up) and intensity in [0, 1]; first returns with noise."""
     object_indices: Int16[np.ndarray, " n"]
     world_from_lidar: Pose
 

@@ -9,12 +9,12 @@ from sparsestreet.data.synthetic.parts import Pose, at
 
 @dataclass(frozen=True)
 class Path:
-    """x = start + speed t; y moves by ``shift`` around ``shift_time`` (world frame, metres and seconds)."""
+    """x = start + speed t; y moves by ``shift`` around ``shift_time`` (world frame, meters and seconds)."""
 
     start: float
     y: float
     speed: float
-    """Signed, along x, metres per second; 0 stands still and takes its heading from ``rest_heading``."""
+    """Signed, along x, meters per second; 0 stands still and takes its heading from ``rest_heading``."""
     shift: float = 0.0
     shift_time: float = 0.0
     shift_duration: float = 2.5
@@ -31,12 +31,12 @@ class Path:
         sideways = self.shift * 6 * s * (1 - s) / self.shift_duration
         return float(np.arctan2(sideways, self.speed))
 
-    def travelled(self, time: float) -> float:
-        """Metres along x since time 0 (the sideways part is left out: it turns wheels by less than a percent)."""
+    def traveled(self, time: float) -> float:
+        """Meters along x since time 0 (the sideways part is left out: it turns wheels by less than a percent)."""
         return abs(self.speed) * time
 
     def pose(self, time: float, height: float) -> Pose:
-        """World from object, the object's origin ``height`` metres above the road."""
+        """World from object, the object's origin ``height`` meters above the road."""
         x, y = self.position(time)
         return at(x, y, height, self.heading(time))
 
@@ -57,7 +57,7 @@ class EgoDrive:
     def pose(self, time: float, offset: float = 0.0) -> Pose:
         """World from ego: x forward, y left, z up, origin on the road under the rear axle.
 
-        ``offset`` shifts the car to its left, metres.
+        ``offset`` shifts the car to its left, meters.
         """
         x = self.speed * (time + 0.15 * np.sin(0.9 * time))
         y = 0.12 * np.sin(0.8 * time)

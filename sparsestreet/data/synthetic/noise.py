@@ -36,7 +36,7 @@ def _interpolated(values: Float64[np.ndarray, "a b"]) -> Float64[np.ndarray, "c 
 def smooth_noise(
     u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"], cell: float, footprint: Float32[np.ndarray, " n"]
 ) -> Float32[np.ndarray, " n"]:
-    """Noise with features of ``cell`` metres, faded out where a pixel covers (``footprint``, metres) half a cell."""
+    """Noise with features of ``cell`` meters, faded out where a pixel covers (``footprint``, meters) half a cell."""
     scale = np.float32(_TEXELS_PER_CELL / cell)
     column = np.floor(u * scale).astype(np.int32) & (_SIZE - 1)
     row = np.floor(v * scale).astype(np.int32) & (_SIZE - 1)

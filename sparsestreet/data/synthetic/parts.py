@@ -49,7 +49,7 @@ def axis_along_y(x: float, y: float, z: float) -> Pose:
 
 
 def limb(start: Point, end: Point, radius: float, surface: Surface) -> Part:
-    """A capsule whose axis runs from one point to another, metres."""
+    """A capsule whose axis runs from one point to another, meters."""
     a, b = np.array(start, np.float64), np.array(end, np.float64)
     length = float(np.linalg.norm(b - a))
     axis = (b - a) / length

@@ -18,12 +18,12 @@ from sparsestreet.data.synthetic.world import World
 
 @dataclass(frozen=True)
 class StreetImage:
-    """A picture and the truth along the ray through each pixel's centre."""
+    """A picture and the truth along the ray through each pixel's center."""
 
     camera: StreetCamera
     rgb: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]
-    """Along the optical axis, metres; 0 in the sky."""
+    """Along the optical axis, meters; 0 in the sky."""
     object_indices: Int16[np.ndarray, "h w"]
     """Position in World.actors, or BACKGROUND."""
     sky: Bool[np.ndarray, "h w"]
@@ -38,7 +38,7 @@ class StreetFrame:
     actor_poses: tuple[Pose, ...]
     """World from object of every actor of the world."""
     novel: dict[float, StreetImage]
-    """The front camera with the ego car shifted left by the key, metres."""
+    """The front camera with the ego car shifted left by the key, meters."""
 
 
 def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFrame:
@@ -68,20 +68,20 @@ def _render(
     settings: StreetSettings, scene: Scene, view: SunView, weather: Weather, camera: StreetCamera
 ) -> StreetImage:
     samples = settings.supersampling
-    centre_rays = camera.rays(1)
-    centre_hits = first_hits(scene, centre_rays)
-    rays = centre_rays if samples == 1 else camera.rays(samples)
-    hits = centre_hits if samples == 1 else first_hits(scene, rays)
+    center_rays = camera.rays(1)
+    center_hits = first_hits(scene, center_rays)
+    rays = center_rays if samples == 1 else camera.rays(samples)
+    hits = center_hits if samples == 1 else first_hits(scene, rays)
     linear = radiance(scene, view, weather, rays, hits, 1 / float(camera.intrinsics[0, 0]) / samples)
     linear = linear.reshape(3, camera.height, samples, camera.width, samples).mean((2, 4))
-    sky = centre_hits.parts == NOTHING
-    depth = np.where(sky, 0, centre_hits.distances * camera.axis_cosines()).astype(np.float32)
-    objects = np.where(sky, BACKGROUND, scene.object_indices[centre_hits.parts]).astype(np.int16)
+    sky = center_hits.parts == NOTHING
+    depth = np.where(sky, 0, center_hits.distances * camera.axis_cosines()).astype(np.float32)
+    objects = np.where(sky, BACKGROUND, scene.object_indices[center_hits.parts]).astype(np.int16)
     return StreetImage(camera, to_srgb(linear), depth, objects, sky)
 
 
 def _inside_an_actor(world: World, time: float, camera: StreetCamera, margin: float = 0.3) -> bool:
-    """Whether the camera would sit in (or within ``margin`` metres of) the box of something annotated."""
+    """Whether the camera would sit in (or within ``margin`` meters of) the box of something annotated."""
     for actor in world.actors:
         local = np.linalg.inv(actor.pose(time)) @ camera.world_from_camera[:, 3]
         if (np.abs(local[:3]) < np.array(actor.model.size) / 2 + margin).all():

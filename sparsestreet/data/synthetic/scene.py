@@ -10,7 +10,7 @@ from sparsestreet.data.synthetic.shapes import Vectors, rotated
 
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
 _MARGIN = np.float32(5e-3)
-"""Slack of all culling tests, metres: float32 holds 250 m to 1.5e-5, products of three such terms to less than this."""
+"""Slack of all culling tests, meters: float32 holds 250 m to 1.5e-5, products of three such terms to less than this."""
 
 
 @dataclass(frozen=True)
@@ -18,12 +18,12 @@ class Scene:
     parts: tuple[Part, ...]
     rotations: Float32[np.ndarray, "p 3 3"]
     """World from part."""
-    centres: Float32[np.ndarray, "p 3"]
+    centers: Float32[np.ndarray, "p 3"]
     half_extents: Float32[np.ndarray, "p 3"]
     corners: Float32[np.ndarray, "p 8 3"]
     """Corners of the bounding boxes, world frame."""
     half_axes: Float32[np.ndarray, "p 3 3"]
-    """Columns: from the centre of each bounding box to the middle of its faces, world frame, metres."""
+    """Columns: from the center of each bounding box to the middle of its faces, world frame, meters."""
     object_indices: Int[np.ndarray, " p"]
 
     @staticmethod
@@ -31,14 +31,14 @@ class Scene:
         poses = np.stack([part.frame_from_part for part in parts])
         half = np.stack([part.shape.half_extent for part in parts]).astype(np.float32)
         rotations = np.ascontiguousarray(poses[:, :3, :3], np.float32)
-        centres = np.ascontiguousarray(poses[:, :3, 3], np.float32)
-        corners = centres[:, None] + (_SIGNS * half[:, None]) @ rotations.transpose(0, 2, 1)
+        centers = np.ascontiguousarray(poses[:, :3, 3], np.float32)
+        corners = centers[:, None] + (_SIGNS * half[:, None]) @ rotations.transpose(0, 2, 1)
         objects = np.array([part.object_index for part in parts], np.int16)
-        return Scene(tuple(parts), rotations, centres, half, corners, rotations * half[:, None], objects)
+        return Scene(tuple(parts), rotations, centers, half, corners, rotations * half[:, None], objects)
 
     def to_part(self, index: int, points: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "3 m"]:
         """World points in the frame of a part."""
-        return rotated(self.rotations[index].T, points - self.centres[index][:, None])
+        return rotated(self.rotations[index].T, points - self.centers[index][:, None])
 
     def turn_to_part(self, index: int, directions: Vectors) -> Vectors:
         return rotated(self.rotations[index].T, directions)
@@ -47,8 +47,8 @@ class Scene:
         return rotated(self.rotations[index], directions)
 
     def distances(self, origin: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, " p"]:
-        """Lower bound of the distance from a point to each part, metres."""
-        local = np.einsum("pji,pj->pi", self.rotations, origin - self.centres)
+        """Lower bound of the distance from a point to each part, meters."""
+        local = np.einsum("pji,pj->pi", self.rotations, origin - self.centers)
         return np.linalg.norm(np.maximum(np.abs(local) - self.half_extents, 0), axis=1)
 
     def in_bundle(
@@ -57,7 +57,7 @@ class Scene:
         """Those parts that are not wholly outside one of the planes through ``origin`` (normals point inwards)."""
         # The support function of a box: how far its farthest corner reaches along each normal.
         reach = np.abs(planes @ self.half_axes[among]).sum(2)
-        heights = (self.centres[among] - origin) @ planes.T + reach
+        heights = (self.centers[among] - origin) @ planes.T + reach
         return among[(heights >= -_MARGIN).all(1)]
 
 

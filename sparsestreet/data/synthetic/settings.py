@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
-"""Front, front left, front right; with 60 degrees of view each, neighbours overlap by 10."""
+"""Front, front left, front right; with 60 degrees of view each, neighbors overlap by 10."""
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,7 @@ class StreetSettings:
     """A short drive along a straight street, seen by up to three cameras and a spinning lidar."""
 
     seed: int = 0
-    """Decides the houses, colours, traffic, weather: everything but the sensors."""
+    """Decides the houses, colors, traffic, weather: everything but the sensors."""
     num_frames: int = 40
     width: int = 320
     """Image width, pixels."""
@@ -23,11 +23,11 @@ class StreetSettings:
     field_of_view: float = 60.0
     """Horizontal field of view of every camera, degrees."""
     supersampling: int = 2
-    """Rays per pixel and axis: a pixel's colour is the mean of supersampling^2 rays."""
+    """Rays per pixel and axis: a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
     """Frames per second."""
     ego_speed: float = 8.0
-    """Mean speed of the recording car, metres per second."""
+    """Mean speed of the recording car, meters per second."""
     num_parked_cars: int = 14
     num_moving_cars: int = 5
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
@@ -37,11 +37,11 @@ class StreetSettings:
     lidar_azimuth_steps: int = 600
     """Rays of one beam in one full turn; about 40 percent of them look where the three cameras look."""
     lidar_noise: float = 0.02
-    """Standard deviation of the measured range, metres."""
+    """Standard deviation of the measured range, meters."""
     annotation_range: float = 60.0
-    """Objects farther from the ego car than this are not annotated, metres."""
+    """Objects farther from the ego car than this are not annotated, meters."""
     novel_offsets: Sequence[float] = ()
-    """Sideways shifts (to the left, metres) of the ego car for which the front camera is rendered as well.
+    """Sideways shifts (to the left, meters) of the ego car for which the front camera is rendered as well.
 
     A view from inside another car is left out."""
     novel_stride: int = 10

@@ -1,4 +1,4 @@
-"""Colour of what the rays hit: sun with hard shadows, light of the sky and the ground, a mirrored sky, haze."""
+"""Color of what the rays hit: sun with hard shadows, light of the sky and the ground, a mirrored sky, haze."""
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -10,7 +10,7 @@ from sparsestreet.data.synthetic.textures.look import column, mix
 from sparsestreet.data.synthetic.tracer import NOTHING, Hits, Rays, sunlit
 
 _HAZE_LENGTH = 900.0
-"""Metres in which haze takes all but 1/e of a surface's colour."""
+"""Meters in which haze takes all but 1/e of a surface's color."""
 _HAZE = (0.62, 0.70, 0.80)
 _STREET_MIRROR = (0.22, 0.21, 0.20)
 """What a mirror sees below the roofs: the other side of the street."""
@@ -20,7 +20,7 @@ _EXPOSURE = 0.62
 def radiance(
     scene: Scene, view: SunView, weather: Weather, rays: Rays, hits: Hits, pixel_angle: float
 ) -> Float32[np.ndarray, "3 h w"]:
-    """Linear RGB of every ray. ``pixel_angle``: angle between neighbouring rays, radians."""
+    """Linear RGB of every ray. ``pixel_angle``: angle between neighboring rays, radians."""
     directions = rays.directions.reshape(3, -1)
     parts, distances = hits.parts.ravel(), hits.distances.ravel()
     colors = np.empty(directions.shape, np.float32)

@@ -1,7 +1,7 @@
 """Convex solids in their own frames and where rays enter them.
 
 Arrays hold one coordinate per row ([3, n]), so that each is contiguous. Directions have unit length; distances are
-metres; a ray that misses, starts inside or points away has distance infinity.
+meters; a ray that misses, starts inside or points away has distance infinity.
 """
 
 from dataclasses import dataclass
@@ -52,9 +52,9 @@ def _away_from_zero(values: np.ndarray) -> np.ndarray:
 def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) -> tuple[Scalars, Scalars]:
     """Distances at which rays enter and leave |coordinate| <= half."""
     inverse = np.float32(1) / _away_from_zero(directions)
-    centre = -origins * inverse
+    center = -origins * inverse
     reach = np.float32(half) * np.abs(inverse)
-    return centre - reach, centre + reach
+    return center - reach, center + reach
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class Box:
 
     def enter(self, origins: Float32[np.ndarray, "3 m"], directions: Vectors) -> Scalars:
         inverse = np.float32(1) / _away_from_zero(directions)
-        centre = -origins * inverse
+        center = -origins * inverse
         reach = self.half_extent[:, None] * np.abs(inverse)
-        return _entered((centre - reach).max(0), (centre + reach).min(0))
+        return _entered((center - reach).max(0), (center + reach).min(0))
 
     def normals(self, points: Vectors) -> Vectors:
         face = (np.abs(points) - self.half_extent[:, None]).argmax(0)
@@ -95,7 +95,7 @@ class Polytope:
         return _entered(near, far)
 
     def depths(self, points: Vectors) -> Float32[np.ndarray, "k n"]:
-        """Distance of each point inside each face plane, metres (negative outside)."""
+        """Distance of each point inside each face plane, meters (negative outside)."""
         return self.offsets[:, None] - rotated(self.normals_out, points)
 
     def normals(self, points: Vectors) -> Vectors:
@@ -113,7 +113,7 @@ class Ellipsoid:
         origins, directions = origins * scale, directions * scale
         a = (directions * directions).sum(0)
         middle = -(origins * directions).sum(0) / a
-        # The closest point to the centre, not b^2 - 4ac: far origins would lose all digits in float32.
+        # The closest point to the center, not b^2 - 4ac: far origins would lose all digits in float32.
         closest = origins + middle * directions
         room = np.float32(1) - (closest * closest).sum(0)
         half_chord = np.sqrt(np.maximum(room, 0) / a)
@@ -199,7 +199,7 @@ def _unit(vectors: Vectors) -> Vectors:
 
 
 def box(length: float, width: float, height: float) -> Box:
-    """A box by its full sides along x, y, z, metres."""
+    """A box by its full sides along x, y, z, meters."""
     return Box(np.array([length, width, height], np.float32) / 2)
 
 

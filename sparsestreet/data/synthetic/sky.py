@@ -26,7 +26,7 @@ class Weather:
     cloud_offset: float
 
     def radiance(self, directions: Vectors) -> Vectors:
-        """The sky in unit directions of the world frame; below the horizon it keeps the horizon's colour."""
+        """The sky in unit directions of the world frame; below the horizon it keeps the horizon's color."""
         up = np.maximum(directions[2], 0)
         sky = mix(column(self.horizon), column(self.zenith), 1 - np.exp(np.float32(-3.2) * up))
         sky = mix(sky, column((0.98, 0.98, 0.99)), self._clouds(directions, up))

@@ -15,7 +15,7 @@ _TILE = 64
 """Side of the bundles that share one list of candidate parts, rays: small enough for the cache and for culling,
 large enough that NumPy's cost per call does not count."""
 _LIFT = np.float32(2e-3)
-"""Shadow rays start this far above the surface, metres: more than the rounding of a hit 250 m away."""
+"""Shadow rays start this far above the surface, meters: more than the rounding of a hit 250 m away."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Rays:
 @dataclass(frozen=True)
 class Hits:
     distances: Float32[np.ndarray, "h w"]
-    """Metres along the ray; infinity where nothing was hit."""
+    """Meters along the ray; infinity where nothing was hit."""
     parts: Int16[np.ndarray, "h w"]
     """Index of the part that was hit, or NOTHING."""
 

@@ -26,10 +26,10 @@ class Actor:
     model: Model
     path: Path
     ground: float
-    """Height of what it stands on, metres."""
+    """Height of what it stands on, meters."""
 
     def pose(self, time: float) -> Pose:
-        """World from object: the object's origin is the centre of its box."""
+        """World from object: the object's origin is the center of its box."""
         return self.path.pose(time, self.ground + self.model.size[2] / 2)
 
 
@@ -46,7 +46,7 @@ class World:
         """All parts in the world frame at a time in seconds."""
         parts = list(self.scenery)
         for index, actor in enumerate(self.actors):
-            parts += placed(actor.model.parts(actor.path.travelled(time)), actor.pose(time), index)
+            parts += placed(actor.model.parts(actor.path.traveled(time)), actor.pose(time), index)
         return parts
 
 
@@ -70,22 +70,22 @@ def _ground(seed: int, end: float) -> list[Part]:
         solid=layout.SOLID_LINES,
         dashed=layout.DASHED_LINES,
         crossings=(_crossing(seed, end), stop - 12),
-        kerb_right=layout.KERB_RIGHT,
-        kerb_left=layout.KERB_LEFT,
+        curb_right=layout.CURB_RIGHT,
+        curb_left=layout.CURB_LEFT,
     )
-    grey = float(rng.uniform(0.09, 0.15))
-    asphalt = Asphalt(lines, (grey, grey, grey * 1.03), float(rng.uniform(0, 30)))
+    gray = float(rng.uniform(0.09, 0.15))
+    asphalt = Asphalt(lines, (gray, gray, gray * 1.03), float(rng.uniform(0, 30)))
     parts = [Part(box(1600.0, 1600.0, 2.0), asphalt, at(0.0, 0.0, -1.0))]
     half, half_length = layout.FOOTWAY_WIDTH / 2, (stop - start) / 2
     tone = float(rng.uniform(0.24, 0.34))
-    for side, kerb in ((1, layout.KERB_RIGHT), (-1, layout.KERB_LEFT)):
+    for side, curb in ((1, layout.CURB_RIGHT), (-1, layout.CURB_LEFT)):
         footway = Footway((tone, tone * 0.97, tone * 0.91), half, side, float(rng.uniform(0, 30)))
         # Sunk into the ground; wider at the back, so that set-back houses leave no gap to the road surface.
-        solid = box(2 * half_length, 2 * half, 2 * layout.KERB_HEIGHT)
-        parts.append(Part(solid, footway, at((start + stop) / 2.0, kerb - side * half, 0.0)))
+        solid = box(2 * half_length, 2 * half, 2 * layout.CURB_HEIGHT)
+        parts.append(Part(solid, footway, at((start + stop) / 2.0, curb - side * half, 0.0)))
         back = Footway((tone * 0.9, tone * 0.88, tone * 0.8), 50.0, side, float(rng.uniform(0, 30)))
-        yard = box(2 * half_length, 30.0, 2 * layout.KERB_HEIGHT - 0.01)
-        parts.append(Part(yard, back, at((start + stop) / 2.0, kerb - side * (2 * half + 15.0), 0.0)))
+        yard = box(2 * half_length, 30.0, 2 * layout.CURB_HEIGHT - 0.01)
+        parts.append(Part(yard, back, at((start + stop) / 2.0, curb - side * (2 * half + 15.0), 0.0)))
     return parts
 
 
@@ -98,7 +98,7 @@ def _houses(seed: int, end: float) -> list[Part]:
     """Two rows along the street, with a few gaps, and a row across its end."""
     rng = stream(seed, "houses")
     stop = end + layout.AHEAD
-    fronts = ((1, layout.KERB_RIGHT - layout.FOOTWAY_WIDTH), (-1, layout.KERB_LEFT + layout.FOOTWAY_WIDTH))
+    fronts = ((1, layout.CURB_RIGHT - layout.FOOTWAY_WIDTH), (-1, layout.CURB_LEFT + layout.FOOTWAY_WIDTH))
     parts: list[Part] = []
     for road_side, front in fronts:
         x = -layout.BEHIND + float(rng.uniform(-6, 0))
@@ -113,8 +113,8 @@ def _houses(seed: int, end: float) -> list[Part]:
                 behind = house(rng, gap + 10.0, 10.0, road_side)
                 parts += placed(behind, at(x + gap / 2.0, front - road_side * 15.0, 0.0))
                 x += gap
-    y = layout.KERB_RIGHT - 12.0
-    while y < layout.KERB_LEFT + 12:
+    y = layout.CURB_RIGHT - 12.0
+    while y < layout.CURB_LEFT + 12:
         width = float(rng.uniform(9, 14))
         # Turned by a quarter: the front looks back along the street.
         parts += placed(house(rng, width, 10.0, 1), at(stop + 14.0, y + width / 2.0, 0.0, np.pi / 2.0))
@@ -123,17 +123,17 @@ def _houses(seed: int, end: float) -> list[Part]:
 
 
 def _footway_things(seed: int, end: float) -> list[Part]:
-    """Trees, lamp posts and bins by turns along both kerbs."""
+    """Trees, lamp posts and bins by turns along both curbs."""
     rng = stream(seed, "footway")
     parts: list[Part] = []
-    for side, y in ((1, layout.KERB_RIGHT - 0.75), (-1, layout.KERB_LEFT + 0.75)):
+    for side, y in ((1, layout.CURB_RIGHT - 0.75), (-1, layout.CURB_LEFT + 0.75)):
         x, turn = -12.0 + float(rng.uniform(0, 6)), int(rng.integers(3))
         while x < end + layout.AHEAD - 15:
             is_lamp = turn % 3 == 2
             thing = lamp_post(side) if is_lamp else tree(rng)
-            parts += placed(thing, at(x, y, layout.KERB_HEIGHT))
+            parts += placed(thing, at(x, y, layout.CURB_HEIGHT))
             if rng.random() < 0.25:
-                parts += placed(bin_box(rng), at(x + 1.6, y, layout.KERB_HEIGHT))
+                parts += placed(bin_box(rng), at(x + 1.6, y, layout.CURB_HEIGHT))
             x, turn = x + float(rng.uniform(6.5, 10)), turn + 1
     return parts
 
@@ -195,11 +195,11 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
     for number in range(settings.num_pedestrians):
         on_right = number % 2 == 0
         lane = float(rng.uniform(1.3, 2.9))
-        y = layout.KERB_RIGHT - lane if on_right else layout.KERB_LEFT + lane
+        y = layout.CURB_RIGHT - lane if on_right else layout.CURB_LEFT + lane
         speed = float(rng.uniform(0.9, 1.6)) * (1 if rng.random() < 0.5 else -1)
         share = (number + float(rng.uniform(0.2, 0.8))) / settings.num_pedestrians
         path = Path(start=6 + share * (end + 18.0), y=y, speed=speed)
-        actors.append(Actor(f"pedestrian_{number:02d}", random_pedestrian(rng), path, layout.KERB_HEIGHT))
+        actors.append(Actor(f"pedestrian_{number:02d}", random_pedestrian(rng), path, layout.CURB_HEIGHT))
     return actors
 
 

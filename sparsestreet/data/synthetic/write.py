@@ -87,7 +87,7 @@ class StreetWriter:
 
     def _write_image(self, image: StreetImage, name: str, annotated: list[int]) -> None:
         picture = Image.fromarray(image.rgb)
-        # 4:4:4: halved colour would smear the edges that a 320-pixel image has few pixels for.
+        # 4:4:4: halved color would smear the edges that a 320-pixel image has few pixels for.
         picture.save(self._file("images", f"{name}.jpg"), quality=97, subsampling=0)
         np.savetxt(self._file("extrinsics", f"{name}.txt"), image.camera.world_from_camera)
         _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)

@@ -23,7 +23,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class ImageError:
-    """Differences of colours in [0, 1]; premultiplied, black behind."""
+    """Differences of colors in [0, 1]; premultiplied, black behind."""
 
     maximum: float
     mean: float

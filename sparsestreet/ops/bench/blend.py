@@ -1,4 +1,4 @@
-"""``sparsestreet bench blend``: the stages of the C++ backend beside vectorised torch and the arithmetic floor."""
+"""``sparsestreet bench blend``: the stages of the C++ backend beside vectorized torch and the arithmetic floor."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from sparsestreet.ops.splat import splat
 from sparsestreet.types import Camera, Gaussians
 
 FORWARD_FLOPS, BACKWARD_FLOPS = 30, 57
-"""Per (splat, pixel) sample: the arithmetic of one colour blend and of its gradient."""
+"""Per (splat, pixel) sample: the arithmetic of one color blend and of its gradient."""
 SETTINGS = SplatSettings()
 MAIN = Size(640, 384, 100_000)
 TRAINING = (Size(320, 192, 20_000), Size(320, 192, 60_000))
@@ -28,7 +28,7 @@ _TIE = 1e-5
 
 @dataclass(frozen=True)
 class Difference:
-    """C++ against vectorised torch, largest over the pixels."""
+    """C++ against vectorized torch, largest over the pixels."""
 
     pixels: int
     ties: int
@@ -46,7 +46,7 @@ class BlendRecord:
     height: int
     times: OpTimes
     peer: dict[str, Spread] | None
-    """Vectorised torch on splats that are already on the screen: ``forward``, and ``both`` with the backward."""
+    """Vectorized torch on splats that are already on the screen: ``forward``, and ``both`` with the backward."""
     peak_gflops: float | None
     """float32 operations of a matrix product in the same run."""
     floor_ms: dict[str, float] | None

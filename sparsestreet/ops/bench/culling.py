@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.ops.bench.timing import GROUPS, Cotangent, last_workspace, leaves
-from sparsestreet.ops.cpu.rasteriser import rasterise
+from sparsestreet.ops.cpu.rasterizer import rasterize
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import contribution
 from sparsestreet.types import Camera, Gaussians
@@ -26,7 +26,7 @@ class Culling:
     pairs_listed: int
     """Pairs in the tiles' own lists."""
     pixels_changed: int
-    """Pixels whose colour, transmittance or depth differs in any bit between the two (float32)."""
+    """Pixels whose color, transmittance or depth differs in any bit between the two (float32)."""
     rows_changed: int
     """Rows of which a gradient differs in any bit between the two."""
     rows_touching_other_pixels: int | None = None
@@ -74,7 +74,7 @@ class _Drawn:
 def _draw(gaussians: Gaussians, camera: Camera, settings: SplatSettings, every_tile: bool) -> _Drawn:
     rows = leaves(gaussians, torch.float32)
     offsets = torch.zeros(len(rows), 2, requires_grad=True)
-    raster = rasterise(rows, offsets, camera, settings, every_tile=every_tile)
+    raster = rasterize(rows, offsets, camera, settings, every_tile=every_tile)
     cotangent = Cotangent.of(camera, rows.means)
     layers = [raster.rgb, raster.transmittance, raster.depth_sum]
     torch.autograd.backward(layers, [cotangent.rgb, cotangent.alpha, cotangent.alpha])

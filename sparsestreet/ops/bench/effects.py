@@ -11,11 +11,11 @@ from sparsestreet.types import Shutter
 EffectsName = Literal["off", "lens", "shutter", "lens and shutter"]
 EFFECTS: tuple[EffectsName, ...] = ("off", "lens", "shutter", "lens and shutter")
 DISTORTION = (-0.05, 0.01, 5e-4, -5e-4, 0.0)
-"""k1, k2, p1, p2, k3: moves a point 27 degrees off the axis inwards by 1.2 % of its distance from the centre."""
+"""k1, k2, p1, p2, k3: moves a point 27 degrees off the axis inwards by 1.2 % of its distance from the center."""
 TRANSLATION, ROTATION = (0.0, 0.0, 0.3), (0.0, 0.01, 0.0)
-"""A readout of 30 ms in a car at 10 m/s that turns by 20 degrees a second: metres and radians, camera frame."""
+"""A readout of 30 ms in a car at 10 m/s that turns by 20 degrees a second: meters and radians, camera frame."""
 WALK = 0.05
-"""Metres by which rows move themselves during the readout, standard deviation of each coordinate: a brisk walk."""
+"""Meters by which rows move themselves during the readout, standard deviation of each coordinate: a brisk walk."""
 
 
 def seen_through(scene: BenchScene, effects: EffectsName | None) -> BenchScene:

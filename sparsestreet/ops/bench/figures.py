@@ -17,16 +17,16 @@ from sparsestreet.ops.bench.records import Json
 Record = dict[str, Json]
 PlottedPoint = tuple[float, float, Record]
 """Cost, error, and what they belong to."""
-# Okabe and Ito's palette: distinguishable with any colour vision. One colour and marker a knob.
+# Okabe and Ito's palette: distinguishable with any color vision. One color and marker a knob.
 _STYLES = {
     "default": ("#000000", "o"),
     "alpha_min": ("#0072B2", "o"),
-    "box": ("#56B4E9", "s"),
+    "max_sigma": ("#56B4E9", "s"),
     "box alone": ("#56B4E9", "d"),
     "transmittance_min": ("#009E73", "D"),
     "stop": ("#D55E00", "v"),
     "exclusive stop": ("#D55E00", "<"),
-    "blur": ("#999999", "h"),
+    "eps2d": ("#999999", "h"),
     "half_colors": ("#CC79A7", "P"),
     "depth_bits": ("#E69F00", "^"),
     "effects": ("#117733", ">"),

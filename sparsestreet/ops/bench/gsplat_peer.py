@@ -43,7 +43,7 @@ def version(module: ModuleType) -> str:
 def draw(
     module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], int]:
-    """Colour (premultiplied), alpha and the number of (splat, tile) pairs.
+    """Color (premultiplied), alpha and the number of (splat, tile) pairs.
 
     ``absgrad`` is on, as our op always sums absolute screen gradients; ``packed`` trades time for memory.
     """
@@ -58,8 +58,8 @@ def draw(
         Ks=camera.intrinsics.to(gaussians.means)[None],
         width=camera.width,
         height=camera.height,
-        near_plane=SETTINGS.near,
-        eps2d=SETTINGS.blur,
+        near_plane=SETTINGS.near_plane,
+        eps2d=SETTINGS.eps2d,
         sh_degree=degree,
         packed=packed,
         absgrad=True,

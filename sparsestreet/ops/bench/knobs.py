@@ -13,10 +13,10 @@ DEFAULT = SplatSettings()
 PRESETS = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast", "fine")
 KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
     "alpha_min": (0.0, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64),
-    "box": (3.0, 3.33, 4.0, inf),
+    "max_sigma": (3.0, 3.33, 4.0, inf),
     "transmittance_min": (1e-5, 1e-4, 1e-3, 1e-2),
     "stop": ("inclusive", "exclusive"),
-    "blur": (0.0, 0.1, 0.3),
+    "eps2d": (0.0, 0.1, 0.3),
     "half_colors": (False, True),
     "depth_bits": (12, 16, 24, 32),
 }
@@ -69,11 +69,11 @@ class Point:
         """This point's own model without cut-offs: R0."""
         blur, alpha_max, antialias = _model(self.settings)
         exact = SplatSettings.preset("exact")
-        return replace(exact, blur=blur, alpha_max=alpha_max, antialias=antialias, near=self.settings.near)
+        return replace(exact, eps2d=blur, alpha_max=alpha_max, antialias=antialias, near_plane=self.settings.near_plane)
 
     @property
     def same_cutoffs(self) -> SplatSettings:
-        """This point's cut-offs without its rounding of colours and depths: R1."""
+        """This point's cut-offs without its rounding of colors and depths: R1."""
         return replace(self.settings, half_colors=False, depth_bits=32)
 
 
@@ -99,7 +99,10 @@ def _points_of_settings() -> list[Point]:
     for knob, values in KNOBS.items():
         changed = [(value, replace(DEFAULT, **{knob: value})) for value in values]
         swept += [Point(knob, _text(knob, value), settings) for value, settings in changed if settings != DEFAULT]
-    swept += [Point("box alone", _text("box", box), replace(DEFAULT, alpha_min=0.0, box=box)) for box in BOXES_ALONE]
+    swept += [
+        Point("box alone", _text("max_sigma", box), replace(DEFAULT, alpha_min=0.0, max_sigma=box))
+        for box in BOXES_ALONE
+    ]
     swept += [
         Point("exclusive stop", f"at {least:g}", replace(DEFAULT, stop="exclusive", transmittance_min=least))
         for least in STOPS_EARLIER
@@ -111,7 +114,7 @@ def _points_of_settings() -> list[Point]:
 
 
 def _model(settings: SplatSettings) -> tuple[float, float, bool]:
-    return settings.blur, settings.alpha_max, settings.antialias
+    return settings.eps2d, settings.alpha_max, settings.antialias
 
 
 def _text(knob: str, value: float | int | bool | str) -> str:

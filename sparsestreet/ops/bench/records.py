@@ -82,10 +82,10 @@ def encode(value: object, where: str) -> Json:
 
 
 def _settings(settings: SplatSettings) -> dict[str, Json]:
-    """All fields; a box that reaches to infinity, which JSON cannot say, is None: no box."""
+    """All fields; a max_sigma of infinity, which JSON cannot say, is None."""
     entries = dataclasses.asdict(settings)
-    box = entries.pop("box")
-    return {**encode(entries, "settings"), "box": None if math.isinf(box) else box}
+    max_sigma = entries.pop("max_sigma")
+    return {**encode(entries, "settings"), "max_sigma": None if math.isinf(max_sigma) else max_sigma}
 
 
 def _refuse_constant(name: str) -> float:

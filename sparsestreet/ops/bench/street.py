@@ -1,6 +1,6 @@
 """A stand-in for a trained street, made of numbers: same kinds of splats at the same places, but nothing was trained.
 
-Camera frame at the origin (x right, y down, z forward, metres), the road 1.6 m below. Splats lie on surfaces as a
+Camera frame at the origin (x right, y down, z forward, meters), the road 1.6 m below. Splats lie on surfaces as a
 trained street has them: flat on the road and on facades, thin and upright on poles and trunks, small on cars, a few
 large faint ones adrift. Sizes grow with distance, as what one camera saw has about one size on its screen.
 """
@@ -15,7 +15,7 @@ from sparsestreet.types import Gaussians
 _ROAD = 1.6
 _NEAR, _FAR = 3.0, 70.0
 _CARS = ((-3.6, 9.0), (3.4, 14.0), (-3.4, 22.0), (3.6, 30.0), (-0.4, 38.0), (3.4, 48.0))
-"""Centres (x, z) of cars of 1.8 x 1.5 x 4.2 m."""
+"""Centers (x, z) of cars of 1.8 x 1.5 x 4.2 m."""
 _SHARES = {"road": 0.3, "facades": 0.4, "cars": 0.15, "poles": 0.1, "adrift": 0.05}
 
 
@@ -75,14 +75,14 @@ _Part = tuple[Tensor, Tensor, Tensor, Tensor]
 
 def _road(draw: _Draw, count: int) -> _Part:
     z, x = draw.depth(count), draw.between(-9, 9, count)
-    grey = draw.between(0.2, 0.4, count, 1).expand(-1, 3)
-    return torch.stack((x, torch.full_like(x, _ROAD), z), -1), draw.sizes(z, 1.5, 0.1, 6), draw.opacities(count), grey
+    gray = draw.between(0.2, 0.4, count, 1).expand(-1, 3)
+    return torch.stack((x, torch.full_like(x, _ROAD), z), -1), draw.sizes(z, 1.5, 0.1, 6), draw.opacities(count), gray
 
 
 def _facades(draw: _Draw, count: int) -> _Part:
     z, y = draw.depth(count), draw.between(-12, _ROAD, count)
     side = 2.0 * draw.pick(2, count) - 1
-    color = draw.between(0.3, 0.8, 8, 3)[(z / 9).long()]  # a house every nine metres
+    color = draw.between(0.3, 0.8, 8, 3)[(z / 9).long()]  # a house every nine meters
     sizes = draw.sizes(z, 0.1, 1.2, 4)
     return torch.stack((9.5 * side, y, z), -1), sizes, draw.opacities(count), color
 
@@ -94,14 +94,14 @@ def _cars(draw: _Draw, count: int) -> _Part:
     inside = draw.between(-1, 1, count, 3)
     axis = draw.pick(3, count)[:, None]
     inside = inside.scatter(1, axis, inside.gather(1, axis).sign())
-    centre = torch.stack((place[chosen, 0], torch.full((count,), _ROAD - 0.75), place[chosen, 1]), -1)
-    means = centre + inside * half
+    center = torch.stack((place[chosen, 0], torch.full((count,), _ROAD - 0.75), place[chosen, 1]), -1)
+    means = center + inside * half
     color = draw.between(0.1, 0.9, len(_CARS), 3)[chosen]
     return means, draw.sizes(means[:, 2], 0.7, 0.7, 0.7), draw.opacities(count), color
 
 
 def _poles(draw: _Draw, count: int) -> _Part:
-    """Every eight metres at both kerbs; needles, tens of pixels long and about one wide."""
+    """Every eight meters at both curbs; needles, tens of pixels long and about one wide."""
     z = 5 + 8.0 * draw.pick(8, count)
     side = 2.0 * draw.pick(2, count) - 1
     means = torch.stack((6.5 * side, draw.between(-5, _ROAD, count), z), -1)
@@ -112,5 +112,5 @@ def _poles(draw: _Draw, count: int) -> _Part:
 def _adrift(draw: _Draw, count: int) -> _Part:
     z = draw.depth(count)
     means = torch.stack((z * draw.between(-0.6, 0.6, count), draw.between(-6, 1, count), z), -1)
-    grey = draw.between(0.4, 0.7, count, 1).expand(-1, 3)
-    return means, draw.sizes(z, 6, 6, 6), draw.between(0.01, 0.15, count), grey
+    gray = draw.between(0.4, 0.7, count, 1).expand(-1, 3)
+    return means, draw.sizes(z, 6, 6, 6), draw.between(0.01, 0.15, count), gray

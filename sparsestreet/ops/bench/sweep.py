@@ -102,8 +102,8 @@ class Truths:
         self._answers: dict[tuple[SplatSettings, EffectsName | None], Answer] = {}
 
     def of(self, settings: SplatSettings, effects: EffectsName | None = None) -> Answer:
-        if not self._depths_between(settings.near, DEFAULT.near):
-            settings = replace(settings, near=DEFAULT.near)  # the same rows, the same answer
+        if not self._depths_between(settings.near_plane, DEFAULT.near_plane):
+            settings = replace(settings, near_plane=DEFAULT.near_plane)  # the same rows, the same answer
         if (settings, effects) not in self._answers:
             seen = seen_through(self._scene, effects)
             truth = answer(seen.gaussians, seen.camera, settings, _EXACT_BACKEND, torch.float64)
@@ -224,7 +224,7 @@ def affordable(scene: BenchScene, settings: SplatSettings) -> bool:
     """Whether the pairs can be held where nothing bounds a splat, so that each covers every tile."""
     side = tile_size()
     tiles = -(-scene.camera.width // side) * -(-scene.camera.height // side)
-    bounded = settings.alpha_min > 0 or settings.box < float("inf")
+    bounded = settings.alpha_min > 0 or settings.max_sigma < float("inf")
     return bounded or int((scene.gaussians.opacities > 0).sum()) * tiles <= UNBOUNDED_PAIRS
 
 

@@ -68,7 +68,7 @@ class Effort:
 
 @dataclass(frozen=True)
 class Cotangent:
-    """A fixed random upstream gradient of colour and alpha; alpha's part shows what is lost in the transmittance."""
+    """A fixed random upstream gradient of color and alpha; alpha's part shows what is lost in the transmittance."""
 
     rgb: Tensor
     alpha: Tensor
@@ -131,7 +131,7 @@ def time_op(gaussians: Gaussians, camera: Camera, settings: SplatSettings, backe
 
 
 Draw = Callable[[Gaussians], tuple[Tensor, Tensor]]
-"""Colour and alpha of one view, differentiable."""
+"""Color and alpha of one view, differentiable."""
 
 
 def time_once(draw: Draw, cotangent: Cotangent, gaussians: Gaussians) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The blend in vectorised torch, tile by tile: the peer on the CPU, and a second oracle for large scenes.
+"""The blend in vectorized torch, tile by tile: the peer on the CPU, and a second oracle for large scenes.
 
 Splats are listed by 16x16 tile, nearest first; tiles of similar length are padded to one [tiles, splats, pixels] block.
 """
@@ -29,7 +29,7 @@ class Block:
 def blend(
     splats: Splats, width: int, height: int, settings: SplatSettings
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Colour (premultiplied) and transmittance; splats must come nearest first."""
+    """Color (premultiplied) and transmittance; splats must come nearest first."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     image = splats.means.new_zeros(tiles_x * tiles_y, TILE * TILE, 4)
     image[..., 3] = 1
@@ -43,7 +43,7 @@ def blend(
 def blend_gradients(
     splats: Splats, width: int, height: int, settings: SplatSettings, cotangent: Float[Tensor, "h w 3"]
 ) -> dict[str, Tensor]:
-    """Gradients of sum(cotangent * colour) with respect to means, cholesky, opacities and colours.
+    """Gradients of sum(cotangent * color) with respect to means, cholesky, opacities and colors.
 
     Each block is differentiated as soon as it is blended, so that the graph of only one block is held.
     """
@@ -87,7 +87,7 @@ def tile_blocks(splats: Splats, tiles_x: int, tiles_y: int) -> Iterator[Block]:
 
 
 def blend_block(splats: Splats, block: Block, tiles_x: int, settings: SplatSettings) -> Float[Tensor, "t 256 4"]:
-    """Colour and transmittance of the pixels of a block's tiles."""
+    """Color and transmittance of the pixels of a block's tiles."""
     weights, transmittance = block_weights(splats, block, tiles_x, settings)
     colors = torch.einsum("tkp,tkc->tpc", weights, splats.colors[block.splats])
     return torch.cat((colors, transmittance[..., None]), -1)

@@ -10,13 +10,13 @@ from torch.utils.checkpoint import checkpoint
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.types import Camera, Contribution, Gaussians, Removal
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 DTYPES = (torch.float32, torch.float64)
 _CHUNK_ELEMENTS = 1 << 20
 
 
-def rasterise(
+def rasterize(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
@@ -66,20 +66,20 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
 
 
 @torch.no_grad()
-def removal(
+def leave_one_out(
     gaussians: Gaussians,
     background: Float[Tensor, "h w 3"] | None,
     pixel_weights: Float[Tensor, "h w"] | None,
     camera: Camera,
     settings: SplatSettings,
-) -> Removal:
+) -> LeaveOneOut:
     """Change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
     check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
     if not len(rows):
-        return Removal(largest, squared)
+        return LeaveOneOut(largest, squared)
     if background is None:
         background = splats.colors.new_zeros(camera.height, camera.width, 3)
     if pixel_weights is None:
@@ -99,7 +99,7 @@ def removal(
         largest[rows] = torch.maximum(largest[rows], change.abs().amax((1, 2)).double())
         squared[rows] += change.double().square().sum(2) @ pixel_weights.reshape(-1)[here].double()
         begin += len(chunk)
-    return Removal(largest, squared)
+    return LeaveOneOut(largest, squared)
 
 
 def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
@@ -112,11 +112,11 @@ def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:
-    """Pixel centres in row order, as many at a time as keep a splats x pixels table small."""
+    """Pixel centers in row order, as many at a time as keep a splats x pixels table small."""
     like = {"dtype": splats.means.dtype, "device": splats.means.device}
     y, x = torch.meshgrid(torch.arange(camera.height, **like), torch.arange(camera.width, **like), indexing="ij")
-    centres = torch.stack((x, y), dim=-1).reshape(-1, 2) + 0.5
-    return centres.split(max(1, _CHUNK_ELEMENTS // max(1, len(splats.means))))
+    centers = torch.stack((x, y), dim=-1).reshape(-1, 2) + 0.5
+    return centers.split(max(1, _CHUNK_ELEMENTS // max(1, len(splats.means))))
 
 
 def _alphas(

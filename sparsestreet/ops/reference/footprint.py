@@ -35,9 +35,9 @@ def slope_limits(camera: Camera, like: Tensor) -> tuple[Float[Tensor, "2"], Floa
     It is the limit 1.3 tan(fov/2) of 3DGS, moved with the principal point.
     """
     K, size = camera.intrinsics.to(like), like.new_tensor([camera.width, camera.height])
-    focal, centre = K.diagonal()[:2], K[:2, 2]
+    focal, center = K.diagonal()[:2], K[:2, 2]
     margin = 0.3 * size / (2 * focal)
-    return -centre / focal - margin, (size - centre) / focal + margin
+    return -center / focal - margin, (size - center) / focal + margin
 
 
 def slopes_held(in_camera: Float[Tensor, "v 3"], camera: Camera) -> Bool[Tensor, " v"]:
@@ -52,16 +52,16 @@ def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], cam
 
     With alpha = 1, beta = 2, kappa = 0 the points are mu and mu +- sqrt(3) a_k; mu weighs 0 in the mean and 2 in the
     covariance, the others 1/6 in both: no weight is negative, so V V^T is a covariance. A point at less than ``near``
-    metres is taken there, with its x and y; its depth has no derivative then.
+    meters is taken there, with its x and y; its depth has no derivative then.
     """
     K = camera.intrinsics.to(in_camera)
     points = _sigma_points(in_camera, axes)
-    normalised = points[..., :2] / points[..., 2:].clamp(min=near)
+    normalized = points[..., :2] / points[..., 2:].clamp(min=near)
     # From the principal point, whose digits the differences would lose.
-    pixels = distort(normalised, camera.distortion) * K.diagonal()[:2]
-    centres = pixels[:, 1:].mean(1)
+    pixels = distort(normalized, camera.distortion) * K.diagonal()[:2]
+    centers = pixels[:, 1:].mean(1)
     weights = pixels.new_tensor([2.0] + [1 / 6] * 6)
-    return centres + K[:2, 2], ((pixels - centres[:, None]) * weights.sqrt()[:, None]).mT
+    return centers + K[:2, 2], ((pixels - centers[:, None]) * weights.sqrt()[:, None]).mT
 
 
 def sigma_points_held(

@@ -1,6 +1,6 @@
 """From rows of Gaussians to splats on the screen.
 
-Notation: u = mean on the screen, d = pixel centre - u, Sigma = V V^T + blur I with the screen factor V (footprint.py),
+Notation: u = mean on the screen, d = pixel center - u, Sigma = V V^T + blur I with the screen factor V (footprint.py),
 Sigma^-1 = L^T L with L = [[l11, l21], [0, l22]]; a splat's alpha is o exp(-q/2) with q = |L d|^2.
 """
 
@@ -25,7 +25,7 @@ BOX_MARGIN = 0.01
 COMPENSATION_FLOOR = 0.005
 """Least antialias compensation (gsplat 1.6): below it the ratio of determinants has no correct digits."""
 DETERMINANT_MIN = 1e-12
-"""px^4. Reached only without blur, by splats so thin that they touch no pixel centre; their conic would overflow."""
+"""px^4. Reached only without blur, by splats so thin that they touch no pixel center; their conic would overflow."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Splats:
 def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Int[Tensor, " n"]:
     """For each row the first ``Reason`` why it is not drawn, or DRAWN. Comparisons are written so that NaN culls."""
     depths = to_camera(gaussians.means, camera)[:, 2]
-    reasons = first_reason({Reason.MASKED: ~(gaussians.opacities > 0), Reason.NEAR: ~(depths > settings.near)})
+    reasons = first_reason({Reason.MASKED: ~(gaussians.opacities > 0), Reason.NEAR: ~(depths > settings.near_plane)})
     rows = (reasons == Reason.DRAWN).nonzero().squeeze(-1)
     splats = on_screen(gaussians, rows, camera, settings)
     size = torch.tensor([camera.width, camera.height], dtype=depths.dtype, device=depths.device)
@@ -65,7 +65,7 @@ def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -
 
 @torch.no_grad()
 def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Int[Tensor, " v"]:
-    """Rows whose box holds a pixel centre, nearest first, ties in row order.
+    """Rows whose box holds a pixel center, nearest first, ties in row order.
 
     Found before anything is differentiated: a culled row takes no part in the graph, so no infinity of its
     intermediates can meet a zero cotangent.
@@ -79,8 +79,8 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
     """Project the given rows, which must lie in front of the camera."""
     in_camera = to_camera(gaussians.means[rows], camera)
     means, factors, refusals = _footprints(gaussians, rows, in_camera, camera, settings)
-    determinant, bare = _determinants(factors, settings.blur)
-    variances = factors.square().sum(-1) + settings.blur
+    determinant, bare = _determinants(factors, settings.eps2d)
+    variances = factors.square().sum(-1) + settings.eps2d
     covariance, variance_y = (factors[:, 0] * factors[:, 1]).sum(-1), variances[:, 1]
     l11 = (variance_y / determinant).sqrt()
     cholesky = torch.stack((l11, -covariance / (variance_y.sqrt() * determinant.sqrt()), variance_y.rsqrt()), -1)
@@ -105,16 +105,16 @@ def _rotation(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
 def to_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
     """R ((m - c) - rest), where c + rest is the camera's position with twice the digits of the dtype.
 
-    A difference of neighbours far from the origin is exact; R m + t would round two numbers of the world's size.
+    A difference of neighbors far from the origin is exact; R m + t would round two numbers of the world's size.
     """
     position = exact_position(camera).to(means.device)
-    centre = position.to(means.dtype)
-    rest = (position - centre).to(means.dtype)
-    return ((means - centre) - rest) @ _rotation(camera, means).T
+    center = position.to(means.dtype)
+    rest = (position - center).to(means.dtype)
+    return ((means - center) - rest) @ _rotation(camera, means).T
 
 
 def axes_in_camera(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera) -> Float[Tensor, "v 3 3"]:
-    """Columns: the rows' own axes times their standard deviations, metres in the camera frame."""
+    """Columns: the rows' own axes times their standard deviations, meters in the camera frame."""
     axes = to_matrix(gaussians.quaternions[rows]) * gaussians.scales[rows][:, None]
     return _rotation(camera, axes) @ axes
 
@@ -131,7 +131,7 @@ def _footprints(
     if camera.distortion is None:
         means, factors = pinhole(in_camera, axes, camera)
     else:
-        means, factors = unscented(in_camera, axes, camera, settings.near)
+        means, factors = unscented(in_camera, axes, camera, settings.near_plane)
         slopes = in_camera.detach()[:, :2] / in_camera.detach()[:, 2:]
         refusals[Reason.PAST_FOLD] = ~(slopes.square().sum(-1) <= fold_radius_squared(camera.distortion))
     if camera.shutter is not None:
@@ -150,7 +150,7 @@ def _determinants(factors: Float[Tensor, "v 2 k"], blur: float) -> tuple[Float[T
 
 def _reaches(opacities: Float[Tensor, " v"], settings: SplatSettings) -> Float[Tensor, " v"]:
     """o exp(-q/2) >= alpha_min needs q <= 2 ln(o / alpha_min); ``box`` standard deviations need q <= box^2."""
-    end = settings.box * settings.box
+    end = settings.max_sigma * settings.max_sigma
     if settings.alpha_min == 0:
         return torch.full_like(opacities, end)
     return (2 * (opacities / settings.alpha_min).log().clamp(min=0)).clamp(max=end)

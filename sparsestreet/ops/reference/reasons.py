@@ -26,7 +26,7 @@ class Reason(IntEnum):
     FAINT = 7
     """Peak alpha below the cut-off."""
     OUTSIDE = 8
-    """The box holds no pixel centre of the image."""
+    """The box holds no pixel center of the image."""
 
 
 def first_reason(holds: dict[Reason, Bool[Tensor, " v"]]) -> Int[Tensor, " v"]:

@@ -1,6 +1,6 @@
 """A rolling shutter without a second look at any pixel: the moving splat is again one 2D Gaussian.
 
-Image row y (pixel centre at +0.5) is read at tau = y / H - 1/2 of the readout, and the splat's mean is then at
+Image row y (pixel center at +0.5) is read at tau = y / H - 1/2 of the readout, and the splat's mean is then at
 m + tau u, with u its motion on the screen over the whole readout. As tau is linear in y, the exponent stays a quadratic
 form in the pixel: with A = [[1, -u_x / H], [0, 1 - u_y / H]] the splat's mean m' solves A m' = m - u / 2 and its
 covariance is A^-1 Sigma A^-T.

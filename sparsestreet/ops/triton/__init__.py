@@ -4,11 +4,11 @@
    ``unscented``, ``shutter``, ``harmonics``, ``tiles``);
 2. lists: visible rows by depth, pairs by tile (``lists``); here the host waits once, for the number of pairs;
 3. pixels: each tile's splats into its 256 pixels (``blend``), those of long tiles in parts (``parts``), or counters of
-   them (``count``, ``removal``);
+   them (``count``, ``leave_one_out``);
 4. backward: pixels to a slot per pair (``blend_backward``), slots to rows (``slots``), rows to parameters
    (``rows_backward``, and the backward halves beside each formula).
 
-``screen`` starts the first two stages, ``pixels`` the third and the pixels' half of the fourth, ``rasteriser`` makes an
+``screen`` starts the first two stages, ``pixels`` the third and the pixels' half of the fourth, ``rasterizer`` makes an
 autograd function of them.
 
 No atomics: two runs agree to the last bit. Nothing here is imported before a backend "triton" is asked for.

@@ -8,7 +8,7 @@ from torch import Tensor, uint8
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
 
-# One number per lane: whether a lane loads differs between neighbours, so that wider loads would not be merged.
+# One number per lane: whether a lane loads differs between neighbors, so that wider loads would not be merged.
 LANES = 256
 OPTIONS = {"num_warps": 8}
 

@@ -30,7 +30,7 @@ def registers(lasts: bool, exclusive: bool) -> int:
 def pixels_of(tile, width, height, tiles_x):
     """Columns and lines of a tile's pixels, and which of them lie in the image; all [256].
 
-    Of 32 neighbours each lane gets one: its 8 pixels lie in one line, two columns apart.
+    Of 32 neighbors each lane gets one: its 8 pixels lie in one line, two columns apart.
     """
     p = tl.arange(0, PIXELS)
     x = (tile % tiles_x) * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE

@@ -1,5 +1,5 @@
 """Backward, from the last splat of a pixel to the first: dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light
-from behind k), where f = colour and depth against the cotangents. The light from behind is summed from the back, its
+from behind k), where f = color and depth against the cotangents. The light from behind is summed from the back, its
 small terms first, and the transmittance before a splat is that after it / (1 - alpha): both keep their relative digits
 however deep the stack. (Total minus prefix, from the front, would carry the rounding of the total to the faintest
 splat.) Each pair writes its own slot: no atomics.

@@ -8,7 +8,7 @@ import triton.language as tl
 
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.vectors import cross, dot, plus, scaled
-from sparsestreet.ops.triton.view import CENTRE, FOCAL, SLOPE_LEAST, SLOPE_MOST
+from sparsestreet.ops.triton.view import CENTER, FOCAL, SLOPE_LEAST, SLOPE_MOST
 
 
 @jit
@@ -29,8 +29,8 @@ def pinhole(view, mean, axes):
     """Shape on the screen of a Gaussian at ``mean`` with ``axes`` = camera_from_gaussian times scales."""
     vx, vy = factor(view, mean, axes[0], axes[2], 0), factor(view, mean, axes[1], axes[2], 1)
     c = cross(vx, vy)
-    x = tl.load(view + FOCAL) * mean[0] / mean[2] + tl.load(view + CENTRE)
-    y = tl.load(view + FOCAL + 1) * mean[1] / mean[2] + tl.load(view + CENTRE + 1)
+    x = tl.load(view + FOCAL) * mean[0] / mean[2] + tl.load(view + CENTER)
+    y = tl.load(view + FOCAL + 1) * mean[1] / mean[2] + tl.load(view + CENTER + 1)
     return x, y, dot(vx, vx), dot(vy, vy), dot(vx, vy), dot(c, c)
 
 

@@ -1,7 +1,7 @@
 """Visible rows by depth, and the tiles' lists of splats in that order.
 
 Rows are sorted by depth first and pairs then stably by their tile's short key: a fraction of the traffic of sorting
-long keys. A pair keeps its number from before the second sort, so the pairs of a row have neighbouring numbers: these
+long keys. A pair keeps its number from before the second sort, so the pairs of a row have neighboring numbers: these
 are the slots its gradient is summed from.
 """
 

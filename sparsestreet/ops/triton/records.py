@@ -7,7 +7,7 @@ from sparsestreet.ops.triton.language import constant, jit
 LENGTH = 12
 RECORD = constant(LENGTH)
 X, Y, L11, L21, L22, LOG2_OPACITY = (constant(i) for i in range(6))
-# The exponent of 2 below which the splat is not drawn; then the colour's three numbers and the depth.
+# The exponent of 2 below which the splat is not drawn; then the color's three numbers and the depth.
 CUTOFF, COLOR, DEPTH = constant(6), constant(7), constant(10)
 
 

@@ -123,7 +123,7 @@ def store_record(to, x, y, factor, log2_opacity, cutoff, color, depth, mask, HAL
     tl.store(to + record.LOG2_OPACITY, log2_opacity, mask)
     tl.store(to + record.CUTOFF, cutoff, mask)
     for i in tl.static_range(3):
-        # As in torch.where(colour > 0, colour, 0).
+        # As in torch.where(color > 0, color, 0).
         channel = tl.where(color[i] > 0, color[i], 0.0)
         if HALF_COLORS:
             channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)

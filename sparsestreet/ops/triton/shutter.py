@@ -17,20 +17,20 @@ ROLL_LEAST = constant(0.1)
 
 @jit
 def drift(view, mean, moved):
-    """Motion of the mean in the camera over the readout, metres; ``moved`` is its own displacement there."""
+    """Motion of the mean in the camera over the readout, meters; ``moved`` is its own displacement there."""
     turned = cross(load_vector(view + TURN), mean)
     return plus(moved, scaled(-1.0, plus(load_vector(view + SHIFT), turned)))
 
 
 @jit
-def normalised_speed(mean, dX):
+def normalized_speed(mean, dX):
     return (dX[0] - mean[0] / mean[2] * dX[2]) / mean[2], (dX[1] - mean[1] / mean[2] * dX[2]) / mean[2]
 
 
 @jit
 def velocity(view, mean, moved, DISTORTED: tl.constexpr):
     """Motion on the screen, pixels per readout: J dX with the exact Jacobian, through the distortion where given."""
-    n_x, n_y = normalised_speed(mean, drift(view, mean, moved))
+    n_x, n_y = normalized_speed(mean, drift(view, mean, moved))
     if DISTORTED:
         xx, xy, yy = jacobian(view, mean[0] / mean[2], mean[1] / mean[2])
         n_x, n_y = xx * n_x + xy * n_y, xy * n_x + yy * n_y
@@ -42,7 +42,7 @@ def velocity_backward(view, mean, moved, v, DISTORTED: tl.constexpr):
     """From the gradient of the velocity to that of the mean in the camera."""
     dX, inverse = drift(view, mean, moved), 1.0 / mean[2]
     x, y = mean[0] * inverse, mean[1] * inverse
-    n_x, n_y = normalised_speed(mean, dX)
+    n_x, n_y = normalized_speed(mean, dX)
     g_x, g_y = tl.load(view + FOCAL) * v[0], tl.load(view + FOCAL + 1) * v[1]
     v_x, v_y = 0 * g_x, 0 * g_y
     if DISTORTED:

@@ -1,4 +1,4 @@
-"""Sums over the slots of each row, which are neighbours, in a fixed order."""
+"""Sums over the slots of each row, which are neighbors, in a fixed order."""
 
 from functools import partial
 

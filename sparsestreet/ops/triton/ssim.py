@@ -96,7 +96,7 @@ def down(lines, FIELDS: tl.constexpr, FIELD: tl.constexpr):
 
 @jit
 def across_images(image, truth, at, level, mask):
-    """Window means along a line of s - level, d and their squares, for windows that begin ``at``."""
+    """Interval means along a line of s - level, d and their squares, for windows that begin ``at``."""
     zero = tl.zeros_like(at).to(tl.float32)
     mean_s, mean_d, mean_ss, mean_dd = zero, zero, zero, zero
     for k in tl.static_range(COUNT):
@@ -159,7 +159,7 @@ def similarity(
 
 @jit
 def across_partials(partials, line, column, height, width):
-    """Window means along a line of the three partial derivatives, for windows that end at ``column``; 0 outside."""
+    """Interval means along a line of the three partial derivatives, for windows that end at ``column``; 0 outside."""
     zero = tl.zeros_like(column).to(tl.float32)
     of_mean, of_var_s, of_var_d = zero, zero, zero
     for k in tl.static_range(COUNT):

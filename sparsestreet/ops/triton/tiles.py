@@ -22,7 +22,7 @@ def limited(value, least, most):
 
 @jit
 def tile_span(low, high, size):
-    """First and last tile with a pixel centre in [low, high]; last < first if there is none. ``size`` in pixels."""
+    """First and last tile with a pixel center in [low, high]; last < first if there is none. ``size`` in pixels."""
     # As float first: the box of a giant does not fit an integer.
     first = limited(tl.ceil(low - 0.5), 0.0, size).to(tl.int32)
     last = limited(tl.floor(high - 0.5), -1.0, size - 1.0).to(tl.int32)

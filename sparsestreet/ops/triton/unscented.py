@@ -11,7 +11,7 @@ import math
 import triton.language as tl
 
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.view import CENTRE, DISTORTION, FOCAL, FOLD, NEAR
+from sparsestreet.ops.triton.view import CENTER, DISTORTION, FOCAL, FOLD, NEAR
 
 POINTS = constant(8)
 SQRT3 = constant(math.sqrt(3))
@@ -27,7 +27,7 @@ def radial(view, r2):
 
 @jit
 def distort(view, x, y):
-    """Normalised coordinates as the lens shows them."""
+    """Normalized coordinates as the lens shows them."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
     r2 = x * x + y * y
     f, _, _ = radial(view, r2)
@@ -81,7 +81,7 @@ def shown(view, x, y):
 
 @jit
 def shown_backward(view, x, y, v_x, v_y):
-    """From the gradient of pixels to that of normalised coordinates.
+    """From the gradient of pixels to that of normalized coordinates.
 
     With s proportional to 1/|p|, d(D(s p) / s) = D' dp - (D' p - D(s p) / s) (p . dp) / |p|^2.
     """
@@ -122,16 +122,16 @@ def on_axis(point, K: tl.constexpr):
 
 
 @jit
-def sigma(centre, row):
+def sigma(center, row):
     """One coordinate of the points; ``row`` holds that coordinate of the three axes."""
     point = tl.arange(0, POINTS)[None, :]
     axis = tl.where(on_axis(point, 0), row[0][:, None], tl.where(on_axis(point, 1), row[1][:, None], row[2][:, None]))
-    return centre[:, None] + stretch() * axis
+    return center[:, None] + stretch() * axis
 
 
 @jit
 def sigma_backward(v):
-    """From the gradient of one coordinate of the points to those of the centre and of the three axes."""
+    """From the gradient of one coordinate of the points to those of the center and of the three axes."""
     point, g = tl.arange(0, POINTS)[None, :], stretch() * v
     along = (
         tl.sum(tl.where(on_axis(point, 0), g, 0.0), 1),
@@ -142,7 +142,7 @@ def sigma_backward(v):
 
 
 @jit
-def normalised_points(view, mean, axes):
+def normalized_points(view, mean, axes):
     """x/z and y/z of the points, 1/z, and whether z was left as it is: it is limited to >= near."""
     depth, near = sigma(mean[2], axes[2]), tl.load(view + NEAR)
     inverse = 1.0 / tl.maximum(depth, near)
@@ -166,11 +166,11 @@ def minors(vx, vy):
 @jit
 def unscented(view, mean, axes):
     """Shape on the screen (lens.py) of a Gaussian behind the distorted lens."""
-    x, y, _, _ = normalised_points(view, mean, axes)
+    x, y, _, _ = normalized_points(view, mean, axes)
     m_x, m_y, vx, vy = screen_factor(view, x, y)
     c = minors(vx, vy)
     bare = 0.5 * tl.sum(tl.sum(c * c, 2), 1)
-    m_x, m_y = m_x + tl.load(view + CENTRE), m_y + tl.load(view + CENTRE + 1)
+    m_x, m_y = m_x + tl.load(view + CENTER), m_y + tl.load(view + CENTER + 1)
     return m_x, m_y, tl.sum(vx * vx, 1), tl.sum(vy * vy, 1), tl.sum(vx * vy, 1), bare
 
 
@@ -184,7 +184,7 @@ def point_gradient(v_mean, g):
 @jit
 def unscented_backward(view, mean, axes, v):
     """From the gradient of the shape to those of ``mean`` and ``axes``."""
-    x, y, inverse, free = normalised_points(view, mean, axes)
+    x, y, inverse, free = normalized_points(view, mean, axes)
     _, _, vx, vy = screen_factor(view, x, y)
     c = minors(vx, vy)
     g_x = 2 * (v[2][:, None] * vx + v[5][:, None] * tl.sum(c * vy[:, None, :], 2)) + v[4][:, None] * vy

@@ -23,7 +23,7 @@ LEAST_LIGHT = 1e-30
 
 # Places in the table.
 ROTATION, POSITION = constant(0), constant(9)
-FOCAL, CENTRE = constant(12), constant(14)
+FOCAL, CENTER = constant(12), constant(14)
 SLOPE_LEAST, SLOPE_MOST = constant(16), constant(18)
 SIZE, BLUR, NEAR = constant(20), constant(22), constant(23)
 ALPHA_MIN, LOG2_ALPHA_MIN, BOX_REACH = constant(24), constant(25), constant(26)
@@ -44,7 +44,7 @@ def load_matrix(table):
 
 @jit
 def in_camera(view, rotation, mean):
-    """A mean in the camera. Of neighbours far from the origin the difference is exact, R m + t would round both."""
+    """A mean in the camera. Of neighbors far from the origin the difference is exact, R m + t would round both."""
     c, rest = load_vector(view + POSITION), load_vector(view + POSITION_REST)
     return times(rotation, ((mean[0] - c[0]) - rest[0], (mean[1] - c[1]) - rest[1], (mean[2] - c[2]) - rest[2]))
 
@@ -72,7 +72,7 @@ class View:
     @property
     def bounded(self) -> bool:
         """Whether splats end anywhere."""
-        return self.settings.alpha_min > 0 or math.isfinite(self.settings.box)
+        return self.settings.alpha_min > 0 or math.isfinite(self.settings.max_sigma)
 
     @property
     def exclusive(self) -> bool:
@@ -104,7 +104,7 @@ class View:
             *position,
             *(K[0][0], K[1][1], K[0][2], K[1][2]),
             *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
-            *(camera.width, camera.height, s.blur, s.near),
+            *(camera.width, camera.height, s.eps2d, s.near_plane),
             # Without a cut-off the exponent still ends where float32 does: 2^-126.
             *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.box * s.box),
             *distortion,
@@ -116,7 +116,7 @@ class View:
         return [float(number) for number in numbers]
 
 
-def _slope_limits(focal: float, centre: float, size: int) -> tuple[float, float]:
+def _slope_limits(focal: float, center: float, size: int) -> tuple[float, float]:
     """Where x/z is limited in the Jacobian: 1.3 tan(fov/2) of 3DGS, moved with the principal point."""
     margin = 0.3 * size / (2 * focal)
-    return -centre / focal - margin, (size - centre) / focal + margin
+    return -center / focal - margin, (size - center) / focal + margin

@@ -9,7 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RowPlan:
-    """New row i is a copy of old row source[i]; parameters, optimiser moments and buffers all follow it.
+    """New row i is a copy of old row source[i]; parameters, optimizer moments and buffers all follow it.
 
     Raises ValueError if a source is no row of the table that the plan was made for.
     """
@@ -18,7 +18,7 @@ class RowPlan:
     """Number of rows the plan was made for: a stale plan must not be applied to another table."""
     source: Int[Tensor, " new"]
     fresh: Bool[Tensor, " new"]
-    """True: the row's optimiser moments start at zero."""
+    """True: the row's optimizer moments start at zero."""
     edits: dict[str, Tensor] = field(default_factory=dict)
     """Name of a parameter or buffer -> full replacement values [new, ...], for rows that are no plain copies."""
     reset_moments: frozenset[str] = frozenset()

@@ -35,10 +35,10 @@ class Rows(nn.Module):
 
     @torch.no_grad()
     def resize(self, plan: RowPlan, optimizer: Optimizer | None = None) -> None:
-        """Apply a plan once, to values, optimiser moments and buffers; gradients are dropped.
+        """Apply a plan once, to values, optimizer moments and buffers; gradients are dropped.
 
         Raises KeyError or ValueError, with nothing changed, if the plan was made for another number of rows, edits a
-        column that does not exist or in another shape, or if the optimiser does not hold a trainable column.
+        column that does not exist or in another shape, or if the optimizer does not hold a trainable column.
         """
         columns = self.columns()
         self._check(plan, optimizer)
@@ -55,7 +55,7 @@ class Rows(nn.Module):
 
     @torch.no_grad()
     def drop_column(self, name: str, optimizer: Optimizer | None = None) -> None:
-        """Remove a parameter from the table and from the optimiser (a mask that has done its work)."""
+        """Remove a parameter from the table and from the optimizer (a mask that has done its work)."""
         parameter = self.get_parameter(name)
         delattr(self, name)
         if optimizer is None:
@@ -82,12 +82,12 @@ class Rows(nn.Module):
         held = {id(parameter) for group in optimizer.param_groups for parameter in group["params"]}
         missing = [name for name in sorted(parameters) if columns[name].requires_grad and id(columns[name]) not in held]
         if missing:
-            raise ValueError(f"the optimiser does not hold the columns {missing}: build it after the scene was loaded")
+            raise ValueError(f"the optimizer does not hold the columns {missing}: build it after the scene was loaded")
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
         """Take the number of rows, and whether there are still masks, from the checkpoint.
 
-        Load before building an optimiser: parameters of another length are replaced.
+        Load before building an optimizer: parameters of another length are replaced.
         """
         for name, column in self.columns().items():
             saved = state_dict.get(prefix + name)

@@ -15,7 +15,7 @@ class StaticMask:
 
     weight: float
     """lambda_n of the paper: how strongly the node's Gaussians are pushed out."""
-    minimum_rows: int
+    min_gaussians: int
     """K_min of the paper: masks and pruning never leave fewer rows in the node class."""
     threshold: float = 0.01
     """epsilon of the paper (value of Compact-3DGS, whose mask the paper repeats)."""
@@ -28,8 +28,8 @@ class StaticMask:
     def __post_init__(self) -> None:
         if not self.weight >= 0:
             raise ValueError(f"a mask's weight must be >= 0, got {self.weight}")
-        if not self.minimum_rows >= 0:
-            raise ValueError(f"a mask's minimum_rows must be >= 0, got {self.minimum_rows}")
+        if not self.min_gaussians >= 0:
+            raise ValueError(f"a mask's min_gaussians must be >= 0, got {self.min_gaussians}")
         if not 0 <= self.threshold < 1:
             raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
 
@@ -44,14 +44,14 @@ class StaticMask:
     def multipliers(self, scores: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """M_k in {0, 1} for opacity and scale, with straight-through gradient; re-opens below K_min.
 
-        If fewer than ``minimum_rows`` scores pass the threshold, the highest ones count as passing.
+        If fewer than ``min_gaussians`` scores pass the threshold, the highest ones count as passing.
         """
         return straight_through(scores, self.effective_threshold(scores))
 
     def effective_threshold(self, scores: Float[Tensor, " n"]) -> float:
-        """The threshold, lowered where needed so that ``minimum_rows`` (or all) rows pass; ties all pass."""
+        """The threshold, lowered where needed so that ``min_gaussians`` (or all) rows pass; ties all pass."""
         rows = scores.shape[0]
-        floor = min(self.minimum_rows, rows)
+        floor = min(self.min_gaussians, rows)
         if floor == 0 or int((scores > self.threshold).sum()) >= floor:
             return self.threshold
         lowest_kept = scores.detach().kthvalue(rows - floor + 1).values

@@ -12,7 +12,7 @@ from sparsestreet.scene.masks import StaticMask
 from sparsestreet.types import Gaussians
 
 BYTES_PER_NUMBER = 4
-"""Sizes are stated as float32, whatever precision a test or an optimiser holds them in."""
+"""Sizes are stated as float32, whatever precision a test or an optimizer holds them in."""
 
 OPACITY_LOGIT_LIMIT = 15.0
 """sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
@@ -35,7 +35,7 @@ class Node(nn.Module, ABC):
 
     The rows hold ``means``, ``log_scales``, ``quaternions``, ``opacity_logits``, ``sh_dc`` [n, 1, 3],
     ``sh_rest`` [n, k - 1, 3] and, while a mask is being trained, ``mask_logits``. They stay unmasked: only
-    ``gaussians_at`` applies the mask, so densification, culling and regularisers see what the mask hides
+    ``gaussians_at`` applies the mask, so densification, culling and regularizers see what the mask hides
     (a scale of 0 has no logarithm and no ratio).
     """
 
@@ -54,7 +54,7 @@ class Node(nn.Module, ABC):
 
     @abstractmethod
     def gaussians_at(self, time: float, sh_degree: int) -> Gaussians:
-        """The node's Gaussians in the world at a normalised time, activated, with the mask applied.
+        """The node's Gaussians in the world at a normalized time, activated, with the mask applied.
 
         ``sh`` has (min(sh_degree, stored degree) + 1)^2 terms.
         """

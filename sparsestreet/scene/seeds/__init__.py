@@ -1,6 +1,6 @@
 """Where the Gaussians of a node start: from lidar, from boxes, at random."""
 
-from sparsestreet.scene.seeds.background import BackgroundSeeds
-from sparsestreet.scene.seeds.rigid import RigidSeeds
+from sparsestreet.scene.seeds.background import BackgroundSettings
+from sparsestreet.scene.seeds.rigid import RigidSettings
 
-__all__ = ["BackgroundSeeds", "RigidSeeds"]
+__all__ = ["BackgroundSettings", "RigidSettings"]

@@ -13,16 +13,16 @@ from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes.background import Background
 from sparsestreet.scene.seeds.boxes import moving_tracks, outside_boxes
 from sparsestreet.scene.seeds.points import Points, far_positions, near_positions, random_points
-from sparsestreet.scene.seeds.rows import MINIMUM_SCALE, neighbour_scales, seed_rows
+from sparsestreet.scene.seeds.rows import MINIMUM_SCALE, neighbor_scales, seed_rows
 from sparsestreet.types import Frame
 
 LARGEST_RANDOM_RATIO = 0.02
-"""Of a random seed's distance from the nearest camera. Their neighbours are metres away, so without a limit (here 1.1
+"""Of a random seed's distance from the nearest camera. Their neighbors are meters away, so without a limit (here 1.1
 degrees) they start as a fog that hides the lidar points and makes every early step slow."""
 
 
 @dataclass(frozen=True)
-class BackgroundSeeds:
+class BackgroundSettings:
     """Lidar points outside moving boxes, random points around the drive and far away."""
 
     lidar_points: int = 100_000
@@ -31,8 +31,8 @@ class BackgroundSeeds:
     sh_degree: int = 3
     mask: StaticMask | None = None
     initial_opacity: float = 0.1
-    minimum_travel: float = 1.0
-    """Metres; objects that travel farther leave no points in the background."""
+    min_path_length: float = 1.0
+    """Meters; objects that travel farther leave no points in the background."""
     moving_classes: Sequence[str] | None = None
     """Classes that may move; None: all."""
     box_enlargement: float = 1.1
@@ -52,11 +52,11 @@ class BackgroundSeeds:
         points = Points.concatenate([lidar, near, far])
         if len(points) == 0:
             raise ValueError(
-                f"the background of {log.name!r} has no seeds: no coloured lidar point of a training sweep, and no "
+                f"the background of {log.name!r} has no seeds: no colored lidar point of a training sweep, and no "
                 f"random point (near_points={self.near_points}, far_points={self.far_points}) is seen by one of "
                 f"{len(train_frames)} training views; raise near_points, or check the poses of the cameras"
             )
-        scales = neighbour_scales(points.positions)
+        scales = neighbor_scales(points.positions)
         limits = _largest_scales(points.positions[len(lidar) :], train_frames)
         scales[len(lidar) :] = torch.minimum(scales[len(lidar) :], limits)
         rows = seed_rows(
@@ -71,8 +71,8 @@ class BackgroundSeeds:
         return Background(rows, self.mask)
 
     def _lidar(self, log: DrivingLog, held_out: frozenset[int]) -> Points:
-        """Coloured returns of the training sweeps that lie in no moving box of their instant."""
-        moving = moving_tracks(log.tracks, self.minimum_travel, self.moving_classes)
+        """Colored returns of the training sweeps that lie in no moving box of their instant."""
+        moving = moving_tracks(log.tracks, self.min_path_length, self.moving_classes)
         parts = []
         for sweep in log.sweeps:
             if sweep.index not in held_out:
@@ -82,7 +82,7 @@ class BackgroundSeeds:
 
 
 def _largest_scales(positions: Float[Tensor, "n 3"], frames: Sequence[Frame]) -> Float[Tensor, " n"]:
-    """Metres, by the distance from the nearest camera."""
+    """Meters, by the distance from the nearest camera."""
     cameras = torch.stack([frame.camera.position for frame in frames]).double().numpy()
     distances, _ = cKDTree(cameras).query(positions.double().numpy())
     return (LARGEST_RANDOM_RATIO * torch.from_numpy(distances).float()).clamp(min=MINIMUM_SCALE)

@@ -11,16 +11,18 @@ from sparsestreet.types import Track
 
 
 def moving_tracks(
-    tracks: Sequence[Track], minimum_travel: float, classes: Sequence[str] | None = None
+    tracks: Sequence[Track], min_path_length: float, classes: Sequence[str] | None = None
 ) -> tuple[Track, ...]:
-    """Tracks whose box centre moves more than ``minimum_travel`` metres; of some classes only, or of all (None)."""
+    """Tracks whose box center moves more than ``min_path_length`` meters; of some classes only, or of all (None)."""
     return tuple(
-        track for track in tracks if track.travel > minimum_travel and (classes is None or track.class_name in classes)
+        track
+        for track in tracks
+        if track.path_length > min_path_length and (classes is None or track.class_name in classes)
     )
 
 
 def points_in_box_frame(track: Track, frame: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
-    """World points in the track's box frame at an integer frame, metres; None where it is not annotated."""
+    """World points in the track's box frame at an integer frame, meters; None where it is not annotated."""
     found = torch.nonzero(track.frames == frame).flatten()
     if found.numel() == 0:
         return None

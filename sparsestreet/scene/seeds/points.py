@@ -1,4 +1,4 @@
-"""Coloured points in the world: what lidar saw, and random guesses where it saw nothing."""
+"""Colored points in the world: what lidar saw, and random guesses where it saw nothing."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ CANDIDATES_PER_POINT = 3
 """Random positions drawn at once for each one wanted, since most lie in no view (DriveStudio)."""
 
 VIEWS_PER_ROUND = 24
-"""Views that each draw is tested against, chosen anew: neighbouring views see nearly the same space."""
+"""Views that each draw is tested against, chosen anew: neighboring views see nearly the same space."""
 
 ROUNDS = 10
 """Draws before a scene whose cameras see a small part of the space makes do with fewer points."""
@@ -25,7 +25,7 @@ ROUNDS = 10
 
 @dataclass(frozen=True)
 class Points:
-    """Positions in metres and RGB in [0, 1]."""
+    """Positions in meters and RGB in [0, 1]."""
 
     positions: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
@@ -55,7 +55,7 @@ class Points:
 def near_positions(
     count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
 ) -> Float[Tensor, "n 3"]:
-    """Uniform in the ball of ``radius`` metres about ``center``."""
+    """Uniform in the ball of ``radius`` meters about ``center``."""
     distance = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
     return center + distance * _directions(count, generator)
 
@@ -88,7 +88,7 @@ def random_points(
 
 
 def seen_points(positions: Float[Tensor, "n 3"], frames: Sequence[Frame]) -> Points:
-    """Those positions that the first view looking at them does not show as sky, with the colour they have there.
+    """Those positions that the first view looking at them does not show as sky, with the color they have there.
 
     A ray that ends in the sky meets nothing, so a Gaussian on it could only learn to vanish. Without sky masks every
     position inside some view is kept.

@@ -9,28 +9,28 @@ from torch import Tensor
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes.knots import Knots
 from sparsestreet.scene.nodes.rigid import Rigid
+from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.seeds.boxes import inside_box, moving_tracks, points_in_box_frame
 from sparsestreet.scene.seeds.points import Points
-from sparsestreet.scene.seeds.rows import neighbour_scales, seed_rows
+from sparsestreet.scene.seeds.rows import neighbor_scales, seed_rows
 from sparsestreet.types import Frame, Sweep, Track
 
 
 @dataclass(frozen=True)
-class RigidSeeds:
+class RigidSettings:
     """Lidar points of all training instants pooled in the frame of each object's box."""
 
     classes: Sequence[str]
-    minimum_travel: float = 1.0
-    """Metres; an object that travels no farther is left to the background."""
+    min_path_length: float = 1.0
+    """Meters; an object that travels no farther is left to the background."""
     points_per_instance: int = 5000
     box_points: int = 1000
     """An instance with fewer lidar points than this is filled up with random points on the faces of its box."""
     sh_degree: int = 3
     mask: StaticMask | None = None
     initial_opacity: float = 0.1
-    maximum_gap: int = 2
+    max_gap: int = 2
     """Frames; an object is present within its span up to this far from a training annotation."""
 
     def build(
@@ -42,7 +42,7 @@ class RigidSeeds:
         """
         tracks = [
             track
-            for track in moving_tracks(log.tracks, self.minimum_travel, self.classes)
+            for track in moving_tracks(log.tracks, self.min_path_length, self.classes)
             if any(int(frame) not in held_out for frame in track.frames)
         ]
         if not tracks:
@@ -55,7 +55,7 @@ class RigidSeeds:
             points.positions,
             points.colors,
             # Per instance: in their own frames all objects lie on top of each other.
-            torch.cat([neighbour_scales(instance.positions) for instance in instances]),
+            torch.cat([neighbor_scales(instance.positions) for instance in instances]),
             sh_degree=self.sh_degree,
             initial_opacity=self.initial_opacity,
             mask=self.mask,
@@ -63,11 +63,11 @@ class RigidSeeds:
             buffers={"instances": torch.repeat_interleave(torch.arange(len(tracks)), counts)},
         )
         sizes = torch.stack([track.size.float() for track in tracks])
-        gap = self.maximum_gap / max(log.num_frames - 1, 1)
-        return Rigid(rows, Knots.from_tracks(tracks, held_out, log.num_frames), sizes, self.mask, gap)
+        gap = self.max_gap / max(log.num_frames - 1, 1)
+        return Rigid(rows, Trajectories.from_tracks(tracks, held_out, log.num_frames), sizes, self.mask, gap)
 
     def _instance_points(self, track: Track, sweeps: Sequence[Sweep], generator: torch.Generator) -> Points:
-        """One object's coloured points in its box frame, filled up where lidar left too few."""
+        """One object's colored points in its box frame, filled up where lidar left too few."""
         lidar = _lidar_in_box(track, sweeps).sampled(self.points_per_instance, generator)
         missing = min(self.box_points, self.points_per_instance) - len(lidar)
         if missing <= 0:
@@ -89,7 +89,7 @@ def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Ge
 
 
 def _lidar_in_box(track: Track, sweeps: Sequence[Sweep]) -> Points:
-    """Coloured returns inside the object's box at their own instant, in the box frame."""
+    """Colored returns inside the object's box at their own instant, in the box frame."""
     parts = []
     for sweep in sweeps:
         in_box_frame = points_in_box_frame(track, sweep.index, sweep.points)

@@ -1,4 +1,4 @@
-"""From coloured points to rows of Gaussians."""
+"""From colored points to rows of Gaussians."""
 
 import math
 
@@ -16,21 +16,21 @@ SH_CONSTANT = 0.5 / math.sqrt(math.pi)
 """The basis function of degree 0."""
 
 MINIMUM_SCALE = 1e-3
-"""Metres; coincident points are no distance apart, and a scale has to have a logarithm."""
+"""Meters; coincident points are no distance apart, and a scale has to have a logarithm."""
 
 
-def neighbour_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Mean distance to the three nearest other points (fewer where there are no three), at least 1 mm.
 
-    A point without any neighbour gets 1 mm.
+    A point without any neighbor gets 1 mm.
     """
     num_points = points.shape[0]
-    neighbours = min(3, num_points - 1)
-    if neighbours < 1:
+    neighbors = min(3, num_points - 1)
+    if neighbors < 1:
         return torch.full((num_points,), MINIMUM_SCALE)
     # The nearest is the point itself, or a coincident one: both are 0 away, so dropping the first is right.
     positions = points.double().numpy()
-    distances, _ = cKDTree(positions).query(positions, k=np.arange(2, neighbours + 2))
+    distances, _ = cKDTree(positions).query(positions, k=np.arange(2, neighbors + 2))
     return torch.from_numpy(distances.mean(1)).float().clamp(min=MINIMUM_SCALE)
 
 
@@ -45,7 +45,7 @@ def seed_rows(
     generator: torch.Generator,
     buffers: dict[str, Tensor] | None = None,
 ) -> Rows:
-    """Isotropic Gaussians with random rotations (as in 3DGS), one per point; colours RGB in [0, 1], scales metres.
+    """Isotropic Gaussians with random rotations (as in 3DGS), one per point; colors RGB in [0, 1], scales meters.
 
     Raises ValueError if the opacity is outside (0, 1) or the degree outside 0 to 3.
     """

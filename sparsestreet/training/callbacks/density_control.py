@@ -10,11 +10,11 @@ from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import resize_rows
 from sparsestreet.training.density.gradient import GradientDensity, cull, densify, outside_boxes, reset_opacity
 from sparsestreet.training.density.statistics import DensityStatistics
-from sparsestreet.training.schedule import Window
+from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
 
 BOX_MARGIN = 0.1
-"""Metres by which a rigid row's centre may lie outside its box: annotated boxes are about this tight."""
+"""Meters by which a rigid row's center may lie outside its box: annotated boxes are about this tight."""
 
 
 class DensityControl(Callback):
@@ -33,9 +33,9 @@ class DensityControl(Callback):
     def __init__(
         self,
         nodes: Mapping[str, GradientDensity],
-        densify_in: Window,
-        cull_in: Window,
-        reset_in: Window,
+        densify_in: Interval,
+        cull_in: Interval,
+        reset_in: Interval,
         *,
         reset_to: float = 0.01,
         pause_after_reset: int = 100,

@@ -6,7 +6,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.pruning.select import keep_by_mask
 from sparsestreet.training.callbacks.resizing import resize_rows
-from sparsestreet.training.schedule import Window
+from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
@@ -19,7 +19,7 @@ class MaskTraining(Callback):
     image, only the time a step takes.
     """
 
-    def __init__(self, remove_in: Window) -> None:
+    def __init__(self, remove_in: Interval) -> None:
         self.remove_in = remove_in
 
     def on_train_batch_end(
@@ -39,11 +39,11 @@ class MaskTraining(Callback):
 
     def _remove(self, trainer: Trainer, system: StreetSystem, name: str) -> None:
         node = system.scene.nodes[name]
-        selection = keep_by_mask(node.mask_scores().detach(), node.mask.threshold, node.mask.minimum_rows)
+        selection = keep_by_mask(node.mask_scores().detach(), node.mask.threshold, node.mask.min_gaussians)
         if selection.floor_hit:
             log.info(
                 "step %d: the floor of %d rows (K_min) of node %r holds: masks of the best rows stay open",
-                trainer.global_step, node.mask.minimum_rows, name,
+                trainer.global_step, node.mask.min_gaussians, name,
             )  # fmt: skip
         if selection.removed:
             resize_rows(trainer, system, name, selection.plan(), "mask")

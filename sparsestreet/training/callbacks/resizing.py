@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 
 
 def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan, reason: str) -> None:
-    """Apply a plan to a node's rows and the optimiser, drop the stale graph, and tell whoever keeps row statistics."""
+    """Apply a plan to a node's rows and the optimizer, drop the stale graph, and tell whoever keeps row statistics."""
     rows = system.scene.nodes[node].rows
     before = len(rows)
     rows.resize(plan, trainer.optimizers[0])

@@ -37,7 +37,7 @@ class GradientDensity:
     """Children (and a parent that stays) have this much smaller scales."""
     keep_parent: bool = True
     """DriveStudio keeps the shrunk parent beside its children; the original 3DGS replaces it."""
-    maximum_rows: int | None = None
+    max_gaussians: int | None = None
     """The node never grows beyond this; the rows of highest gradient get the room that is left."""
 
     def __post_init__(self) -> None:
@@ -58,10 +58,10 @@ def densify(
     """Clone small rows and split large ones where the image asks for detail.
 
     With g the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the scene
-    radius in metres: a row with g > grad_threshold is split if s_max > split_scale R (or, with ``use_screen_size``,
+    radius in meters: a row with g > grad_threshold is split if s_max > split_scale R (or, with ``use_screen_size``,
     r > split_screen), else cloned. A clone is an exact copy. Children of a split are at mu + R(q) (s * z) with
     z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies inherit all other columns (mask
-    logits, instances ...) and start with zero optimiser moments; parents keep theirs.
+    logits, instances ...) and start with zero optimizer moments; parents keep theirs.
 
     New order: the surviving rows in theirs, then clones, then children, siblings side by side. Raises ValueError if
     the statistics do not belong to the rows or hold a gradient that is not finite.
@@ -85,7 +85,7 @@ def cull(
     use_screen: bool,
 ) -> RowPlan:
     """Drop rows that are faint (opacity < cull_opacity), with ``use_scale`` those that are huge (largest scale >
-    cull_scale * ``radius``, metres) and with ``use_screen`` those that were huge on screen (> cull_screen).
+    cull_scale * ``radius``, meters) and with ``use_screen`` those that were huge on screen (> cull_screen).
 
     Raises ValueError if the statistics do not belong to the rows.
     """
@@ -101,9 +101,9 @@ def cull(
 def outside_boxes(
     means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], sizes: Float[Tensor, "i 3"], margin: float
 ) -> Bool[Tensor, " n"]:
-    """Whether each row's centre (metres, in the frame of its instance's box) is more than ``margin`` metres outside.
+    """Whether each row's center (meters, in the frame of its instance's box) is more than ``margin`` meters outside.
 
-    ``sizes``: length, width, height of each instance's box, which is centred at the origin.
+    ``sizes``: length, width, height of each instance's box, which is centerd at the origin.
     """
     return (means.detach().abs() > sizes[instances] / 2 + margin).any(dim=-1)
 
@@ -141,13 +141,13 @@ def _largest_scale(rows: Rows) -> Float[Tensor, " n"]:
 def _within_cap(
     gradients: Float[Tensor, " n"], wanted: Bool[Tensor, " n"], large: Bool[Tensor, " n"], settings: GradientDensity
 ) -> Bool[Tensor, " n"]:
-    """Which rows may grow under ``maximum_rows``: highest gradient first, ties by row, until one has no room."""
-    if settings.maximum_rows is None:
+    """Which rows may grow under ``max_gaussians``: highest gradient first, ties by row, until one has no room."""
+    if settings.max_gaussians is None:
         return torch.ones_like(wanted)
     split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
     growth = torch.where(large, split_growth, 1) * wanted
     order = torch.sort(gradients, descending=True, stable=True).indices
-    room = max(settings.maximum_rows - wanted.shape[0], 0)
+    room = max(settings.max_gaussians - wanted.shape[0], 0)
     allowed = torch.zeros_like(wanted)
     allowed[order] = growth[order].cumsum(0) <= room
     return allowed
@@ -176,7 +176,7 @@ def _grow(
 
 
 def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:
-    """One draw from each listed row's Gaussian, relative to its mean, metres."""
+    """One draw from each listed row's Gaussian, relative to its mean, meters."""
     scales = rows.log_scales.detach()[children].exp()
     # Drawn where the generator lives: a CPU generator gives the same children on every device.
     normal = torch.randn(scales.shape, dtype=scales.dtype, generator=generator, device=generator.device)

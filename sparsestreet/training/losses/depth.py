@@ -16,7 +16,7 @@ class InverseDepth:
     weight: float = 0.1
     nearest: float = 0.5
     farthest: float = 80.0
-    """Returns outside [nearest, farthest] metres are left out."""
+    """Returns outside [nearest, farthest] meters are left out."""
 
     def applies(self, frame: Frame) -> bool:
         return frame.depth is not None

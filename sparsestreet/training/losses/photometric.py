@@ -12,10 +12,10 @@ from sparsestreet.types import Frame
 
 @dataclass(frozen=True)
 class Photometric:
-    """On unclamped colours: a clamp would stop the gradient of saturated pixels (lamps, white sky)."""
+    """On unclamped colors: a clamp would stop the gradient of saturated pixels (lamps, white sky)."""
 
     weight: float = 1.0
-    ssim_share: float = 0.2
+    lambda_dssim: float = 0.2
 
     def applies(self, frame: Frame) -> bool:
         return True
@@ -23,6 +23,6 @@ class Photometric:
     def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
         truth = frame.image.to(rendering.rgb.dtype) / 255
         error = (rendering.rgb - truth).abs().mean()
-        if self.ssim_share > 0:
-            error = (1 - self.ssim_share) * error + self.ssim_share * (1 - ssim(rendering.rgb, truth))
+        if self.lambda_dssim > 0:
+            error = (1 - self.lambda_dssim) * error + self.lambda_dssim * (1 - ssim(rendering.rgb, truth))
         return self.weight * error

@@ -28,7 +28,7 @@ def pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def make_nuscenes(root: Path, *, frames: int = 3, cameras: int = 2, offset: np.ndarray | None = None) -> Path:
-    """World coordinates are shifted by ``offset`` (metres), as map coordinates are."""
+    """World coordinates are shifted by ``offset`` (meters), as map coordinates are."""
     offset = np.zeros(3) if offset is None else offset
     for frame in range(frames):
         for camera in range(cameras):

@@ -23,7 +23,7 @@ def test_it_is_sound_and_quick_to_read(kitti):
     assert check_drivestudio(kitti, contents=False) == []
     start = time.process_time()
     read_drivestudio(kitti)
-    # 0.8 s of one thread, 1.1 s with shape checks; CPU time, since a wall clock would measure the neighbours.
+    # 0.8 s of one thread, 1.1 s with shape checks; CPU time, since a wall clock would measure the neighbors.
     assert time.process_time() - start < 3
 
 
@@ -32,13 +32,13 @@ def test_it_holds_what_its_description_says(log):
     assert log.frames[0].image.shape == (120, 397, 3)
     assert {track.class_name for track in log.tracks} == {"Car", "Cyclist", "Tram"}
     (tram,) = (track for track in log.tracks if track.class_name == "Tram")
-    assert tram.travel > 30
+    assert tram.path_length > 30
     assert len(log.notes) == 1
     assert "sky" in log.notes[0]
 
 
 def test_the_cameras_stand_side_by_side_and_drive_forward(log):
-    """KITTI's colour cameras are 0.54 m apart, a rectified pair: the right one sees the same axes."""
+    """KITTI's color cameras are 0.54 m apart, a rectified pair: the right one sees the same axes."""
     for left, right in zip(log.frames[::2], log.frames[1::2], strict=True):
         between = left.camera.camera_from_world[:3, :3] @ (right.camera.position - left.camera.position)
         assert torch.allclose(between, torch.tensor([0.54, 0, 0]), atol=0.02)
@@ -52,7 +52,7 @@ def colors_at(frame: Frame, points: torch.Tensor) -> tuple[torch.Tensor, torch.T
 
 
 def difference(log: DrivingLog, frame: Frame, index: int) -> float:
-    """Mean distance in grey levels of the colours of sweep ``index`` from the pixels of another image."""
+    """Mean distance in gray levels of the colors of sweep ``index`` from the pixels of another image."""
     sweep = log.sweeps[index]
     rows, seen = colors_at(frame, sweep.points)
     both = sweep.colored[rows]
@@ -60,7 +60,7 @@ def difference(log: DrivingLog, frame: Frame, index: int) -> float:
 
 
 def mean_difference(log: DrivingLog, steps: int, camera: int, pose_from: tuple[int, int]) -> float:
-    """Over several sweeps: colours against the image ``steps`` later, taken to have the pose of another image."""
+    """Over several sweeps: colors against the image ``steps`` later, taken to have the pose of another image."""
     total, sweeps = 0.0, range(0, 50, 10)
     for index in sweeps:
         frame = log.frames[2 * (index + steps) + camera]
@@ -70,18 +70,18 @@ def mean_difference(log: DrivingLog, steps: int, camera: int, pose_from: tuple[i
     return total / len(sweeps)
 
 
-def test_both_cameras_see_a_point_in_the_same_colour(log):
-    """Colours come from the left camera wherever it sees a point: the right image, with its own pose or the left's.
+def test_both_cameras_see_a_point_in_the_same_color(log):
+    """Colors come from the left camera wherever it sees a point: the right image, with its own pose or the left's.
 
-    Measured: 7.6 and 21.6 grey levels.
+    Measured: 7.6 and 21.6 gray levels.
     """
     right = mean_difference(log, 0, 1, (0, 1))
     assert right < 10
     assert mean_difference(log, 0, 1, (0, 0)) > 2 * right
 
 
-def test_colours_carried_five_frames_by_the_poses_fit_better_than_with_poses_one_frame_off(log):
-    """Measured: 15.4 grey levels with the poses, 21.2 and 21.4 with the next and the previous one."""
+def test_colors_carried_five_frames_by_the_poses_fit_better_than_with_poses_one_frame_off(log):
+    """Measured: 15.4 gray levels with the poses, 21.2 and 21.4 with the next and the previous one."""
     carried = mean_difference(log, 5, 0, (5, 0))
     assert mean_difference(log, 5, 0, (6, 0)) > 1.2 * carried
     assert mean_difference(log, 5, 0, (4, 0)) > 1.2 * carried

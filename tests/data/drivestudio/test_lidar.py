@@ -1,4 +1,4 @@
-"""Colouring and the z-buffer on hand-made cases."""
+"""Coloring and the z-buffer on hand-made cases."""
 
 import torch
 
@@ -35,7 +35,7 @@ def test_the_nearest_point_wins_in_any_order():
         assert torch.equal(depth_image(points[order], CAMERA), expected)
 
 
-def test_no_points_give_no_colour_and_no_depth():
+def test_no_points_give_no_color_and_no_depth():
     empty = torch.zeros(0, 3)
     colors, colored = color_points(empty, [(CAMERA, IMAGE)])
     assert colors.shape == (0, 3)
@@ -43,6 +43,6 @@ def test_no_points_give_no_colour_and_no_depth():
     assert not depth_image(empty, CAMERA).any()
 
 
-def test_without_cameras_nothing_is_coloured():
+def test_without_cameras_nothing_is_colored():
     _, colored = color_points(torch.ones(3, 3), [])
     assert not colored.any()

@@ -25,7 +25,7 @@ from tests.data.drivestudio.folders import (
     write_lines,
 )
 
-MAP = np.array([450123.377, 5400321.713, 230.19])  # metres, as UTM coordinates of central Europe
+MAP = np.array([450123.377, 5400321.713, 230.19])  # meters, as UTM coordinates of central Europe
 FLAVOURS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 
 
@@ -33,7 +33,9 @@ FLAVOURS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 def test_frames_are_ordered_and_timed(make, tmp_path):
     log = read_drivestudio(make(tmp_path / "street_7"))
     assert (log.name, log.num_frames, log.num_cameras, log.notes) == ("street_7", 3, 2, ())
-    assert [(frame.index, frame.camera_index) for frame in log.frames] == [(i, c) for i in range(3) for c in range(2)]
+    assert [(frame.frame_index, frame.camera_index) for frame in log.frames] == [
+        (i, c) for i in range(3) for c in range(2)
+    ]
     assert [frame.time for frame in log.frames[::2]] == [0.0, 0.5, 1.0]
     assert [sweep.index for sweep in log.sweeps] == [0, 1, 2]
     assert log.frames[0].image.dtype == torch.uint8
@@ -41,19 +43,19 @@ def test_frames_are_ordered_and_timed(make, tmp_path):
 
 
 @FLAVOURS
-def test_a_point_straight_ahead_lands_in_the_image_centre(make, tmp_path):
+def test_a_point_straight_ahead_lands_in_the_image_center(make, tmp_path):
     """Camera 0 stands at height 1.5 m and looks along the drive: (x, 0, 1.5) is on its axis, at depth x - frame."""
     log = read_drivestudio(make(tmp_path))
     for frame in log.frames[::2]:
-        pixels, depths, inside = project(frame.camera, log.sweeps[frame.index].points[:2])
+        pixels, depths, inside = project(frame.camera, log.sweeps[frame.frame_index].points[:2])
         assert inside.all()
         assert torch.allclose(pixels, torch.tensor([WIDTH / 2, HEIGHT / 2]), atol=1e-4)  # float32 of a 40 px image
-        assert torch.allclose(depths, torch.tensor([10.0, 20.0]) - frame.index, atol=1e-5)
+        assert torch.allclose(depths, torch.tensor([10.0, 20.0]) - frame.frame_index, atol=1e-5)
 
 
 @FLAVOURS
 def test_left_and_up_are_left_and_up_in_the_image(make, tmp_path):
-    """The point at (8, 0.3, 1.5) is left of camera 0 by 0.3 m at 8 m; the car's centre is left and below."""
+    """The point at (8, 0.3, 1.5) is left of camera 0 by 0.3 m at 8 m; the car's center is left and below."""
     log = read_drivestudio(make(tmp_path))
     pixels, _, inside = project(log.frames[0].camera, log.sweeps[0].points[[2, 4]])
     expected = torch.tensor(
@@ -68,7 +70,7 @@ def test_left_and_up_are_left_and_up_in_the_image(make, tmp_path):
 
 @FLAVOURS
 def test_map_coordinates_keep_their_relative_geometry(make, tmp_path):
-    """float32 at 5.4e6 has a spacing of 0.5 m; after re-centring in float64 nothing of that may be left."""
+    """float32 at 5.4e6 has a spacing of 0.5 m; after re-centering in float64 nothing of that may be left."""
     here, far = read_drivestudio(make(tmp_path / "here")), read_drivestudio(make(tmp_path / "far", offset=MAP))
     for frame, distant in zip(here.frames, far.frames, strict=True):
         assert torch.allclose(frame.camera.camera_from_world, distant.camera.camera_from_world, atol=1e-4)
@@ -103,7 +105,7 @@ def test_the_window_and_the_cameras_are_counted_from_zero(tmp_path):
     whole = read_drivestudio(make_nuscenes(tmp_path, frames=6))
     part = read_drivestudio(tmp_path, first_frame=2, last_frame=4, cameras=[1, 0])
     assert (part.num_frames, part.num_cameras) == (3, 2)
-    assert [(frame.index, frame.camera_index) for frame in part.frames[:3]] == [(0, 0), (0, 1), (1, 0)]
+    assert [(frame.frame_index, frame.camera_index) for frame in part.frames[:3]] == [(0, 0), (0, 1), (1, 0)]
     assert torch.equal(part.frames[0].image, whole.frames[5].image)  # frame 2 of camera 1 comes first
     assert torch.equal(part.tracks[0].frames, torch.arange(3))
     assert part.frames[-1].time == 1.0
@@ -214,7 +216,7 @@ def test_distortion_is_ignored_only_when_asked(tmp_path):
 
 
 @FLAVOURS
-def test_sweeps_are_coloured_by_the_images_of_their_instant(make, tmp_path):
+def test_sweeps_are_colored_by_the_images_of_their_instant(make, tmp_path):
     """At frame 0 all points but the one behind the vehicle lie in camera 0's (red) image; JPEG costs a few levels."""
     sweep = read_drivestudio(make(tmp_path)).sweeps[0]
     assert sweep.colored.tolist() == [True, True, True, False, True]
@@ -226,7 +228,7 @@ def test_sweeps_are_coloured_by_the_images_of_their_instant(make, tmp_path):
 
 @FLAVOURS
 def test_depth_takes_the_nearest_of_the_points_in_a_pixel(make, tmp_path):
-    """Points 0 and 1 share the centre pixel, at 10 and 20 m."""
+    """Points 0 and 1 share the center pixel, at 10 and 20 m."""
     depth = read_drivestudio(make(tmp_path)).frames[0].depth
     assert depth[HEIGHT // 2, WIDTH // 2] == pytest.approx(10.0, abs=1e-5)
     assert int((depth > 0).sum()) == 3

@@ -23,8 +23,8 @@ def test_a_street_opens_as_a_log(tmp_path):
     assert len(starting) > 5
     for track in starting:
         # The log's world is shifted: compare where the first frame's front camera has the box.
-        centre = (log.frames[0].camera.camera_from_world.double() @ track.world_from_object[0])[:3, 3]
-        distances = (seen_from_camera - centre).norm(dim=1)
+        center = (log.frames[0].camera.camera_from_world.double() @ track.world_from_object[0])[:3, 3]
+        distances = (seen_from_camera - center).norm(dim=1)
         # Camera matrices are float32: 1e-4 m at 60 m.
         assert distances.min() < 1e-4
         actor = world.actors[int(distances.argmin())]
@@ -33,13 +33,13 @@ def test_a_street_opens_as_a_log(tmp_path):
 
 
 def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:
-    """Centre of the actor's box in the front camera, which sits 1.6 m ahead of the ego origin and 1.65 m above it."""
+    """Center of the actor's box in the front camera, which sits 1.6 m ahead of the ego origin and 1.65 m above it."""
     ahead = (ego_from_world @ torch.from_numpy(actor.pose(0.0)))[:3, 3]
     x, y, z = ahead - torch.tensor([1.6, 0.0, 1.65], dtype=torch.float64)
     return torch.stack((-y, -z, x))
 
 
-def test_sweeps_fall_on_the_pixels_that_colour_them(tmp_path):
+def test_sweeps_fall_on_the_pixels_that_color_them(tmp_path):
     log = open_street(SETTINGS, tmp_path / "street")
     sweep = log.sweeps[0]
     assert sweep.colored.any()

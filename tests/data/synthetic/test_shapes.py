@@ -91,8 +91,8 @@ def test_normals_point_out_and_extent_contains_the_surface(shape, inside):
 @pytest.mark.parametrize(("shape", "inside"), SOLIDS)
 def test_rays_from_inside_and_pointing_away_do_not_hit(shape, inside):
     origins, directions = random_rays(50)
-    centre = np.zeros((3, 1), np.float32)
-    assert np.isinf(shape.enter(centre, directions)).all()
+    center = np.zeros((3, 1), np.float32)
+    assert np.isinf(shape.enter(center, directions)).all()
     assert np.isinf(shape.enter(origins, -directions)).all()
 
 

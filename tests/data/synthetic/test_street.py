@@ -119,9 +119,9 @@ def test_boxes_contain_the_points_of_their_pixels_and_enclose_them_in_the_image(
                 pixels = in_camera @ intrinsics.T
                 pixels = pixels[:, :2] / pixels[:, 2:]
                 v, u = np.nonzero(mine)
-                centres = np.stack((u, v), 1) + 0.5
-                assert (centres >= pixels.min(0) - 1e-2).all()
-                assert (centres <= pixels.max(0) + 1e-2).all()
+                centers = np.stack((u, v), 1) + 0.5
+                assert (centers >= pixels.min(0) - 1e-2).all()
+                assert (centers <= pixels.max(0) + 1e-2).all()
     assert seen >= 15
 
 

@@ -69,7 +69,7 @@ def surfaces() -> dict[str, Part]:
 
 
 @pytest.mark.parametrize("name", sorted(surfaces()))
-def test_looks_are_colours_and_flatten_with_distance(name):
+def test_looks_are_colors_and_flatten_with_distance(name):
     part = surfaces()[name]
     rng = np.random.default_rng(2)
     # Rays from all around, onto the part's surface.

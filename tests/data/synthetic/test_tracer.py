@@ -11,7 +11,7 @@ from sparsestreet.data.synthetic.sky import random_weather
 from sparsestreet.data.synthetic.textures.plain import Plain
 from sparsestreet.data.synthetic.tracer import NOTHING, Rays, first_hits, sunlit
 
-GREY = Plain((0.5, 0.5, 0.5))
+GRAY = Plain((0.5, 0.5, 0.5))
 
 
 def random_scene(seed: int) -> Scene:
@@ -23,13 +23,13 @@ def random_scene(seed: int) -> Scene:
         Cylinder(0.5, 1.2),
         Capsule(0.3, 1.0),
     ]
-    parts = [Part(box(400.0, 400.0, 2.0), GREY, at(0.0, 0.0, -3.0))]
+    parts = [Part(box(400.0, 400.0, 2.0), GRAY, at(0.0, 0.0, -3.0))]
     for number in range(40):
         rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
         pose = np.eye(4)
         pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
         pose[:3, 3] = rng.uniform(-20, 20, 3) * [1, 1, 0.2]
-        parts.append(Part(shapes[number % 4], GREY, pose, number))
+        parts.append(Part(shapes[number % 4], GRAY, pose, number))
     return Scene.of(parts)
 
 
@@ -112,7 +112,7 @@ def test_sunlit_equals_brute_force():
 def test_shadow_of_a_box_on_the_ground():
     """A box of 2 m, sun from the south at 45 degrees: the shadow reaches 2 m to the north of the box."""
     scene = Scene.of(
-        [Part(box(100.0, 100.0, 2.0), GREY, at(0.0, 0.0, -1.0)), Part(box(2.0, 2.0, 2.0), GREY, at(0.0, 0.0, 1.0))]
+        [Part(box(100.0, 100.0, 2.0), GRAY, at(0.0, 0.0, -1.0)), Part(box(2.0, 2.0, 2.0), GRAY, at(0.0, 0.0, 1.0))]
     )
     sun = np.array([0, -1, 1], np.float32) / np.float32(np.sqrt(2))
     points = np.array([[0, 1.5, 0], [0, 2.9, 0], [0, 3.1, 0], [0, -1.5, 0], [0.9, 2, 0], [1.1, 2, 0]], np.float32).T
@@ -124,8 +124,8 @@ def test_shadow_of_a_box_on_the_ground():
 
 def test_a_point_behind_a_box_is_darker():
     ground, wall = (
-        Part(box(100.0, 100.0, 2.0), GREY, at(0.0, 0.0, -1.0)),
-        Part(box(2.0, 2.0, 6.0), GREY, at(0.0, 0.0, 3.0)),
+        Part(box(100.0, 100.0, 2.0), GRAY, at(0.0, 0.0, -1.0)),
+        Part(box(2.0, 2.0, 6.0), GRAY, at(0.0, 0.0, 3.0)),
     )
     weather = random_weather(0)
     behind = -4 * weather.sun / np.linalg.norm(weather.sun[:2])
@@ -144,7 +144,7 @@ def test_a_point_behind_a_box_is_darker():
 
 
 def test_limb_runs_from_start_to_end():
-    part = limb((1.0, 2.0, 3.0), (1.5, 1.0, 4.0), 0.1, GREY)
+    part = limb((1.0, 2.0, 3.0), (1.5, 1.0, 4.0), 0.1, GRAY)
     rotation = part.frame_from_part[:3, :3]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)

@@ -13,12 +13,12 @@ from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.world import build_world
 
 CLOTHES = random_clothes(np.random.default_rng(0))
-GREY = (0.5, 0.5, 0.5)
+GRAY = (0.5, 0.5, 0.5)
 MODELS = [
-    *(Car(style, GREY, GREY) for style in STYLES),
+    *(Car(style, GRAY, GRAY) for style in STYLES),
     Pedestrian(1.58, CLOTHES),
     Pedestrian(1.9, CLOTHES),
-    Cyclist(CLOTHES, GREY),
+    Cyclist(CLOTHES, GRAY),
 ]
 
 
@@ -26,8 +26,8 @@ MODELS = [
 def test_parts_stay_within_the_box_and_nearly_fill_it(model):
     reach = np.zeros(3)
     rng = np.random.default_rng(0)
-    for travelled in np.linspace(0, 6.3, 13):
-        for part in model.parts(float(travelled)):
+    for traveled in np.linspace(0, 6.3, 13):
+        for part in model.parts(float(traveled)):
             directions = rng.standard_normal((3, 300))
             directions /= np.linalg.norm(directions, axis=0)
             # Rays towards a point within the part, from all around: their entries sample its surface.
@@ -43,7 +43,7 @@ def test_parts_stay_within_the_box_and_nearly_fill_it(model):
 
 def test_wheels_touch_the_road():
     for style in STYLES:
-        car = Car(style, GREY, GREY)
+        car = Car(style, GRAY, GRAY)
         lowest = min(part.frame_from_part[2, 3] - part.shape.half_extent[0] for part in car.parts(0.0)[2:])
         assert lowest == pytest.approx(-style.height / 2, abs=1e-6)
 
@@ -83,14 +83,14 @@ def test_moving_actors_travel_at_their_speed_and_nobody_collides(settings):
     ego_half = np.array([2.4, 1.0])
     for frame in range(settings.num_frames):
         time = frame / settings.frame_rate
-        centres = [actor.pose(time)[:2, 3] for actor in world.actors]
+        centers = [actor.pose(time)[:2, 3] for actor in world.actors]
         halves = [np.array(actor.model.size[:2]) / 2 for actor in world.actors]
         forward = world.ego.pose(time) @ [1.3, 0, 0, 1]
-        for centre, half in zip(centres, halves, strict=True):
+        for center, half in zip(centers, halves, strict=True):
             # Headings stay within a few degrees of the street's, so boxes overlap only if both intervals do.
-            assert (np.abs(centre - forward[:2]) > half + ego_half).any()
-        for a, b in itertools.combinations(range(len(centres)), 2):
-            assert (np.abs(centres[a] - centres[b]) > halves[a] + halves[b]).any(), (frame, a, b)
+            assert (np.abs(center - forward[:2]) > half + ego_half).any()
+        for a, b in itertools.combinations(range(len(centers)), 2):
+            assert (np.abs(centers[a] - centers[b]) > halves[a] + halves[b]).any(), (frame, a, b)
         for actor in world.actors:
             moved = np.linalg.norm(actor.pose(time + 0.1)[:2, 3] - actor.pose(time)[:2, 3])
             assert moved >= abs(actor.path.speed) * 0.1 - 1e-9
@@ -105,10 +105,10 @@ def test_people_walk_on_footways_and_cars_on_the_road():
     world = build_world(StreetSettings(seed=5))
     for actor in world.actors:
         y = actor.pose(1.0)[1, 3]
-        on_road = layout.KERB_RIGHT < y < layout.KERB_LEFT
+        on_road = layout.CURB_RIGHT < y < layout.CURB_LEFT
         assert on_road == (actor.model.class_name != "Pedestrian")
         bottom = actor.pose(1.0)[2, 3] - actor.model.size[2] / 2
-        assert bottom == pytest.approx(0.0 if on_road else layout.KERB_HEIGHT, abs=1e-9)
+        assert bottom == pytest.approx(0.0 if on_road else layout.CURB_HEIGHT, abs=1e-9)
 
 
 def test_seeds_give_other_streets_and_counts_can_be_zero():

@@ -96,7 +96,7 @@ def test_ssim_of_identical_images_is_one():
 
 
 def test_ssim_keeps_its_digits_where_images_are_nearly_flat():
-    """A sky of one grey with 1e-3 noise: variances of 1e-6, against float32's 6e-8 of E[x^2]."""
+    """A sky of one gray with 1e-3 noise: variances of 1e-6, against float32's 6e-8 of E[x^2]."""
     generator = torch.Generator().manual_seed(3)
     truth = 0.9 + 1e-3 * torch.randn(20, 20, 3, generator=generator)
     image = 0.9 + 1e-3 * torch.randn(20, 20, 3, generator=generator)

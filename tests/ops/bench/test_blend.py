@@ -1,4 +1,4 @@
-"""The stages beside vectorised torch, at a size of milliseconds."""
+"""The stages beside vectorized torch, at a size of milliseconds."""
 
 import pytest
 

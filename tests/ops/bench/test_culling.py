@@ -10,12 +10,16 @@ from sparsestreet.ops.bench import culling
 from sparsestreet.ops.bench.effects import seen_through
 from sparsestreet.ops.bench.scenes import Size, bench_scenes
 from sparsestreet.ops.cpu.library import tile_size
-from sparsestreet.ops.cpu.rasteriser import rasterise
+from sparsestreet.ops.cpu.rasterizer import rasterize
 from sparsestreet.types import Gaussians
 
 SCENES = bench_scenes(Size(75, 53, 300))
 DEFAULT = SplatSettings()
-SETTINGS = {"default": DEFAULT, "exclusive": SplatSettings(stop="exclusive"), "box": SplatSettings(box=2.5, blur=0.1)}
+SETTINGS = {
+    "default": DEFAULT,
+    "exclusive": SplatSettings(stop="exclusive"),
+    "max_sigma": SplatSettings(max_sigma=2.5, eps2d=0.1),
+}
 
 
 def tiles(scene) -> int:
@@ -65,9 +69,9 @@ def test_splats_that_end_too_early_are_found(scene, monkeypatch):
     """As if the lists ended at an alpha of 1/128 where the pixel loop ends at 1/255."""
 
     def tight(rows, offsets, camera, settings, every_tile):
-        return rasterise(rows, offsets, camera, settings if every_tile else replace(settings, alpha_min=1 / 128))
+        return rasterize(rows, offsets, camera, settings if every_tile else replace(settings, alpha_min=1 / 128))
 
-    monkeypatch.setattr(culling, "rasterise", tight)
+    monkeypatch.setattr(culling, "rasterize", tight)
     found = culling.compare_culling(scene.gaussians, scene.camera, DEFAULT)
     assert found.pixels_changed > 0
     assert found.rows_changed > 0

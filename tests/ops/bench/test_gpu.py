@@ -65,7 +65,7 @@ def test_another_image_or_another_gradient_disagrees(rows):
     found = gsplat_peer.parity(stand_in(brightness=1.02), rows, frustum_camera(48, 32), "cpu")
     assert not gsplat_peer.agrees(found)
     assert found.gradients["sh"].relative_l2 == pytest.approx(0.02, rel=1e-3)
-    # A thousandth of the colours is within the limits.
+    # A thousandth of the colors is within the limits.
     slight = gsplat_peer.parity(stand_in(brightness=1.001), rows, frustum_camera(48, 32), "cpu")
     assert gsplat_peer.agrees(slight)
 
@@ -79,7 +79,7 @@ def test_a_gradient_alone_can_disagree():
 
 
 def test_settings_are_those_of_gsplat():
-    assert (gsplat_peer.SETTINGS.stop, gsplat_peer.SETTINGS.alpha_max, gsplat_peer.SETTINGS.near) == (
+    assert (gsplat_peer.SETTINGS.stop, gsplat_peer.SETTINGS.alpha_max, gsplat_peer.SETTINGS.near_plane) == (
         "exclusive",
         0.999,
         0.01,

@@ -57,15 +57,15 @@ def test_values_are_readable():
 
 def test_truths_of_a_point():
     by_value = {(point.knob, point.value): point for point in POINTS}
-    blurred = by_value["blur", "0.1"]
+    blurred = by_value["eps2d", "0.1"]
     assert blurred.other_model
-    assert blurred.exact.blur == 0.1
+    assert blurred.exact.eps2d == 0.1
     assert (blurred.exact.alpha_min, blurred.exact.transmittance_min, blurred.exact.box) == (0, 0, inf)
     half = by_value["half_colors", "True"]
     assert half.same_cutoffs == DEFAULT
     assert half.exact == SplatSettings.preset("exact")
     assert by_value["depth_bits", "12"].same_cutoffs == DEFAULT
-    boxed = by_value["box", "3"]
+    boxed = by_value["max_sigma", "3"]
     assert boxed.same_cutoffs == boxed.settings
     assert not boxed.other_model
     assert boxed.exact.box == inf

@@ -28,12 +28,12 @@ def test_lines_are_there_as_soon_as_written(tmp_path):
     assert first["values"] == [1.0, 0.333333]
     assert first["kind"] == "sample"
     assert first["provenance"]["commit"] == "abc"
-    assert second["settings"]["box"] is None
+    assert second["settings"]["max_sigma"] is None
     assert second["settings"]["alpha_min"] == pytest.approx(1 / 255, rel=1e-5)
 
 
 def test_a_finite_box_is_a_number():
-    assert encode(SplatSettings(box=3.33), "settings")["box"] == 3.33
+    assert encode(SplatSettings(max_sigma=3.33), "settings")["max_sigma"] == 3.33
 
 
 @pytest.mark.parametrize("value", [nan, inf, -inf])

@@ -29,7 +29,7 @@ def test_deep_stack_is_as_deep_as_it_says():
     never_stop = SplatSettings(transmittance_min=0.0)
     touched = contribution(scene.gaussians, scene.camera, settings=never_stop, backend="cpu").pixels.sum()
     depth = float(touched) / (SIZE.width * SIZE.height)
-    # Centres lie inside the image only, so that of the stack at an edge half is missing.
+    # Centers lie inside the image only, so that of the stack at an edge half is missing.
     assert 0.75 * STACK < depth < STACK
 
 

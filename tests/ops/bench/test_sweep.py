@@ -22,7 +22,7 @@ def swept(tmp_path_factory):
     file = RecordFile(tmp_path_factory.mktemp("sweep") / "knobs.jsonl", PROVENANCE)
     said: list[str] = []
     chosen = [
-        point for point in points() if point.knob in ("default", "alpha_min", "preset", "blur", "effects", "backend")
+        point for point in points() if point.knob in ("default", "alpha_min", "preset", "eps2d", "effects", "backend")
     ]
     sweep.run_sweep(SCENES, SCENES[:2], chosen, ONCE, file, said.append)
     return read_records(file.path), said, len(chosen)
@@ -50,9 +50,9 @@ def test_errors_are_against_the_right_truth(swept):
         assert same is None or same > 60, record["value"]
         assert record["other_model"] or record["model_psnr"] is None
         if record["value"] == "exact":
-            assert exact > 110  # float32: 3e-6 of a colour
+            assert exact > 110  # float32: 3e-6 of a color
         if (record["knob"], record["value"]) == ("alpha_min", "0"):
-            assert exact > 80  # the stop alone: at most transmittance_min = 1e-4 of a colour
+            assert exact > 80  # the stop alone: at most transmittance_min = 1e-4 of a color
         if record["knob"] == "blur" and record["scene"] == "random frustum":
             # Splats of 2 px: another model is further away than a cut-off.
             assert record["model_psnr"] < exact
@@ -137,9 +137,9 @@ def test_truth_is_computed_once_and_near_changes_it_only_where_rows_are(monkeypa
     monkeypatch.setattr(sweep, "answer", counted)
     truths = sweep.Truths(SCENES[0])  # nearest row at 2 m
     assert truths.of(EXACT) is truths.of(EXACT)
-    assert truths.of(SplatSettings(near=0.01)) is truths.of(DEFAULT)
-    assert truths.of(SplatSettings(near=30.0)) is not truths.of(DEFAULT)
-    assert [settings.near for settings in calls] == [0.2, 0.2, 30.0]
+    assert truths.of(SplatSettings(near_plane=0.01)) is truths.of(DEFAULT)
+    assert truths.of(SplatSettings(near_plane=30.0)) is not truths.of(DEFAULT)
+    assert [settings.near_plane for settings in calls] == [0.2, 0.2, 30.0]
 
 
 def test_gradient_errors_see_a_wrong_gradient():

@@ -6,7 +6,7 @@ import torch
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.ops.bench.timing import Cotangent, Effort, leaves, time_op, work_of
-from sparsestreet.ops.cpu.rasteriser import rasterise
+from sparsestreet.ops.cpu.rasterizer import rasterize
 
 CAMERA = frustum_camera(48, 32)
 GAUSSIANS = frustum_gaussians(80, CAMERA, sigma_pixels=2.0, terms=4)
@@ -45,7 +45,7 @@ def test_work_is_that_of_the_view_whatever_was_rendered_before():
 
 def test_work_is_that_of_the_variant_that_splat_uses():
     few = leaves(frustum_gaussians(5, CAMERA, 2.0, 1), torch.float32)
-    rasterise(few, torch.zeros(5, 2), CAMERA, SplatSettings(), 0)
+    rasterize(few, torch.zeros(5, 2), CAMERA, SplatSettings(), 0)
     rows = leaves(GAUSSIANS, torch.float32)
     pairs, samples = work_of(rows, CAMERA, SplatSettings(), "cpu")
     assert pairs > 80  # each of the 80 splats covers a tile, most cover more

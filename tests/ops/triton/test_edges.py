@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, resolve_backend, splat
-from sparsestreet.ops.triton import lists, rasteriser
+from sparsestreet.ops.triton import lists, rasterizer
 from sparsestreet.types import Gaussians, Shutter
 from tests.ops.scenes import FIELDS, camera, cast, device_of, front_camera, one_gaussian, random_gaussians, render
 
@@ -115,7 +115,7 @@ def test_behind_the_fold_of_the_lens():
     assert not result.gradients["means"][1].any()
 
 
-@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(antialias=True, stop="exclusive", blur=0.0)])
+@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(antialias=True, stop="exclusive", eps2d=0.0)])
 def test_no_nan_in_extreme_scenes(settings):
     generator = torch.Generator().manual_seed(3)
 
@@ -187,14 +187,14 @@ def test_removal_against_taking_rows_away(behind):
         without = torch.where(torch.arange(8) == row, 0.0, gaussians.opacities)
         moved.append(image(dataclasses.replace(gaussians, opacities=without)) - image(gaussians))
     given = background.to(DEVICE, torch.float32) if behind else None
-    found = rasteriser.removal(
+    found = rasterizer.leave_one_out(
         single(gaussians), given, weights.to(DEVICE, torch.float32) if behind else None, view, settings
     )
     largest = torch.stack([change.abs().max() for change in moved])
     squared = torch.stack([(weights * change.square().sum(-1)).sum() for change in moved])
     assert (largest > 0.01).sum() > 3
-    torch.testing.assert_close(found.largest.cpu(), largest, rtol=1e-4, atol=1e-6)
-    torch.testing.assert_close(found.squared.cpu(), squared, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(found.max_abs_change.cpu(), largest, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(found.squared_change.cpu(), squared, rtol=1e-4, atol=1e-6)
 
 
 def test_no_rows():
@@ -240,7 +240,9 @@ def test_displacements_in_any_layout(laid_out):
     assert torch.equal(splat(strided, view, backend="triton").rgb, splat(compact, view, backend="triton").rgb)
     assert contribution(compact, view, backend="triton").weight.any()
     assert torch.equal(*(contribution(g, view, backend="triton").weight for g in (compact, strided)))
-    assert torch.equal(*(rasteriser.removal(g, None, None, view, SplatSettings()).squared for g in (compact, strided)))
+    assert torch.equal(
+        *(rasterizer.leave_one_out(g, None, None, view, SplatSettings()).squared_change for g in (compact, strided))
+    )
 
 
 def test_more_pairs_than_may_be_held(monkeypatch):
@@ -276,7 +278,7 @@ def test_float64_is_refused():
 
 
 def test_cpu_tensors_need_the_interpreter(monkeypatch):
-    monkeypatch.setattr(rasteriser, "is_interpreted", lambda kernel: False)
+    monkeypatch.setattr(rasterizer, "is_interpreted", lambda kernel: False)
     with pytest.raises(ValueError, match=r"'triton' needs tensors on a CUDA device, got cpu: move them, .*INTERPRET=1"):
         splat(cast(one_gaussian(), torch.float32), VIEW, backend="triton")
 

@@ -29,7 +29,7 @@ def listed(screen: Screen) -> set[tuple[int, int]]:
 
 
 def touched(screen: Screen, view: Camera, rows: int, margin: float = 0.0) -> set[tuple[int, int]]:
-    """Pairs with a pixel centre in the ellipse, which is widened by ``margin`` pixels; from the records, in float64."""
+    """Pairs with a pixel center in the ellipse, which is widened by ``margin`` pixels; from the records, in float64."""
     y, x = torch.meshgrid(
         torch.arange(view.height, dtype=torch.float64) + 0.5,
         torch.arange(view.width, dtype=torch.float64) + 0.5,
@@ -51,7 +51,7 @@ def touched(screen: Screen, view: Camera, rows: int, margin: float = 0.0) -> set
 
 
 def ellipses() -> Gaussians:
-    """Needles and balls all over the image and beyond its edges, two metres away."""
+    """Needles and balls all over the image and beyond its edges, two meters away."""
     generator = torch.Generator().manual_seed(2)
     rows = []
     for k in range(24):
@@ -98,18 +98,18 @@ def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
 
 
 @pytest.mark.parametrize(("edge", "distance"), [("left", 9), ("right", 8), ("top", 9), ("bottom", 8)])
-def test_a_splat_that_ends_on_a_pixel_centre_is_listed(edge, distance):
-    # The mean is on the pixel centre (24.5, 24.5) of 3 x 3 tiles; the next tiles' nearest centres lie 9 and 8 px away.
+def test_a_splat_that_ends_on_a_pixel_center_is_listed(edge, distance):
+    # The mean is on the pixel center (24.5, 24.5) of 3 x 3 tiles; the next tiles' nearest centers lie 9 and 8 px away.
     # The splat ends 1e-6 before them: rounding in the pixel loop may still draw them, so they must be listed.
     view = front_camera(48, 48, 1000.0)
     view.intrinsics[:2, 2] = 24.5
     sigma = distance * (1 - 1e-6) / math.sqrt(2 * math.log(0.8 * 255))
     scene = one_gaussian(scales=[[sigma * 2 / 1000] * 3])
-    screen = project(cast(scene, torch.float32, device=DEVICE), View(view, SplatSettings(blur=1e-9)))
+    screen = project(cast(scene, torch.float32, device=DEVICE), View(view, SplatSettings(eps2d=1e-9)))
     assert (0, {"left": 3, "right": 5, "top": 1, "bottom": 7}[edge]) in listed(screen)
 
 
-@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(box=2.0)], ids=["cut-off", "box"])
+@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(max_sigma=2.0)], ids=["cut-off", "max_sigma"])
 def test_culling_by_tiles_changes_no_bit(settings, monkeypatch):
     view = camera(35, 19)
     scene = cast(random_gaussians(12, view), torch.float32, device=DEVICE)

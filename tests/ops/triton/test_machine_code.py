@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution, splat
-from sparsestreet.ops.triton import parts, rasteriser
+from sparsestreet.ops.triton import parts, rasterizer
 from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
@@ -68,7 +68,7 @@ def launches_of_the_op(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
     for settings in (SplatSettings(), SplatSettings(stop="exclusive")):
         contribution(scene, STILL, settings=settings, backend="triton")
     for background, weights in ((None, None), (image, image[..., 0])):
-        rasteriser.removal(scene, background, weights, STILL, SplatSettings())
+        rasterizer.leave_one_out(scene, background, weights, STILL, SplatSettings())
     monkeypatch.setattr(parts, "PART_LENGTH", 1)
     for stop in ("inclusive", "exclusive"):
         splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()

@@ -25,8 +25,8 @@ SETTINGS = {
     "exclusive": SplatSettings(stop="exclusive", transmittance_min=0.05),
     "antialias": SplatSettings(antialias=True),
     "exact": SplatSettings.preset("exact"),
-    "box": SplatSettings(box=1.5),
-    "box_alone": SplatSettings(alpha_min=0.0, box=2.5),
+    "max_sigma": SplatSettings(max_sigma=1.5),
+    "box_alone": SplatSettings(alpha_min=0.0, max_sigma=2.5),
     "few_depth_bits_half_colors": SplatSettings(depth_bits=9, half_colors=True),
 }
 DEVICE = device_of("triton")
@@ -56,7 +56,7 @@ def assert_matches_reference(
     result = render(gaussians, view, "triton", torch.float32, settings)
     for name in ("rgb", "alpha"):
         assert (result.images[name] - truth.images[name]).abs().max() <= 1e-5, name
-    # Depth is in metres and divided by alpha, so its error is relative.
+    # Depth is in meters and divided by alpha, so its error is relative.
     assert relative_error(result.images["depth"], truth.images["depth"]) <= 1e-5
     # Sigma points a thousand pixels away carry 1e-5.
     torch.testing.assert_close(result.radii, truth.radii, rtol=3e-5, atol=0)
@@ -147,7 +147,7 @@ def test_pairs_behind_a_stack(stop):
         for k in range(36)
     ]
     scene, settings = Gaussians.concatenate(stack), SplatSettings(stop=stop)
-    # Colours of neighbours differ by 0.003: what an opacity changes is a small difference of two lights.
+    # Colors of neighbors differ by 0.003: what an opacity changes is a small difference of two lights.
     assert_matches_reference(scene, view, settings, gradient_bar=5e-5)
     assert render(scene, view, "triton", torch.float32, settings).images["alpha"].min() > 0.9995
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
-from sparsestreet.ops.triton import parts, rasteriser
+from sparsestreet.ops.triton import parts, rasterizer
 from sparsestreet.ops.triton.parts import split_tiles
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -56,14 +56,14 @@ def short_parts(monkeypatch):
 def test_against_the_reference(name, short_parts):
     scene, seen = stack(13), []
     truth = render(scene, VIEW, "reference", torch.float64, STOPS[name])
-    original = rasteriser.blend_view
+    original = rasterizer.blend_view
 
     def watched(*args, **kwargs):
         seen.append(original(*args, **kwargs))
         return seen[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rasteriser, "blend_view", watched)
+        patch.setattr(rasterizer, "blend_view", watched)
         result = render(scene, VIEW, "triton", torch.float32, STOPS[name])
     used = seen[0].ends.parts
     assert used is not None
@@ -115,10 +115,10 @@ def test_counting_and_removal_walk_whole_tiles(short_parts):
     assert torch.equal(counted.dominant.cpu(), truth.dominant)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(parts, "PART_LENGTH", 256)
-        whole = rasteriser.removal(single, None, None, VIEW, SplatSettings())
-    split = rasteriser.removal(single, None, None, VIEW, SplatSettings())
-    torch.testing.assert_close(split.squared, whole.squared, rtol=1e-5, atol=1e-9)
-    torch.testing.assert_close(split.largest, whole.largest, rtol=1e-5, atol=1e-7)
+        whole = rasterizer.leave_one_out(single, None, None, VIEW, SplatSettings())
+    split = rasterizer.leave_one_out(single, None, None, VIEW, SplatSettings())
+    torch.testing.assert_close(split.squared_change, whole.squared_change, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(split.max_abs_change, whole.max_abs_change, rtol=1e-5, atol=1e-7)
 
 
 def test_parts_longer_than_a_look(monkeypatch):

@@ -51,7 +51,7 @@ def test_a_gradient_that_enters_from_the_next_program(monkeypatch):
 
 
 def test_flat_and_alike_images():
-    """A sky of one colour: about zero, variances of 1e-6 beside squares of 3 would cost the gradient 5e-5."""
+    """A sky of one color: about zero, variances of 1e-6 beside squares of 3 would cost the gradient 5e-5."""
     generator = torch.Generator().manual_seed(2)
     truth = 0.9 + 1e-3 * torch.rand(14, 16, 3, generator=generator, dtype=torch.float64)
     image = truth + 1e-2 * torch.rand(14, 16, 3, generator=generator, dtype=torch.float64)

@@ -6,7 +6,7 @@ from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes import Background
 from tests.scene.street import random_rows
 
-MASK = StaticMask(weight=1.0, minimum_rows=0)
+MASK = StaticMask(weight=1.0, min_gaussians=0)
 
 
 def trained(count: int = 6, steps: int = 3) -> tuple[Rows, torch.optim.Adam]:

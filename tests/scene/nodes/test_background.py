@@ -41,7 +41,7 @@ def test_extreme_opacity_logits_stay_finite():
 
 
 def test_mask_and_its_logits_come_together():
-    mask = StaticMask(weight=1.0, minimum_rows=0)
+    mask = StaticMask(weight=1.0, min_gaussians=0)
     with pytest.raises(ValueError, match="mask_logits"):
         Background(random_rows(2, 0), mask)
     with pytest.raises(ValueError, match="mask_logits"):
@@ -49,7 +49,7 @@ def test_mask_and_its_logits_come_together():
 
 
 def test_masked_rows_vanish_and_the_table_stays_unmasked():
-    mask = StaticMask(weight=1.0, minimum_rows=0)
+    mask = StaticMask(weight=1.0, min_gaussians=0)
     node = Background(random_rows(6, 0, mask=mask), mask)
     hidden = torch.tensor([False, True, False, False, True, True])
     plain = Background(random_rows(6, 0), None).gaussians_at(0.0, 1)
@@ -66,7 +66,7 @@ def test_masked_rows_vanish_and_the_table_stays_unmasked():
 
 def test_the_mask_multiplies_opacity_and_scale_in_the_gradient():
     """d/dm of sum(c_o o M + c_s . s M) = (c_o o + c_s . s) sigma'(m), by the straight-through rule."""
-    mask = StaticMask(weight=1.0, minimum_rows=0)
+    mask = StaticMask(weight=1.0, min_gaussians=0)
     rows = random_rows(5, 1, mask=mask)
     node = Background(rows, mask)
     generator = torch.Generator().manual_seed(2)
@@ -82,7 +82,7 @@ def test_the_mask_multiplies_opacity_and_scale_in_the_gradient():
 
 
 def test_dropped_logits_end_the_masking():
-    mask = StaticMask(weight=1.0, minimum_rows=0)
+    mask = StaticMask(weight=1.0, min_gaussians=0)
     node = Background(random_rows(3, 0, mask=mask), mask)
     with torch.no_grad():
         node.rows.mask_logits[0] = -9.0
@@ -92,7 +92,7 @@ def test_dropped_logits_end_the_masking():
 
 
 def test_the_image_of_a_masked_table_after_removal_is_the_same_gaussians():
-    mask = StaticMask(weight=1.0, minimum_rows=0)
+    mask = StaticMask(weight=1.0, min_gaussians=0)
     node = Background(random_rows(7, 3, mask=mask), mask)
     with torch.no_grad():
         node.rows.mask_logits[::2] = -6.0
@@ -105,14 +105,14 @@ def test_the_image_of_a_masked_table_after_removal_is_the_same_gaussians():
 
 
 def test_sizes_are_float32_without_the_mask():
-    mask = StaticMask(weight=1.0, minimum_rows=0)
+    mask = StaticMask(weight=1.0, min_gaussians=0)
     node = Background(random_rows(3, 0, sh_degree=3, mask=mask), mask)
     assert node.row_bytes() == 3 * 59 * 4  # 3 + 3 + 4 + 1 + 48, the 59 numbers of 3DGS
     assert node.pose_bytes() == 0
 
 
 def test_an_empty_node():
-    mask = StaticMask(weight=1.0, minimum_rows=5)
+    mask = StaticMask(weight=1.0, min_gaussians=5)
     node = Background(random_rows(0, 0, mask=mask), mask)
     assert len(node.gaussians_at(0.0, 1)) == 0
     assert node.mask_scores().shape == (0,)

@@ -6,17 +6,17 @@ import torch
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.nodes import Rigid
-from tests.scene.street import knots, pose, random_rows, track
+from tests.scene.street import keyframes, pose, random_rows, track
 
 FRAMES = 11
 """Frame f is at time f / 10."""
 
 
-def rigid_of(tracks, rows_per_instance=3, dtype=torch.float64, held_out=frozenset(), maximum_gap=0.2, seed=0) -> Rigid:
+def rigid_of(tracks, rows_per_instance=3, dtype=torch.float64, held_out=frozenset(), max_gap=0.2, seed=0) -> Rigid:
     instances = torch.arange(len(tracks)).repeat_interleave(rows_per_instance)
     rows = random_rows(len(instances), seed, instances=instances, dtype=dtype)
     sizes = torch.ones(len(tracks), 3, dtype=dtype)
-    return Rigid(rows, knots(tracks, FRAMES, held_out, dtype), sizes, maximum_gap=maximum_gap)
+    return Rigid(rows, keyframes(tracks, FRAMES, held_out, dtype), sizes, max_gap=max_gap)
 
 
 def covariances(gaussians) -> torch.Tensor:
@@ -37,9 +37,9 @@ def test_a_quarter_turn_and_a_shift_by_hand():
         {"instances": torch.tensor([0])},
     )
     turned = track("car", [0], [pose(math.pi / 2, (10.0, 20.0, 1.0))])
-    node = Rigid(rows, knots([turned], FRAMES, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64))
+    node = Rigid(rows, keyframes([turned], FRAMES, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64))
     gaussians = node.gaussians_at(0.0, 1)
-    # The length axis x now points along world y. Knots are stored as float32: 1e-6 of 20 m.
+    # The length axis x now points along world y. Trajectories are stored as float32: 1e-6 of 20 m.
     torch.testing.assert_close(gaussians.means, torch.tensor([[10.0, 22.0, 1.5]]).double(), atol=2e-5, rtol=0)
     expected = torch.diag(torch.tensor([1.0, 9.0, 0.25])).double()[None]
     torch.testing.assert_close(covariances(gaussians), expected, atol=1e-5, rtol=0)
@@ -58,22 +58,22 @@ def test_means_and_covariances_follow_general_poses():
     local, world = node.activated(1), node.gaussians_at(0.4, 1)
     for row, instance in enumerate(node.rows.instances.tolist()):
         rotation, translation = matrices[instance][:3, :3], matrices[instance][:3, 3]
-        # Knots are float32: 1e-6 of values of a few metres.
+        # Trajectories are float32: 1e-6 of values of a few meters.
         torch.testing.assert_close(world.means[row], rotation @ local.means[row] + translation, atol=1e-5, rtol=0)
         expected = rotation @ covariances(local)[row] @ rotation.T
         torch.testing.assert_close(covariances(world)[row], expected, atol=1e-5, rtol=0)
 
 
-def test_halfway_between_knots():
+def test_halfway_between_keyframes():
     moving = track("car", [2, 4], [pose(0.2, (0.0, 0.0, 0.0)), pose(0.6, (4.0, 2.0, 0.0))])
     quaternions, translations, active = rigid_of([moving]).pose_at(0.35)
     expected = quat.from_matrix(pose(0.5, (0, 0, 0))[:3, :3])
-    torch.testing.assert_close(quaternions[0], expected, atol=1e-6, rtol=0)  # float32 knots
+    torch.testing.assert_close(quaternions[0], expected, atol=1e-6, rtol=0)  # float32 keyframes
     torch.testing.assert_close(translations[0], torch.tensor([3.0, 1.5, 0.0]).double(), atol=1e-5, rtol=0)
     assert active.tolist() == [True]
 
 
-def test_every_instance_has_its_own_knots():
+def test_every_instance_has_its_own_keyframes():
     slow = track("slow", [0, 4], [pose(0.0, (0.0, 0.0, 0.0)), pose(0.0, (4.0, 0.0, 0.0))])
     late = track(
         "late", [1, 2, 3], [pose(0.0, (0.0, 0.0, 0.0)), pose(0.0, (0.0, 8.0, 0.0)), pose(0.0, (0.0, 9.0, 0.0))]
@@ -95,7 +95,7 @@ def test_yaw_across_180_degrees_takes_the_short_way():
 
 def test_absent_outside_the_annotated_span():
     node = rigid_of([track("car", [3, 4], [pose(0, (0, 0, 0))] * 2), track("tram", [0, 10], [pose(0, (1, 1, 1))] * 2)])
-    # The tram's gap of 10 frames: present only within 0.2 of its two knots.
+    # The tram's gap of 10 frames: present only within 0.2 of its two keyframes.
     presence = {0.0: (0, 1), 0.2: (0, 1), 0.3: (1, 0), 0.35: (1, 0), 0.4: (1, 0), 0.5: (0, 0), 0.8: (0, 1), 1.0: (0, 1)}
     for time, (car, tram) in presence.items():
         assert node.pose_at(time)[2].tolist() == [bool(car), bool(tram)], time
@@ -117,12 +117,12 @@ def test_every_frame_time_of_an_odd_log_is_a_knot():
     """60 frames: 1/59 has no exact float, so presence at the ends of a span needs the tolerance."""
     tracks = [track("car", list(range(7, 53)), [pose(0.01 * f, (float(f), 0.0, 0.0)) for f in range(7, 53)])]
     rows = random_rows(1, 0, instances=torch.zeros(1, dtype=torch.int64))
-    node = Rigid(rows, knots(tracks, 60), torch.ones(1, 3), maximum_gap=0.0)
+    node = Rigid(rows, keyframes(tracks, 60), torch.ones(1, 3), max_gap=0.0)
     for frame in range(60):
         _, translations, active = node.pose_at(frame / 59)
         assert active.item() == (7 <= frame < 53)
         if active.item():
-            assert abs(translations[0, 0].item() - frame) < 1e-4  # float32 knots and times, 1 m a frame
+            assert abs(translations[0, 0].item() - frame) < 1e-4  # float32 keyframes and times, 1 m a frame
 
 
 def test_held_out_annotations_are_not_used_but_count_as_present():
@@ -138,7 +138,7 @@ def test_held_out_annotations_are_not_used_but_count_as_present():
     quaternions, translations, active = node.pose_at(0.6)
     assert active.item()
     torch.testing.assert_close(translations[0], torch.tensor([6.0, 0.0, 0.0]).double(), atol=1e-5, rtol=0)
-    # 0.1 rad beyond the knots by a normalised lerp: third order in the step of 0.2 rad.
+    # 0.1 rad beyond the keyframes by a normalized lerp: third order in the step of 0.2 rad.
     torch.testing.assert_close(quat.to_matrix(quaternions[0]), pose(0.6, (0, 0, 0))[:3, :3], atol=2e-4, rtol=0)
     assert not node.pose_at(0.7)[2].item()
     # Far outside the extrapolation stops at the end of the span instead of running away.
@@ -147,7 +147,7 @@ def test_held_out_annotations_are_not_used_but_count_as_present():
 
 def test_a_track_seen_only_in_held_out_frames_is_an_error():
     with pytest.raises(ValueError, match="'car' is annotated only in held-out frames"):
-        knots([track("car", [4], [pose(0, (0, 0, 0))])], FRAMES, frozenset({4}))
+        keyframes([track("car", [4], [pose(0, (0, 0, 0))])], FRAMES, frozenset({4}))
 
 
 def test_corrections_turn_in_the_box_frame_and_shift_in_metres():
@@ -189,7 +189,7 @@ def test_gradients_reach_rows_and_corrections():
 
 
 def test_gradients_are_zero_not_nan_at_the_start():
-    """Zero corrections, equal neighbours: the places where norms and arc cosines have no derivative."""
+    """Zero corrections, equal neighbors: the places where norms and arc cosines have no derivative."""
     node = rigid_of([track("car", [0, 1], [pose(0.5, (1.0, 0.0, 0.0))] * 2)], dtype=torch.float32)
     gaussians = node.gaussians_at(0.05, 1)
     cotangent = torch.randn(gaussians.quaternions.shape, generator=torch.Generator().manual_seed(0))
@@ -201,22 +201,22 @@ def test_gradients_are_zero_not_nan_at_the_start():
 def test_instance_counts_include_empty_instances():
     rows = random_rows(4, 0, instances=torch.tensor([2, 0, 2, 2]))
     tracks = [track(str(i), [0], [pose(0, (0, 0, 0))]) for i in range(4)]
-    node = Rigid(rows, knots(tracks, FRAMES), torch.ones(4, 3))
+    node = Rigid(rows, keyframes(tracks, FRAMES), torch.ones(4, 3))
     assert node.instance_counts().tolist() == [1, 0, 3, 0]
 
 
 def test_a_node_without_rows_and_one_without_instances():
     rows = random_rows(0, 0, instances=torch.zeros(0, dtype=torch.int64))
-    node = Rigid(rows, knots([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES), torch.ones(1, 3))
+    node = Rigid(rows, keyframes([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES), torch.ones(1, 3))
     assert len(node.gaussians_at(0.0, 3)) == 0
-    node = Rigid(rows, knots([], FRAMES), torch.ones(0, 3))
+    node = Rigid(rows, keyframes([], FRAMES), torch.ones(0, 3))
     assert len(node.gaussians_at(0.0, 3)) == 0
 
 
 def test_instances_that_do_not_exist_are_an_error():
     rows = random_rows(2, 0, instances=torch.tensor([0, 1]))
     with pytest.raises(ValueError, match="rows name instances 0 to 1, but there are 1"):
-        Rigid(rows, knots([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES), torch.ones(1, 3))
+        Rigid(rows, keyframes([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES), torch.ones(1, 3))
 
 
 def test_poses_stay_float32_under_autocast():

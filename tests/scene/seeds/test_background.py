@@ -6,17 +6,17 @@ import torch
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.nodes import Background
-from sparsestreet.scene.seeds import BackgroundSeeds
+from sparsestreet.scene.seeds import BackgroundSettings
 from sparsestreet.scene.seeds.rows import SH_CONSTANT
 from sparsestreet.types import Sweep
 from tests.scene.street import CAR_COLOR, NUM_FRAMES, ROAD_COLOR, street_log
 
-LIDAR_ONLY = BackgroundSeeds(lidar_points=10_000, near_points=0, far_points=0)
+LIDAR_ONLY = BackgroundSettings(lidar_points=10_000, near_points=0, far_points=0)
 
 
-def build(seeds: BackgroundSeeds, held_out: frozenset[int] = frozenset(), seed: int = 0, log=None) -> Background:
+def build(seeds: BackgroundSettings, held_out: frozenset[int] = frozenset(), seed: int = 0, log=None) -> Background:
     log = log or street_log()
-    frames = [frame for frame in log.frames if frame.index not in held_out]
+    frames = [frame for frame in log.frames if frame.frame_index not in held_out]
     return seeds.build(log, frames, held_out, torch.Generator().manual_seed(seed))
 
 
@@ -24,7 +24,7 @@ def colors(node: Background) -> torch.Tensor:
     return 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
 
 
-def test_lidar_outside_moving_boxes_keeps_its_colour():
+def test_lidar_outside_moving_boxes_keeps_its_color():
     node = build(LIDAR_ONLY)
     torch.testing.assert_close(colors(node), torch.tensor(ROAD_COLOR).expand(len(node.rows), 3))
     driving = street_log().tracks[1]
@@ -38,7 +38,7 @@ def test_lidar_outside_moving_boxes_keeps_its_colour():
 
 def test_what_does_not_move_or_is_of_another_class_stays():
     everything = sum(int(sweep.colored.sum()) for sweep in street_log().sweeps)
-    assert len(build(replace(LIDAR_ONLY, minimum_travel=100.0)).rows) == everything
+    assert len(build(replace(LIDAR_ONLY, min_path_length=100.0)).rows) == everything
     assert len(build(replace(LIDAR_ONLY, moving_classes=("Tram",))).rows) == everything
     # Cars only: the driving one is cut out; the cyclist's box takes no points of its own away.
     cars = build(replace(LIDAR_ONLY, moving_classes=("Car",)))
@@ -55,7 +55,7 @@ def test_held_out_sweeps_are_not_used():
 
 
 def test_the_number_of_points_of_each_kind():
-    seeds = BackgroundSeeds(lidar_points=40, near_points=30, far_points=20, sh_degree=1)
+    seeds = BackgroundSettings(lidar_points=40, near_points=30, far_points=20, sh_degree=1)
     node = build(seeds)
     log = street_log()
     assert len(node.rows) == 90
@@ -69,7 +69,7 @@ def test_the_number_of_points_of_each_kind():
 
 
 def test_the_same_seed_gives_the_same_rows():
-    seeds = BackgroundSeeds(lidar_points=40, near_points=30, far_points=20)
+    seeds = BackgroundSettings(lidar_points=40, near_points=30, far_points=20)
     first, second, other = build(seeds), build(seeds), build(seeds, seed=1)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
     assert not torch.equal(first.rows.means, other.rows.means)
@@ -85,14 +85,14 @@ def test_duplicated_returns_start_finite():
 
 
 def test_a_mask_arrives_at_the_node():
-    mask = StaticMask(weight=0.5, minimum_rows=3)
+    mask = StaticMask(weight=0.5, min_gaussians=3)
     node = build(replace(LIDAR_ONLY, mask=mask))
     assert node.mask is mask
     assert node.mask_scores().shape == (len(node.rows),)
 
 
 def test_a_log_without_lidar_starts_from_random_points():
-    node = build(BackgroundSeeds(near_points=10, far_points=5), log=replace(street_log(), sweeps=()))
+    node = build(BackgroundSettings(near_points=10, far_points=5), log=replace(street_log(), sweeps=()))
     assert len(node.rows) == 15
 
 

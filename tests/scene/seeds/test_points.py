@@ -22,7 +22,7 @@ def test_far_points_lie_between_1_and_50_radii():
     assert abs((distance < 10.0 / 0.51).float().mean() - 0.5) < 0.04
 
 
-def test_seen_points_are_in_a_view_with_its_colour_and_not_in_the_sky():
+def test_seen_points_are_in_a_view_with_its_color_and_not_in_the_sky():
     frames = [frame_at(0), frame_at(4)]
     positions = near_positions(3000, CENTER, 20.0, torch.Generator().manual_seed(1))
     seen = seen_points(positions, frames)
@@ -40,12 +40,12 @@ def test_seen_points_are_in_a_view_with_its_colour_and_not_in_the_sky():
 
 def test_without_sky_masks_every_position_in_view_is_kept():
     frame = frame_at(0)
-    unmasked = type(frame)(0, 0.0, 0, frame.camera, frame.image)
+    unmasked = type(frame)(frame.camera, 0.0, 0, 0, image=frame.image)
     positions = near_positions(500, CENTER, 20.0, torch.Generator().manual_seed(1))
     assert len(seen_points(positions, [unmasked])) == int(project(frame.camera, positions)[2].sum())
 
 
-def test_samples_are_distinct_points_with_their_colours():
+def test_samples_are_distinct_points_with_their_colors():
     points = Points(torch.arange(30.0).reshape(10, 3), torch.arange(30.0).reshape(10, 3) / 30)
     sample = points.sampled(4, torch.Generator().manual_seed(0))
     assert len(set(sample.positions[:, 0].tolist())) == 4

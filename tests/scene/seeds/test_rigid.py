@@ -3,17 +3,17 @@ from dataclasses import replace
 import torch
 
 from sparsestreet.scene.nodes import Rigid
-from sparsestreet.scene.seeds import RigidSeeds
+from sparsestreet.scene.seeds import RigidSettings
 from sparsestreet.scene.seeds.rigid import box_surface_points
 from sparsestreet.scene.seeds.rows import SH_CONSTANT
 from tests.scene.street import CAR_COLOR, NUM_FRAMES, car_pose, street_log, track
 
-CARS = RigidSeeds(classes=("Car",), box_points=50)
+CARS = RigidSettings(classes=("Car",), box_points=50)
 
 
-def build(seeds: RigidSeeds, held_out: frozenset[int] = frozenset(), log=None) -> Rigid | None:
+def build(seeds: RigidSettings, held_out: frozenset[int] = frozenset(), log=None) -> Rigid | None:
     log = log or street_log()
-    frames = [frame for frame in log.frames if frame.index not in held_out]
+    frames = [frame for frame in log.frames if frame.frame_index not in held_out]
     return seeds.build(log, frames, held_out, torch.Generator().manual_seed(0))
 
 
@@ -23,10 +23,10 @@ def test_only_what_moves_and_is_of_the_classes():
     assert node.instance_counts().tolist() == [60 * NUM_FRAMES]
     assert build(replace(CARS, classes=("Car", "Cyclist"))).sizes.shape == (2, 3)
     assert build(replace(CARS, classes=("Tram",))) is None
-    assert build(replace(CARS, minimum_travel=50.0)) is None
+    assert build(replace(CARS, min_path_length=50.0)) is None
 
 
-def test_points_lie_in_the_box_in_the_cars_colour():
+def test_points_lie_in_the_box_in_the_cars_color():
     node = build(CARS)
     assert (node.rows.means.abs() <= node.sizes[0] / 2 + 1e-4).all()
     colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
@@ -39,7 +39,7 @@ def test_the_node_puts_the_points_back_where_lidar_saw_them():
     world = node.gaussians_at(log.frames[2].time, 0).means
     seen = log.sweeps[2].points[50:110]
     nearest = (seen[:, None] - world[None]).norm(dim=2).min(1).values
-    assert nearest.max() < 1e-4  # float32 knots and points at 20 m
+    assert nearest.max() < 1e-4  # float32 keyframes and points at 20 m
 
 
 def test_a_sample_of_many_points():
@@ -53,17 +53,17 @@ def test_few_points_are_filled_up_on_the_box():
     on_a_face = ((added.abs() - node.sizes[0] / 2).abs() < 1e-5).any(1)
     assert on_a_face.all()
     colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
-    torch.testing.assert_close(colors, torch.tensor(CAR_COLOR).expand_as(colors))  # the mean of equal colours
+    torch.testing.assert_close(colors, torch.tensor(CAR_COLOR).expand_as(colors))  # the mean of equal colors
 
 
-def test_an_instance_that_lidar_never_hit_is_a_grey_box():
+def test_an_instance_that_lidar_never_hit_is_a_gray_box():
     node = build(CARS, log=replace(street_log(), sweeps=()))
     assert node.instance_counts().tolist() == [50]
     assert (node.rows.sh_dc.abs() < 1e-6).all()
 
 
 def test_scales_are_those_of_each_instance_alone():
-    """Two cars with the same points: pooled in one frame every point would have a neighbour at distance 0."""
+    """Two cars with the same points: pooled in one frame every point would have a neighbor at distance 0."""
     log = street_log()
     twin = track("twin", list(range(NUM_FRAMES)), [car_pose(frame) for frame in range(NUM_FRAMES)])
     alone, both = build(CARS), build(CARS, log=replace(log, tracks=(*log.tracks, twin)))
@@ -75,7 +75,7 @@ def test_scales_are_those_of_each_instance_alone():
 def test_held_out_frames_give_neither_points_nor_poses():
     node = build(CARS, held_out=frozenset({2}))
     assert node.instance_counts().tolist() == [60 * (NUM_FRAMES - 1)]
-    assert node.knot_valid.sum().item() == NUM_FRAMES - 1
+    assert node.keyframe_valid.sum().item() == NUM_FRAMES - 1
     assert node.pose_at(0.5)[2].tolist() == [True]
 
 
@@ -85,7 +85,7 @@ def test_a_track_only_in_held_out_frames_is_left_out():
 
 def test_the_gap_is_counted_in_frames():
     tracks = (track("car", [0, 4], [car_pose(0), car_pose(4)]),)
-    node = build(replace(CARS, maximum_gap=1), log=replace(street_log(), tracks=tracks))
+    node = build(replace(CARS, max_gap=1), log=replace(street_log(), tracks=tracks))
     assert [node.pose_at(frame / 4)[2].item() for frame in range(5)] == [True, True, False, True, True]
 
 

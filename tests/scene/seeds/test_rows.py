@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.seeds.rows import neighbour_scales, seed_rows
+from sparsestreet.scene.seeds.rows import neighbor_scales, seed_rows
 
 
 def seeded(points: Tensor, colors: Tensor, opacity: float = 0.1, sh_degree: int = 3, mask: StaticMask | None = None):
@@ -11,7 +11,7 @@ def seeded(points: Tensor, colors: Tensor, opacity: float = 0.1, sh_degree: int 
     return seed_rows(
         points,
         colors,
-        neighbour_scales(points),
+        neighbor_scales(points),
         sh_degree=sh_degree,
         initial_opacity=opacity,
         mask=mask,
@@ -19,22 +19,22 @@ def seeded(points: Tensor, colors: Tensor, opacity: float = 0.1, sh_degree: int 
     )
 
 
-def test_mean_distance_to_three_neighbours_by_hand():
+def test_mean_distance_to_three_neighbors_by_hand():
     line = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [7.0, 0, 0], [50.0, 0, 0]])
     expected = torch.tensor([(1 + 3 + 7) / 3, (1 + 2 + 6) / 3, (2 + 3 + 4) / 3, (4 + 6 + 7) / 3, (43 + 47 + 49) / 3])
-    torch.testing.assert_close(neighbour_scales(line), expected)
+    torch.testing.assert_close(neighbor_scales(line), expected)
 
 
 def test_against_all_distances():
     points = torch.randn(57, 3, generator=torch.Generator().manual_seed(0))
     nearest = torch.cdist(points.double(), points.double()).sort(dim=1).values[:, 1:4]
-    torch.testing.assert_close(neighbour_scales(points).double(), nearest.mean(1), atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(neighbor_scales(points).double(), nearest.mean(1), atol=1e-6, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [1e-3]), (2, [2.0, 2.0])])
 def test_fewer_than_four_points(count: int, expected: list[float]):
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])[:count]
-    torch.testing.assert_close(neighbour_scales(points), torch.tensor(expected))
+    torch.testing.assert_close(neighbor_scales(points), torch.tensor(expected))
 
 
 def test_coincident_points_have_a_logarithm():
@@ -45,7 +45,7 @@ def test_coincident_points_have_a_logarithm():
 def test_rows_of_seeds():
     colors = torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.3, 0.4]])
     rows = seeded(torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]), colors)
-    # colour = 0.5 + basis_0 sh_0 with basis_0 = 0.28209479
+    # color = 0.5 + basis_0 sh_0 with basis_0 = 0.28209479
     torch.testing.assert_close(0.5 + 0.28209479177387814 * rows.sh_dc[:, 0], colors)
     assert rows.sh_rest.shape == (2, 15, 3)
     assert (rows.sh_rest == 0).all()
@@ -56,7 +56,7 @@ def test_rows_of_seeds():
 
 
 def test_a_mask_brings_its_logits():
-    mask = StaticMask(weight=1.0, minimum_rows=0, initial_logit=2.0)
+    mask = StaticMask(weight=1.0, min_gaussians=0, initial_logit=2.0)
     assert seeded(torch.rand(3, 3), torch.rand(3, 3), mask=mask).mask_logits.tolist() == [2.0] * 3
 
 

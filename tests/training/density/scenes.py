@@ -7,7 +7,7 @@ from sparsestreet.training.density import DensityStatistics
 
 
 def make_rows(number: int, generator: torch.Generator, scale: float = 0.1) -> Rows:
-    """Random rows with mask logits and instances, scales around ``scale`` metres."""
+    """Random rows with mask logits and instances, scales around ``scale`` meters."""
     return Rows(
         {
             "means": torch.randn(number, 3, generator=generator),

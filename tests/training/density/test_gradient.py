@@ -19,7 +19,7 @@ from sparsestreet.training.density import (
 )
 from tests.training.density.scenes import make_rows, with_statistics
 
-RADIUS = 10.0  # metres; split_scale 0.003 R = 0.03 m, cull_scale 0.5 R = 5 m
+RADIUS = 10.0  # meters; split_scale 0.003 R = 0.03 m, cull_scale 0.5 R = 5 m
 HIGH, LOW = 0.001, 0.0001
 
 
@@ -116,13 +116,13 @@ def test_the_same_seed_gives_the_same_children_and_another_other_ones():
 def test_a_cap_takes_the_highest_gradients(maximum, grown):
     rows = rows_of_scales([0.02, 0.02, 0.02, 0.04, 0.04])
     statistics = with_statistics([LOW, HIGH, 2 * HIGH, HIGH, 3 * HIGH])
-    plan = densify(rows, statistics, GradientDensity(maximum_rows=maximum), RADIUS, seeded(), False)
+    plan = densify(rows, statistics, GradientDensity(max_gaussians=maximum), RADIUS, seeded(), False)
     assert plan.source.tolist() == [0, 1, 2, 3, 4, *grown]
     assert len(plan.source) <= max(maximum, 5)
 
 
 def test_a_cap_counts_a_replaced_parent_as_room():
-    density = GradientDensity(maximum_rows=3, keep_parent=False)
+    density = GradientDensity(max_gaussians=3, keep_parent=False)
     plan = densify(rows_of_scales([0.04, 0.04]), with_statistics([HIGH, HIGH]), density, RADIUS, seeded(), False)
     assert plan.source.tolist() == [1, 0, 0]
 
@@ -173,7 +173,7 @@ def test_plans_are_well_formed(data):
     density = GradientDensity(
         split_children=data.draw(st.integers(2, 4)),
         keep_parent=data.draw(st.booleans()),
-        maximum_rows=data.draw(st.none() | st.integers(0, 20)),
+        max_gaussians=data.draw(st.none() | st.integers(0, 20)),
     )
     rows = make_rows(number, seeded(number), scale=0.03)
     statistics = with_statistics(gradients)
@@ -184,8 +184,8 @@ def test_plans_are_well_formed(data):
     assert plan.source.tolist() == survivors + copies
     assert set(range(number)) == set(survivors) | set(copies)  # nobody vanishes: a replaced parent leaves children
     assert all(gradients[row] > density.grad_threshold for row in copies)
-    if density.maximum_rows is not None:
-        assert len(plan.source) <= max(number, density.maximum_rows)
+    if density.max_gaussians is not None:
+        assert len(plan.source) <= max(number, density.max_gaussians)
     rows.resize(plan)
     statistics.resize(plan)
     culled = cull(rows, statistics, density, RADIUS, use_scale=True, use_screen=True).source.tolist()

@@ -1,4 +1,4 @@
-"""Optimiser moments follow their rows through densify, cull, opacity reset and pruning.
+"""Optimizer moments follow their rows through densify, cull, opacity reset and pruning.
 
 The oracle keeps each row as its own little object, with Adam written out, and knows nothing of row plans.
 """
@@ -131,7 +131,7 @@ def test_moments_through_densify_cull_reset_and_pruning():
 
     # Pruning by mask: the two lowest go.
     scores = torch.sigmoid(run.rows.mask_logits.detach())
-    selection = keep_by_mask(scores, float(scores.sort().values[1]), minimum_rows=1)
+    selection = keep_by_mask(scores, float(scores.sort().values[1]), min_gaussians=1)
     run.rows.resize(selection.plan(), run.adam)
     lowest = sorted(run.simulated, key=lambda row: float(row.values["mask_logits"]))[:2]
     run.simulated = [row for row in run.simulated if all(row is not gone for gone in lowest)]

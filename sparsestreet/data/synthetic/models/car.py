@@ -12,7 +12,7 @@ from sparsestreet.data.synthetic.textures.look import Color
 
 @dataclass(frozen=True)
 class BodyStyle:
-    """Shares of the length from the front bumper, and heights above the road in metres."""
+    """Shares of the length from the front bumper, and heights above the road in meters."""
 
     length: float
     width: float
@@ -55,8 +55,8 @@ class Car:
     def size(self) -> tuple[float, float, float]:
         return (self.style.length, self.style.width, self.style.height)
 
-    def parts(self, travelled: float) -> list[Part]:
-        return [self._body(), self._cabin(), *self._wheels(travelled)]
+    def parts(self, traveled: float) -> list[Part]:
+        return [self._body(), self._cabin(), *self._wheels(traveled)]
 
     @property
     def _axles(self) -> tuple[float, float]:
@@ -105,8 +105,8 @@ class Car:
         posts = tuple(self._x(post) for post in style.posts)
         return Part(shape, Cabin(self.color, shape, 0.065, posts), at(0.0, 0.0, middle - style.height / 2.0))
 
-    def _wheels(self, travelled: float) -> list[Part]:
-        half_width, angle = 0.11, travelled / _WHEEL_RADIUS
+    def _wheels(self, traveled: float) -> list[Part]:
+        half_width, angle = 0.11, traveled / _WHEEL_RADIUS
         tyre = Cylinder(_WHEEL_RADIUS, half_width)
         y, z = self.style.width / 2 - half_width - 0.004, _WHEEL_RADIUS - self.style.height / 2
         return [
@@ -118,5 +118,5 @@ class Car:
 
 def random_car(rng: np.random.Generator) -> Car:
     style = STYLES[rng.choice(len(STYLES), p=[0.27, 0.27, 0.18, 0.18, 0.10])]
-    grey = float(rng.uniform(0.18, 0.42))
-    return Car(style, metallic(rng), (grey, grey, grey))
+    gray = float(rng.uniform(0.18, 0.42))
+    return Car(style, metallic(rng), (gray, gray, gray))

@@ -7,16 +7,16 @@ from sparsestreet.data.synthetic.parts import Part
 
 @runtime_checkable
 class Model(Protocol):
-    """An object in its box frame: x along the heading, y left, z up, origin at the box centre."""
+    """An object in its box frame: x along the heading, y left, z up, origin at the box center."""
 
     @property
     def class_name(self) -> str: ...
 
     @property
     def size(self) -> tuple[float, float, float]:
-        """Length, width, height of the box, metres."""
+        """Length, width, height of the box, meters."""
         ...
 
-    def parts(self, travelled: float) -> list[Part]:
-        """The parts after ``travelled`` metres: wheels turn and legs walk with the distance."""
+    def parts(self, traveled: float) -> list[Part]:
+        """The parts after ``traveled`` meters: wheels turn and legs walk with the distance."""
         ...

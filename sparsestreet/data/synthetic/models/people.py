@@ -13,7 +13,7 @@ from sparsestreet.data.synthetic.textures.plain import Grainy, Plain
 
 @dataclass(frozen=True)
 class Clothes:
-    """Colours of a person."""
+    """Colors of a person."""
 
     top: Color
     trousers: Color
@@ -46,7 +46,7 @@ class Pedestrian:
     height: float
     clothes: Clothes
     stride: float = 1.4
-    """Metres of one full gait cycle (two steps)."""
+    """Meters of one full gait cycle (two steps)."""
 
     class_name = "Pedestrian"
 
@@ -54,9 +54,9 @@ class Pedestrian:
     def size(self) -> tuple[float, float, float]:
         return (0.56 * self.height, 0.36 * self.height, self.height)
 
-    def parts(self, travelled: float) -> list[Part]:
+    def parts(self, traveled: float) -> list[Part]:
         h, scale = self.height, self.height / 1.75
-        gait = 2 * np.pi * travelled / self.stride
+        gait = 2 * np.pi * traveled / self.stride
         ground = -h / 2
         hip, shoulder = ground + 0.50 * h, ground + 0.80 * h
         cloth = Grainy(self.clothes.top, 0.25, 0.08)
@@ -95,26 +95,26 @@ class Cyclist:
     class_name = "Cyclist"
     size = (1.82, 0.62, 1.82)
 
-    def parts(self, travelled: float) -> list[Part]:
+    def parts(self, traveled: float) -> list[Part]:
         ground, radius = -self.size[2] / 2, 0.34
         axle = ground + radius
         front, rear, crank = (0.54, 0.0, axle), (-0.54, 0.0, axle), (-0.05, 0.0, axle - 0.04)
         seat, bar = (-0.22, 0.0, ground + 0.95), (0.40, 0.0, ground + 1.02)
         metal = Plain(self.frame, 0.3)
         tyre = Cylinder(radius, 0.02)
-        wheel = Wheel(radius, travelled / radius, (0.35, 0.35, 0.36))
+        wheel = Wheel(radius, traveled / radius, (0.35, 0.35, 0.36))
         parts = [Part(tyre, wheel, axis_along_y(x, 0.0, axle)) for x in (front[0], rear[0])]
         for start, end in ((rear, crank), (crank, seat), (crank, bar), (seat, rear), (bar, front), (seat, bar)):
             parts.append(limb(start, end, 0.022, metal))
         parts.append(limb((bar[0], -0.24, bar[2] + 0.04), (bar[0], 0.24, bar[2] + 0.04), 0.02, metal))
-        return parts + self._rider(travelled, seat, bar, crank)
+        return parts + self._rider(traveled, seat, bar, crank)
 
-    def _rider(self, travelled: float, seat: Point, bar: Point, crank: Point) -> list[Part]:
+    def _rider(self, traveled: float, seat: Point, bar: Point, crank: Point) -> list[Part]:
         cloth = Grainy(self.clothes.top, 0.25, 0.08)
         hip, shoulder = (seat[0], 0.0, seat[2] + 0.10), (0.08, 0.0, seat[2] + 0.50)
         parts = [limb(hip, shoulder, 0.14, cloth), *_head(0.17, shoulder[2] + 0.20, 1.0, self.clothes)]
         for side in (-1, 1):
-            angle = travelled / 0.9 + (np.pi if side > 0 else 0.0)
+            angle = traveled / 0.9 + (np.pi if side > 0 else 0.0)
             foot = (crank[0] + 0.15 * float(np.cos(angle)), side * 0.11, crank[2] - 0.15 * float(np.sin(angle)) + 0.03)
             knee = ((foot[0] + hip[0]) / 2 + 0.22, side * 0.12, (foot[2] + hip[2]) / 2 + 0.08)
             parts += _leg((hip[0], side * 0.09, hip[2]), knee, foot, 1.0, self.clothes)

@@ -14,7 +14,7 @@ CAR_GLASS = (0.02, 0.025, 0.03)
 
 @dataclass(frozen=True)
 class BodyPaint:
-    """Lower body: x forward, z measured from the part's centre. Lengths in metres."""
+    """Lower body: x forward, z measured from the part's center. Lengths in meters."""
 
     color: Color
     half_length: float
@@ -22,7 +22,7 @@ class BodyPaint:
     sill: float
     """Height below which the sides are dark plastic."""
     light: float
-    """Height of the lamps' centres."""
+    """Height of the lamps' centers."""
     axles: tuple[float, float]
     """x of the front and the rear axle."""
     axle_height: float
@@ -80,7 +80,7 @@ class BodyPaint:
 
 @dataclass(frozen=True)
 class Cabin:
-    """Painted pillars and roof around glass: every steep face is a pane set in by ``pillar`` metres."""
+    """Painted pillars and roof around glass: every steep face is a pane set in by ``pillar`` meters."""
 
     color: Color
     shape: Polytope
@@ -122,7 +122,7 @@ class Wheel:
 
 
 def metallic(rng: np.random.Generator) -> Color:
-    """A car colour: mostly white, silver, grey, black; sometimes red, blue, green, yellow."""
+    """A car color: mostly white, silver, gray, black; sometimes red, blue, green, yellow."""
     palette = (
         (0.62, 0.62, 0.62), (0.40, 0.41, 0.42), (0.17, 0.18, 0.19), (0.03, 0.03, 0.035), (0.36, 0.03, 0.03),
         (0.03, 0.08, 0.30), (0.04, 0.16, 0.10), (0.55, 0.36, 0.05), (0.10, 0.25, 0.42), (0.42, 0.33, 0.24),

@@ -15,7 +15,7 @@ ROOF = (0.16, 0.14, 0.13)
 
 @dataclass(frozen=True)
 class FacadeStyle:
-    """How one house is built; lengths in metres, shares of a window's cell in [0, 1]."""
+    """How one house is built; lengths in meters, shares of a window's cell in [0, 1]."""
 
     wall: Color
     frame: Color
@@ -25,7 +25,7 @@ class FacadeStyle:
     """Sign board and doors."""
     storey: float
     pitch: float
-    """Wanted distance of window centres; the face's width is divided evenly."""
+    """Wanted distance of window centers; the face's width is divided evenly."""
     window_width: float
     window_low: float
     window_high: float
@@ -116,7 +116,7 @@ class Facade:
     def _windows(
         self, face: _Face, s: Scalars, fs: Scalars, column_index: Scalars
     ) -> tuple[tuple[Float32[np.ndarray, "3 1"], Scalars, Vectors], Scalars]:
-        """Frame colour, frame coverage and glass colour; and the coverage of the glass."""
+        """Frame color, frame coverage and glass color; and the coverage of the glass."""
         style = self.style
         z = (face.z - np.float32(style.ground_floor)) / np.float32(style.storey)
         fz = face.fz / np.float32(style.storey)
@@ -139,7 +139,7 @@ class Facade:
     def _ground_floor(
         self, face: _Face, s: Scalars, fs: Scalars, column_index: Scalars, wall: Vectors
     ) -> tuple[Vectors, Scalars]:
-        """Colour of the ground floor and the coverage of its glass."""
+        """Color of the ground floor and the coverage of its glass."""
         style = self.style
         z, fz = face.z, face.fz
         kind = cell_random(column_index, np.full_like(s, -7), style.seed)

@@ -1,4 +1,4 @@
-"""Asphalt with lane markings, and paved footways with kerbs. Points are in the world frame but for a shift in z."""
+"""Asphalt with lane markings, and paved footways with curbs. Points are in the world frame but for a shift in z."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ WHITE = (0.72, 0.72, 0.70)
 
 @dataclass(frozen=True)
 class Lines:
-    """Where paint lies on the road, metres; x along the road."""
+    """Where paint lies on the road, meters; x along the road."""
 
     solid: tuple[float, ...]
     dashed: tuple[float, ...]
     crossings: tuple[float, ...]
     """Near ends (x) of the zebra crossings."""
-    kerb_right: float
-    kerb_left: float
+    curb_right: float
+    curb_left: float
 
     width: float = 0.14
     dash: float = 3.0
@@ -40,7 +40,7 @@ class Asphalt:
         fx, fy, _ = footprints
         road = column(self.color) * self._tone(x, y, np.maximum(fx, fy))
         albedo = mix(road, column(WHITE), self._paint(x, y, fx, fy) * np.float32(0.9))
-        on_road = strip(y, self.lines.kerb_right - 0.5, self.lines.kerb_left + 0.5, fy)
+        on_road = strip(y, self.lines.curb_right - 0.5, self.lines.curb_left + 0.5, fy)
         albedo = mix(column(self.grass), albedo, on_road)
         return Look(albedo, np.zeros(len(x), np.float32))
 
@@ -60,7 +60,7 @@ class Asphalt:
         dashes = stripes(x, lines.dash_period, 0.0, lines.dash, fx)
         for at in lines.dashed:
             paint += strip(y, at - half, at + half, fy) * dashes
-        bars = stripes(y, 1.0, 0.25, 0.75, fy) * strip(y, lines.kerb_right + 0.4, lines.kerb_left - 0.4, fy)
+        bars = stripes(y, 1.0, 0.25, 0.75, fy) * strip(y, lines.curb_right + 0.4, lines.curb_left - 0.4, fy)
         for start in lines.crossings:
             zone = strip(x, start, start + lines.crossing_length, fx)
             paint = paint * (1 - zone) + bars * zone
@@ -69,11 +69,11 @@ class Asphalt:
 
 @dataclass(frozen=True)
 class Footway:
-    """Slabs with joints; a kerb stone along the road. ``kerb_side`` is +1 where the road lies towards +y."""
+    """Slabs with joints; a curb stone along the road. ``curb_side`` is +1 where the road lies towards +y."""
 
     color: Color
     half_width: float
-    kerb_side: int
+    curb_side: int
     offset: float
 
     def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
@@ -86,7 +86,7 @@ class Footway:
         tone += np.float32(0.06) * smooth_noise(x + np.float32(self.offset), y, 0.8, width)
         joints = np.maximum(stripes(x, 0.9, 0.0, 0.03, fx), stripes(y, 0.6, 0.0, 0.03, fy))
         slabs = mix(column(self.color) * tone, column((0.12, 0.12, 0.12)), joints * np.float32(0.6))
-        kerb = beyond(y * np.float32(self.kerb_side), self.half_width - 0.22, fy)
+        curb = beyond(y * np.float32(self.curb_side), self.half_width - 0.22, fy)
         gaps = stripes(x, 1.0, 0.0, 0.025, fx) * np.float32(0.5)
         stone = column((0.46, 0.45, 0.43)) * (1 - gaps)
-        return Look(mix(slabs, stone, kerb), np.zeros(len(x), np.float32))
+        return Look(mix(slabs, stone, curb), np.zeros(len(x), np.float32))

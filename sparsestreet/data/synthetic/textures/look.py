@@ -25,7 +25,7 @@ class Look:
 @runtime_checkable
 class Surface(Protocol):
     def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
-        """Appearance at points of the part's own frame; ``footprints`` are a pixel's extents along its axes, metres."""
+        """Appearance at points of the part's own frame; ``footprints`` are a pixel's extents along its axes, meters."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""One colour, with or without grain."""
+"""One color, with or without grain."""
 
 from dataclasses import dataclass
 
@@ -22,15 +22,15 @@ class Plain:
 
 @dataclass(frozen=True)
 class Grainy:
-    """A colour modulated by noise of two sizes: cloth, bark, foliage, rough walls."""
+    """A color modulated by noise of two sizes: cloth, bark, foliage, rough walls."""
 
     color: Color
     coarse: float
-    """Size of the large features, metres; the fine ones are a third of it."""
+    """Size of the large features, meters; the fine ones are a third of it."""
     contrast: float
     """Standard deviation of the relative brightness."""
     offset: float = 0.0
-    """Shifts the pattern, so that copies differ, metres."""
+    """Shifts the pattern, so that copies differ, meters."""
 
     def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
         # Each point takes the section of the noise that its surface faces most: no section is seen edge-on.

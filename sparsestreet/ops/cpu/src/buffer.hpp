@@ -1,4 +1,4 @@
-// Memory that grows and is reused between calls; never initialised, so nothing may be read before it was written.
+// Memory that grows and is reused between calls; never initialized, so nothing may be read before it was written.
 #pragma once
 #include <cstdint>
 #include <cstring>

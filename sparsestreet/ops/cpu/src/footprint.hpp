@@ -53,7 +53,7 @@ template <class V>
 struct Distorted {
   static constexpr int COLUMNS = 7;
   using T = Scalar<V>;
-  LensPoint<V> points[7];  // normalised
+  LensPoint<V> points[7];  // normalized
   V inverse_z[7];
   Index<V> in_front[7];  // depth was not limited to the near plane
 

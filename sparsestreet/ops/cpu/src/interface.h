@@ -14,7 +14,7 @@ enum Status : int32_t { OK = 0, BAD_VALUE = 1, TOO_MANY_PAIRS = 2, OUT_OF_MEMORY
 // A camera and the settings of one rendering.
 struct View {
   double rotation[9];     // camera from world
-  double position[3];     // of the camera in the world, metres
+  double position[3];     // of the camera in the world, meters
   double fx, fy, cx, cy;  // pixels
   double alpha_min, alpha_max, transmittance_min, blur, near_plane;
   double box;             // standard deviations
@@ -36,7 +36,7 @@ struct Rows {
   const void* displacements;  // null: none
 };
 
-// Layers of an image: premultiplied colour [h,w,3], transmittance [h,w], sum of weighted depths [h,w].
+// Layers of an image: premultiplied color [h,w,3], transmittance [h,w], sum of weighted depths [h,w].
 struct Layers {
   void *rgb, *transmittance, *depth_sum;
 };

@@ -1,4 +1,4 @@
-// Brown-Conrady distortion ("Close-range camera calibration", 1971) of normalised points and its derivatives, in the
+// Brown-Conrady distortion ("Close-range camera calibration", 1971) of normalized points and its derivatives, in the
 // form of geometry/distortion.py: past the fold of the radial polynomial it is continued in proportion to the radius.
 #pragma once
 #include "camera.hpp"
@@ -29,7 +29,7 @@ struct LensJacobian {
   }
 };
 
-// A normalised point and where the lens images it.
+// A normalized point and where the lens images it.
 template <class V>
 struct LensPoint {
   using T = Scalar<V>;

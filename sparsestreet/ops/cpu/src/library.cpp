@@ -138,11 +138,11 @@ SPLAT_API int32_t splat_contribution(Handle* h, const View* view, const Rows* ro
   });
 }
 
-SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, const Backdrop* backdrop,
+SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, const Backdrop* sky_image,
                                 const Changes* changes, Report* report) {
   return guarded([&]() -> int32_t {
     const Status status = h->rows().prepare(h->workspace, *view, *rows, nullptr, *report);
-    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, *backdrop, *changes);
+    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, *sky_image, *changes);
     return status;
   });
 }

@@ -39,7 +39,7 @@ struct Sample {
   Lanes<T> alpha;  // 0 past the splat's end
 };
 
-// Evaluates a splat in neighbouring pixels of one row.
+// Evaluates a splat in neighboring pixels of one row.
 template <class T>
 inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, const Cuts<T>& cuts) {
   Sample<T> p;

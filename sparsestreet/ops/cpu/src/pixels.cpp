@@ -1,9 +1,9 @@
-// Compiled once per instruction set, with the rules of arithmetic loosened so that the loops vectorise.
+// Compiled once per instruction set, with the rules of arithmetic loosened so that the loops vectorize.
 #include "blend.hpp"
 #include "blend_backward.hpp"
 #include "contribution.hpp"
 #include "kernels.h"
-#include "removal.hpp"
+#include "leave_one_out.hpp"
 
 namespace SPLAT_VARIANT {
 namespace {
@@ -20,8 +20,8 @@ PixelKernels kernels() {
           [](void* w, const View& v, int64_t rows, const Counters& out) {
             count_contributions(as<T>(w), v, rows, out);
           },
-          [](void* w, const View& v, int64_t rows, const Backdrop& backdrop, const Changes& out) {
-            remove_rows(as<T>(w), v, rows, backdrop, out);
+          [](void* w, const View& v, int64_t rows, const Backdrop& sky_image, const Changes& out) {
+            remove_rows(as<T>(w), v, rows, sky_image, out);
           }};
 }
 

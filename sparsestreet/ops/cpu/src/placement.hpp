@@ -49,7 +49,7 @@ inline void rotation_from_quaternion(const V* given, Placement<V>& p) {
 template <class T, class V>
 inline Placement<V> place(const Camera<T>& camera, const RowValues<V>& row) {
   Placement<V> p;
-  // A difference of neighbours far from the origin is exact; R m + t would round two numbers of the world's size.
+  // A difference of neighbors far from the origin is exact; R m + t would round two numbers of the world's size.
   const Vector<T>&c = camera.position, &rest = camera.position_rest;
   p.mean = camera.rotation *
            Vector<V>{(row.mean.x - c.x) - rest.x, (row.mean.y - c.y) - rest.y, (row.mean.z - c.z) - rest.z};

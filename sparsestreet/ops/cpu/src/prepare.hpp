@@ -19,7 +19,7 @@ struct Inputs {
         displacements(static_cast<const T*>(r.displacements)) {}
 };
 
-// Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorises.
+// Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorizes.
 template <class T>
 inline bool finite(const T* values, int64_t count) {
   using Bits = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
@@ -69,7 +69,7 @@ inline typename E::template Row<Lanes<T>> load_rows(const Inputs<T>& in, RowAt r
   return v;
 }
 
-// The colour of the rows of a register in the direction in which the camera sees them.
+// The color of the rows of a register in the direction in which the camera sees them.
 template <class T, class RowAt>
 inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, const Vector<Lanes<T>>& in_camera,
                        Splat<Lanes<T>>& s) {

@@ -9,7 +9,7 @@ namespace SPLAT_VARIANT {
 
 constexpr double BOX_MARGIN = 0.01;               // pixels; rounding must never cull a touched pixel
 constexpr double COMPENSATION_FLOOR = 2.5e-5;     // least det / det_blurred of the antialias compensation
-constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: thinner splats touch no pixel centre
+constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: thinner splats touch no pixel center
 constexpr double LOG2_SCALE = 0.84932180028801907;  // sqrt(log2(e) / 2)
 constexpr double TWO_LN2 = 1.3862943611198906;
 
@@ -77,7 +77,7 @@ inline V compensation(const Camera<T>& camera, const Covariance<V, K>& c) {
   return root(ratio > floor ? ratio : floor);
 }
 
-// Colour before the clamp at zero; also the unit direction, the distance and the basis for backward.
+// Color before the clamp at zero; also the unit direction, the distance and the basis for backward.
 template <class V>
 struct ViewColor {
   Vector<V> direction, raw;
@@ -97,12 +97,12 @@ inline ViewColor<V> view_color(const Camera<T>& camera, const Vector<V>& in_came
   return c;
 }
 
-// First and last index whose pixel centre lies within [centre - half, centre + half], cut to [0, size); limited first,
+// First and last index whose pixel center lies within [center - half, center + half], cut to [0, size); limited first,
 // since the box of a giant does not fit an integer.
 template <class T, class V>
-inline void pixel_span(const V& centre, const V& half, T size, Index<V>& first, Index<V>& last) {
-  first = ceiling(limited(centre - half - T(0.5), T(0), size));
-  last = floored(limited(centre + half - T(0.5), T(-1), size - 1));
+inline void pixel_span(const V& center, const V& half, T size, Index<V>& first, Index<V>& last) {
+  first = ceiling(limited(center - half - T(0.5), T(0), size));
+  last = floored(limited(center + half - T(0.5), T(-1), size - 1));
 }
 
 // Where a splat ends: o exp(-q/2) >= alpha_min needs q <= 2 ln(o / alpha_min), a box of b deviations q <= b^2. Fills
@@ -123,7 +123,7 @@ inline void bound(const Camera<T>& camera, const Covariance<V, K>& c, const V& o
   s.half_x = root(reach * c.xx), s.half_y = root(reach * c.yy);
 }
 
-// Fills `s` but for its colour; answers which rows can touch a pixel. Comparisons are written so that NaN culls.
+// Fills `s` but for its color; answers which rows can touch a pixel. Comparisons are written so that NaN culls.
 template <class T, class E, class V>
 inline Index<V> project(const Camera<T>& camera, const RowValues<V>& row, const Projection<E, V>& p, Splat<V>& s) {
   const Covariance<V, Projection<E, V>::K> c(camera, p.footprint);

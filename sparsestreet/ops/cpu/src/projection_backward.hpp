@@ -84,7 +84,7 @@ inline Vector<V> color_backward(const Camera<T>& camera, const Vector<V>& in_cam
 }
 
 // All gradients of a register of rows but that of the harmonics' coefficients. `v_color`: of the mean in the camera,
-// through the colour.
+// through the color.
 template <class T, class E, class V>
 inline RowValues<V> row_backward(const Camera<T>& camera, const RowValues<V>& row, const Projection<E, V>& p,
                                  const ScreenGradient<V>& g, const Vector<V>& v_color) {

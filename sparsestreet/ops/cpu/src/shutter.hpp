@@ -19,7 +19,7 @@ template <class V, bool LENS>
 struct Motion {
   using T = Scalar<V>;
   V slope_x, slope_y, motion_z;
-  V velocity_x, velocity_y;  // of the normalised mean
+  V velocity_x, velocity_y;  // of the normalized mean
   V x, y;                    // u
 
   Motion() = default;

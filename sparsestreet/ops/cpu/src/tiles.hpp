@@ -34,7 +34,7 @@ struct Ellipse {
     const V ratio = half_y > V{} ? dy / half_y : V{};
     return half_width * root(positive_part(1 - ratio * ratio));
   }
-  // Extent in x, relative to the centre, over dy in [from, to].
+  // Extent in x, relative to the center, over dy in [from, to].
   void extent(const V& from, const V& to, V& left, V& right) const {
     const V low = limited(from - margin_y, -half_y, half_y), high = limited(to + margin_y, -half_y, half_y);
     const V at_right = limited(peak, low, high), at_left = limited(-peak, low, high);

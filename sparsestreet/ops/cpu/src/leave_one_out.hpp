@@ -12,10 +12,10 @@ struct TileBehind {
 };
 
 template <class T>
-inline void behind_everything(const TileColors<T>& total, const View& view, const Backdrop& backdrop, int64_t x0,
+inline void behind_everything(const TileColors<T>& total, const View& view, const Backdrop& sky_image, int64_t x0,
                               int64_t y0, TileBehind<T>& behind) {
   const T* blended[3] = {total.red, total.green, total.blue};
-  const T *background = static_cast<const T*>(backdrop.rgb), *weights = static_cast<const T*>(backdrop.pixel_weights);
+  const T *background = static_cast<const T*>(sky_image.rgb), *weights = static_cast<const T*>(sky_image.pixel_weights);
   for (int i = 0; i < PIXELS; ++i) {
     const int64_t x = x0 + i % TILE, y = y0 + i / TILE, pixel = y * view.width + x;
     const bool inside = x < view.width && y < view.height;
@@ -51,7 +51,7 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
 }
 
 template <class T, bool EXCLUSIVE>
-void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const Backdrop& backdrop) {
+void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const Backdrop& sky_image) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   TileColors<T> c;
   TileBehind<T> behind;
@@ -60,7 +60,7 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
   int64_t samples = 0;
   sort_tile(ws, tile);
   blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
-  behind_everything(c, view, backdrop, x0, y0, behind);
+  behind_everything(c, view, sky_image, x0, y0, behind);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
@@ -78,16 +78,16 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
 }
 
 template <class T>
-void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const Backdrop& backdrop, const Changes& out) {
+void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const Backdrop& sky_image, const Changes& out) {
   const double start = omp_get_wtime();
   const Cuts<T> cuts(view);
   ws.change_slots.reserve(ws.pair_count);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     if (view.exclusive_stop)
-      remove_tile<T, true>(ws, view, cuts, tile, backdrop);
+      remove_tile<T, true>(ws, view, cuts, tile, sky_image);
     else
-      remove_tile<T, false>(ws, view, cuts, tile, backdrop);
+      remove_tile<T, false>(ws, view, cuts, tile, sky_image);
   }
 #pragma omp parallel for num_threads(view.threads) schedule(static)
   for (int64_t i = 0; i < rows; ++i) {

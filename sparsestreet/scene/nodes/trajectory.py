@@ -15,20 +15,20 @@ TIME_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
-class Knots:
-    """World-from-box poses at annotated instants; row i is object i, its valid knots come first, in order of time."""
+class Trajectories:
+    """World-from-box poses at annotated instants; row i is object i, its valid keyframes first, in order of time."""
 
     times: Float[Tensor, "i k"]
-    """Normalised time; 0 where not valid."""
+    """Normalized time; 0 where not valid."""
     quaternions: Float[Tensor, "i k 4"]
     translations: Float[Tensor, "i k 3"]
-    """Box centre in the world, metres."""
+    """Box center in the world, meters."""
     valid: Bool[Tensor, "i k"]
     spans: Float[Tensor, "i 2"]
     """First and last annotated instant, held-out ones included."""
 
     @staticmethod
-    def from_tracks(tracks: Sequence[Track], held_out: frozenset[int], num_frames: int) -> "Knots":
+    def from_tracks(tracks: Sequence[Track], held_out: frozenset[int], num_frames: int) -> "Trajectories":
         """The tracks' annotations without those of held-out frames, float32.
 
         Raises ValueError if a track keeps no annotation.
@@ -54,43 +54,43 @@ class Knots:
             translations[i, :count] = poses[:, :3, 3].float()
             valid[i, :count] = True
             spans[i] = torch.stack((track.frames[0], track.frames[-1])).double() / last_frame
-        return Knots(times, rotations, translations, valid, spans)
+        return Trajectories(times, rotations, translations, valid, spans)
 
 
 @dataclass(frozen=True)
-class Bracket:
-    """Which two knots a query lies between, per object."""
+class KeyframeInterval:
+    """Which two keyframes a query lies between, per object."""
 
     lower: Int[Tensor, " i"]
     upper: Int[Tensor, " i"]
     fraction: Float[Tensor, " i"]
-    """0 at the lower knot, 1 at the upper; outside [0, 1] where the pose is extrapolated."""
+    """0 at the lower keyframe, 1 at the upper; outside [0, 1] where the pose is extrapolated."""
     active: Bool[Tensor, " i"]
 
 
-def bracket(
+def keyframe_interval(
     times: Float[Tensor, "i k"],
     valid: Bool[Tensor, "i k"],
     spans: Float[Tensor, "i 2"],
     time: float,
-    maximum_gap: float,
-) -> Bracket:
-    """The knots around ``time``. An object is active within its annotated span where a knot is near enough.
+    max_gap: float,
+) -> KeyframeInterval:
+    """The keyframes around ``time``. An object is active within its annotated span where a keyframe is near enough.
 
     Args:
-        maximum_gap: farthest distance in time to the nearest knot at which an object counts as present.
+        max_gap: farthest distance in time to the nearest keyframe at which an object counts as present.
 
-    A held-out end of a span lies beyond the last knot: there the first or last two knots are extrapolated at
+    A held-out end of a span lies beyond the last keyframe: there the first or last two keyframes are extrapolated at
     constant velocity, up to the end of the span and no farther.
     """
     count = valid.sum(1)
     num_before = (valid & (times <= time)).sum(1)
     lower = torch.minimum((num_before - 1).clamp(min=0), (count - 2).clamp(min=0))
     upper = torch.minimum(lower + 1, count - 1)
-    time_lower, time_upper = (times.gather(1, knot[:, None]).squeeze(1) for knot in (lower, upper))
+    time_lower, time_upper = (times.gather(1, keyframe[:, None]).squeeze(1) for keyframe in (lower, upper))
     inside = torch.full_like(time_lower, time).clamp(spans[:, 0], spans[:, 1])
     step = torch.where(upper > lower, time_upper - time_lower, torch.ones_like(time_lower))
     fraction = torch.where(upper > lower, (inside - time_lower) / step, torch.zeros_like(step))
     nearest = torch.where(valid, (times - time).abs(), torch.inf).amin(1)
-    active = (nearest <= maximum_gap + TIME_TOLERANCE) & ((inside - time).abs() <= TIME_TOLERANCE)
-    return Bracket(lower, upper, fraction, active)
+    active = (nearest <= max_gap + TIME_TOLERANCE) & ((inside - time).abs() <= TIME_TOLERANCE)
+    return KeyframeInterval(lower, upper, fraction, active)

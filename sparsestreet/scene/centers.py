@@ -1,4 +1,4 @@
-"""Where the Gaussians are: a dot for every centre, coloured by node class."""
+"""Where the Gaussians are: a dot for every center, colored by node class."""
 
 from collections.abc import Iterable
 
@@ -25,10 +25,10 @@ def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
 
 
 @torch.no_grad()
-def project_centres(
+def project_centers(
     scene: SceneGraph, camera: Camera, time: float, *, minimum_opacity: float = 0.005
 ) -> Float[Tensor, "h w 3"]:
-    """An image in [0, 1] with one pixel per centre in view, the nearest centre on top.
+    """An image in [0, 1] with one pixel per center in view, the nearest center on top.
 
     Rows below ``minimum_opacity`` are left out: those of absent instances, those masked, those about to be culled.
     """

@@ -14,14 +14,14 @@ from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_values
-from sparsestreet.types import Camera, Contribution, Gaussians, Removal
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
 """(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward in float32."""
 
 
-def rasterise(
+def rasterize(
     gaussians: Gaussians,
     screen_offsets: Float[Tensor, "n 2"],
     camera: Camera,
@@ -64,14 +64,14 @@ def contribution(
     return Contribution(weight, pixels, dominant)
 
 
-def removal(
+def leave_one_out(
     gaussians: Gaussians,
     background: Float[Tensor, "h w 3"] | None,
     pixel_weights: Float[Tensor, "h w"] | None,
     camera: Camera,
     settings: SplatSettings,
     variant: int = FASTEST_VARIANT,
-) -> Removal:
+) -> LeaveOneOut:
     """How far the view moves when each row alone is taken away."""
     _check_dtype(gaussians)
     g = gaussians
@@ -89,7 +89,7 @@ def removal(
         byref(report),
     )
     _raise_for(status, fields, displacements, report)
-    return Removal(largest, squared)
+    return LeaveOneOut(largest, squared)
 
 
 class _Blend(torch.autograd.Function):
@@ -161,9 +161,9 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
         alpha_min=settings.alpha_min,
         alpha_max=settings.alpha_max,
         transmittance_min=settings.transmittance_min,
-        blur=settings.blur,
-        near_plane=settings.near,
-        box=settings.box,
+        blur=settings.eps2d,
+        near_plane=settings.near_plane,
+        box=settings.max_sigma,
         width=camera.width,
         height=camera.height,
         exclusive_stop=settings.stop == "exclusive",

@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend, blend_backward, count, rows_backward, slots
-from sparsestreet.ops.triton import removal as remove
+from sparsestreet.ops.triton import leave_one_out as remove
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
 from sparsestreet.ops.triton.pixels import (
@@ -26,10 +26,10 @@ from sparsestreet.ops.triton.pixels import (
 )
 from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import View
-from sparsestreet.types import Camera, Contribution, Gaussians, Removal
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 
-def rasterise(
+def rasterize(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
     """Project, sort by tile and blend, in float32. Bitwise the same in every run on one device."""
@@ -60,13 +60,13 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
 
 
 @torch.no_grad()
-def removal(
+def leave_one_out(
     gaussians: Gaussians,
     background: Float[Tensor, "h w 3"] | None,
     pixel_weights: Float[Tensor, "h w"] | None,
     camera: Camera,
     settings: SplatSettings,
-) -> Removal:
+) -> LeaveOneOut:
     """How far the view moves when each row alone is taken away, over a background (None: black)."""
     _check(gaussians)
     view = View(camera, settings)
@@ -86,7 +86,7 @@ def removal(
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
     largest.scatter_reduce_(0, lists.pair_rows.long(), changes[lists.slots, 0].double(), "amax")
-    return Removal(largest, totals[:, 1])
+    return LeaveOneOut(largest, totals[:, 1])
 
 
 class _Blend(torch.autograd.Function):
