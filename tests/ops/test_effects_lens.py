@@ -118,7 +118,7 @@ def test_against_the_text_book(backend, coefficients):
         if mean[2] < 2 or (splat(one, view, settings=FITTED, backend=backend).alpha > 1e-3).sum() < 30:
             continue
         center, covariance = drawn(one, view, backend)
-        expected_center, expected = unscented(mean, axes, view, FITTED.near)
+        expected_center, expected = unscented(mean, axes, view, FITTED.near_plane)
         np.testing.assert_allclose(center, expected_center, atol=1e-6)
         np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-6)
         compared += 1
@@ -133,11 +133,11 @@ def test_sigma_points_past_the_fold_and_behind_the_near_plane(backend):
         ball = one_gaussian(means=[[1.2, 0.6, 1.5]], scales=[scales], quaternions=[[0.9, 0.2, -0.1, 0.3]])
         mean, axes = in_camera(ball, 0, view)
         points = mean + math.sqrt(3) * np.concatenate((axes.T, -axes.T))
-        slopes = np.hypot(points[:, 0], points[:, 1]) / np.maximum(points[:, 2], FITTED.near)
+        slopes = np.hypot(points[:, 0], points[:, 1]) / np.maximum(points[:, 2], FITTED.near_plane)
         assert (slopes**2 > fold(WIDE)).any()
-        assert (points[:, 2] < FITTED.near).any() == (scales[2] > 1)
+        assert (points[:, 2] < FITTED.near_plane).any() == (scales[2] > 1)
         center, covariance = drawn(ball, view, backend)
-        expected_center, expected = unscented(mean, axes, view, FITTED.near)
+        expected_center, expected = unscented(mean, axes, view, FITTED.near_plane)
         np.testing.assert_allclose(center, expected_center, rtol=1e-5)
         np.testing.assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5)
         assert render(ball, view, backend, torch.float32).is_finite()

@@ -106,7 +106,7 @@ class View:
             *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
             *(camera.width, camera.height, s.eps2d, s.near_plane),
             # Without a cut-off the exponent still ends where float32 does: 2^-126.
-            *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.box * s.box),
+            *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.max_sigma * s.max_sigma),
             *distortion,
             math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
             *motion,

@@ -60,7 +60,7 @@ def test_truths_of_a_point():
     blurred = by_value["eps2d", "0.1"]
     assert blurred.other_model
     assert blurred.exact.eps2d == 0.1
-    assert (blurred.exact.alpha_min, blurred.exact.transmittance_min, blurred.exact.box) == (0, 0, inf)
+    assert (blurred.exact.alpha_min, blurred.exact.transmittance_min, blurred.exact.max_sigma) == (0, 0, inf)
     half = by_value["half_colors", "True"]
     assert half.same_cutoffs == DEFAULT
     assert half.exact == SplatSettings.preset("exact")
@@ -68,7 +68,7 @@ def test_truths_of_a_point():
     boxed = by_value["max_sigma", "3"]
     assert boxed.same_cutoffs == boxed.settings
     assert not boxed.other_model
-    assert boxed.exact.box == inf
+    assert boxed.exact.max_sigma == inf
     assert by_value["backend", "cpu float64"].dtype == torch.float64
     clamped = next(point for point in POINTS if point.preset == "gsplat15")
     assert clamped.other_model
