@@ -17,6 +17,7 @@ from sparsestreet.evaluation.run import evaluate_run
 from sparsestreet.ops import guards
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.centers import node_legend, project_centers
+from sparsestreet.scene.rendering import render
 from sparsestreet.training.system import StreetSystem
 
 
@@ -37,15 +38,15 @@ def assemble(cfg: DictConfig) -> Assembly:
         split.train,
         frozenset(frame.frame_index for frame in split.held_out),
         instantiate(cfg.node, _convert_="all"),
-        instantiate(cfg.sky) if cfg.sky else None,
+        instantiate(cfg.sky, _convert_="all") if cfg.sky else None,
         cfg.seed,
     )
     system = StreetSystem(
         scene,
         instantiate(cfg.loss, _convert_="all"),
-        instantiate(cfg.optimization, _convert_="all"),
+        instantiate(cfg.optimizer, _convert_="all"),
         radius=log.radius,
-        options=instantiate(cfg.render),
+        options=instantiate(cfg.render, _convert_="all"),
         sh_interval=cfg.schedule.sh_interval,
     )
     return Assembly(log, datamodule, system)
@@ -60,10 +61,10 @@ def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seco
     system, scene = parts.system.cpu().eval(), parts.system.scene
     summary = evaluate_run(
         held_out,
-        render=system.render,
-        centers=lambda frame: project_centers(scene, frame.camera, frame.time),
+        render=lambda frame: render(scene, frame, options=system.options),
+        centers=lambda frame: project_centers(scene, frame),
         guards=lambda frame: guards(
-            scene.gaussians_at(frame.time).gaussians, frame.camera, settings=system.options.settings
+            scene.gaussians_at(frame).gaussians, frame.camera, settings=system.options.settings
         ),
         gaussians=scene.counts(),
         bytes_by_part=scene.bytes_by_part(),

@@ -2,18 +2,24 @@
 
 import difflib
 import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from hydra.errors import ConfigCompositionException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
+
+ADDABLE = ("++", "+hydra", "+loss/", "+callback/", "+node/", "+sweep")
+"""What may be added: whole option files of these groups, such as a loss of one's own (docs/extending.md)."""
 
 
 @dataclass
@@ -22,42 +28,58 @@ class TrainSchema:
 
     name: str = MISSING
     seed: int = MISSING
+    capacity: str = MISSING
     split: Any = MISSING
-    resume: Any = None
+    resume: str | None = None
     data: Any = MISSING
-    scale: Any = MISSING
     schedule: Any = MISSING
+    method: Any = MISSING
+    sparsify: Any = MISSING
     node: Any = MISSING
     sky: Any = None
     loss: Any = MISSING
     callback: Any = MISSING
-    optimization: Any = MISSING
+    optimizer: Any = MISSING
     render: Any = MISSING
     trainer: Any = MISSING
     logger: Any = None
 
 
+def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
+    """The resolver of conf/node: the entry of the capacity that is chosen."""
+    if _root_.capacity not in values:
+        raise ValueError(f"no capacity {_root_.capacity!r}: choose one of {', '.join(values)}")
+    return values[_root_.capacity]
+
+
 ConfigStore.instance().store(name="train_schema", node=TrainSchema)
+OmegaConf.register_new_resolver("by_capacity", by_capacity, replace=True)
+
+
+@contextmanager
+def configuration() -> Iterator[None]:
+    """Hydra knows where conf/ lies."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield
 
 
 def override_problem(overrides: list[str], config_name: str = "train") -> str | None:
     """One line on what is wrong with the overrides, naming the nearest key; None if they compose."""
     keyed = [text for before, text in zip(["", *overrides], overrides, strict=False) if not _is_flag(before, text)]
-    for text in keyed:
-        # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
-        if text.startswith("+") and not text.startswith(("++", "+hydra")):
-            with initialize_config_dir(str(CONF), version_base="1.3"):
-                return _explain(f"Key '{text.lstrip('+').partition('=')[0]}' not in the schema", [text], config_name)
-    # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
-    single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with configuration():
+        for text in keyed:
+            if "=" not in text and not text.startswith("~"):
+                return f"{text!r} is no override: write key=value"
+            # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
+            if text.startswith("+") and not text.startswith(ADDABLE):
+                return _unknown_key(text.lstrip("+").partition("=")[0], config_name)
+        # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
+        single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
         try:
-            compose(config_name, single)
-        except OverrideParseException as error:
-            return f"{error.override!r} is no override: write key=value"
-        except ConfigCompositionException as error:
+            cfg = compose(config_name, single)
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
             return _explain(str(error.__cause__ or error).splitlines()[0], single, config_name)
-    return None
+    return _masks_that_are_off(single, cfg)
 
 
 def _is_flag(before: str, text: str) -> bool:
@@ -65,20 +87,36 @@ def _is_flag(before: str, text: str) -> bool:
     return text.startswith("-") or (before.startswith("-") and "=" not in text)
 
 
+def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:
+    """A mask's option has no effect where masks are not trained: it must not pass in silence."""
+    if cfg.sparsify.masks:
+        return None
+    for text in overrides:
+        key = text.partition("=")[0]
+        if re.match(r"(node\.\w+\.mask\.|schedule\.(mask_|lambda_m))", key):
+            return f"{key} has no effect with sparsify={cfg.sparsify.name}: choose sparsify=masks, paper or removal"
+    return None
+
+
 def _explain(reason: str, overrides: list[str], config_name: str) -> str:
     """Hydra's reason with the whole key and the key or option that was probably meant."""
-    option = re.search(r"Could not find '([^']+)/([^/']+)'", reason)
+    option = re.search(r"Could not find '([^']+)/([^/']+)'|Could not load '([^']+)/([^/']+)'", reason)
     if option:
-        choices = sorted(path.stem for path in (CONF / option[1]).glob("*.yaml"))
-        return f"no option {option[2]!r} in conf/{option[1]}: choose one of {', '.join(choices)}"
+        group, name = (part for part in option.groups() if part)
+        choices = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+        return f"no option {name!r} in conf/{group}: choose one of {', '.join(choices)}"
     unknown = re.search(r"[Kk]ey '([^']+)' is not in struct|Key '([^']+)' not in|Could not override '([^']+)'", reason)
     if not unknown:
         return reason
     part = next(group for group in unknown.groups() if group)
     given = [text.partition("=")[0].lstrip("+~") for text in overrides]
-    key = next((name for name in given if part in name.split(".") or name == part), part)
+    return _unknown_key(next((name for name in given if part in name.split(".") or name == part), part), config_name)
+
+
+def _unknown_key(key: str, config_name: str) -> str:
     known = _keys(OmegaConf.to_container(compose(config_name), resolve=False))
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    groups = [path.name for path in CONF.iterdir() if path.is_dir()]
+    close = difflib.get_close_matches(key, known + groups, n=1, cutoff=0.5)
     return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else "")
 
 
@@ -93,7 +131,7 @@ def _keys(tree: object, prefix: str = "") -> list[str]:
 
 
 def load_run_config(run: Path) -> DictConfig:
-    """The resolved configuration that a run wrote. Raises FileNotFoundError naming what a run folder holds."""
+    """The configuration that a run wrote. Raises FileNotFoundError naming what a run folder holds."""
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")

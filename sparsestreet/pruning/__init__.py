@@ -1,18 +1,20 @@
-"""Scores of Gaussians and the rules that select which to keep."""
+"""Scores of Gaussians over all training views, and the rules that select which to keep.
+
+``importance`` is the paper's score; ``rules`` the paper's rule and ours (leave one out); ``select`` what is kept.
+"""
 
 from sparsestreet.pruning.importance import Importance, measure_importance
-from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule, PruningRule, View
-from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance, keep_by_mask
+from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule, Look, PruningRule, prunable_floors
+from sparsestreet.pruning.select import keep_by_cost, keep_by_importance
 
 __all__ = [
     "Importance",
     "ImportanceRule",
     "LeaveOneOutRule",
+    "Look",
     "PruningRule",
-    "Selection",
-    "View",
     "keep_by_cost",
     "keep_by_importance",
-    "keep_by_mask",
     "measure_importance",
+    "prunable_floors",
 ]

@@ -9,11 +9,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
-from sparsestreet.ops import SplatSettings, contribution, leave_one_out
+from sparsestreet.ops import contribution, leave_one_out
 from sparsestreet.pruning.importance import measure_importance
-from sparsestreet.pruning.select import Selection, keep_by_cost, keep_by_importance
+from sparsestreet.pruning.select import keep_by_cost, keep_by_importance
+from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import render, sky_image
+from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, render, sky_image
+from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.types import Contribution, Frame, LeaveOneOut
 
 LEAST_ERROR = 1e-12
@@ -21,20 +23,23 @@ LEAST_ERROR = 1e-12
 
 
 @dataclass(frozen=True)
-class View:
-    """How a rule looks at the scene; the same as training does."""
+class Look:
+    """How a rule looks at the scene: as training does."""
 
-    settings: SplatSettings
-    backend: str
+    state: SceneState = FINISHED
+    options: RenderOptions = DEFAULT_OPTIONS
 
 
 @runtime_checkable
 class PruningRule(Protocol):
-    """Answers, for the nodes in ``min_gaussians`` (name -> K_min), which rows stay. Without gradients."""
+    """Answers which rows of the prunable nodes stay, never fewer than a node's K_min. Without gradients."""
 
-    def select(
-        self, scene: SceneGraph, frames: Sequence[Frame], min_gaussians: dict[str, int], view: View
-    ) -> dict[str, Selection]: ...
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]: ...
+
+
+def prunable_floors(scene: SceneGraph) -> dict[str, int]:
+    """Name of every node that pruning may touch -> its K_min."""
+    return {name: node.settings.min_gaussians for name, node in scene.nodes.items() if node.settings.prunable}
 
 
 @dataclass(frozen=True)
@@ -48,12 +53,10 @@ class ImportanceRule:
     """Count a view only for rows that are the largest contributor of one of its pixels."""
 
     @torch.no_grad()
-    def select(
-        self, scene: SceneGraph, frames: Sequence[Frame], min_gaussians: dict[str, int], view: View
-    ) -> dict[str, Selection]:
-        scores = measure_importance(_contributions(scene, frames, view), gate=self.gate)
-        spans = scene.gaussians_at(frames[0].time).rows
-        return {name: keep_by_importance(scores[spans[name]], floor) for name, floor in min_gaussians.items()}
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
+        scores = measure_importance(_contributions(scene, frames, how), gate=self.gate)
+        spans = scene.gaussians_at(frames[0], how.state).spans
+        return {name: keep_by_importance(scores[spans[name]], floor) for name, floor in prunable_floors(scene).items()}
 
 
 @dataclass(frozen=True)
@@ -83,20 +86,17 @@ class LeaveOneOutRule:
             raise ValueError(f"noticeable must be >= 0 (images lie in [0, 1]), got {self.noticeable}")
 
     @torch.no_grad()
-    def select(
-        self, scene: SceneGraph, frames: Sequence[Frame], min_gaussians: dict[str, int], view: View
-    ) -> dict[str, Selection]:
-        errors = sum(_squared_errors(scene, frame, view) for frame in _beside(scene, frames))
-        spans = scene.gaussians_at(frames[0].time).rows
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
+        errors = sum(_squared_errors(scene, frame, how) for frame in _beside(scene, frames))
+        spans = scene.gaussians_at(frames[0], how.state).spans
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
         for frame in _beside(scene, frames):
-            change = _removal(scene, frame, errors, view)
+            change = _without_each(scene, frame, errors, how)
             largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         costs = torch.where(largest > self.noticeable, squared, 0.0)
-        return keep_by_cost(
-            {name: costs[spans[name]] for name in min_gaussians}, 10 ** (self.allowed_db / 10) - 1, min_gaussians
-        )
+        floors = prunable_floors(scene)
+        return keep_by_cost({name: costs[spans[name]] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
 
 
 def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
@@ -107,24 +107,24 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
     return torch.stack([everywhere, *marked]).float()
 
 
-def _removal(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], view: View) -> LeaveOneOut:
+def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], how: Look) -> LeaveOneOut:
     """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
     # Where there is no error left, any change is too dear. A region that no frame marks has no pixel to weigh.
     share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
     return leave_one_out(
-        scene.gaussians_at(frame.time).gaussians,
+        scene.gaussians_at(frame, how.state).gaussians,
         frame.camera,
         background=sky_image(scene, frame.camera),
         pixel_weights=weights,
-        settings=view.settings,
-        backend=view.backend,
+        settings=how.options.settings,
+        backend=how.options.backend,
     )
 
 
-def _squared_errors(scene: SceneGraph, frame: Frame, view: View) -> Float64[Tensor, "3"]:
+def _squared_errors(scene: SceneGraph, frame: Frame, how: Look) -> Float64[Tensor, "3"]:
     """Sum over pixels and channels of the squared error of one frame, in each of its regions."""
-    image = render(scene, frame.camera, frame.time, settings=view.settings, backend=view.backend).rgb
+    image = render(scene, frame, how.state, how.options).rgb
     squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
     return (_regions(frame).double() * squared).sum((1, 2))
 
@@ -134,7 +134,7 @@ def _beside(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
     return (to_device(frame, scene.device) for frame in frames)
 
 
-def _contributions(scene: SceneGraph, frames: Sequence[Frame], view: View) -> Iterator[Contribution]:
+def _contributions(scene: SceneGraph, frames: Sequence[Frame], how: Look) -> Iterator[Contribution]:
     for frame in _beside(scene, frames):
-        gaussians = scene.gaussians_at(frame.time).gaussians
-        yield contribution(gaussians, frame.camera, settings=view.settings, backend=view.backend)
+        gaussians = scene.gaussians_at(frame, how.state).gaussians
+        yield contribution(gaussians, frame.camera, settings=how.options.settings, backend=how.options.backend)

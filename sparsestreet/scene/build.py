@@ -2,14 +2,16 @@
 
 import logging
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import torch
 
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.scene.assignment import Assignment, assign_tracks
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes.node import Node
-from sparsestreet.scene.seeds import BackgroundSettings, RigidSettings
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import Frame
 
@@ -20,27 +22,47 @@ def build_scene(
     log: DrivingLog,
     train_frames: Sequence[Frame],
     held_out: frozenset[int],
-    nodes: Mapping[str, BackgroundSettings | RigidSettings],
+    nodes: Mapping[str, NodeSettings],
     sky: SkySettings | None,
     seed: int,
 ) -> SceneGraph:
-    """Seed every node class from what training may see.
+    """Start every node class from what training may see.
 
     Args:
         log: the drive.
         train_frames: views that random points are placed in and colored by.
         held_out: integer frames whose sweeps and boxes must not be used.
-        nodes: name of the node class -> its seeds. A class without any instance is left out, and the log says so.
+        nodes: name of the node class -> what is said about it. A class without any instance is left out, and the
+            program's log says so.
         sky: settings of the cube map; None for a scene without sky.
         seed: each node draws from its own stream, so a change of one leaves the others as they are.
+
+    Raises ValueError where two nodes claim one track, or a node has nothing to start from.
     """
+    assignment = assign_tracks(log.tracks, nodes)
+    _report(assignment)
     built: dict[str, Node] = {}
-    for name, seeds in nodes.items():
+    for name, settings in nodes.items():
         generator = torch.Generator().manual_seed(seed + zlib.crc32(name.encode()))
-        node = seeds.build(log, train_frames, held_out, generator)
+        data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed)
+        node = settings.build(data, generator)
         if node is None:
             _log.warning("node %r has no instance in %s: the scene goes without it", name, log.name)
         else:
             _log.info("node %r starts with %d Gaussians", name, len(node.rows))
             built[name] = node
     return SceneGraph(built, None if sky is None else Sky(sky))
+
+
+def _report(assignment: Assignment) -> None:
+    """What becomes of the objects of the log."""
+    for name, tracks in assignment.by_node.items():
+        if tracks:
+            _log.info("node %r takes %s", name, _by_class(tracks))
+    if assignment.unclaimed:
+        _log.info("no node takes %s: they are part of the background", _by_class(assignment.unclaimed))
+
+
+def _by_class(tracks: Sequence) -> str:
+    """As "3 Vehicle, 1 Cyclist"."""
+    return ", ".join(f"{count} {name}" for name, count in Counter(track.class_name for track in tracks).items())

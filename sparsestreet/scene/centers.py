@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sparsestreet.geometry.cameras import project
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.types import Camera
+from sparsestreet.types import View
 
 NODE_COLORS = ((0.30, 0.60, 0.90), (0.98, 0.60, 0.15), (0.35, 0.80, 0.40), (0.90, 0.35, 0.60), (0.80, 0.75, 0.25))
 """RGB of the nodes in their order in the scene, repeated where there are more nodes."""
@@ -25,19 +25,17 @@ def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
 
 
 @torch.no_grad()
-def project_centers(
-    scene: SceneGraph, camera: Camera, time: float, *, minimum_opacity: float = 0.005
-) -> Float[Tensor, "h w 3"]:
+def project_centers(scene: SceneGraph, view: View, *, min_opacity: float = 0.005) -> Float[Tensor, "h w 3"]:
     """An image in [0, 1] with one pixel per center in view, the nearest center on top.
 
-    Rows below ``minimum_opacity`` are left out: those of absent instances, those masked, those about to be culled.
+    Rows below ``min_opacity`` are left out: those of absent instances, those masked, those about to be culled.
     """
-    placed = scene.gaussians_at(time)
+    placed, camera = scene.gaussians_at(view), view.camera
     colors = placed.gaussians.means.new_zeros(len(placed.gaussians), 3)
-    for position, rows in enumerate(placed.rows.values()):
+    for position, rows in enumerate(placed.spans.values()):
         colors[rows] = colors.new_tensor(NODE_COLORS[position % len(NODE_COLORS)])
     pixels, depth, inside = project(camera, placed.gaussians.means)
-    drawn = inside & (placed.gaussians.opacities >= minimum_opacity)
+    drawn = inside & (placed.gaussians.opacities >= min_opacity)
     column, row = pixels[drawn].long().unbind(1)
     image = colors.new_full((camera.height * camera.width, 3), BACKGROUND_COLOR)
     target, nearest = _nearest_per_pixel(row * camera.width + column, depth[drawn], image.shape[0])

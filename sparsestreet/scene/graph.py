@@ -1,63 +1,75 @@
-"""The scene graph: nodes by name, one list of Gaussians at a time."""
+"""The scene graph: nodes by name, one list of Gaussians in a view."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
-from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, MaskTerm, Node
+from sparsestreet.scene.learning_rate import LearningRate, matching_rate
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
 from sparsestreet.scene.sky import Sky
-from sparsestreet.types import Gaussians
+from sparsestreet.scene.state import FINISHED, SceneState
+from sparsestreet.types import Gaussians, View
 
 
 @dataclass(frozen=True)
 class SceneGaussians:
-    """All nodes' Gaussians at a time, in the order of the nodes."""
+    """All nodes' Gaussians in a view, in the order of the nodes."""
 
     gaussians: Gaussians
-    rows: dict[str, slice]
+    spans: dict[str, slice]
     """Name of a node -> its rows in ``gaussians``."""
 
 
 class SceneGraph(nn.Module):
-    """Nodes by name, and the sky behind them. ``active_sh_degree`` is what training raises step by step."""
+    """Nodes by name, and the sky behind them. Raises ValueError without any node."""
 
-    def __init__(self, nodes: Mapping[str, Node], sky: Sky | None = None, active_sh_degree: int = 3) -> None:
+    def __init__(self, nodes: Mapping[str, Node], sky: Sky | None = None) -> None:
         super().__init__()
         if not nodes:
             raise ValueError("a scene needs at least one node, got none: add a background")
         self.nodes = nn.ModuleDict(nodes)
         self.sky = sky
-        self.active_sh_degree = active_sh_degree
 
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""
         return next(self.parameters()).device
 
-    def gaussians_at(self, time: float) -> SceneGaussians:
-        """Activated Gaussians of all nodes in the world at a normalized time."""
-        parts, rows, start = [], {}, 0
+    def gaussians_at(self, view: View, state: SceneState = FINISHED) -> SceneGaussians:
+        """Activated Gaussians of all nodes in the world, seen from a view."""
+        parts, spans, start = [], {}, 0
         for name, node in self.nodes.items():
-            part = node.gaussians_at(time, self.active_sh_degree)
+            part = node.gaussians_at(view, state)
             parts.append(part)
-            rows[name] = slice(start, start + len(part))
+            spans[name] = slice(start, start + len(part))
             start += len(part)
-        return SceneGaussians(Gaussians.concatenate(parts), rows)
+        return SceneGaussians(Gaussians.concatenate(parts), spans)
 
     def counts(self) -> dict[str, int]:
         """Number of rows of every node, absent instances included."""
         return {name: len(node.rows) for name, node in self.nodes.items()}
 
-    def mask_terms(self) -> dict[str, MaskTerm]:
-        """Scores and weight of every node that is being masked."""
-        scores = {name: node.mask_scores() for name, node in self.nodes.items()}
+    def regularizers(self, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """The weighted terms of all nodes, named node/term."""
         return {
-            name: MaskTerm(value, self.nodes[name].mask.weight, self.nodes[name].mask.visible_only)
-            for name, value in scores.items()
-            if value is not None
+            f"{name}/{term}": value
+            for name, node in self.nodes.items()
+            for term, value in node.regularizers(state).items()
         }
+
+    def learning_rates(self) -> dict[str, LearningRate]:
+        """Dotted name of every parameter -> its rate. Raises ValueError, naming where to add it, for a missing one."""
+        rates = {}
+        for name, node in self.nodes.items():
+            for parameter, _ in node.named_parameters():
+                where = f"node.{name}.learning_rates"
+                rates[f"nodes.{name}.{parameter}"] = matching_rate(parameter, node.settings.learning_rates, where)
+        if self.sky is not None:
+            rates["sky.texels"] = self.sky.settings.learning_rate
+        return rates
 
     def bytes_by_part(self) -> dict[str, int]:
         """float32 bytes of what has to be stored: every node's rows (no masks), ``poses``, ``sky``."""

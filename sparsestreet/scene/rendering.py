@@ -1,6 +1,6 @@
-"""From a scene, a camera and a time to an image."""
+"""From a scene and a view to an image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -9,9 +9,9 @@ from torch import Tensor
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes.node import MaskTerm
 from sparsestreet.scene.sky import Sky
-from sparsestreet.types import Camera, Rendering
+from sparsestreet.scene.state import FINISHED, SceneState
+from sparsestreet.types import Camera, Rendering, View
 
 
 @dataclass(frozen=True)
@@ -26,26 +26,30 @@ class SceneRendering:
     """Expected depth of the Gaussians along the optical axis, meters."""
     splats: Rendering
     """The op's answer, row-wise fields included."""
-    rows: dict[str, slice]
+    spans: dict[str, slice]
     """Name of a node -> its rows in ``splats``."""
-    mask_terms: dict[str, MaskTerm]
-    """Of the nodes that are being masked."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a scene is rendered; training, pruning and evaluation take the same."""
+
+    settings: SplatSettings = field(default_factory=SplatSettings)
+    backend: str = "auto"
+
+
+DEFAULT_OPTIONS = RenderOptions()
 
 
 def render(
-    scene: SceneGraph,
-    camera: Camera,
-    time: float,
-    *,
-    settings: SplatSettings = SplatSettings(),  # noqa: B008 (frozen)
-    backend: str = "auto",
+    scene: SceneGraph, view: View, state: SceneState = FINISHED, options: RenderOptions = DEFAULT_OPTIONS
 ) -> SceneRendering:
-    """Render the scene at a normalized time in [0, 1], in full precision also under autocast."""
+    """Render the scene as a view sees it, in full precision also under autocast."""
     with torch.autocast(scene.device.type, enabled=False):
-        placed = scene.gaussians_at(time)
-        splats = splat(placed.gaussians, camera, settings=settings, backend=backend)
-        rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, camera, settings)
-        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.rows, scene.mask_terms())
+        placed = scene.gaussians_at(view, state)
+        splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
+        rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options.settings)
+        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans)
 
 
 def sky_image(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:

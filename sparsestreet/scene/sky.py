@@ -1,10 +1,12 @@
 """The sky: a color for every direction, at infinity."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+
+from sparsestreet.scene.learning_rate import LearningRate
 
 # Rows of each face: outward axis, direction of increasing column, direction of increasing row.
 # Faces +x, -x, +y, -y, +z, -z. Which way a face lies on its square is our own choice; nobody else reads it.
@@ -23,10 +25,11 @@ _FACES = torch.tensor(
 
 @dataclass(frozen=True)
 class SkySettings:
-    """Size and start of the sky's cube map."""
+    """Size, start and learning rate of the sky's cube map."""
 
     resolution: int = 128
     initial_color: float = 0.5
+    learning_rate: LearningRate = field(default_factory=lambda: LearningRate(0.01))
 
 
 class Sky(nn.Module):
@@ -38,6 +41,7 @@ class Sky(nn.Module):
         super().__init__()
         if settings.resolution < 1:
             raise ValueError(f"a cube map needs at least one texel a side, got resolution {settings.resolution}")
+        self.settings = settings
         side = settings.resolution
         self.texels = nn.Parameter(torch.full((6, side, side, 3), settings.initial_color))
         self.register_buffer("bordered", _bordered_texels(side), persistent=False)

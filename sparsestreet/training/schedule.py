@@ -1,4 +1,4 @@
-"""When things happen: windows that keep their shape at any length of training."""
+"""When things happen: intervals that keep their shape at any length of training."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ class Interval:
     """
 
     start: float
-    """Fraction of max_steps after which the event may happen first."""
+    """Fraction of max_steps at which the event may happen first."""
     stop: float
     """Fraction of max_steps at which it happens last."""
     every: int = 100
@@ -20,24 +20,25 @@ class Interval:
 
     def __post_init__(self) -> None:
         if not 0 <= self.start <= self.stop <= 1:
-            raise ValueError(f"a window needs 0 <= start <= stop <= 1, got {self.start} and {self.stop}")
+            raise ValueError(f"an interval needs 0 <= start <= stop <= 1, got {self.start} and {self.stop}")
         if self.every < 1:
-            raise ValueError(f"a window needs every >= 1 step, got {self.every}")
+            raise ValueError(f"an interval needs every >= 1 step, got {self.every}")
 
     def due(self, step: int, max_steps: int) -> bool:
         """Whether the event happens after ``step`` (1 is the first) of ``max_steps`` optimizer steps."""
-        return self.start * max_steps < step <= self.stop * max_steps and step % self.every == 0
+        return self.start * max_steps <= step <= self.stop * max_steps and step % self.every == 0
 
     def closes(self, step: int, max_steps: int) -> bool:
-        """Whether ``step`` is the last one inside the window."""
+        """Whether ``step`` is the last one inside the interval."""
         return step == self.last(max_steps)
 
     def last(self, max_steps: int) -> int:
+        """The last step inside the interval."""
         return int(self.stop * max_steps)
 
 
 def milestone(fraction: float, max_steps: int) -> int:
     """The step (at least 1) of a single event at a fraction of the run."""
     if not 0 <= fraction <= 1:
-        raise ValueError(f"a moment of the run is a fraction in [0, 1], got {fraction}")
+        raise ValueError(f"a milestone of the run is a fraction in [0, 1], got {fraction}")
     return max(1, int(fraction * max_steps))

@@ -1,7 +1,6 @@
 """The LightningModule: render, sum the losses, log. What changes the scene's rows lives in callbacks."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -11,78 +10,79 @@ from torch.optim import Optimizer
 from torchmetrics.aggregation import RunningMean
 
 from sparsestreet.evaluation.metrics.image import psnr
-from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import SceneRendering, render
+from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
+from sparsestreet.scene.state import SceneState
 from sparsestreet.training.losses import Loss
-from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.types import Frame
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """How training renders; evaluation takes the same."""
-
-    settings: SplatSettings = field(default_factory=SplatSettings)
-    backend: str = "auto"
 
 
 class StreetSystem(LightningModule):
     """Trains a scene graph on single frames.
 
     ``rendering`` holds the newest training rendering between forward and the end of the batch; density control reads
-    the screen gradients there. Whoever resizes rows sets it to None, so that no graph keeps the old parameters alive.
+    the screen gradients there. ``resize_rows`` and ``end_mask`` set it to None, so that no graph keeps the old
+    parameters alive.
     """
 
     def __init__(
         self,
         scene: SceneGraph,
         losses: Mapping[str, Loss],
-        optimization: OptimizerSettings,
+        optimizer: OptimizerSettings,
         *,
         radius: float,
-        options: RenderOptions = RenderOptions(),
+        options: RenderOptions = DEFAULT_OPTIONS,
         sh_interval: float = 1 / 30,
     ) -> None:
+        """Make a system of its parts.
+
+        Args:
+            scene: what is trained.
+            losses: the terms by name, summed.
+            optimizer: settings of Adam; the rates stand with the nodes.
+            radius: of the scene, meters.
+            options: how it is rendered.
+            sh_interval: fraction of the run after which one more degree of spherical harmonics is used.
+        """
         super().__init__()
         self.scene = scene
         self.losses = dict(losses)
-        self.optimization = optimization
+        self.optimizer_settings = optimizer
         self.radius = radius
         self.options = options
         self.sh_interval = sh_interval
-        """Fraction of the run after which one more degree of spherical harmonics is used."""
         self.rendering: SceneRendering | None = None
         self.train_psnr = RunningMean(window=100)
 
-    def render(self, frame: Frame) -> SceneRendering:
-        return render(
-            self.scene, frame.camera, frame.time, settings=self.options.settings, backend=self.options.backend
-        )
+    def state(self, *, training: bool = False) -> SceneState:
+        """Where training stands, for whoever renders the scene now."""
+        progress = self.global_step / max(self.trainer.max_steps, 1)
+        return SceneState(progress, int(progress / self.sh_interval), training)
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
-        self.scene.active_sh_degree = int(self._progress() / self.sh_interval)
+        state = self.state(training=True)
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
-            self.rendering = self.render(frame)
-            terms = {name: loss(self.rendering, frame) for name, loss in self.losses.items() if loss.applies(frame)}
+            self.rendering = render(self.scene, frame, state, self.options)
+            applicable = {name: loss for name, loss in self.losses.items() if loss.applies(frame)}
+            terms = {name: loss(self.rendering, frame, self.scene) for name, loss in applicable.items()}
+            terms |= self.scene.regularizers(state)
         self._log_training(terms, frame)
         return torch.stack(tuple(terms.values())).sum()
 
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
-            image = self.render(frame).rgb.clamp(0, 1)
+            image = render(self.scene, frame, self.state(), self.options).rgb.clamp(0, 1)
             value = psnr(image, frame.image.to(image.dtype) / 255)
         self.log("val/psnr", value, batch_size=1)
 
     def configure_optimizers(self) -> Optimizer:
-        return self.optimization.build(self.scene, self.radius)
+        return self.optimizer_settings.build(self.scene, self.radius)
 
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
-        self.optimization.set_rates(self.trainer.optimizers[0], self._progress())
-
-    def _progress(self) -> float:
-        return self.global_step / max(self.trainer.max_steps, 1)
+        set_rates(self.trainer.optimizers[0], self.scene, self.state().progress)
 
     def _log_training(self, terms: Mapping[str, Tensor], frame: Frame) -> None:
         """Running PSNR and the number of Gaussians in the progress bar, the terms in the log."""

@@ -1,6 +1,7 @@
 """Rows of Gaussian parameters, and the one way to add, drop and replace them."""
 
 from sparsestreet.scene.gaussians.plan import RowPlan
-from sparsestreet.scene.gaussians.rows import Rows
+from sparsestreet.scene.gaussians.rows import Rows, drop_parameter
+from sparsestreet.scene.gaussians.selection import Selection, keep_best
 
-__all__ = ["RowPlan", "Rows"]
+__all__ = ["RowPlan", "Rows", "Selection", "drop_parameter", "keep_best"]

@@ -1,13 +1,12 @@
 """A table of Gaussians: every parameter and buffer in it has one entry per row."""
 
+from collections.abc import Collection, Mapping
+
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from sparsestreet.scene.gaussians.plan import RowPlan
-
-TRANSIENT = frozenset({"mask_logits"})
-"""Columns that training may have dropped: a checkpoint without them loads into a table without them."""
 
 
 class Rows(nn.Module):
@@ -16,8 +15,15 @@ class Rows(nn.Module):
     Raises ValueError without any column, or if the columns disagree in their number of rows.
     """
 
-    def __init__(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor] | None = None) -> None:
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        buffers: Mapping[str, Tensor] | None = None,
+        transient: Collection[str] = (),
+    ) -> None:
+        """``transient``: columns that training may drop (a mask's); a checkpoint may come without them."""
         super().__init__()
+        self.transient = frozenset(transient)
         for name, value in parameters.items():
             self.register_parameter(name, nn.Parameter(value.detach().clone()))
         for name, value in (buffers or {}).items():
@@ -58,12 +64,8 @@ class Rows(nn.Module):
         """Remove a parameter from the table and from the optimizer (a mask that has done its work)."""
         parameter = self.get_parameter(name)
         delattr(self, name)
-        if optimizer is None:
-            return
-        optimizer.state.pop(parameter, None)
-        for group in optimizer.param_groups:
-            group["params"] = [other for other in group["params"] if other is not parameter]
-        optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
+        if optimizer is not None:
+            drop_parameter(optimizer, parameter)
 
     def _check(self, plan: RowPlan, optimizer: Optimizer | None) -> None:
         columns = self.columns()
@@ -91,13 +93,21 @@ class Rows(nn.Module):
         """
         for name, column in self.columns().items():
             saved = state_dict.get(prefix + name)
-            if saved is None and name in TRANSIENT:
+            if saved is None and name in self.transient:
                 delattr(self, name)
             elif saved is not None and saved.shape[1:] == column.shape[1:] and len(saved) != len(column):
                 value = torch.empty(saved.shape, dtype=column.dtype, device=column.device)
                 is_parameter = isinstance(column, nn.Parameter)
                 setattr(self, name, nn.Parameter(value, column.requires_grad) if is_parameter else value)
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
+    """Take a parameter with its moments out of an optimizer; one that it does not hold is left alone."""
+    optimizer.state.pop(parameter, None)
+    for group in optimizer.param_groups:
+        group["params"] = [other for other in group["params"] if other is not parameter]
+    optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
 def _replace_in_optimizer(optimizer: Optimizer, old: Tensor, new: nn.Parameter, source: Tensor, zero: Tensor) -> None:

@@ -1,6 +1,9 @@
-"""Learnable masks: which Gaussians a scene can do without."""
+"""Learnable masks: which Gaussians a scene can do without.
 
-from sparsestreet.scene.masks.static import StaticMask
-from sparsestreet.scene.masks.straight_through import straight_through
+``mask`` is what every mask answers; ``static`` one score per Gaussian, the same at all times.
+"""
 
-__all__ = ["StaticMask", "straight_through"]
+from sparsestreet.scene.masks.mask import Mask, MaskSettings
+from sparsestreet.scene.masks.static import StaticMask, StaticMaskSettings, straight_through
+
+__all__ = ["Mask", "MaskSettings", "StaticMask", "StaticMaskSettings", "straight_through"]

@@ -1,22 +1,24 @@
-"""One learnable keep score per Gaussian, the same at all times."""
+"""One learnable keep score per Gaussian, the same at all times (the paper's mask of static and rigid nodes)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.scene.masks.straight_through import straight_through
+from sparsestreet.scene.gaussians import Rows, Selection, keep_best
+from sparsestreet.scene.masks.mask import Mask
+
+COLUMN = "mask_logits"
 
 
 @dataclass(frozen=True)
-class StaticMask:
-    """Settings of a node's mask; the logits themselves are the column ``mask_logits`` of the node's rows."""
+class StaticMaskSettings:
+    """Raises ValueError for a negative weight or a threshold that is no value of a sigmoid."""
 
-    weight: float
+    sparsity_weight: float
     """lambda_n of the paper: how strongly the node's Gaussians are pushed out."""
-    min_gaussians: int
-    """K_min of the paper: masks and pruning never leave fewer rows in the node class."""
     threshold: float = 0.01
     """epsilon of the paper (value of Compact-3DGS, whose mask the paper repeats)."""
     initial_logit: float = 1.0
@@ -26,34 +28,68 @@ class StaticMask:
     lambda is weighed against the image error. Rows that no image sees are then left to background pruning."""
 
     def __post_init__(self) -> None:
-        if not self.weight >= 0:
-            raise ValueError(f"a mask's weight must be >= 0, got {self.weight}")
-        if not self.min_gaussians >= 0:
-            raise ValueError(f"a mask's min_gaussians must be >= 0, got {self.min_gaussians}")
+        if not self.sparsity_weight >= 0:
+            raise ValueError(f"a mask's sparsity_weight must be >= 0, got {self.sparsity_weight}")
         if not 0 <= self.threshold < 1:
             raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
 
-    def initial_logits(self, rows: int) -> Float[Tensor, " n"]:
-        return torch.full((rows,), self.initial_logit, dtype=torch.float32)
+    def build(self, min_gaussians: int, times: Sequence[float] = ()) -> "StaticMask":
+        return StaticMask(self, min_gaussians)
 
-    def scores(self, logits: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+
+class StaticMask(Mask):
+    """sigma(m_k) > epsilon, with the logits m as the column ``mask_logits``."""
+
+    columns = (COLUMN,)
+
+    def __init__(self, settings: StaticMaskSettings, min_gaussians: int = 0) -> None:
+        super().__init__()
+        self.settings = settings
+        self.min_gaussians = min_gaussians
+        self.sparsity_weight = settings.sparsity_weight
+
+    def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
+        return {COLUMN: torch.full((num_rows,), self.settings.initial_logit, dtype=torch.float32)}
+
+    def scores(self, rows: Rows) -> Float[Tensor, " n"]:
         """sigma(m), float32 under any precision: in bfloat16 logits stop moving at -4.0, above the threshold."""
-        with torch.autocast(logits.device.type, enabled=False):
-            return torch.sigmoid(logits.float())
+        with torch.autocast(rows.mask_logits.device.type, enabled=False):
+            return torch.sigmoid(rows.mask_logits.float())
 
-    def multipliers(self, scores: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """M_k in {0, 1} for opacity and scale, with straight-through gradient; re-opens below K_min.
+    def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
+        """If fewer than K_min scores pass the threshold, the highest ones count as passing."""
+        scores = self.scores(rows)
+        return straight_through(scores, self._effective_threshold(scores.detach()))
 
-        If fewer than ``min_gaussians`` scores pass the threshold, the highest ones count as passing.
-        """
-        return straight_through(scores, self.effective_threshold(scores))
+    def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+        scores = self.scores(rows)
+        return (scores * visible if self.settings.visible_only else scores).sum()
 
-    def effective_threshold(self, scores: Float[Tensor, " n"]) -> float:
-        """The threshold, lowered where needed so that ``min_gaussians`` (or all) rows pass; ties all pass."""
-        rows = scores.shape[0]
+    def keep(self, rows: Rows) -> Selection:
+        # Compared in the scores' own dtype, as the multipliers are: both must agree on who is closed.
+        scores = self.scores(rows).detach()
+        return keep_best(scores, scores <= self.settings.threshold, self.min_gaussians)
+
+    def finish(self) -> None:
+        """Nothing: M = 1 for all rows that stayed."""
+
+    def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float:
+        """The threshold, lowered where needed so that K_min (or all) rows pass; ties all pass."""
+        rows, threshold = scores.shape[0], self.settings.threshold
         floor = min(self.min_gaussians, rows)
-        if floor == 0 or int((scores > self.threshold).sum()) >= floor:
-            return self.threshold
-        lowest_kept = scores.detach().kthvalue(rows - floor + 1).values
+        if floor == 0 or int((scores > threshold).sum()) >= floor:
+            return threshold
+        self.floor_firings += 1
+        lowest_kept = scores.kthvalue(rows - floor + 1).values
         # One step below the lowest score that must pass, since the comparison is strict.
         return float(torch.nextafter(lowest_kept, torch.full_like(lowest_kept, -1.0)))
+
+
+def straight_through(scores: Float[Tensor, " n"], threshold: float) -> Float[Tensor, " n"]:
+    """1[score > threshold] forward, d/dscore = 1 backward (the paper's M_k; Bengio et al. 2013).
+
+    Scores are sigmoids already: no second one here.
+    """
+    # score - score.detach() is exactly 0, so the product with a closed mask is exactly 0 in every dtype.
+    hard = (scores > threshold).to(scores.dtype)
+    return hard + (scores - scores.detach())

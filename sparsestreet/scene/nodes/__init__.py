@@ -1,7 +1,10 @@
-"""What the scene is made of: each node answers with its Gaussians in the world at a time."""
+"""What the scene is made of; each node class is one module: what is said about it, how it starts, what it answers.
 
-from sparsestreet.scene.nodes.background import Background
-from sparsestreet.scene.nodes.node import Node
-from sparsestreet.scene.nodes.rigid import Rigid
+``node`` is what all have in common; ``background`` stands still, ``rigid`` moves its objects along ``trajectory``.
+"""
 
-__all__ = ["Background", "Node", "Rigid"]
+from sparsestreet.scene.nodes.background import Background, BackgroundSettings
+from sparsestreet.scene.nodes.node import Instances, Node, NodeSettings
+from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
+
+__all__ = ["Background", "BackgroundSettings", "Instances", "Node", "NodeSettings", "Rigid", "RigidSettings"]

@@ -1,15 +1,23 @@
-"""What every node class of the scene graph has in common."""
+"""What every node class of the scene graph has in common: what is said about it, and what it answers."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from sparsestreet.scene.density import DensityStrategy
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMask
-from sparsestreet.types import Gaussians
+from sparsestreet.scene.initialize.gaussians import init_gaussians
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import Mask, MaskSettings
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Gaussians, Track, View
 
 BYTES_PER_NUMBER = 4
 """Sizes are stated as float32, whatever precision a test or an optimizer holds them in."""
@@ -18,71 +26,168 @@ OPACITY_LOGIT_LIMIT = 15.0
 """sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
 
 
-@dataclass(frozen=True)
-class MaskTerm:
-    """What the sparsity loss needs of one node."""
+@dataclass(frozen=True, kw_only=True)
+class NodeSettings(ABC):
+    """Everything that is said about one node class; callbacks, losses and rules read it here and nowhere else.
 
-    scores: Float[Tensor, " n"]
-    """sigma(m), float32."""
-    weight: float
-    """lambda_n of the paper."""
-    visible_only: bool = False
-    """Whether the loss sums over the rows drawn in the view only."""
+    Raises ValueError for limits that contradict each other.
+    """
+
+    classes: Sequence[str] = ()
+    """Class names of the log whose tracks the node takes."""
+    min_path_length: float = 0.0
+    """Meters; a track that travels no farther is left to the static nodes."""
+    min_gaussians: int
+    """K_min of the paper: neither masks nor pruning leave fewer Gaussians in the node class."""
+    max_gaussians: int | None
+    """Density control stops here; None: no limit."""
+    sh_degree: int = 3
+    initial_opacity: float = 0.1
+    mask: MaskSettings | None
+    """None: this node knows no mask."""
+    masked: bool
+    """Whether the mask is trained in this run."""
+    density: DensityStrategy | None
+    """None: the node keeps the Gaussians it starts with."""
+    prunable: bool
+    """Whether pruning rules may take Gaussians of this node."""
+    learning_rates: Mapping[str, LearningRate]
+    """Column, parameter or module of the node -> its rate; the longest name that matches wins."""
+
+    def __post_init__(self) -> None:
+        if self.min_gaussians < 0:
+            raise ValueError(f"min_gaussians must be >= 0, got {self.min_gaussians}")
+        if self.max_gaussians is not None and self.max_gaussians < max(self.min_gaussians, 1):
+            raise ValueError(
+                f"max_gaussians must be at least min_gaussians, got {self.max_gaussians} and {self.min_gaussians}: "
+                "raise the first or lower the second"
+            )
+
+    def takes(self, track: Track) -> bool:
+        """Whether the node claims a track of the log."""
+        return track.class_name in self.classes and track.path_length > self.min_path_length
+
+    @property
+    def mask_settings(self) -> MaskSettings | None:
+        """The mask that is trained in this run, if any."""
+        return self.mask if self.masked else None
+
+    @abstractmethod
+    def build(self, data: TrainingData, generator: torch.Generator) -> "Node | None":
+        """Make the node from what training may see; None where it would have no instance."""
+
+    @abstractmethod
+    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Node":
+        """The node of a scene file: its table, all its tensors by name, and what ``Node.header`` said."""
+
+    def start(
+        self,
+        data: TrainingData,
+        points: Points,
+        scales: Float[Tensor, " n"],
+        generator: torch.Generator,
+        buffers: Mapping[str, Tensor] | None = None,
+    ) -> tuple[Rows, Mask | None]:
+        """The table of a node that begins, one Gaussian a point, and its mask; ``scales`` in meters."""
+        mask = None if self.mask_settings is None else self.mask_settings.build(self.min_gaussians, data.times)
+        columns = {} if mask is None else mask.initial_columns(len(points))
+        rows = init_gaussians(
+            points.positions,
+            points.colors,
+            scales,
+            sh_degree=self.sh_degree,
+            initial_opacity=self.initial_opacity,
+            generator=generator,
+            mask_columns=columns,
+            buffers=buffers,
+        )
+        return rows, mask
+
+
+@dataclass(frozen=True)
+class Instances:
+    """The objects of a node."""
+
+    names: tuple[str, ...]
+    """Names of their tracks in the log."""
+    ids: Int[Tensor, " n"]
+    """Row of the node -> its instance."""
+    sizes: Float[Tensor, "i 3"]
+    """Length, width, height of their boxes, meters."""
+
+    def counts(self) -> Int[Tensor, " i"]:
+        """Number of rows of every instance."""
+        return torch.bincount(self.ids, minlength=len(self.names))
 
 
 class Node(nn.Module, ABC):
     """One node class: a table of Gaussians with an optional mask.
 
     The rows hold ``means``, ``log_scales``, ``quaternions``, ``opacity_logits``, ``sh_dc`` [n, 1, 3],
-    ``sh_rest`` [n, k - 1, 3] and, while a mask is being trained, ``mask_logits``. They stay unmasked: only
+    ``sh_rest`` [n, k - 1, 3] and, while a mask is being trained, the mask's columns. They stay unmasked: only
     ``gaussians_at`` applies the mask, so densification, culling and regularizers see what the mask hides
     (a scale of 0 has no logarithm and no ratio).
     """
 
-    rows: Rows
-    mask: StaticMask | None
-
-    def __init__(self, rows: Rows, mask: StaticMask | None) -> None:
+    def __init__(self, settings: NodeSettings, rows: Rows, mask: Mask | None = None) -> None:
         super().__init__()
-        if (mask is None) != ("mask_logits" not in rows.columns()):
+        held = sorted(rows.transient)
+        if held != sorted(mask.columns if mask is not None else ()):
             raise ValueError(
-                f"a mask and the column 'mask_logits' come together, got mask={mask} with columns "
-                f"{sorted(rows.columns())}: add mask.initial_logits(len(rows)) to the rows, or leave both out"
+                f"a mask and its columns come together, got mask={mask} with the mask columns {held}: "
+                "make the table with NodeSettings.start, or leave both out"
             )
+        self.settings = settings
         self.rows = rows
         self.mask = mask
 
     @abstractmethod
-    def gaussians_at(self, time: float, sh_degree: int) -> Gaussians:
-        """The node's Gaussians in the world at a normalized time, activated, with the mask applied.
+    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
+        """The node's Gaussians in the world, seen from a view, activated, with the mask applied.
 
-        ``sh`` has (min(sh_degree, stored degree) + 1)^2 terms.
+        ``sh`` has (min(state.sh_degree, stored degree) + 1)^2 terms. A view without frame and camera index is a novel
+        one: it is answered from its time alone.
         """
 
-    def mask_scores(self) -> Float[Tensor, " n"] | None:
-        """sigma(m) of every row, float32; None without a mask, or once its logits have been dropped."""
-        if self.mask is None or "mask_logits" not in self.rows.columns():
-            return None
-        return self.mask.scores(self.rows.mask_logits)
+    def regularizers(self, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """Terms of the loss that concern the node alone, by name, each with its weight."""
+        return {}
 
-    def activated(self, sh_degree: int) -> Gaussians:
+    def outside(self) -> Bool[Tensor, " n"] | None:
+        """Rows that left the bounds of their instance; None for a node without bounds."""
+        return None
+
+    def instances(self) -> Instances | None:
+        """The node's objects; None for a node that is no collection of objects."""
+        return None
+
+    def header(self) -> dict[str, Any]:
+        """What a scene file has to know beside settings and tensors; JSON values only."""
+        return {}
+
+    def pose_bytes(self) -> int:
+        """float32 bytes of what moves the rows over time; 0 for a node that stands still."""
+        return 0
+
+    def activated(self, view: View, state: SceneState) -> Gaussians:
         """The rows in their own frame, activated: opacities and scales times the mask's 0 or 1."""
         rows = self.rows
         opacities = torch.sigmoid(rows.opacity_logits.clamp(-OPACITY_LOGIT_LIMIT, OPACITY_LOGIT_LIMIT))
         scales = torch.exp(rows.log_scales)
-        scores = self.mask_scores()
-        if scores is not None:
-            multipliers = self.mask.multipliers(scores)
+        if self.mask is not None:
+            multipliers = self.mask.multipliers(rows, view.time)
             opacities, scales = opacities * multipliers, scales * multipliers[:, None]
-        rest = rows.sh_rest[:, : (sh_degree + 1) ** 2 - 1]
+        rest = rows.sh_rest[:, : (state.sh_degree + 1) ** 2 - 1]
         sh = torch.cat((rows.sh_dc, rest), dim=1) if rest.shape[1] else rows.sh_dc
         return Gaussians(rows.means, rows.quaternions, scales, opacities, sh)
 
     def row_bytes(self) -> int:
         """float32 bytes of the rows without their masks (an instance number counts as one number)."""
-        numbers = sum(column.numel() for name, column in self.rows.columns().items() if name != "mask_logits")
-        return BYTES_PER_NUMBER * numbers
+        columns = self.rows.columns()
+        return BYTES_PER_NUMBER * sum(columns[name].numel() for name in columns.keys() - self.rows.transient)
 
-    def pose_bytes(self) -> int:
-        """float32 bytes of what moves the rows over time; 0 for a node that stands still."""
-        return 0
+    def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
+        """A checkpoint from after the mask stage comes without the mask's columns: then the mask goes too."""
+        if self.mask is not None and not any(f"{prefix}rows.{name}" in state_dict for name in self.mask.columns):
+            self.mask = self.mask.finish()
+        super()._load_from_state_dict(state_dict, prefix, *args)

@@ -1,51 +1,129 @@
-"""Objects that move without changing their shape: cars, trams, trucks."""
+"""Objects that move without changing their shape: where they start, and what they answer."""
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
+from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_box
+from sparsestreet.scene.initialize.gaussians import neighbor_scales
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.masks import Mask
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
 from sparsestreet.scene.nodes.trajectory import Trajectories, keyframe_interval
-from sparsestreet.types import Gaussians
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Gaussians, Sweep, Track, View
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidSettings(NodeSettings):
+    """Starts from the lidar points of all training instants, pooled in the frame of each object's box."""
+
+    points_per_instance: int = 5000
+    box_points: int = 1000
+    """An instance with fewer lidar points than this is filled up with random points on the faces of its box."""
+    max_gap: int = 2
+    """Frames; an object is present within its span up to this far from a training annotation."""
+    box_margin: float = 0.1
+    """Meters by which a row's center may lie outside its box: annotated boxes are about this tight."""
+
+    def build(self, data: TrainingData, generator: torch.Generator) -> "Rigid | None":
+        """Boxes of frames without training image (held out, or outside the training range) are not used."""
+        tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
+        if not tracks:
+            return None
+        sweeps = data.sweeps
+        objects = [self._object_points(track, sweeps, generator) for track in tracks]
+        counts = torch.tensor([len(points) for points in objects])
+        rows, mask = self.start(
+            data,
+            Points.concatenate(objects),
+            # Per instance: in their own frames all objects lie on top of each other.
+            torch.cat([neighbor_scales(points.positions) for points in objects]),
+            generator,
+            buffers={"instances": torch.repeat_interleave(torch.arange(len(tracks)), counts)},
+        )
+        return Rigid(
+            self,
+            rows,
+            Trajectories.from_tracks(tracks, data.held_out, data.log.num_frames),
+            torch.stack([track.size.float() for track in tracks]),
+            names=tuple(track.name for track in tracks),
+            max_gap=self.max_gap / max(data.log.num_frames - 1, 1),
+            mask=mask,
+        )
+
+    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Rigid":
+        trajectories = Trajectories(
+            tensors["keyframe_times"],
+            tensors["keyframe_quaternions"],
+            tensors["keyframe_translations"],
+            tensors["keyframe_valid"],
+            tensors["spans"],
+        )
+        names = tuple(header["names"])
+        return Rigid(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
+
+    def _object_points(self, track: Track, sweeps: Sequence[Sweep], generator: torch.Generator) -> Points:
+        """One object's colored points in its box frame, filled up where lidar left too few."""
+        lidar = lidar_in_box(track, sweeps).sampled(self.points_per_instance, generator)
+        missing = min(self.box_points, self.points_per_instance) - len(lidar)
+        if missing <= 0:
+            return lidar
+        color = lidar.colors.mean(0) if len(lidar) else torch.full((3,), 0.5)
+        surface = box_surface_points(missing, track.size.float(), generator)
+        return Points.concatenate([lidar, Points(surface, color.expand(missing, 3))])
 
 
 class Rigid(Node):
     """All instances of one node class: rows in the box frame of the instance named by the buffer ``instances``.
 
     The pose of a keyframe is its annotation with a learned correction, both zero at the start: rotation
-    R_knot exp([rotation_delta]) (a rotation vector in the box frame, radians) and translation t_knot +
+    R_keyframe exp([rotation_delta]) (a rotation vector in the box frame, radians) and translation t_keyframe +
     translation_delta (world, meters).
     """
 
     def __init__(
         self,
+        settings: RigidSettings,
         rows: Rows,
         keyframes: Trajectories,
         sizes: Float[Tensor, "i 3"],
-        mask: StaticMask | None = None,
+        *,
+        names: Sequence[str] | None = None,
         max_gap: float = 0.05,
+        mask: Mask | None = None,
     ) -> None:
         """Make a node of the tables.
 
         Args:
+            settings: what is said about the node.
             rows: columns as in ``Node``, and the buffer ``instances`` [n] int64: row of ``keyframes``.
             keyframes: training poses of every instance.
             sizes: length, width, height of every instance's box, meters.
-            mask: settings of the mask, if the rows have one.
+            names: of the instances' tracks; None: their numbers.
             max_gap: normalized time to the nearest keyframe beyond which an instance counts as absent.
+            mask: the mask, if the rows have its columns.
 
         Raises:
-            ValueError: if sizes and keyframes disagree in their number of instances, or a row names none of them.
+            ValueError: if sizes, names and keyframes disagree in their number of instances, or a row names none of
+                them.
         """
-        super().__init__(rows, mask)
+        super().__init__(settings, rows, mask)
         num_instances = keyframes.times.shape[0]
-        if sizes.shape[0] != num_instances:
-            raise ValueError(f"every instance needs a box size, got {sizes.shape[0]} for {num_instances} instances")
+        self.names = tuple(str(index) for index in range(num_instances)) if names is None else tuple(names)
+        if sizes.shape[0] != num_instances or len(self.names) != num_instances:
+            raise ValueError(
+                f"every instance needs a box size and a name, got {sizes.shape[0]} sizes and {len(self.names)} names "
+                f"for {num_instances} instances"
+            )
         if len(rows) and not 0 <= int(rows.instances.min()) <= int(rows.instances.max()) < num_instances:
             raise ValueError(
                 f"rows name instances {int(rows.instances.min())} to {int(rows.instances.max())}, but there are "
@@ -61,10 +139,10 @@ class Rigid(Node):
         self.rotation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
         self.translation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
 
-    def gaussians_at(self, time: float, sh_degree: int) -> Gaussians:
+    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
         """Every instance's Gaussians at its pose; opacity exactly 0 where the instance is absent."""
-        local = self.activated(sh_degree)
-        quaternions, translations, active = self.pose_at(time)
+        local = self.activated(view, state)
+        quaternions, translations, active = self.pose_at(view.time)
         instances: Int[Tensor, " n"] = self.rows.instances
         # One table, one gather: rotation matrix (9), quaternion (4), translation (3), presence (1) of each row's box.
         poses = (quat.to_matrix(quaternions).flatten(1), quaternions, translations, active[:, None].to(translations))
@@ -91,9 +169,16 @@ class Rigid(Node):
         translations = torch.lerp(translation_lower, translation_upper, at.fraction[:, None])
         return quaternions, translations, at.active
 
-    def instance_counts(self) -> Int[Tensor, " i"]:
-        """Number of rows of every instance."""
-        return torch.bincount(self.rows.instances, minlength=self.sizes.shape[0])
+    def instances(self) -> Instances:
+        """The objects, named as their tracks."""
+        return Instances(self.names, self.rows.instances, self.sizes)
+
+    def outside(self) -> Bool[Tensor, " n"]:
+        """Rows whose center left its box by more than ``box_margin``."""
+        return outside_boxes(self.rows.means, self.rows.instances, self.sizes, margin=self.settings.box_margin)
+
+    def header(self) -> dict[str, Any]:
+        return {"names": list(self.names), "max_gap": self.max_gap}
 
     def pose_bytes(self) -> int:
         """float32 bytes of the keyframes: a time, a quaternion and a translation each, corrections folded in."""

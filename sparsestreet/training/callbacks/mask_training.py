@@ -4,16 +4,17 @@ import logging
 
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.pruning.select import keep_by_mask
-from sparsestreet.training.callbacks.resizing import resize_rows
+from sparsestreet.training.callbacks.resizing import end_mask, resize_rows
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
+REASON = "mask"
+
 
 class MaskTraining(Callback):
-    """Removes rows whose mask fell to the threshold; at the end of the window fixes M = 1 and drops the masks.
+    """Removes rows that their mask has closed; at the end of the interval the masks are finished.
 
     A row with M = 0 has alpha 0, gets no image gradient and can never come back: removing it at once changes no
     image, only the time a step takes.
@@ -30,20 +31,20 @@ class MaskTraining(Callback):
         if not last and not self.remove_in.due(step, steps):
             return
         for name, node in pl_module.scene.nodes.items():
-            if node.mask_scores() is None:
-                continue
-            self._remove(trainer, pl_module, name)
-            if last:
-                node.rows.drop_column("mask_logits", trainer.optimizers[0])
-                pl_module.rendering = None
+            if node.mask is not None:
+                self._remove(trainer, pl_module, name)
+                if last:
+                    end_mask(trainer, pl_module, name)
 
     def _remove(self, trainer: Trainer, system: StreetSystem, name: str) -> None:
         node = system.scene.nodes[name]
-        selection = keep_by_mask(node.mask_scores().detach(), node.mask.threshold, node.mask.min_gaussians)
-        if selection.floor_hit:
+        selection = node.mask.keep(node.rows)
+        if selection.floor_hit or node.mask.floor_firings:
             log.info(
-                "step %d: the floor of %d rows (K_min) of node %r holds: masks of the best rows stay open",
-                trainer.global_step, node.mask.min_gaussians, name,
+                "step %d: the floor of %d Gaussians (K_min) of node %r held in %d steps since the last removal: "
+                "masks of the best rows stay open",
+                trainer.global_step, node.settings.min_gaussians, name, node.mask.floor_firings,
             )  # fmt: skip
+            node.mask.floor_firings = 0
         if selection.removed:
-            resize_rows(trainer, system, name, selection.plan(), "mask")
+            resize_rows(trainer, system, name, selection.plan(), REASON)

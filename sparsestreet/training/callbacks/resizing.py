@@ -1,26 +1,53 @@
-"""The one way in which callbacks change a node's rows during training."""
+"""The one way in which callbacks change a node's rows and columns during training."""
 
 import logging
+from dataclasses import dataclass
 
 from lightning import Trainer
 
-from sparsestreet.scene.gaussians import RowPlan
-from sparsestreet.training.callbacks.row_ledger import RowLedger
+from sparsestreet.scene.gaussians import RowPlan, drop_parameter
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class RowChange:
+    """One change of a node's number of rows."""
+
+    step: int
+    node: str
+    before: int
+    after: int
+    reason: str
+
+
+class RowListener:
+    """A callback that keeps something for every row; it hears of each change."""
+
+    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+        raise NotImplementedError
+
+
 def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan, reason: str) -> None:
-    """Apply a plan to a node's rows and the optimizer, drop the stale graph, and tell whoever keeps row statistics."""
+    """Apply a plan to a node's rows and the optimizer, drop the stale graph, and tell every listener."""
     rows = system.scene.nodes[node].rows
     before = len(rows)
     rows.resize(plan, trainer.optimizers[0])
     system.rendering = None
+    change = RowChange(trainer.global_step, node, before, len(rows), reason)
     for callback in trainer.callbacks:
-        follow = getattr(callback, "follow_rows", None)
-        if follow is not None:
-            follow(node, plan)
-        if isinstance(callback, RowLedger) and len(rows) != before:
-            callback.record(trainer.global_step, node, before, len(rows), reason)
-    log.debug("step %d: %s %s, %d -> %d rows", trainer.global_step, node, reason, before, len(rows))
+        if isinstance(callback, RowListener):
+            callback.on_rows_changed(change, plan)
+    log.debug("step %d: %s %s, %d -> %d rows", change.step, node, reason, before, change.after)
+
+
+def end_mask(trainer: Trainer, system: StreetSystem, node: str) -> None:
+    """Take a node's mask out of the scene and the optimizer; what it says stays is left in its place."""
+    masked, optimizer = system.scene.nodes[node], trainer.optimizers[0]
+    for column in masked.mask.columns:
+        masked.rows.drop_column(column, optimizer)
+    for parameter in masked.mask.parameters():
+        drop_parameter(optimizer, parameter)
+    masked.mask = masked.mask.finish()
+    system.rendering = None

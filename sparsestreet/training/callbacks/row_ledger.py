@@ -1,35 +1,29 @@
 """Keeps the count of Gaussians per node over the steps, with the reason of each change."""
 
 import csv
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, fields
 from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
-
-@dataclass(frozen=True)
-class RowChange:
-    step: int
-    node: str
-    before: int
-    after: int
-    reason: str
+from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.training.callbacks.resizing import RowChange, RowListener
 
 
-class RowLedger(Callback):
+class RowLedger(Callback, RowListener):
     """Collects row changes and writes them as ``counts.csv`` when training ends (or is interrupted)."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.changes: list[RowChange] = []
 
-    def record(self, step: int, node: str, before: int, after: int, reason: str) -> None:
-        self.changes.append(RowChange(step, node, before, after, reason))
+    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+        if change.after != change.before:
+            self.changes.append(change)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not self.changes:
-            for node, rows in pl_module.scene.counts().items():
-                self.record(0, node, 0, rows, "seeds")
+            self.changes += [RowChange(0, node, 0, rows, "start") for node, rows in pl_module.scene.counts().items()]
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if stage != "fit" or not trainer.is_global_zero:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
@@ -21,7 +22,7 @@ class InverseDepth:
     def applies(self, frame: Frame) -> bool:
         return frame.depth is not None
 
-    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         measured, rendered = frame.depth, rendering.depth
         valid = (measured > self.nearest) & (measured < self.farthest) & (rendered > self.nearest)
         if not bool(valid.any()):

@@ -6,13 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
 
 @dataclass(frozen=True)
 class MaskSparsity:
-    """K counts all rows of all nodes, masked nodes or not; lambda_n is the node's own ``mask.weight``."""
+    """K counts all Gaussians of all nodes, masked nodes or not; lambda_n is the ``sparsity_weight`` of the node's own
+    mask."""
 
     weight: float = 1.0
     """lambda_m."""
@@ -20,12 +22,11 @@ class MaskSparsity:
     def applies(self, frame: Frame) -> bool:
         return True
 
-    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
-        rows = max(sum(span.stop - span.start for span in rendering.rows.values()), 1)
+    def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
+        rows = max(sum(scene.counts().values()), 1)
         total = torch.zeros((), device=rendering.rgb.device)
-        for name, term in rendering.mask_terms.items():
-            scores = term.scores
-            if term.visible_only:
-                scores = scores * rendering.splats.visible[rendering.rows[name]]
-            total = total + term.weight * scores.sum()
+        for name, node in scene.nodes.items():
+            if node.mask is not None:
+                visible = rendering.splats.visible[rendering.spans[name]]
+                total = total + node.mask.sparsity_weight * node.mask.sparsity(node.rows, frame.time, visible)
         return self.weight * total / rows

@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.ops.ssim import ssim
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
@@ -20,7 +21,7 @@ class Photometric:
     def applies(self, frame: Frame) -> bool:
         return True
 
-    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         truth = frame.image.to(rendering.rgb.dtype) / 255
         error = (rendering.rgb - truth).abs().mean()
         if self.lambda_dssim > 0:

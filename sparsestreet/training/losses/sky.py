@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy
 
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
@@ -20,7 +21,7 @@ class SkyMask:
     def applies(self, frame: Frame) -> bool:
         return frame.sky is not None
 
-    def __call__(self, rendering: SceneRendering, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         alpha = rendering.alpha.clamp(self.margin, 1 - self.margin)
         occupied = torch.logical_not(frame.sky).to(alpha.dtype)
         return self.weight * binary_cross_entropy(alpha, occupied)

@@ -1,0 +1,187 @@
+"""Gradient-based density control (3DGS, Kerbl et al. 2023; absolute gradients as in AbsGS, Ye et al. 2024).
+
+Pure decisions: they read rows and statistics, and answer with a RowPlan. All tests see
+unmasked values: a closed mask would make the scale 0.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry.quaternions import to_matrix
+from sparsestreet.scene.density.statistics import DensityStatistics
+from sparsestreet.scene.gaussians import RowPlan, Rows
+
+
+@dataclass(frozen=True)
+class GradientDensity:
+    """Clone, split, cull and reset by thresholds; the defaults are DriveStudio's for its background node.
+
+    Raises ValueError for thresholds that contradict each other.
+    """
+
+    grad_threshold: float = 0.0003
+    """Mean screen gradient above which a row is cloned or split."""
+    split_scale: float = 0.003
+    """Fraction of the scene radius: larger rows are split, smaller ones cloned."""
+    split_screen: float = 0.05
+    """Fraction of the longer image side: rows that were larger on screen are split at any scale."""
+    cull_opacity: float = 0.005
+    """Fainter rows go."""
+    cull_scale: float = 0.5
+    """Fraction of the scene radius: larger rows go."""
+    cull_scale_from: float = 0.1
+    """Fraction of the run after which ``cull_scale`` counts: early Gaussians are large for lack of others."""
+    cull_screen: float = 0.15
+    """Fraction of the longer image side: rows that were larger on screen go."""
+    screen_size_until: float = 0.0
+    """Fraction of the run up to which ``split_screen`` and ``cull_screen`` count; 0: never. (DriveStudio: 0.133 for
+    its background, 1 for its rigid node.)"""
+    split_children: int = 2
+    split_shrink: float = 1.6
+    """Children (and a parent that stays) have this much smaller scales."""
+    keep_parent: bool = True
+    """DriveStudio keeps the shrunk parent beside its children; the original 3DGS replaces it."""
+    reset_opacity_to: float = 0.01
+    """What a reset leaves of an opacity at most."""
+
+    def __post_init__(self) -> None:
+        if self.split_children < 2:
+            raise ValueError(f"a split needs at least 2 children, got split_children={self.split_children}")
+        if self.split_shrink < 1:
+            raise ValueError(f"children must not be larger than their parent, got split_shrink={self.split_shrink}")
+        if not 0 < self.reset_opacity_to < 1:
+            raise ValueError(f"opacities are reset to a value between 0 and 1, got {self.reset_opacity_to}")
+
+    def densify(
+        self,
+        rows: Rows,
+        statistics: DensityStatistics,
+        *,
+        radius: float,
+        progress: float,
+        max_gaussians: int | None,
+        generator: torch.Generator,
+    ) -> RowPlan:
+        """Clone small rows and split large ones where the image asks for detail.
+
+        With g the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the
+        scene radius in meters: a row with g > grad_threshold is split if s_max > split_scale R (or, up to
+        ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are at
+        mu + R(q) (s * z) with z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies
+        inherit all other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep
+        theirs.
+
+        New order: the surviving rows in theirs, then clones, then children, siblings side by side. Raises ValueError
+        if the statistics do not belong to the rows or hold a gradient that is not finite.
+        """
+        _check_same_rows(rows, statistics)
+        gradients = statistics.mean_gradients()
+        wanted = gradients > self.grad_threshold
+        large = _largest_scale(rows) > self.split_scale * radius
+        if progress <= self.screen_size_until:
+            large = large | (statistics.largest_screen > self.split_screen)
+        wanted = wanted & _within_cap(gradients, wanted, large, self, max_gaussians)
+        return _grow(rows, wanted & large, wanted & ~large, self, generator)
+
+    def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
+        """Drop rows that are faint (opacity < cull_opacity), after ``cull_scale_from`` those that are huge (largest
+        scale > cull_scale * ``radius``, meters), up to ``screen_size_until`` those that were huge on screen.
+
+        Raises ValueError if the statistics do not belong to the rows.
+        """
+        _check_same_rows(rows, statistics)
+        drop = torch.sigmoid(rows.opacity_logits.detach()) < self.cull_opacity
+        if progress > self.cull_scale_from:
+            drop = drop | (_largest_scale(rows) > self.cull_scale * radius)
+        if progress <= self.screen_size_until:
+            drop = drop | (statistics.largest_screen > self.cull_screen)
+        return RowPlan.keep(~drop)
+
+    def reset(self, rows: Rows) -> RowPlan:
+        """Lower every opacity to at most ``reset_opacity_to`` and forget the opacities' moments; rows that matter
+        grow back."""
+        logits = rows.opacity_logits.detach()
+        source = torch.arange(len(rows), device=logits.device)
+        lowered = logits.clamp(max=math.log(self.reset_opacity_to / (1 - self.reset_opacity_to)))
+        return RowPlan(
+            len(rows),
+            source,
+            fresh=torch.zeros_like(source, dtype=torch.bool),
+            edits={"opacity_logits": lowered},
+            reset_moments=frozenset({"opacity_logits"}),
+        )
+
+
+def outside_boxes(
+    means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], sizes: Float[Tensor, "i 3"], margin: float
+) -> Bool[Tensor, " n"]:
+    """Whether each row's center (meters, in the frame of its instance's box) is more than ``margin`` meters outside.
+
+    ``sizes``: length, width, height of each instance's box, which is centerd at the origin.
+    """
+    return (means.detach().abs() > sizes[instances] / 2 + margin).any(dim=-1)
+
+
+def _check_same_rows(rows: Rows, statistics: DensityStatistics) -> None:
+    if len(rows) != len(statistics):
+        raise ValueError(
+            f"the node has {len(rows)} rows but its statistics {len(statistics)}: apply every RowPlan to both"
+        )
+
+
+def _largest_scale(rows: Rows) -> Float[Tensor, " n"]:
+    return rows.log_scales.detach().amax(dim=-1).exp()
+
+
+def _within_cap(
+    gradients: Float[Tensor, " n"],
+    wanted: Bool[Tensor, " n"],
+    large: Bool[Tensor, " n"],
+    settings: GradientDensity,
+    max_gaussians: int | None,
+) -> Bool[Tensor, " n"]:
+    """Which rows may grow under the cap: highest gradient first, ties by row, until one has no room."""
+    if max_gaussians is None:
+        return torch.ones_like(wanted)
+    split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
+    growth = torch.where(large, split_growth, 1) * wanted
+    order = torch.sort(gradients, descending=True, stable=True).indices
+    room = max(max_gaussians - wanted.shape[0], 0)
+    allowed = torch.zeros_like(wanted)
+    allowed[order] = growth[order].cumsum(0) <= room
+    return allowed
+
+
+def _grow(
+    rows: Rows,
+    split: Bool[Tensor, " n"],
+    clone: Bool[Tensor, " n"],
+    settings: GradientDensity,
+    generator: torch.Generator,
+) -> RowPlan:
+    """The plan that splits and clones the given rows."""
+    survivors = torch.nonzero(torch.ones_like(split) if settings.keep_parent else ~split).squeeze(-1)
+    clones = torch.nonzero(clone).squeeze(-1)
+    children = torch.nonzero(split).squeeze(-1).repeat_interleave(settings.split_children)
+    source = torch.cat((survivors, clones, children))
+    fresh = torch.arange(len(source), device=source.device) >= len(survivors)
+
+    means = rows.means.detach()[source]
+    first_child = len(survivors) + len(clones)
+    means[first_child:] += _offsets(rows, children, generator)
+    log_scales = rows.log_scales.detach()[source]
+    log_scales[split[source]] -= math.log(settings.split_shrink)
+    return RowPlan(len(rows), source, fresh, edits={"means": means, "log_scales": log_scales})
+
+
+def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:
+    """One draw from each listed row's Gaussian, relative to its mean, meters."""
+    scales = rows.log_scales.detach()[children].exp()
+    # Drawn where the generator lives: a CPU generator gives the same children on every device.
+    normal = torch.randn(scales.shape, dtype=scales.dtype, generator=generator, device=generator.device)
+    rotations = to_matrix(rows.quaternions.detach()[children])
+    return (rotations @ (scales * normal.to(scales.device))[..., None]).squeeze(-1)

@@ -1,0 +1,59 @@
+"""Settings as JSON and back: frozen dataclasses with the name of their class, and nothing that can run.
+
+A class is found by its module's name, which must be one of this package or already imported: a file never imports
+foreign code by itself.
+"""
+
+import importlib
+import sys
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+CLASS = "class"
+"""Key of a JSON object that stands for a dataclass."""
+
+
+def encode(value: Any) -> Any:
+    """JSON of plain values, lists, mappings and frozen dataclasses. Raises TypeError, naming it, for anything else."""
+    if is_dataclass(value) and not isinstance(value, type):
+        entries = {field.name: encode(getattr(value, field.name)) for field in fields(value)}
+        return {CLASS: f"{type(value).__module__}:{type(value).__qualname__}", **entries}
+    if isinstance(value, Mapping):
+        return {str(key): encode(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [encode(entry) for entry in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"settings hold plain values, lists, mappings and dataclasses, got a {type(value).__name__}")
+
+
+def decode(value: Any) -> Any:
+    """What ``encode`` was given, tuples as lists. Raises ValueError for a class that is not known or does not fit."""
+    if isinstance(value, list):
+        return [decode(entry) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    entries = {key: decode(entry) for key, entry in value.items() if key != CLASS}
+    if CLASS not in value:
+        return entries
+    kind = _find(value[CLASS])
+    try:
+        return kind(**entries)
+    except TypeError as error:
+        raise ValueError(f"{value[CLASS]} of this version cannot be made from the file ({error})") from error
+
+
+def _find(name: str) -> type:
+    module_name, _, qualified = name.partition(":")
+    if not module_name.startswith("sparsestreet.") and module_name not in sys.modules:
+        raise ValueError(f"the file uses {name}, which this program has not imported: import {module_name} first")
+    try:
+        found: Any = importlib.import_module(module_name)
+        for part in qualified.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"the file uses {name}, which this version does not have: load it with its own") from error
+    if not (isinstance(found, type) and is_dataclass(found)):
+        raise ValueError(f"the file uses {name} as settings, but that is no dataclass: the file is damaged")
+    return found

@@ -1,0 +1,61 @@
+"""Which points lie in which object's box."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.types import Sweep, Track
+
+
+def points_in_box_frame(track: Track, frame: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
+    """World points in the track's box frame at an integer frame, meters; None where it is not annotated."""
+    found = torch.nonzero(track.frames == frame).flatten()
+    if found.numel() == 0:
+        return None
+    object_from_world = inverse(track.world_from_object[int(found[0])])
+    return transform_points(object_from_world, points.double()).to(points.dtype)
+
+
+def inside_box(
+    points_in_box: Float[Tensor, "n 3"], size: Float[Tensor, "3"], enlargement: float = 1.0
+) -> Bool[Tensor, " n"]:
+    """Whether points of the box frame lie in the box, its sides multiplied by ``enlargement``."""
+    return (points_in_box.abs() <= 0.5 * enlargement * size).all(1)
+
+
+def outside_boxes(
+    tracks: Sequence[Track], frame: int, points: Float[Tensor, "n 3"], enlargement: float
+) -> Bool[Tensor, " n"]:
+    """Whether world points lie in none of the tracks' boxes at an integer frame."""
+    outside = torch.ones(points.shape[0], dtype=torch.bool)
+    for track in tracks:
+        in_box_frame = points_in_box_frame(track, frame, points)
+        if in_box_frame is not None:
+            outside &= ~inside_box(in_box_frame, track.size, enlargement)
+    return outside
+
+
+def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Generator) -> Float[Tensor, "n 3"]:
+    """Random points on the faces of a box about the origin, spread evenly over its area."""
+    length, width, height = size.tolist()
+    areas = torch.tensor([width * height, length * height, length * width])
+    axis = torch.multinomial(areas, count, replacement=True, generator=generator)
+    points = (torch.rand(count, 3, generator=generator) - 0.5) * size
+    side = torch.where(torch.rand(count, generator=generator) < 0.5, -0.5, 0.5)
+    points[torch.arange(count), axis] = side * size[axis]
+    return points
+
+
+def lidar_in_box(track: Track, sweeps: Sequence[Sweep]) -> Points:
+    """Colored returns inside the object's box at their own instant, in the box frame."""
+    parts = []
+    for sweep in sweeps:
+        in_box_frame = points_in_box_frame(track, sweep.index, sweep.points)
+        if in_box_frame is not None:
+            inside = inside_box(in_box_frame, track.size) & sweep.colored
+            parts.append(Points(in_box_frame, sweep.colors).where(inside))
+    return Points.concatenate(parts)

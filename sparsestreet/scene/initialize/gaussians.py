@@ -1,0 +1,68 @@
+"""From colored points to a table of Gaussians."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sparsestreet.geometry.quaternions import normalized
+from sparsestreet.scene.gaussians import Rows
+
+SH_CONSTANT = 0.5 / math.sqrt(math.pi)
+"""The basis function of degree 0."""
+
+MINIMUM_SCALE = 1e-3
+"""Meters; coincident points are no distance apart, and a scale has to have a logarithm."""
+
+
+def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Mean distance to the three nearest other points (fewer where there are no three), at least 1 mm.
+
+    A point without any neighbor gets 1 mm.
+    """
+    num_points = points.shape[0]
+    neighbors = min(3, num_points - 1)
+    if neighbors < 1:
+        return torch.full((num_points,), MINIMUM_SCALE)
+    # The nearest is the point itself, or a coincident one: both are 0 away, so dropping the first is right.
+    positions = points.double().numpy()
+    distances, _ = cKDTree(positions).query(positions, k=np.arange(2, neighbors + 2))
+    return torch.from_numpy(distances.mean(1)).float().clamp(min=MINIMUM_SCALE)
+
+
+def init_gaussians(
+    points: Float[Tensor, "n 3"],
+    colors: Float[Tensor, "n 3"],
+    scales: Float[Tensor, " n"],
+    *,
+    sh_degree: int,
+    initial_opacity: float,
+    generator: torch.Generator,
+    mask_columns: Mapping[str, Tensor] | None = None,
+    buffers: Mapping[str, Tensor] | None = None,
+) -> Rows:
+    """Isotropic Gaussians with random rotations (as in 3DGS), one per point; colors RGB in [0, 1], scales meters.
+
+    ``mask_columns`` are parameters that a mask learns, ``buffers`` what else is known of each row.
+
+    Raises ValueError if the opacity is outside (0, 1) or the degree outside 0 to 3.
+    """
+    if not 0 < initial_opacity < 1:
+        raise ValueError(f"the initial opacity must lie between 0 and 1, got {initial_opacity}")
+    if sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"spherical harmonics are known up to degree 3, got sh_degree={sh_degree}")
+    num_rows = points.shape[0]
+    parameters = {
+        "means": points.float(),
+        "log_scales": scales.float().log()[:, None].expand(-1, 3),
+        "quaternions": normalized(torch.randn(num_rows, 4, generator=generator)),
+        "opacity_logits": torch.full((num_rows,), math.log(initial_opacity / (1 - initial_opacity))),
+        "sh_dc": ((colors.float() - 0.5) / SH_CONSTANT)[:, None, :],
+        "sh_rest": torch.zeros(num_rows, (sh_degree + 1) ** 2 - 1, 3),
+    }
+    masks = mask_columns or {}
+    return Rows(parameters | masks, buffers, transient=masks.keys())

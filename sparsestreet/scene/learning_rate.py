@@ -1,0 +1,48 @@
+"""A learning rate over a run; every node says which of its parameters takes which."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LearningRate:
+    """Decays log-linearly from ``initial`` to ``final``. Raises ValueError for rates or a start out of range."""
+
+    initial: float
+    final: float | None = None
+    """None: constant."""
+    scale_by_scene_radius: bool = False
+    """True: multiplied by the scene radius (meters), as 3DGS does for the means."""
+    start: float = 0.0
+    """Fraction of the run before which the parameter rests (rate 0); the decay counts from the start of the run."""
+
+    def __post_init__(self) -> None:
+        if not self.initial > 0 or (self.final is not None and not self.final > 0):
+            raise ValueError(f"learning rates must be > 0, got initial={self.initial} and final={self.final}")
+        if not 0 <= self.start <= 1:
+            raise ValueError(f"a learning rate starts at a fraction of the run in [0, 1], got start={self.start}")
+
+    def factor(self, progress: float) -> float:
+        """Multiplier of the initial rate at a progress in [0, 1]."""
+        if progress < self.start:
+            return 0.0
+        if self.final is None:
+            return 1.0
+        return (self.final / self.initial) ** min(max(progress, 0.0), 1.0)
+
+
+def matching_rate(name: str, rates: Mapping[str, LearningRate], where: str) -> LearningRate:
+    """The rate of a parameter by its dotted name.
+
+    A key matches where its words stand in the name one after the other: a column (``means`` in ``rows.means``) as
+    well as a module (``mlp`` in ``mlp.0.weight``). The longest key wins. Raises ValueError, naming ``where`` to add
+    one, for a parameter without a rate.
+    """
+    found = [key for key in rates if f".{key}." in f".{name}."]
+    if not found:
+        raise ValueError(f"parameter {name!r} has no learning rate: add one to {where}, which has {_listed(rates)}")
+    return rates[max(found, key=len)]
+
+
+def _listed(keys: Iterable[str]) -> str:
+    return ", ".join(keys) or "none"

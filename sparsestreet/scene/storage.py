@@ -1,0 +1,132 @@
+"""The scene file: a trained scene that opens by itself, on any device, without the log it was made from.
+
+Tensors in safetensors, and in its header, as JSON, what they mean: a version, the nodes with their settings, the sky,
+how the scene is rendered. No pickle, nothing of the log but the names of its tracks. Masks are not in it: what they
+closed is gone.
+"""
+
+import copy
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from sparsestreet.scene.encoding import decode, encode
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
+from sparsestreet.scene.sky import Sky
+from sparsestreet.types import View
+
+VERSION = 1
+"""Raised when an older program could not read the file."""
+
+FILE_NAME = "scene.safetensors"
+"""Name of the scene file in a run's folder."""
+
+_ROWS = "rows."
+
+
+@dataclass(frozen=True)
+class StoredScene:
+    """A trained scene, and how it is rendered."""
+
+    scene: SceneGraph
+    options: RenderOptions
+    name: str
+    """Of the log that it was trained on."""
+    num_frames: int
+    """Of that log: time 0 is its first frame, 1 its last."""
+
+    @torch.no_grad()
+    def render(self, view: View) -> SceneRendering:
+        """The image of any view, without gradients."""
+        return render(self.scene, view, options=self.options)
+
+
+def save_scene(path: Path | str, stored: StoredScene) -> None:
+    """Write the whole file or nothing. A scene with masks is written as they leave it, and stays as it is."""
+    path = Path(path)
+    scene = _without_masks(stored.scene)
+    header = {
+        "version": VERSION,
+        "name": stored.name,
+        "num_frames": stored.num_frames,
+        "options": encode(stored.options),
+        "sky": None if scene.sky is None else encode(scene.sky.settings),
+        "nodes": {
+            name: {"settings": encode(node.settings), "header": node.header(), "columns": sorted(node.rows.columns())}
+            for name, node in scene.nodes.items()
+        },
+    }
+    # safetensors refuses what shares memory or is not contiguous.
+    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in scene.state_dict().items()}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        save_file(tensors, temporary, metadata={"sparsestreet": json.dumps(header)})
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredScene:
+    """Open a scene file, or that of a run's folder; what it shows needs no log.
+
+    Raises FileNotFoundError where there is none, ValueError for a file that is no scene or of a newer version.
+    """
+    path = Path(path)
+    path = path / FILE_NAME if path.is_dir() else path
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no scene at {path}: give a {FILE_NAME}, or the folder of a run that has one")
+    try:
+        with safe_open(path, framework="pt", device=str(torch.device(device))) as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except SafetensorError as error:
+        raise ValueError(f"{path} is no scene file or is damaged ({error}): write it again") from error
+    if "sparsestreet" not in metadata:
+        raise ValueError(f"{path} holds tensors but no scene: give the {FILE_NAME} that a run wrote")
+    header = json.loads(metadata["sparsestreet"])
+    if header["version"] > VERSION:
+        raise ValueError(f"{path} has version {header['version']}, this program reads {VERSION}: update it")
+    nodes = {name: _restored(entry, _below(f"nodes.{name}.", tensors)) for name, entry in header["nodes"].items()}
+    scene = SceneGraph(nodes, None if header["sky"] is None else Sky(decode(header["sky"])))
+    scene.to(torch.device(device)).load_state_dict(tensors)
+    return StoredScene(scene.eval(), decode(header["options"]), header["name"], header["num_frames"])
+
+
+def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
+    columns = {name: tensors[_ROWS + name] for name in entry["columns"]}
+    rows = Rows(
+        {name: column for name, column in columns.items() if column.is_floating_point()},
+        {name: column for name, column in columns.items() if not column.is_floating_point()},
+    )
+    return decode(entry["settings"]).restore(rows, tensors, entry["header"])
+
+
+def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+@torch.no_grad()
+def _without_masks(scene: SceneGraph) -> SceneGraph:
+    """A copy in which the masks have done their work; the scene itself where it has none."""
+    if all(node.mask is None for node in scene.nodes.values()):
+        return scene
+    scene = copy.deepcopy(scene)
+    for node in scene.nodes.values():
+        if node.mask is not None:
+            node.rows.resize(node.mask.keep(node.rows).plan())
+            for column in node.mask.columns:
+                node.rows.drop_column(column)
+            node.mask = node.mask.finish()
+    return scene

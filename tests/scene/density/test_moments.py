@@ -1,0 +1,158 @@
+"""Optimizer moments follow their rows through densify, cull, opacity reset and pruning.
+
+The oracle keeps each row as its own little object, with Adam written out, and knows nothing of row plans.
+"""
+
+import copy
+from dataclasses import dataclass
+
+import torch
+from sparsestreet.training.density import GradientDensity, cull, densify, reset_opacity
+from torch import Tensor
+
+from sparsestreet.pruning import keep_by_mask
+from sparsestreet.scene.gaussians import Rows
+from tests.training.density.scenes import make_rows, with_statistics
+
+LEARNING_RATE, EPSILON = 0.01, 1e-15
+RADIUS = 10.0
+
+
+@dataclass
+class SimulatedRow:
+    """Values and moments of one Gaussian, by column, in float64."""
+
+    values: dict[str, Tensor]
+    first: dict[str, Tensor]
+    second: dict[str, Tensor]
+    instance: int
+
+    def step(self, gradients: dict[str, Tensor], number: int) -> None:
+        """Adam's update of this row (Kingma & Ba 2015, algorithm 1)."""
+        for name, gradient in gradients.items():
+            self.first[name] = 0.9 * self.first[name] + 0.1 * gradient
+            self.second[name] = 0.999 * self.second[name] + 0.001 * gradient**2
+            denominator = (self.second[name] / (1 - 0.999**number)).sqrt() + EPSILON
+            self.values[name] = self.values[name] - LEARNING_RATE * self.first[name] / (1 - 0.9**number) / denominator
+
+    def twin(self) -> "SimulatedRow":
+        """A copy without history."""
+        twin = copy.deepcopy(self)
+        twin.first = {name: torch.zeros_like(moment) for name, moment in self.first.items()}
+        twin.second = copy.deepcopy(twin.first)
+        return twin
+
+
+class Simulation:
+    """The real rows under a real Adam beside the row-by-row oracle."""
+
+    def __init__(self, number: int) -> None:
+        self.generator = torch.Generator().manual_seed(3)
+        self.rows: Rows = make_rows(number, self.generator)
+        self.rows.double()
+        groups = [{"params": [parameter], "name": name} for name, parameter in self.rows.named_parameters()]
+        self.adam = torch.optim.Adam(groups, lr=LEARNING_RATE, eps=EPSILON)
+        self.steps = 0
+        columns = {name: parameter.detach() for name, parameter in self.rows.named_parameters()}
+        self.simulated = [
+            SimulatedRow(
+                {name: column[row].clone() for name, column in columns.items()},
+                {name: torch.zeros_like(column[row]) for name, column in columns.items()},
+                {name: torch.zeros_like(column[row]) for name, column in columns.items()},
+                int(self.rows.instances[row]),
+            )
+            for row in range(number)
+        ]
+
+    def train(self, steps: int) -> None:
+        for _ in range(steps):
+            self.steps += 1
+            gradients = {}
+            for name, parameter in self.rows.named_parameters():
+                parameter.grad = torch.randn(parameter.shape, generator=self.generator, dtype=torch.float64)
+                gradients[name] = parameter.grad
+            self.adam.step()
+            for index, row in enumerate(self.simulated):
+                row.step({name: gradient[index] for name, gradient in gradients.items()}, self.steps)
+
+    def check(self) -> None:
+        assert len(self.rows) == len(self.simulated)
+        assert self.rows.instances.tolist() == [row.instance for row in self.simulated]
+        for name, parameter in self.rows.named_parameters():
+            state = self.adam.state[parameter]
+            for index, row in enumerate(self.simulated):
+                # float64 round-off of a dozen steps
+                torch.testing.assert_close(parameter.detach()[index], row.values[name], rtol=1e-12, atol=1e-12)
+                torch.testing.assert_close(state["exp_avg"][index], row.first[name], rtol=1e-12, atol=1e-15)
+                torch.testing.assert_close(state["exp_avg_sq"][index], row.second[name], rtol=1e-12, atol=1e-15)
+
+
+def test_moments_through_densify_cull_reset_and_pruning():
+    run = Simulation(7)
+    run.train(4)
+    run.check()
+
+    # Densify: rows 2 (large) and 5 (small) are wanted; the parent of the split stays, shrunk, with its moments.
+    for row, scale in ((2, 1.0), (5, 0.001)):
+        with torch.no_grad():
+            run.rows.log_scales[row] = torch.tensor(scale).log()
+        run.simulated[row].values["log_scales"] = torch.full((3,), scale).log().double()
+    statistics = with_statistics([0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0], screens=[0.0, 0.5, 0, 0, 0, 0, 0])
+    plan = densify(run.rows, statistics, GradientDensity(), RADIUS, run.generator, use_screen_size=False)
+    run.rows.resize(plan, run.adam)
+    statistics.resize(plan)
+    clone, children = run.simulated[5].twin(), [run.simulated[2].twin(), run.simulated[2].twin()]
+    for row in (run.simulated[2], *children):
+        row.values["log_scales"] = row.values["log_scales"] - torch.tensor(1.6, dtype=torch.float64).log()
+    run.simulated += [clone, *children]
+    for child, mean in zip(children, run.rows.means.detach()[-2:], strict=True):
+        child.values["means"] = mean.clone()  # the only thing the oracle cannot know is where chance put them
+    run.check()
+    run.train(3)
+    run.check()
+
+    # Cull: row 1 was huge on screen, row 4 is faint; the oracle forgets both.
+    with torch.no_grad():
+        run.rows.opacity_logits[4] = -10.0
+    run.rows.resize(cull(run.rows, statistics, GradientDensity(), RADIUS, True, True), run.adam)
+    run.simulated = [row for index, row in enumerate(run.simulated) if index not in (1, 4)]
+    run.check()
+    run.train(2)
+
+    # Opacity reset: values lowered, opacity moments gone, all other moments untouched.
+    run.rows.resize(reset_opacity(run.rows, 0.1), run.adam)
+    limit = torch.logit(torch.tensor(0.1, dtype=torch.float64))
+    for row in run.simulated:
+        row.values["opacity_logits"] = torch.minimum(row.values["opacity_logits"], limit)
+        row.first["opacity_logits"] = torch.zeros((), dtype=torch.float64)
+        row.second["opacity_logits"] = torch.zeros((), dtype=torch.float64)
+    run.check()
+    run.train(2)
+
+    # Pruning by mask: the two lowest go.
+    scores = torch.sigmoid(run.rows.mask_logits.detach())
+    selection = keep_by_mask(scores, float(scores.sort().values[1]), min_gaussians=1)
+    run.rows.resize(selection.plan(), run.adam)
+    lowest = sorted(run.simulated, key=lambda row: float(row.values["mask_logits"]))[:2]
+    run.simulated = [row for row in run.simulated if all(row is not gone for gone in lowest)]
+    run.check()
+    run.train(3)
+    run.check()
+    assert len(run.adam.state) == sum(len(group["params"]) for group in run.adam.param_groups) == 7
+
+
+def test_replaced_parents_leave_no_moments_behind():
+    run = Simulation(3)
+    run.train(2)
+    with torch.no_grad():
+        run.rows.log_scales.zero_()  # 1 m, large
+    statistics = with_statistics([0.0, 0.01, 0.0])
+    density = GradientDensity(keep_parent=False)
+    plan = densify(run.rows, statistics, density, RADIUS, run.generator, use_screen_size=False)
+    run.rows.resize(plan, run.adam)
+    assert plan.source.tolist() == [0, 2, 1, 1]
+    for name, parameter in run.rows.named_parameters():
+        moments = run.adam.state[parameter]["exp_avg"]
+        assert not moments[2:].any(), name
+        expected = torch.stack([run.simulated[row].first[name] for row in (0, 2)])
+        torch.testing.assert_close(moments[:2], expected, rtol=1e-12, atol=1e-15)  # float64 round-off

@@ -1,0 +1,81 @@
+"""Accumulation over views against a hand-computed case, and rows that come and go."""
+
+import pytest
+import torch
+from sparsestreet.training.density import DensityStatistics
+
+from sparsestreet.scene.gaussians import RowPlan
+
+
+def test_gradients_are_per_half_image_and_averaged_over_visits():
+    statistics = DensityStatistics(3)
+    # 640x400: (3/320, 4/200) per pixel is (3, 4) per half image, norm 5.
+    statistics.add(
+        torch.tensor([[3 / 320, 4 / 200], [1.0, 1.0], [0.0, 0.0]]), torch.tensor([32.0, 0.0, 64.0]), 640, 400
+    )
+    # 200x500: the longer side is the height now.
+    statistics.add(torch.tensor([[0.0, 1 / 250], [2 / 100, 0.0], [0.0, 0.0]]), torch.tensor([50.0, 5.0, 0.0]), 200, 500)
+    # Row 1 was not drawn in the first view: its gradient there does not count, and it has one visit.
+    torch.testing.assert_close(statistics.mean_gradients(), torch.tensor([(5 + 1) / 2, 2.0, 0.0]))
+    assert statistics.visits.tolist() == [2, 1, 1]
+    torch.testing.assert_close(statistics.largest_screen, torch.tensor([0.1, 0.01, 0.1]))
+
+
+def test_rows_never_drawn_have_gradient_zero_not_nan():
+    assert DensityStatistics(2).mean_gradients().tolist() == [0.0, 0.0]
+
+
+def test_gradient_of_an_undrawn_row_may_be_anything():
+    statistics = DensityStatistics(2)
+    nan = float("nan")
+    statistics.add(torch.tensor([[nan, nan], [1.0, 0.0]]), torch.tensor([0.0, 1.0]), 2, 2)
+    assert statistics.mean_gradients().tolist() == [0.0, 1.0]
+
+
+def test_nan_of_a_drawn_row_is_refused():
+    statistics = DensityStatistics(2)
+    statistics.add(torch.tensor([[0.0, 0.0], [float("nan"), 0.0]]), torch.tensor([1.0, 1.0]), 2, 2)
+    with pytest.raises(ValueError, match="row 1 of 2"):
+        statistics.mean_gradients()
+
+
+def test_resize_follows_the_rows_and_starts_fresh_ones_at_zero():
+    statistics = DensityStatistics(3)
+    statistics.add(torch.tensor([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), torch.tensor([1.0, 2.0, 3.0]), 2, 2)
+    statistics.resize(RowPlan(3, torch.tensor([2, 0, 2]), torch.tensor([False, False, True])))
+    assert statistics.mean_gradients().tolist() == [3.0, 1.0, 0.0]
+    assert statistics.visits.tolist() == [1, 1, 0]
+    assert statistics.largest_screen.tolist() == [1.5, 0.5, 0.0]
+    assert len(statistics) == 3
+
+
+def test_reset_keeps_the_rows():
+    statistics = DensityStatistics(2)
+    statistics.add(torch.ones(2, 2), torch.ones(2), 2, 2)
+    statistics.reset()
+    assert statistics.visits.tolist() == [0, 0]
+    assert statistics.mean_gradients().tolist() == [0.0, 0.0]
+    assert statistics.largest_screen.tolist() == [0.0, 0.0]
+
+
+def test_a_checkpoint_continues_where_it_was_with_its_own_number_of_rows():
+    statistics = DensityStatistics(3)
+    statistics.add(torch.rand(3, 2), torch.tensor([1.0, 0.0, 2.0]), 7, 5)
+    resumed = DensityStatistics.from_state(statistics.state_dict())
+    view = (torch.rand(3, 2), torch.ones(3), 7, 5)
+    statistics.add(*view)
+    resumed.add(*view)
+    assert torch.equal(resumed.mean_gradients(), statistics.mean_gradients())
+    assert torch.equal(resumed.largest_screen, statistics.largest_screen)
+
+
+def test_other_rows_are_refused():
+    with pytest.raises(ValueError, match="view has 2 rows but the statistics have 3"):
+        DensityStatistics(3).add(torch.zeros(2, 2), torch.zeros(2), 4, 4)
+
+
+def test_a_node_without_rows():
+    statistics = DensityStatistics(0)
+    statistics.add(torch.zeros(0, 2), torch.zeros(0), 4, 4)
+    statistics.resize(RowPlan.keep(torch.zeros(0, dtype=torch.bool)))
+    assert statistics.mean_gradients().shape == (0,)

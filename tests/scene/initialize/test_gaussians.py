@@ -1,0 +1,71 @@
+import pytest
+import torch
+from sparsestreet.scene.seeds.rows import neighbor_scales, seed_rows
+from torch import Tensor
+
+from sparsestreet.scene.masks import StaticMask
+
+
+def seeded(points: Tensor, colors: Tensor, opacity: float = 0.1, sh_degree: int = 3, mask: StaticMask | None = None):
+    generator = torch.Generator().manual_seed(0)
+    return seed_rows(
+        points,
+        colors,
+        neighbor_scales(points),
+        sh_degree=sh_degree,
+        initial_opacity=opacity,
+        mask=mask,
+        generator=generator,
+    )
+
+
+def test_mean_distance_to_three_neighbors_by_hand():
+    line = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [7.0, 0, 0], [50.0, 0, 0]])
+    expected = torch.tensor([(1 + 3 + 7) / 3, (1 + 2 + 6) / 3, (2 + 3 + 4) / 3, (4 + 6 + 7) / 3, (43 + 47 + 49) / 3])
+    torch.testing.assert_close(neighbor_scales(line), expected)
+
+
+def test_against_all_distances():
+    points = torch.randn(57, 3, generator=torch.Generator().manual_seed(0))
+    nearest = torch.cdist(points.double(), points.double()).sort(dim=1).values[:, 1:4]
+    torch.testing.assert_close(neighbor_scales(points).double(), nearest.mean(1), atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "expected"), [(0, []), (1, [1e-3]), (2, [2.0, 2.0])])
+def test_fewer_than_four_points(count: int, expected: list[float]):
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])[:count]
+    torch.testing.assert_close(neighbor_scales(points), torch.tensor(expected))
+
+
+def test_coincident_points_have_a_logarithm():
+    rows = seeded(torch.ones(6, 3), torch.rand(6, 3))
+    torch.testing.assert_close(rows.log_scales, torch.full((6, 3), 1e-3).log())
+
+
+def test_rows_of_seeds():
+    colors = torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.3, 0.4]])
+    rows = seeded(torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]), colors)
+    # color = 0.5 + basis_0 sh_0 with basis_0 = 0.28209479
+    torch.testing.assert_close(0.5 + 0.28209479177387814 * rows.sh_dc[:, 0], colors)
+    assert rows.sh_rest.shape == (2, 15, 3)
+    assert (rows.sh_rest == 0).all()
+    torch.testing.assert_close(torch.sigmoid(rows.opacity_logits), torch.full((2,), 0.1))
+    torch.testing.assert_close(rows.log_scales.exp(), torch.full((2, 3), 5.0))
+    torch.testing.assert_close(rows.quaternions.norm(dim=1), torch.ones(2))
+    assert "mask_logits" not in rows.columns()
+
+
+def test_a_mask_brings_its_logits():
+    mask = StaticMask(weight=1.0, min_gaussians=0, initial_logit=2.0)
+    assert seeded(torch.rand(3, 3), torch.rand(3, 3), mask=mask).mask_logits.tolist() == [2.0] * 3
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1.0, -0.1])
+def test_impossible_opacities_are_errors(opacity: float):
+    with pytest.raises(ValueError, match="initial opacity"):
+        seeded(torch.rand(3, 3), torch.rand(3, 3), opacity=opacity)
+
+
+def test_an_unknown_degree_is_an_error():
+    with pytest.raises(ValueError, match="sh_degree=4"):
+        seeded(torch.rand(3, 3), torch.rand(3, 3), sh_degree=4)

@@ -1,0 +1,66 @@
+import torch
+from sparsestreet.scene.seeds.points import Points, far_positions, near_positions, random_points, seen_points
+
+from sparsestreet.geometry.cameras import project
+from tests.scene.street import frame_at
+
+CENTER = torch.tensor([1.0, -2.0, 3.0])
+
+
+def test_near_points_fill_the_ball_evenly():
+    distance = (near_positions(4000, CENTER, 10.0, torch.Generator().manual_seed(0)) - CENTER).norm(dim=1)
+    assert distance.max() <= 10.0 * (1 + 1e-5)
+    # Half the volume lies within radius / 2^(1/3); 4,000 draws: standard deviation 0.008.
+    assert abs((distance < 10.0 / 2 ** (1 / 3)).float().mean() - 0.5) < 0.04
+
+
+def test_far_points_lie_between_1_and_50_radii():
+    distance = (far_positions(4000, CENTER, 10.0, torch.Generator().manual_seed(0)) - CENTER).norm(dim=1)
+    assert distance.min() >= 10.0 * (1 - 1e-5)
+    assert distance.max() <= 500.0 * (1 + 1e-5)
+    # u uniform on [0.02, 1]: half the points have u > 0.51.
+    assert abs((distance < 10.0 / 0.51).float().mean() - 0.5) < 0.04
+
+
+def test_seen_points_are_in_a_view_with_its_color_and_not_in_the_sky():
+    frames = [frame_at(0), frame_at(4)]
+    positions = near_positions(3000, CENTER, 20.0, torch.Generator().manual_seed(1))
+    seen = seen_points(positions, frames)
+    assert 0 < len(seen) < 3000
+    for position, color in zip(seen.positions, seen.colors, strict=True):
+        views = [(frame, *project(frame.camera, position[None])) for frame in frames]
+        frame, pixel = next((frame, pixels[0]) for frame, pixels, _, inside in views if inside[0])
+        column, row = pixel.long().tolist()
+        assert not frame.sky[row, column]
+        assert torch.equal(color, frame.image[row, column] / 255)
+    in_some_view = torch.stack([project(frame.camera, positions)[2] for frame in frames]).any(0)
+    in_sky = torch.tensor([p.tolist() not in seen.positions.tolist() for p in positions[in_some_view]])
+    assert in_sky.any()
+
+
+def test_without_sky_masks_every_position_in_view_is_kept():
+    frame = frame_at(0)
+    unmasked = type(frame)(frame.camera, 0.0, 0, 0, image=frame.image)
+    positions = near_positions(500, CENTER, 20.0, torch.Generator().manual_seed(1))
+    assert len(seen_points(positions, [unmasked])) == int(project(frame.camera, positions)[2].sum())
+
+
+def test_samples_are_distinct_points_with_their_colors():
+    points = Points(torch.arange(30.0).reshape(10, 3), torch.arange(30.0).reshape(10, 3) / 30)
+    sample = points.sampled(4, torch.Generator().manual_seed(0))
+    assert len(set(sample.positions[:, 0].tolist())) == 4
+    assert torch.equal(sample.positions / 30, sample.colors)
+    assert len(points.sampled(99, torch.Generator())) == 10
+    assert len(Points.concatenate([])) == 0
+
+
+def test_random_points_are_drawn_until_there_are_enough():
+    frames = [frame_at(0)]
+    points = random_points(near_positions, 40, CENTER, 20.0, frames, torch.Generator().manual_seed(0))
+    assert len(points) == 40
+    assert project(frames[0].camera, points.positions)[2].all()
+
+
+def test_views_of_nothing_give_up():
+    behind = torch.tensor([-100.0, 0.0, 0.0])
+    assert len(random_points(near_positions, 40, behind, 20.0, [frame_at(0)], torch.Generator().manual_seed(0))) == 0
