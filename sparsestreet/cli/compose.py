@@ -18,8 +18,8 @@ PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
 
-ADDABLE = ("++", "+hydra", "+loss/", "+callback/", "+node/", "+sweep")
-"""What may be added: whole option files of these groups, such as a loss of one's own (docs/extending.md)."""
+ADDABLE = ("++", "+hydra", "+sweep")
+"""What may be added: keys that are meant to be new, and sweeps."""
 
 
 @dataclass
