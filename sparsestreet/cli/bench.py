@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
+from sparsestreet.bench.records import Provenance, RecordFile
+from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.evaluation.provenance import this_machine, this_source
-from sparsestreet.ops.bench.records import Provenance, RecordFile
-from sparsestreet.ops.bench.scenes import BenchScene, Size
 
 EXAMPLES = """\
 examples:
@@ -55,9 +55,9 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
 
 
 def _knobs(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import figures, knobs, sweep
-    from sparsestreet.ops.bench.records import read_records
-    from sparsestreet.ops.bench.scenes import bench_scenes
+    from sparsestreet.bench import figures, knobs, sweep
+    from sparsestreet.bench.records import read_records
+    from sparsestreet.bench.scenes import bench_scenes
 
     street = None if options.street is None else trained_street(options.street)
     size = sweep.QUICK if options.quick else sweep.FULL
@@ -75,8 +75,8 @@ def _knobs(options: argparse.Namespace) -> bool:
 
 
 def _blend(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import blend
-    from sparsestreet.ops.bench.timing import Effort
+    from sparsestreet.bench import blend
+    from sparsestreet.bench.timing import Effort
 
     if options.quick:
         once = Effort(repeats=2, least=1)
@@ -87,8 +87,8 @@ def _blend(options: argparse.Namespace) -> bool:
 
 
 def _scaling(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import scaling
-    from sparsestreet.ops.bench.timing import Effort
+    from sparsestreet.bench import scaling
+    from sparsestreet.bench.timing import Effort
 
     file = _file(options)
     if options.quick:
@@ -99,8 +99,8 @@ def _scaling(options: argparse.Namespace) -> bool:
 
 
 def _gpu(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import gpu
-    from sparsestreet.ops.bench.timing import Effort
+    from sparsestreet.bench import gpu
+    from sparsestreet.bench.timing import Effort
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu" and not options.quick:
