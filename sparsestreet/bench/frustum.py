@@ -22,10 +22,10 @@ def frustum_gaussians(rows: int, camera: Camera, sigma_pixels: float, terms: int
     focal = float(camera.intrinsics[0, 0])
     depth = 2 + 48 * uniform(rows)
     pixels = uniform(rows, 2) * torch.tensor([camera.width, camera.height])
-    centerd = (pixels - torch.tensor([camera.width / 2, camera.height / 2])) / focal
+    centered = (pixels - torch.tensor([camera.width / 2, camera.height / 2])) / focal
     sizes = sigma_pixels * torch.exp(0.5 * torch.randn(rows, 3, generator=generator))
     return Gaussians(
-        torch.cat((centerd * depth[:, None], depth[:, None]), -1),
+        torch.cat((centered * depth[:, None], depth[:, None]), -1),
         torch.randn(rows, 4, generator=generator),
         sizes * depth[:, None] / focal,
         0.05 + 0.9 * uniform(rows),

@@ -85,7 +85,7 @@ def needles_and_giants(size: Size, seed: int = 0) -> BenchScene:
 
 
 def half_masked(street: BenchScene, seed: int = 0) -> BenchScene:
-    """The street with the opacity of a random half of its rows at 0, as a mask leaves it before leave_one_out."""
+    """The street with the opacity of a random half of its rows at 0, as a mask leaves it before they are removed."""
     kept = torch.rand(len(street.gaussians), generator=torch.Generator().manual_seed(seed)) < 0.5
     opacities = torch.where(kept, street.gaussians.opacities, 0.0)
     masked = replace(street.gaussians, opacities=opacities)

@@ -53,7 +53,7 @@ def test_errors_are_against_the_right_truth(swept):
             assert exact > 110  # float32: 3e-6 of a color
         if (record["knob"], record["value"]) == ("alpha_min", "0"):
             assert exact > 80  # the stop alone: at most transmittance_min = 1e-4 of a color
-        if record["knob"] == "blur" and record["scene"] == "random frustum":
+        if record["knob"] == "eps2d" and record["scene"] == "random frustum":
             # Splats of 2 px: another model is further away than a cut-off.
             assert record["model_psnr"] < exact
     for scene in SCENES:
