@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from sparsestreet.bench.fit import Line
-from sparsestreet.bench.pareto import pareto_front
-from sparsestreet.bench.records import Json
+from sparsestreet.evaluation.strict_json import Json
 
 Record = dict[str, Json]
 PlottedPoint = tuple[float, float, Record]
@@ -22,11 +21,13 @@ _STYLES = {
     "default": ("#000000", "o"),
     "alpha_min": ("#0072B2", "o"),
     "max_sigma": ("#56B4E9", "s"),
+    "box": ("#56B4E9", "s"),  # its name in benchmarks/knobs.jsonl
     "box alone": ("#56B4E9", "d"),
     "transmittance_min": ("#009E73", "D"),
     "stop": ("#D55E00", "v"),
     "exclusive stop": ("#D55E00", "<"),
     "eps2d": ("#999999", "h"),
+    "blur": ("#999999", "h"),  # its name in benchmarks/knobs.jsonl
     "half_colors": ("#CC79A7", "P"),
     "depth_bits": ("#E69F00", "^"),
     "effects": ("#117733", ">"),
@@ -87,6 +88,19 @@ def gradient_l2(record: Record) -> float:
     """Relative L2 of the worst parameter group; infinite where one has a zero truth and no zero answer."""
     values = [group["relative_l2"] for group in record["exact"]["gradients"].values()]
     return math.inf if None in values else max(LEAST_ERROR, *values)
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points (cost, error) that are not dominated, by rising cost.
+
+    A point is dominated if another is no worse in both and better in one; of equal points the first is kept.
+    """
+    front, least = [], float("inf")
+    for index in sorted(range(len(points)), key=lambda i: points[i]):
+        if points[index][1] < least:
+            front.append(index)
+            least = points[index][1]
+    return front
 
 
 def _pareto_figure(

@@ -1,32 +1,24 @@
 """Records of measurements: one strict JSON object a line, on disk as soon as it is measured."""
 
 import dataclasses
-import json
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from sparsestreet.evaluation.records import Machine, Source
+from sparsestreet.evaluation.strict_json import Json, json_line, parsed
 from sparsestreet.ops.settings import SplatSettings
-
-Json = None | bool | int | float | str | list | dict
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """On what, from which code and by which command something was measured; no host or user name."""
+    """By which command, on what and from which code something was measured."""
 
     command: str
-    commit: str | None
-    modified: bool | None
-    """Whether tracked files differ from the commit."""
-    processor: str
-    cores: int
     threads: int
-    system: str
-    python: str
-    torch: str
+    machine: Machine
+    source: Source
 
 
 class RecordFile:
@@ -36,57 +28,26 @@ class RecordFile:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("", encoding="utf-8")
         self.path = path
-        self._provenance = encode(provenance, "provenance")
+        self._provenance = provenance
 
-    def write(self, kind: str, record: object) -> dict[str, Json]:
-        """Append a frozen dataclass as one line with its kind, the machine's load and provenance; returns the line.
+    def write(self, kind: str, record: object) -> None:
+        """Append a frozen dataclass as one line with its kind, the machine's load and provenance.
 
-        Raises ValueError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
+        Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
         """
-        load = encode(os.getloadavg()[0], "load")
-        entries = {"kind": kind, **encode(record, kind), "load": load, "provenance": self._provenance}
+        line = {"kind": kind, **vars(record), "load": os.getloadavg()[0], "provenance": self._provenance}
+        text = json_line(line, kind)
         with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entries, allow_nan=False) + "\n")
-        return entries
+            file.write(text + "\n")
 
 
 def read_records(path: Path) -> list[dict[str, Json]]:
-    """All lines of a file. Raises ValueError, naming file and line, for anything that is not strict JSON."""
-    records = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        try:
-            records.append(json.loads(line, parse_constant=_refuse_constant))
-        except ValueError as error:
-            raise ValueError(f"{path}:{number} is no record ({error}): measure again") from error
-    return records
+    """All lines of a file. Raises RecordError, naming file and line, for anything that is not strict JSON."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [parsed(line, f"{path}:{number}") for number, line in enumerate(lines, start=1)]
 
 
-def encode(value: object, where: str) -> Json:
-    """Dataclasses, mappings and sequences as JSON; floats with 6 significant digits, more than any time deserves."""
-    if isinstance(value, SplatSettings):
-        return _settings(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {
-            field.name: encode(getattr(value, field.name), f"{where}.{field.name}")
-            for field in dataclasses.fields(value)
-        }
-    if isinstance(value, Mapping):
-        return {str(key): encode(entry, f"{where}.{key}") for key, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return [encode(entry, f"{where}[{index}]") for index, entry in enumerate(value)]
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float) and math.isfinite(value):
-        return float(f"{value:.6g}")
-    raise ValueError(f"{where} is {value!r}, which JSON has no value for: store None or find the cause")
-
-
-def _settings(settings: SplatSettings) -> dict[str, Json]:
+def settings_entries(settings: SplatSettings) -> dict[str, Json]:
     """All fields; a max_sigma of infinity, which JSON cannot say, is None."""
-    entries = dataclasses.asdict(settings)
-    max_sigma = entries.pop("max_sigma")
-    return {**encode(entries, "settings"), "max_sigma": None if math.isinf(max_sigma) else max_sigma}
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")
+    finite = settings.max_sigma if math.isfinite(settings.max_sigma) else None
+    return dataclasses.asdict(settings) | {"max_sigma": finite}

@@ -10,10 +10,11 @@ from sparsestreet.bench.accuracy import Answer, Errors, answer, errors, image_er
 from sparsestreet.bench.culling import Culling, compare_culling, compare_touched
 from sparsestreet.bench.effects import EffectsName, seen_through
 from sparsestreet.bench.knobs import DEFAULT, FIXED, Point, backend_points
-from sparsestreet.bench.records import RecordFile
+from sparsestreet.bench.records import RecordFile, settings_entries
 from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.tile_sizes import build, with_tiles
 from sparsestreet.bench.timing import Effort, OpTimes, leaves, time_op
+from sparsestreet.evaluation.strict_json import Json
 from sparsestreet.ops.backend import BACKENDS, resolve_backend
 from sparsestreet.ops.cpu.library import tile_size
 from sparsestreet.ops.settings import SplatSettings
@@ -44,7 +45,8 @@ class KnobRecord:
     preset: str | None
     backend: str
     dtype: str
-    settings: SplatSettings
+    settings: dict[str, Json]
+    """Fields of SplatSettings, as ``settings_entries`` writes them."""
     distortion: list[float] | None
     """Of the camera that was timed; the shutter's: translation, then rotation."""
     shutter: list[float] | None
@@ -212,7 +214,7 @@ def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
         preset=point.preset,
         backend=point.backend,
         dtype=str(point.dtype).removeprefix("torch."),
-        settings=point.settings,
+        settings=settings_entries(point.settings),
         distortion=None if lens is None else lens.tolist(),
         shutter=None if shutter is None else [*shutter.translation.tolist(), *shutter.rotation.tolist()],
         skipped=unavailable(scene, point),

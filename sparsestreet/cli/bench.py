@@ -134,16 +134,5 @@ def trained_street(run: Path) -> BenchScene:
 
 
 def _file(options: argparse.Namespace) -> RecordFile:
-    machine, source = this_machine(), this_source()
-    provenance = Provenance(
-        command=options.command,
-        commit=source.commit,
-        modified=source.dirty,
-        processor=machine.processor,
-        cores=machine.cores,
-        threads=torch.get_num_threads(),
-        system=machine.system,
-        python=machine.python,
-        torch=machine.torch,
-    )
+    provenance = Provenance(options.command, torch.get_num_threads(), this_machine(), this_source())
     return RecordFile(options.out / f"{options.mode}.jsonl", provenance)

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparsestreet.bench.accuracy import GradientError, gradient_error, image_error
+from sparsestreet.bench.figures import pareto_front
 from sparsestreet.bench.fit import fit_line
-from sparsestreet.bench.pareto import pareto_front
 from sparsestreet.bench.timing import Effort, spread
 
 

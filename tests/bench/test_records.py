@@ -1,57 +1,72 @@
-"""Records are strict JSON lines that name their code and machine."""
+"""Records are strict JSON lines that name their code and machine; the committed ones can be read and drawn."""
 
 import json
 from dataclasses import dataclass
 from math import inf, nan
+from pathlib import Path
 
 import pytest
 
-from sparsestreet.bench.records import Provenance, RecordFile, encode, read_records
+from sparsestreet.bench.figures import draw_pareto
+from sparsestreet.bench.records import Provenance, RecordFile, read_records, settings_entries
+from sparsestreet.evaluation.records import Machine, Source
+from sparsestreet.evaluation.strict_json import RecordError
 from sparsestreet.ops import SplatSettings
 
-PROVENANCE = Provenance("sparsestreet bench", "abc", False, "a processor", 2, 1, "Linux", "3.12", "2.13")
+MACHINE = Machine(processor="a processor", cores=2, system="Linux", python="3.12", torch="2.13")
+PROVENANCE = Provenance("sparsestreet bench", 1, MACHINE, Source("abc", False))
+COMMITTED = Path(__file__).parents[2] / "benchmarks"
 
 
 @dataclass(frozen=True)
 class Sample:
     name: str
     values: tuple[float, ...]
-    settings: SplatSettings | None = None
 
 
 def test_lines_are_there_as_soon_as_written(tmp_path):
     file = RecordFile(tmp_path / "deep" / "a.jsonl", PROVENANCE)
     file.write("sample", Sample("one", (1.0, 1 / 3)))
     assert len(read_records(file.path)) == 1
-    file.write("sample", Sample("two", (), SplatSettings()))
+    file.write("sample", Sample("two", ()))
     first, second = read_records(file.path)
-    assert first["values"] == [1.0, 0.333333]
-    assert first["kind"] == "sample"
-    assert first["provenance"]["commit"] == "abc"
-    assert second["settings"]["max_sigma"] is None
-    assert second["settings"]["alpha_min"] == pytest.approx(1 / 255, rel=1e-5)
+    assert (first["kind"], first["name"], first["values"]) == ("sample", "one", [1.0, 0.333333])
+    assert first["load"] >= 0
+    assert first["provenance"]["command"] == "sparsestreet bench"
+    assert first["provenance"]["source"]["commit"] == "abc"
+    assert first["provenance"]["machine"]["cores"] == 2
+    assert (second["name"], second["provenance"]) == ("two", first["provenance"])
 
 
-def test_a_finite_box_is_a_number():
-    assert encode(SplatSettings(max_sigma=3.33), "settings")["max_sigma"] == 3.33
+def test_settings_are_numbers_that_json_has():
+    assert settings_entries(SplatSettings(max_sigma=3.33))["max_sigma"] == 3.33
+    entries = settings_entries(SplatSettings())
+    assert entries["max_sigma"] is None
+    assert entries["alpha_min"] == SplatSettings().alpha_min
 
 
 @pytest.mark.parametrize("value", [nan, inf, -inf])
-def test_no_number_without_a_value(tmp_path, value):
+def test_a_number_without_a_value_is_refused_and_nothing_written(tmp_path, value):
     file = RecordFile(tmp_path / "a.jsonl", PROVENANCE)
-    with pytest.raises(ValueError, match=r"sample\.values\[1\] is "):
+    with pytest.raises(RecordError, match=r"sample: values\[1\] is "):
         file.write("sample", Sample("bad", (0.0, value)))
     assert read_records(file.path) == []
-
-
-def test_no_type_without_a_json_value():
-    with pytest.raises(ValueError, match=r"x\.y is <object"):
-        encode({"y": object()}, "x")
 
 
 @pytest.mark.parametrize("text", ['{"a": NaN}', '{"a": 1', "Infinity"])
 def test_a_line_that_is_not_strict_json_is_refused(tmp_path, text):
     path = tmp_path / "a.jsonl"
     path.write_text(json.dumps({"a": 1}) + "\n" + text + "\n")
-    with pytest.raises(ValueError, match=r"a\.jsonl:2 is no record"):
+    with pytest.raises(RecordError, match=r"a\.jsonl:2: is not strict JSON"):
         read_records(path)
+
+
+@pytest.mark.parametrize("mode", ["knobs", "blend", "scaling"])
+def test_committed_records_are_read(mode):
+    records = read_records(COMMITTED / f"{mode}.jsonl")
+    assert records
+    assert all(record["provenance"]["command"].startswith(f"sparsestreet bench {mode}") for record in records)
+
+
+def test_committed_records_are_drawn(tmp_path):
+    assert len(draw_pareto(read_records(COMMITTED / "knobs.jsonl"), tmp_path)) == 4
