@@ -10,7 +10,7 @@ from sparsestreet.bench import torch_tiles
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Cotangent, Effort, OpTimes, Spread, leaves, spread, time_op
+from sparsestreet.bench.timing import Cotangent, OpTimes, Spread, TimingBudget, leaves, spread, time_op
 from sparsestreet.ops.reference import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
@@ -57,32 +57,32 @@ class BlendRecord:
 def run_blend(
     size: Size,
     training: Sequence[Size],
-    effort: Effort,
-    peer_effort: Effort,
+    budget: TimingBudget,
+    peer_budget: TimingBudget,
     file: RecordFile,
     say: Callable[[str], None] = print,
 ) -> None:
     """Time one size beside the peer, then the sizes of training alone."""
-    for record in (_with_peer(size, effort, peer_effort), *(_alone(other, effort) for other in training)):
+    for record in (_with_peer(size, budget, peer_budget), *(_alone(other, budget) for other in training)):
         file.write("blend", record)
         for line in lines(record):
             say(line)
 
 
-def _alone(size: Size, effort: Effort) -> BlendRecord:
+def _alone(size: Size, budget: TimingBudget) -> BlendRecord:
     gaussians, camera = _scene(size)
-    times = time_op(leaves(gaussians, torch.float32), camera, SETTINGS, "cpu", effort)
+    times = time_op(leaves(gaussians, torch.float32), camera, SETTINGS, "cpu", budget)
     return BlendRecord(size.rows, size.width, size.height, times, None, None, None, None)
 
 
-def _with_peer(size: Size, effort: Effort, peer_effort: Effort) -> BlendRecord:
-    alone = _alone(size, effort)
+def _with_peer(size: Size, budget: TimingBudget, peer_budget: TimingBudget) -> BlendRecord:
+    alone = _alone(size, budget)
     gaussians, camera = _scene(size)
     peak = measured_peak()
     flops = {"blend": FORWARD_FLOPS, "blend_backward": BACKWARD_FLOPS}
     return replace(
         alone,
-        peer=time_torch(gaussians, camera, peer_effort),
+        peer=time_torch(gaussians, camera, peer_budget),
         peak_gflops=1e-9 * peak,
         floor_ms={stage: 1e3 * count * (alone.times.samples or 0) / peak for stage, count in flops.items()},
         difference=image_difference(gaussians, camera),
@@ -94,7 +94,7 @@ def _scene(size: Size) -> tuple[Gaussians, Camera]:
     return frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16), camera
 
 
-def time_torch(gaussians: Gaussians, camera: Camera, effort: Effort) -> dict[str, Spread]:
+def time_torch(gaussians: Gaussians, camera: Camera, budget: TimingBudget) -> dict[str, Spread]:
     """Forward alone, and forward + backward, each with the listing of tiles, of splats already on the screen."""
     splats, size = _projected(gaussians, camera), (camera.width, camera.height)
     cotangent = Cotangent.of(camera, gaussians.means).rgb
@@ -106,7 +106,7 @@ def time_torch(gaussians: Gaussians, camera: Camera, effort: Effort) -> dict[str
     def both() -> None:
         torch_tiles.blend_gradients(splats, *size, SETTINGS, cotangent)
 
-    return {"forward": spread(_repeat(forward, effort)), "both": spread(_repeat(both, effort))}
+    return {"forward": spread(_repeat(forward, budget)), "both": spread(_repeat(both, budget))}
 
 
 def image_difference(gaussians: Gaussians, camera: Camera) -> Difference:
@@ -123,7 +123,7 @@ def image_difference(gaussians: Gaussians, camera: Camera) -> Difference:
 def measured_peak(size: int = 2048) -> float:
     """float32 operations per second of a matrix product, the best of several."""
     a, b = torch.randn(size, size), torch.randn(size, size)
-    return 2 * size**3 / min(_repeat(lambda: a @ b, Effort(repeats=5)))
+    return 2 * size**3 / min(_repeat(lambda: a @ b, TimingBudget(repeats=5)))
 
 
 def lines(record: BlendRecord) -> list[str]:
@@ -155,7 +155,7 @@ def _projected(gaussians: Gaussians, camera: Camera) -> Splats:
         return on_screen(gaussians, visible_rows(gaussians, camera, SETTINGS), camera, SETTINGS)
 
 
-def _repeat(call: Callable[[], object], effort: Effort) -> list[float]:
+def _repeat(call: Callable[[], object], budget: TimingBudget) -> list[float]:
     seconds: list[float] = []
 
     def run() -> None:
@@ -163,7 +163,7 @@ def _repeat(call: Callable[[], object], effort: Effort) -> list[float]:
         call()
         seconds.append(time.perf_counter() - start)
 
-    effort.warm_up(run)
+    budget.warm_up(run)
     seconds.clear()
-    effort.runs(run)
+    budget.runs(run)
     return seconds

@@ -17,8 +17,8 @@ from sparsestreet.bench.scenes import Size
 from sparsestreet.bench.timing import (
     Cotangent,
     Draw,
-    Effort,
     Spread,
+    TimingBudget,
     clock_of,
     drop_gradients,
     leaves,
@@ -36,7 +36,7 @@ ROWS = (100_000, 500_000, 1_500_000, 5_000_000)
 IMAGES = ((960, 640), (1920, 1280))
 TRUTH_ROWS = 1_500_000
 """Splats up to which we are compared with float64 on the host: seconds, where the device takes milliseconds."""
-EFFORT = Effort(repeats=30, seconds=8.0, least=20)
+BUDGET = TimingBudget(repeats=30, seconds=8.0, least=20)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class GpuRecord:
 
 
 @dataclass(frozen=True)
-class View:
+class Workload:
     """What is rendered at one size."""
 
     rows: Gaussians
@@ -84,7 +84,11 @@ class View:
 
 
 def run_gpu(
-    sizes: Sequence[Size], device: torch.device, effort: Effort, file: RecordFile, say: Callable[[str], None] = print
+    sizes: Sequence[Size],
+    device: torch.device,
+    budget: TimingBudget,
+    file: RecordFile,
+    say: Callable[[str], None] = print,
 ) -> bool:
     """Measure every size; False if a renderer failed or gsplat disagrees, which ends none of the others."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
@@ -95,7 +99,7 @@ def run_gpu(
         return False
     records = []
     for size in sizes:
-        for record in _measure_size(size, device, name, backend, peer, effort):
+        for record in _measure_size(size, device, name, backend, peer, budget):
             file.write("gpu", record)
             say(line(record))
             records.append(record)
@@ -105,61 +109,61 @@ def run_gpu(
 
 
 def _measure_size(
-    size: Size, device: torch.device, name: str, backend: str, peer: ModuleType | str, effort: Effort
+    size: Size, device: torch.device, name: str, backend: str, peer: ModuleType | str, budget: TimingBudget
 ) -> list[GpuRecord]:
     camera = frustum_camera(size.width, size.height)
     gaussians = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
-    view = View(leaves(gaussians, torch.float32, device), camera)
-    draws: dict[str, Draw] = {f"sparsestreet {backend}": _ours(view, backend)}
+    workload = Workload(leaves(gaussians, torch.float32, device), camera)
+    draws: dict[str, Draw] = {f"sparsestreet {backend}": _ours(workload, backend)}
     if isinstance(peer, ModuleType):
         for packed, mode in ((True, "packed"), (False, "unpacked")):
-            draws[f"gsplat {gsplat_peer.version(peer)} {mode}"] = _theirs(view, peer, packed)
+            draws[f"gsplat {gsplat_peer.version(peer)} {mode}"] = _theirs(workload, peer, packed)
     records = []
     for renderer, draw in draws.items():
-        record = measure(GpuRecord(renderer, name, size.rows, size.width, size.height), draw, view, effort)
+        record = measure(GpuRecord(renderer, name, size.rows, size.width, size.height), draw, workload, budget)
         if isinstance(peer, ModuleType) and renderer.startswith("gsplat"):
-            record = compared(record, partial(gsplat_peer.parity, peer, view.rows, view.camera, backend))
+            record = compared(record, partial(gsplat_peer.parity, peer, workload.rows, workload.camera, backend))
         else:
-            record = _counted(record, view, backend)
+            record = _counted(record, workload, backend)
             if size.rows <= TRUTH_ROWS and find_library() is not None:
-                record = compared(record, partial(_against_truth, view, backend))
+                record = compared(record, partial(_against_truth, workload, backend))
         records.append(record)
     return records
 
 
-def _counted(record: GpuRecord, view: View, backend: str) -> GpuRecord:
+def _counted(record: GpuRecord, workload: Workload, backend: str) -> GpuRecord:
     if record.failed is not None:
         return record
-    pairs, samples = work_of(view.rows, view.camera, gsplat_peer.SETTINGS, backend)
+    pairs, samples = work_of(workload.rows, workload.camera, gsplat_peer.SETTINGS, backend)
     return replace(record, pairs=pairs, samples=samples)
 
 
-def _ours(view: View, backend: str) -> Draw:
+def _ours(workload: Workload, backend: str) -> Draw:
     def draw(rows: Gaussians) -> tuple[Tensor, Tensor]:
-        rendering = splat(rows, view.camera, settings=gsplat_peer.SETTINGS, backend=backend)
+        rendering = splat(rows, workload.camera, settings=gsplat_peer.SETTINGS, backend=backend)
         return rendering.rgb, rendering.alpha
 
     return draw
 
 
-def _theirs(view: View, peer: ModuleType, packed: bool) -> Draw:
-    camera = on_device(view.camera, view.device)
+def _theirs(workload: Workload, peer: ModuleType, packed: bool) -> Draw:
+    camera = on_device(workload.camera, workload.device)
     return lambda rows: gsplat_peer.draw(peer, rows, camera, packed)[:2]
 
 
-def measure(record: GpuRecord, draw: Draw, view: View, effort: Effort) -> GpuRecord:
+def measure(record: GpuRecord, draw: Draw, workload: Workload, budget: TimingBudget) -> GpuRecord:
     """Times, then memory, then stages. An error is put on record: it is a result about this renderer at this size."""
-    cotangent = Cotangent.of(view.camera, view.rows.means)
+    cotangent = Cotangent.of(workload.camera, workload.rows.means)
 
     def step() -> None:
-        cotangent.backward(*draw(view.rows))
-        drop_gradients(view.rows)
+        cotangent.backward(*draw(workload.rows))
+        drop_gradients(workload.rows)
 
     try:
-        effort.warm_up(step)
-        forward, backward = _times(draw, cotangent, view, effort)
-        record = replace(record, forward=forward, backward=backward, inference=_inference(draw, view, effort))
-        if view.device.type == "cuda":
+        budget.warm_up(step)
+        forward, backward = _times(draw, cotangent, workload, budget)
+        record = replace(record, forward=forward, backward=backward, inference=_inference(draw, workload, budget))
+        if workload.device.type == "cuda":
             before, peak = peak_megabytes(step)
             record = replace(record, memory_before=before, memory_peak=peak, stages=kernel_milliseconds(step))
     except Exception as error:  # a peer may raise anything
@@ -176,32 +180,32 @@ def compared(record: GpuRecord, compare: Callable[[], Errors]) -> GpuRecord:
     return replace(record, parity=difference, agrees=gsplat_peer.agrees(difference))
 
 
-def _against_truth(view: View, backend: str) -> Errors:
+def _against_truth(workload: Workload, backend: str) -> Errors:
     """Us on the device against the C++ backend in float64."""
-    settings, kind = gsplat_peer.SETTINGS, view.device.type
-    ours = answer(view.rows, view.camera, settings, backend, torch.float32, kind)
-    return errors(ours, answer(view.rows, view.camera, settings, "cpu", torch.float64))
+    settings, kind = gsplat_peer.SETTINGS, workload.device.type
+    ours = answer(workload.rows, workload.camera, settings, backend, torch.float32, kind)
+    return errors(ours, answer(workload.rows, workload.camera, settings, "cpu", torch.float64))
 
 
-def _times(draw: Draw, cotangent: Cotangent, view: View, effort: Effort) -> tuple[Spread, Spread]:
+def _times(draw: Draw, cotangent: Cotangent, workload: Workload, budget: TimingBudget) -> tuple[Spread, Spread]:
     taken: list[dict[str, float]] = []
-    effort.runs(lambda: taken.append(time_once(draw, cotangent, view.rows)))
+    budget.runs(lambda: taken.append(time_once(draw, cotangent, workload.rows)))
     forward, backward = (spread([times[part] for times in taken]) for part in ("forward", "backward"))
     return forward, backward
 
 
 @torch.no_grad()
-def _inference(draw: Draw, view: View, effort: Effort) -> Spread:
-    clock, seconds = clock_of(view.device), []
+def _inference(draw: Draw, workload: Workload, budget: TimingBudget) -> Spread:
+    clock, seconds = clock_of(workload.device), []
 
     def run() -> None:
         start = clock.mark()
-        draw(view.rows)
+        draw(workload.rows)
         seconds.append(clock.seconds(start, clock.mark()))
 
-    effort.warm_up(run)
+    budget.warm_up(run)
     seconds.clear()
-    effort.runs(run)
+    budget.runs(run)
     return spread(seconds)
 
 

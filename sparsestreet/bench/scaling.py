@@ -11,7 +11,7 @@ from sparsestreet.bench.fit import Line, fit_line
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Effort, OpTimes, leaves, time_op
+from sparsestreet.bench.timing import OpTimes, TimingBudget, leaves, time_op
 from sparsestreet.ops.settings import SplatSettings
 
 ROWS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)
@@ -46,15 +46,15 @@ class FitRecord:
 def run_scaling(
     rows: Sequence[int],
     large: Size | None,
-    effort: Effort,
+    budget: TimingBudget,
     file: RecordFile,
     folder: Path,
     say: Callable[[str], None] = print,
 ) -> None:
     """Time the C++ backend at every number of splats, fit forward and backward, draw."""
-    records = [_measure(sized(count), True, effort, file, say) for count in rows]
+    records = [_measure(sized(count), True, budget, file, say) for count in rows]
     if large is not None:
-        _measure(large, False, effort, file, say)
+        _measure(large, False, budget, file, say)
     pairs = [float(record.times.pairs) for record in records]
     times = {part: [record.times.stages[part].median for record in records] for part in ("forward", "backward")}
     lines = {}
@@ -76,10 +76,12 @@ def sized(rows: int) -> Size:
     return Size(*(max(16, round(factor * side / 16) * 16) for factor in (1.5, 1.0)), rows)
 
 
-def _measure(size: Size, fitted: bool, effort: Effort, file: RecordFile, say: Callable[[str], None]) -> ScalingRecord:
+def _measure(
+    size: Size, fitted: bool, budget: TimingBudget, file: RecordFile, say: Callable[[str], None]
+) -> ScalingRecord:
     camera = frustum_camera(size.width, size.height)
     rows = leaves(frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16), torch.float32)
-    times = time_op(rows, camera, SplatSettings(), "cpu", effort)
+    times = time_op(rows, camera, SplatSettings(), "cpu", budget)
     record = ScalingRecord(size.rows, size.width, size.height, fitted, times)
     file.write("scaling", record)
     stages = times.stages

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
-from sparsestreet.bench.street import street_standin
+from sparsestreet.bench.street import proxy_street
 from sparsestreet.types import Camera, Gaussians
 
 STACK = 400
@@ -34,10 +34,10 @@ class BenchScene:
 
 
 def bench_scenes(size: Size, street: BenchScene | None = None, seed: int = 0) -> list[BenchScene]:
-    """All five; ``street`` is a trained one, which otherwise a stand-in replaces. The same for the same seed."""
+    """All five; ``street`` is a trained one, which otherwise a proxy scene replaces. The same for the same seed."""
     camera = frustum_camera(size.width, size.height)
     if street is None:
-        street = BenchScene("street", "stand-in made of numbers, not trained", street_standin(size.rows), camera)
+        street = BenchScene("street", "proxy scene made of numbers, not trained", proxy_street(size.rows), camera)
     frustum = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16, seed=seed)
     return [
         BenchScene("random frustum", "uniform in the frustum, median sigma 2 px", frustum, camera),
@@ -85,7 +85,7 @@ def needles_and_giants(size: Size, seed: int = 0) -> BenchScene:
 
 
 def half_masked(street: BenchScene, seed: int = 0) -> BenchScene:
-    """The street with the opacity of a random half of its rows at 0, as a mask leaves it before they are removed."""
+    """The street with the opacity of a random half of its rows at 0, as mask training leaves them until they go."""
     kept = torch.rand(len(street.gaussians), generator=torch.Generator().manual_seed(seed)) < 0.5
     opacities = torch.where(kept, street.gaussians.opacities, 0.0)
     masked = replace(street.gaussians, opacities=opacities)

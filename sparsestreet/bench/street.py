@@ -1,4 +1,4 @@
-"""A stand-in for a trained street, made of numbers: same kinds of splats at the same places, but nothing was trained.
+"""A proxy scene for a trained street, made of numbers: splats of the same kinds at the same places, nothing trained.
 
 Camera frame at the origin (x right, y down, z forward, meters), the road 1.6 m below. Splats lie on surfaces as a
 trained street has them: flat on the road and on facades, thin and upright on poles and trunks, small on cars, a few
@@ -19,7 +19,7 @@ _CARS = ((-3.6, 9.0), (3.4, 14.0), (-3.4, 22.0), (3.6, 30.0), (-0.4, 38.0), (3.4
 _SHARES = {"road": 0.3, "facades": 0.4, "cars": 0.15, "poles": 0.1, "adrift": 0.05}
 
 
-def street_standin(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
+def proxy_street(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
     """``rows`` splats with spherical harmonics of ``terms`` terms; float32, the same for the same seed."""
     draw = _Draw(seed, unit=0.9 / math.sqrt(max(1, rows)))
     counts = {name: int(share * rows) for name, share in _SHARES.items()}

@@ -13,7 +13,7 @@ from sparsestreet.bench.knobs import DEFAULT, FIXED, Point, backend_points
 from sparsestreet.bench.records import RecordFile, settings_entries
 from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.tile_sizes import build, with_tiles
-from sparsestreet.bench.timing import Effort, OpTimes, leaves, time_op
+from sparsestreet.bench.timing import OpTimes, TimingBudget, leaves, time_op
 from sparsestreet.evaluation.strict_json import Json
 from sparsestreet.ops.backend import BACKENDS, resolve_backend
 from sparsestreet.ops.cpu.library import tile_size
@@ -22,8 +22,8 @@ from sparsestreet.ops.settings import SplatSettings
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(64, 48, 400)
 """Sizes of a sweep, of a trial, and of the copies that the dense reference bears: there it is timed, and is the oracle
 of truths and culling."""
-EFFORT = Effort(repeats=20, seconds=2.0, least=3)
-QUICK_EFFORT = Effort(repeats=2, seconds=0.1, least=1)
+BUDGET = TimingBudget(repeats=20, seconds=2.0, least=3)
+QUICK_BUDGET = TimingBudget(repeats=2, seconds=0.1, least=1)
 DENSE_SAMPLES = 1 << 28
 """(row, pixel) samples beyond which the dense reference is not timed: it takes about a second for each 10^8."""
 UNBOUNDED_PAIRS = 1 << 26
@@ -122,7 +122,7 @@ def run_sweep(
     scenes: Sequence[BenchScene],
     small: Sequence[BenchScene],
     points: Sequence[Point],
-    effort: Effort,
+    budget: TimingBudget,
     file: RecordFile,
     say: Callable[[str], None] = print,
 ) -> None:
@@ -139,10 +139,10 @@ def run_sweep(
     for scene in small:
         file.write("oracle", check_oracle(scene))
         say(f"\nsmall copy of {title(scene)}")
-        _measure_points(scene, [Point("default", "default", DEFAULT), *backend_points()], effort, "small", file, say)
+        _measure_points(scene, [Point("default", "default", DEFAULT), *backend_points()], budget, "small", file, say)
     for scene in scenes:
         say(f"\n{title(scene)}")
-        _measure_points(scene, points, effort, "knob", file, say)
+        _measure_points(scene, points, budget, "knob", file, say)
     for scene in small:
         culling = compare_culling(scene.gaussians, scene.camera, DEFAULT)
         _write_culling(scene, compare_touched(culling, scene.gaussians, scene.camera, DEFAULT), file, say)
@@ -162,24 +162,29 @@ def title(scene: BenchScene) -> str:
 
 
 def _measure_points(
-    scene: BenchScene, points: Sequence[Point], effort: Effort, kind: str, file: RecordFile, say: Callable[[str], None]
+    scene: BenchScene,
+    points: Sequence[Point],
+    budget: TimingBudget,
+    kind: str,
+    file: RecordFile,
+    say: Callable[[str], None],
 ) -> None:
     truths = Truths(scene)
     for point in points:
-        record = measure_point(scene, point, truths, effort)
+        record = measure_point(scene, point, truths, budget)
         file.write(kind, record)
         say(describe(record))
 
 
-def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effort) -> KnobRecord:
+def measure_point(scene: BenchScene, point: Point, truths: Truths, budget: TimingBudget) -> KnobRecord:
     """Time and error of one point, or why it cannot be had here."""
     record = _unmeasured(scene, point)
     if record.skipped is not None:
         return record
     if point.tile is None:
-        times, value = time_and_answer(seen_through(scene, point.effects), point, effort)
+        times, value = time_and_answer(seen_through(scene, point.effects), point, budget)
     else:
-        times, value = with_tiles(point.tile, time_and_answer, scene, point, effort)
+        times, value = with_tiles(point.tile, time_and_answer, scene, point, budget)
         in_use = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype)
         record = replace(record, tiles_in_use=errors(value, in_use))
     record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs, point.effects)))
@@ -193,11 +198,11 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, effort: Effor
     return replace(record, model_psnr=image_error(exact.image, default.image).psnr)
 
 
-def time_and_answer(scene: BenchScene, point: Point, effort: Effort) -> tuple[OpTimes, Answer]:
+def time_and_answer(scene: BenchScene, point: Point, budget: TimingBudget) -> tuple[OpTimes, Answer]:
     """What is timed, and what it draws."""
     device = "cuda" if point.backend == "triton" else "cpu"
     rows = leaves(scene.gaussians, point.dtype, device)
-    times = time_op(rows, scene.camera, point.settings, point.backend, effort)
+    times = time_op(rows, scene.camera, point.settings, point.backend, budget)
     return times, answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype, device)
 
 

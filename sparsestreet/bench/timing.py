@@ -43,7 +43,7 @@ def spread(seconds: Sequence[float]) -> Spread:
 
 
 @dataclass(frozen=True)
-class Effort:
+class TimingBudget:
     """How long to repeat: ``repeats`` runs, fewer once ``seconds`` are spent, but never fewer than ``least``."""
 
     repeats: int = 20
@@ -58,7 +58,7 @@ class Effort:
             run()
 
     def runs(self, run: Callable[[], None]) -> None:
-        """Call ``run`` as often as the effort allows."""
+        """Call ``run`` as often as the budget allows."""
         start = time.perf_counter()
         for done in range(self.repeats):
             if done >= self.least and time.perf_counter() - start > self.seconds:
@@ -109,7 +109,9 @@ def on_device(camera: Camera, device: str | torch.device) -> Camera:
     )
 
 
-def time_op(gaussians: Gaussians, camera: Camera, settings: SplatSettings, backend: str, effort: Effort) -> OpTimes:
+def time_op(
+    gaussians: Gaussians, camera: Camera, settings: SplatSettings, backend: str, budget: TimingBudget
+) -> OpTimes:
     """Forward and backward of the op on rows that are ``leaves``, again and again."""
     cotangent = Cotangent.of(camera, gaussians.means)
     seconds: dict[str, list[float]] = {}
@@ -123,9 +125,9 @@ def time_op(gaussians: Gaussians, camera: Camera, settings: SplatSettings, backe
         for name, value in (times | stage_seconds(gaussians, backend)).items():
             seconds.setdefault(name, []).append(value)
 
-    effort.warm_up(run)
+    budget.warm_up(run)
     seconds.clear()
-    effort.runs(run)
+    budget.runs(run)
     pairs, samples = work_of(gaussians, camera, settings, backend)
     return OpTimes({name: spread(values) for name, values in seconds.items()}, pairs, samples)
 

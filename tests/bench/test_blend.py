@@ -5,10 +5,10 @@ import pytest
 from sparsestreet.bench import blend
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Effort
+from sparsestreet.bench.timing import TimingBudget
 from tests.bench.test_records import PROVENANCE
 
-ONCE = Effort(repeats=2, seconds=0.0, least=1)
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 
 
 def test_main_size_has_a_peer_and_a_floor(tmp_path, monkeypatch):

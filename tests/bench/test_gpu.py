@@ -1,4 +1,4 @@
-"""The plumbing of device timings and of gsplat beside them, with a stand-in for gsplat: no device needed."""
+"""The plumbing of device timings and of gsplat beside them, with a fake gsplat: no device needed."""
 
 import dataclasses
 from types import ModuleType, SimpleNamespace
@@ -14,12 +14,12 @@ from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.bench.gpu import GpuRecord
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Effort, Spread, leaves
+from sparsestreet.bench.timing import Spread, TimingBudget, leaves
 from sparsestreet.ops import splat
 from sparsestreet.types import Camera, Gaussians
 from tests.bench.test_records import PROVENANCE
 
-ONCE = Effort(repeats=2, seconds=0.0, least=1)
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 CPU = torch.device("cpu")
 # What gsplat 1.5.3's rasterization takes, of which we use these.
 TAKES = {
@@ -28,7 +28,7 @@ TAKES = {
 }
 
 
-def stand_in(brightness: float = 1.0) -> ModuleType:
+def fake_gsplat(brightness: float = 1.0) -> ModuleType:
     """A module with gsplat's signature that renders with our op."""
 
     def rasterization(**given):
@@ -54,19 +54,19 @@ def rows() -> Gaussians:
 
 
 def test_the_same_image_agrees(rows):
-    found = gsplat_peer.parity(stand_in(), rows, frustum_camera(48, 32), "cpu")
+    found = gsplat_peer.parity(fake_gsplat(), rows, frustum_camera(48, 32), "cpu")
     assert found.image.psnr is None
     assert gsplat_peer.agrees(found)
     assert rows.means.grad is None
-    assert gsplat_peer.draw(stand_in(), rows, frustum_camera(48, 32), packed=True)[2] == 7
+    assert gsplat_peer.draw(fake_gsplat(), rows, frustum_camera(48, 32), packed=True)[2] == 7
 
 
 def test_another_image_or_another_gradient_disagrees(rows):
-    found = gsplat_peer.parity(stand_in(brightness=1.02), rows, frustum_camera(48, 32), "cpu")
+    found = gsplat_peer.parity(fake_gsplat(brightness=1.02), rows, frustum_camera(48, 32), "cpu")
     assert not gsplat_peer.agrees(found)
     assert found.gradients["sh"].relative_l2 == pytest.approx(0.02, rel=1e-3)
     # A thousandth of the colors is within the limits.
-    slight = gsplat_peer.parity(stand_in(brightness=1.001), rows, frustum_camera(48, 32), "cpu")
+    slight = gsplat_peer.parity(fake_gsplat(brightness=1.001), rows, frustum_camera(48, 32), "cpu")
     assert gsplat_peer.agrees(slight)
 
 
@@ -90,13 +90,13 @@ def test_gsplat_is_looked_for_on_a_cuda_device_only(monkeypatch):
     assert "CUDA" in gsplat_peer.find_gsplat(CPU)
     monkeypatch.setitem(__import__("sys").modules, "gsplat", None)  # makes the import fail
     assert "cannot be imported" in gsplat_peer.find_gsplat(torch.device("cuda"))
-    module = stand_in()
+    module = fake_gsplat()
     monkeypatch.setitem(__import__("sys").modules, "gsplat", module)
     assert gsplat_peer.find_gsplat(torch.device("cuda")) is module
 
 
 def test_both_renderers_get_a_record(tmp_path, monkeypatch):
-    module = stand_in()
+    module = fake_gsplat()
     monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
     file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
     assert gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20)], CPU, ONCE, file, said.append)
@@ -118,7 +118,7 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
 
 
 def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
-    module = stand_in()
+    module = fake_gsplat()
 
     def broken(**given):
         raise RuntimeError("no kernel image is available\nmore")
@@ -134,7 +134,7 @@ def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
 
 
 def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
-    module = stand_in(brightness=0.9)
+    module = fake_gsplat(brightness=0.9)
     monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
     said: list[str] = []
     assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, RecordFile(tmp_path / "g.jsonl", PROVENANCE), said.append)

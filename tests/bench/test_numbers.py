@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sparsestreet.bench.accuracy import GradientError, gradient_error, image_error
 from sparsestreet.bench.figures import pareto_front
 from sparsestreet.bench.fit import fit_line
-from sparsestreet.bench.timing import Effort, spread
+from sparsestreet.bench.timing import TimingBudget, spread
 
 
 def test_line_through_points_on_it():
@@ -59,17 +59,17 @@ def test_spread_by_hand():
     assert spread([0.25]).iqr is None
 
 
-def test_effort_stops_at_repeats_and_at_time_but_not_before_the_least():
+def test_budget_stops_at_repeats_and_at_time_but_not_before_the_least():
     counted: list[int] = []
-    Effort(repeats=4).runs(lambda: counted.append(1))
+    TimingBudget(repeats=4).runs(lambda: counted.append(1))
     assert len(counted) == 4
     counted.clear()
-    Effort(repeats=9, seconds=0.0, least=2).runs(lambda: counted.append(1))
+    TimingBudget(repeats=9, seconds=0.0, least=2).runs(lambda: counted.append(1))
     assert len(counted) == 2
     counted.clear()
-    Effort(seconds=0.0).warm_up(lambda: counted.append(1))
+    TimingBudget(seconds=0.0).warm_up(lambda: counted.append(1))
     assert len(counted) == 1
-    Effort().warm_up(lambda: counted.append(1))
+    TimingBudget().warm_up(lambda: counted.append(1))
     assert len(counted) == 3
 
 

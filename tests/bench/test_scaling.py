@@ -5,7 +5,7 @@ import pytest
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scaling import DENSITY, ROWS, run_scaling, sized
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Effort
+from sparsestreet.bench.timing import TimingBudget
 from tests.bench.test_records import PROVENANCE
 
 
@@ -20,7 +20,7 @@ def test_density_is_the_same_at_every_size():
 
 def test_a_line_through_small_sizes(tmp_path):
     file, said = RecordFile(tmp_path / "scaling.jsonl", PROVENANCE), []
-    run_scaling((300, 1200), Size(64, 48, 500), Effort(repeats=2, least=1), file, tmp_path, said.append)
+    run_scaling((300, 1200), Size(64, 48, 500), TimingBudget(repeats=2, least=1), file, tmp_path, said.append)
     records = read_records(file.path)
     assert [record["kind"] for record in records] == ["scaling"] * 3 + ["fit"] * 2
     small, large, beside = records[:3]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.bench.scenes import STACK, Size, bench_scenes, deep_stack, needles_and_giants
-from sparsestreet.bench.street import street_standin
+from sparsestreet.bench.street import proxy_street
 from sparsestreet.ops import SplatSettings, contribution
 from sparsestreet.ops.reference import visible_rows
 
@@ -51,7 +51,7 @@ def test_half_of_the_street_is_masked_and_nothing_else_changes():
     assert "not trained" in street.source
 
 
-def test_a_given_street_takes_the_place_of_the_stand_in():
+def test_a_given_street_takes_the_place_of_the_proxy():
     street = replace(bench_scenes(SIZE)[3], name="trained street", source="trained: a run")
     *_, kept, masked = bench_scenes(SIZE, street)
     assert kept is street
@@ -59,11 +59,11 @@ def test_a_given_street_takes_the_place_of_the_stand_in():
 
 
 @pytest.mark.parametrize("rows", [0, 1, 7, 500])
-def test_stand_in_has_as_many_rows_as_asked_for(rows):
-    assert len(street_standin(rows, terms=4)) == rows
+def test_proxy_has_as_many_rows_as_asked_for(rows):
+    assert len(proxy_street(rows, terms=4)) == rows
 
 
-def test_most_of_the_stand_in_is_seen():
+def test_most_of_the_proxy_is_seen():
     street = bench_scenes(SIZE)[3]
     visible = visible_rows(street.gaussians, street.camera, SplatSettings())
     assert len(visible) > 0.6 * SIZE.rows

@@ -8,11 +8,11 @@ from sparsestreet.bench.accuracy import answer, errors
 from sparsestreet.bench.knobs import DEFAULT, Point, points
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import Size, bench_scenes
-from sparsestreet.bench.timing import Effort
+from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.ops import SplatSettings
 from tests.bench.test_records import PROVENANCE
 
-ONCE = Effort(repeats=2, seconds=0.0, least=1)
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 SCENES = bench_scenes(Size(48, 32, 120))
 EXACT = SplatSettings.preset("exact")
 

@@ -9,10 +9,10 @@ from sparsestreet.bench import sweep, tile_sizes
 from sparsestreet.bench.knobs import DEFAULT, Point
 from sparsestreet.bench.scenes import Size, bench_scenes
 from sparsestreet.bench.tile_sizes import ROOT, Build, build, with_tiles
-from sparsestreet.bench.timing import Effort
+from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.ops.cpu.library import tile_size
 
-ONCE = Effort(repeats=2, seconds=0.0, least=1)
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 
 
 def test_the_library_in_use_is_not_compiled_again(monkeypatch):

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
-from sparsestreet.bench.timing import Cotangent, Effort, leaves, time_op, work_of
+from sparsestreet.bench.timing import Cotangent, TimingBudget, leaves, time_op, work_of
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.cpu.rasterizer import rasterize
 
 CAMERA = frustum_camera(48, 32)
 GAUSSIANS = frustum_gaussians(80, CAMERA, sigma_pixels=2.0, terms=4)
-ONCE = Effort(repeats=2, seconds=0.0, least=1)
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 
 
 def test_leaves_are_copies_that_collect_gradients():
