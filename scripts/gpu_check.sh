@@ -150,11 +150,11 @@ run_tests() {
   # Without beartype the shape annotations are not checked and the project's filters, which name it, cannot be read.
   has beartype || options+=(-o "addopts=-q --strict-markers" -o "filterwarnings=default")
   if [ "$DRY" = 1 ]; then
-    echo "(a device would run all of tests/ops)"
-    run_part tests 120 "$OUT/tests.log" "$PYTHON" -m pytest "${options[@]}" tests/ops/bench tests/ops/test_errors.py
+    echo "(a device would run all of tests/ops and tests/bench)"
+    run_part tests 120 "$OUT/tests.log" "$PYTHON" -m pytest "${options[@]}" tests/bench tests/ops/test_errors.py
   else
     ! has xdist || options+=(-n 4)
-    run_part tests 120 "$OUT/tests.log" "$PYTHON" -m pytest "${options[@]}" tests/ops
+    run_part tests 120 "$OUT/tests.log" "$PYTHON" -m pytest "${options[@]}" tests/ops tests/bench
   fi
   has beartype || row tests note 0 "no beartype: shapes and types were not checked"
   sed -n 's/^left out: //p' "$OUT/tests.log" 2>/dev/null | while read -r file; do row tests "left out" 0 "$file"; done

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import torch
 
+from sparsestreet.bench.records import Provenance, RecordFile
+from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.evaluation.provenance import this_machine, this_source
-from sparsestreet.ops.bench.records import Provenance, RecordFile
-from sparsestreet.ops.bench.scenes import BenchScene, Size
 
 EXAMPLES = """\
 examples:
-  sparsestreet bench                            knobs, on five scenes; the street is a stand-in made of numbers
+  sparsestreet bench                            knobs, on five scenes; the street is a proxy scene made of numbers
   sparsestreet bench knobs --street RUN         the street of a run that train wrote; its exact images take minutes
   sparsestreet bench knobs --quick              the same at sizes that take seconds: to see that it runs
   sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
@@ -55,9 +55,9 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
 
 
 def _knobs(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import figures, knobs, sweep
-    from sparsestreet.ops.bench.records import read_records
-    from sparsestreet.ops.bench.scenes import bench_scenes
+    from sparsestreet.bench import figures, knobs, sweep
+    from sparsestreet.bench.records import read_records
+    from sparsestreet.bench.scenes import bench_scenes
 
     street = None if options.street is None else trained_street(options.street)
     size = sweep.QUICK if options.quick else sweep.FULL
@@ -66,7 +66,7 @@ def _knobs(options: argparse.Namespace) -> bool:
         bench_scenes(size, street),
         bench_scenes(sweep.SMALL),
         knobs.points(),
-        sweep.QUICK_EFFORT if options.quick else sweep.EFFORT,
+        sweep.QUICK_BUDGET if options.quick else sweep.BUDGET,
         file,
     )
     for path in figures.draw_pareto(read_records(file.path), options.out):
@@ -75,40 +75,40 @@ def _knobs(options: argparse.Namespace) -> bool:
 
 
 def _blend(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import blend
-    from sparsestreet.ops.bench.timing import Effort
+    from sparsestreet.bench import blend
+    from sparsestreet.bench.timing import TimingBudget
 
     if options.quick:
-        once = Effort(repeats=2, least=1)
+        once = TimingBudget(repeats=2, least=1)
         blend.run_blend(Size(64, 48, 300), [Size(48, 32, 200)], once, once, _file(options))
     else:
-        blend.run_blend(blend.MAIN, blend.TRAINING, Effort(), Effort(repeats=3), _file(options))
+        blend.run_blend(blend.MAIN, blend.TRAINING, TimingBudget(), TimingBudget(repeats=3), _file(options))
     return True
 
 
 def _scaling(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import scaling
-    from sparsestreet.ops.bench.timing import Effort
+    from sparsestreet.bench import scaling
+    from sparsestreet.bench.timing import TimingBudget
 
     file = _file(options)
     if options.quick:
-        scaling.run_scaling((200, 400, 800), None, Effort(repeats=2, least=1), file, options.out)
+        scaling.run_scaling((200, 400, 800), None, TimingBudget(repeats=2, least=1), file, options.out)
     else:
-        scaling.run_scaling(scaling.ROWS, scaling.LARGE, Effort(seconds=15.0, least=5), file, options.out)
+        scaling.run_scaling(scaling.ROWS, scaling.LARGE, TimingBudget(seconds=15.0, least=5), file, options.out)
     return True
 
 
 def _gpu(options: argparse.Namespace) -> bool:
-    from sparsestreet.ops.bench import gpu
-    from sparsestreet.ops.bench.timing import Effort
+    from sparsestreet.bench import gpu
+    from sparsestreet.bench.timing import TimingBudget
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu" and not options.quick:
         raise SystemExit("sparsestreet bench gpu: no CUDA device is available; --quick runs it on the CPU, tiny")
     sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
     if options.quick:
-        return gpu.run_gpu([Size(64, 48, 500)], device, Effort(repeats=2, least=1), _file(options))
-    return gpu.run_gpu(sizes, device, gpu.EFFORT, _file(options))
+        return gpu.run_gpu([Size(64, 48, 500)], device, TimingBudget(repeats=2, least=1), _file(options))
+    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options))
 
 
 def trained_street(run: Path) -> BenchScene:
@@ -134,16 +134,5 @@ def trained_street(run: Path) -> BenchScene:
 
 
 def _file(options: argparse.Namespace) -> RecordFile:
-    machine, source = this_machine(), this_source()
-    provenance = Provenance(
-        command=options.command,
-        commit=source.commit,
-        modified=source.dirty,
-        processor=machine.processor,
-        cores=machine.cores,
-        threads=torch.get_num_threads(),
-        system=machine.system,
-        python=machine.python,
-        torch=machine.torch,
-    )
+    provenance = Provenance(options.command, torch.get_num_threads(), this_machine(), this_source())
     return RecordFile(options.out / f"{options.mode}.jsonl", provenance)

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from sparsestreet.evaluation.metrics import image as metrics
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
+from sparsestreet.metrics import image as metrics
 from sparsestreet.types import Frame
 
 

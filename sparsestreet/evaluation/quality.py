@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from sparsestreet.evaluation.metrics.definitions import DEFINITIONS, PSNR_CAP, QUANTITIES, REGIONS, metric_id
+from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, QUANTITIES, REGIONS, metric_id
 
 
 @dataclass(frozen=True)

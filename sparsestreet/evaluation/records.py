@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.evaluation.metrics.definitions import QUANTITIES, REGIONS, metric_id
 from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
 from sparsestreet.evaluation.strict_json import RecordError, read_json, significant, write_atomically, write_json
+from sparsestreet.metrics.definitions import QUANTITIES, REGIONS, metric_id
 
 FORMAT = 1
 """Version of ``summary.json``; raised when a key changes its meaning."""

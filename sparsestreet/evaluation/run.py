@@ -9,7 +9,6 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.evaluation.evaluate import RenderedImage, clamped_render, evaluate_frames
-from sparsestreet.evaluation.metrics.definitions import DEFINITIONS
 from sparsestreet.evaluation.pictures import KINDS, Legend, Picture, picture_sheet, write_picture, write_png
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, summarize
@@ -25,6 +24,7 @@ from sparsestreet.evaluation.records import (
     write_summary,
 )
 from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.ops import Guards
 from sparsestreet.types import Frame
 

@@ -40,17 +40,26 @@ def write_json(path: Path, value: object) -> None:
     write_atomically(path, text + "\n")
 
 
+def json_line(value: object, where: str) -> str:
+    """A frozen dataclass or a mapping as one line of JSON, without its end; numbers and errors as ``write_json``."""
+    return json.dumps(_encoded(value, where), allow_nan=False)
+
+
 def read_json(path: Path, kind: type[Record]) -> Record:
     """Read a dataclass back, every type checked. Raises RecordError naming the file and the entry."""
     try:
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, UnicodeDecodeError) as error:
         raise RecordError(f"{path}: cannot be read ({error}); write the record again") from error
+    return _decoded(kind, parsed(text, str(path)), str(path))
+
+
+def parsed(text: str, where: str) -> Json:
+    """The value of a JSON text. Raises RecordError, naming ``where`` it stands, for a NaN or anything not strict."""
     try:
-        value = json.loads(text, parse_constant=_refuse_constant)
+        return json.loads(text, parse_constant=_refuse_constant)
     except ValueError as error:
-        raise RecordError(f"{path}: is not strict JSON ({error}); write the record again") from error
-    return _decoded(kind, value, str(path))
+        raise RecordError(f"{where}: is not strict JSON ({error}); write the record again") from error
 
 
 def significant(value: float, where: str) -> float:

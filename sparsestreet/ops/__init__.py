@@ -1,4 +1,12 @@
-"""The splat op: one signature, a dense reference, a fast CPU backend and a Triton one."""
+"""The splat op: one signature, a dense reference, a fast CPU backend and a Triton one. In reading order:
+
+1. the signature: Gaussians and a camera in, a differentiable Rendering out (``splat``), its knobs (``settings``), what
+   it demands of its inputs (``validate``) and which rows it does not draw (``guards``);
+2. the backends: which one runs (``backend``), what each hands back (``raster``), the truth (``reference``), C++
+   (``cpu``), GPUs (``triton``); ``spherical_harmonics`` is the formula that all of them follow;
+3. steps of training in torch and as one fused kernel (``fused`` chooses): D-SSIM (``ssim``, its window in
+   ``ssim_window``) and Adam of the rows that were seen (``visible_adam``).
+"""
 
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.guards import Guards, guards

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torchmetrics.aggregation import RunningMean
 
-from sparsestreet.evaluation.metrics.image import psnr
+from sparsestreet.metrics.image import psnr
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState

@@ -5,11 +5,11 @@ import json
 import pytest
 import torch
 
+from sparsestreet.bench import gpu, scaling
 from sparsestreet.cli.assemble import assemble
 from sparsestreet.cli.bench import bench, trained_street
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.ops import splat
-from sparsestreet.ops.bench import gpu, scaling
 
 
 def test_help_teaches_by_example(capsys):

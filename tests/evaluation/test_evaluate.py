@@ -10,8 +10,8 @@ import torch
 from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.metrics.definitions import DEFINITIONS
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality, summarize
+from sparsestreet.metrics.definitions import DEFINITIONS
 from tests.evaluation.frames import make_frame
 
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from sparsestreet.bench import sweep
+from sparsestreet.bench.knobs import DEFAULT, Point
+from sparsestreet.bench.scenes import Size, bench_scenes
+from sparsestreet.bench.tile_sizes import build, with_tiles
+from sparsestreet.bench.timing import TimingBudget, work_of
 from sparsestreet.ops import SplatSettings
-from sparsestreet.ops.bench import sweep
-from sparsestreet.ops.bench.knobs import DEFAULT, Point
-from sparsestreet.ops.bench.scenes import Size, bench_scenes
-from sparsestreet.ops.bench.tile_sizes import build, with_tiles
-from sparsestreet.ops.bench.timing import Effort, work_of
 from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.ops.cpu.library import load_library, tile_size
 from sparsestreet.types import Gaussians
@@ -28,7 +28,7 @@ from tests.ops.scenes import (
     with_threads,
 )
 
-ONCE = Effort(repeats=2, seconds=0.0, least=1)
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 # Not the order in which a pixel blends, only where a distance is rounded depends on the tile: images of colors below
 # about 2. Gradients are summed tile by tile, in another order.
 IMAGE_BAR = {torch.float32: 1e-6, torch.float64: 1e-14}

@@ -1,4 +1,13 @@
-"""Synthetic streets: a ray-traced drive with exact truth, written as a log on disk."""
+"""Synthetic streets: a ray-traced drive with exact truth, written as a log on disk. In reading order:
+
+1. what is asked for: ``settings``; ``open`` makes a street when it is first needed, ``street`` writes it whole or not
+   at all;
+2. the world: what stands where and who moves how (``world``, ``layout``, ``motion``), things built from parts
+   (``models``, ``parts``), convex solids (``shapes``);
+3. how it looks: ``textures`` with ``coverage`` and ``noise``, light (``sky``, ``shading``);
+4. one instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
+   ``lidar``), all of it to pictures and truth (``render``), frames to disk (``write``).
+"""
 
 from sparsestreet.data.synthetic.open import open_street
 from sparsestreet.data.synthetic.settings import StreetSettings

@@ -1,0 +1,237 @@
+"""``sparsestreet bench gpu``: stage times and peak memory at sizes of real scenes, gsplat beside it in the same run."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from sparsestreet.bench import gsplat_peer
+from sparsestreet.bench.accuracy import Errors, answer, errors
+from sparsestreet.bench.device_profile import kernel_milliseconds, peak_megabytes
+from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.bench.records import RecordFile
+from sparsestreet.bench.scenes import Size
+from sparsestreet.bench.timing import (
+    Cotangent,
+    Draw,
+    Spread,
+    TimingBudget,
+    clock_of,
+    drop_gradients,
+    leaves,
+    on_device,
+    spread,
+    time_once,
+    work_of,
+)
+from sparsestreet.ops.backend import resolve_backend
+from sparsestreet.ops.cpu.library import find_library
+from sparsestreet.ops.splat import splat
+from sparsestreet.types import Camera, Gaussians
+
+ROWS = (100_000, 500_000, 1_500_000, 5_000_000)
+IMAGES = ((960, 640), (1920, 1280))
+TRUTH_ROWS = 1_500_000
+"""Splats up to which we are compared with float64 on the host: seconds, where the device takes milliseconds."""
+BUDGET = TimingBudget(repeats=30, seconds=8.0, least=20)
+
+
+@dataclass(frozen=True)
+class GpuRecord:
+    """One renderer at one size. Times are milliseconds, memory is MB (10^6 bytes)."""
+
+    renderer: str
+    device: str
+    rows: int
+    width: int
+    height: int
+    pairs: int | None = None
+    """(splat, tile) pairs, and (splat, pixel) samples of the forward pass; None for gsplat."""
+    samples: int | None = None
+    failed: str | None = None
+    """Why a measurement is missing; what was measured before it stands."""
+    inference: Spread | None = None
+    """Forward without gradients."""
+    forward: Spread | None = None
+    backward: Spread | None = None
+    stages: dict[str, Spread] | None = None
+    """Device time of the kernels of one forward and backward by stage; None without a CUDA device."""
+    memory_before: float | None = None
+    memory_peak: float | None = None
+    """Most during one forward and backward; includes what lay there before: the Gaussians."""
+    parity: Errors | None = None
+    """gsplat against us; us against the C++ backend in float64, where it is built and the splats are not too many."""
+    agrees: bool | None = None
+
+    @property
+    def ok(self) -> bool:
+        return self.failed is None and self.agrees is not False
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What is rendered at one size."""
+
+    rows: Gaussians
+    camera: Camera
+
+    @property
+    def device(self) -> torch.device:
+        return self.rows.means.device
+
+
+def run_gpu(
+    sizes: Sequence[Size],
+    device: torch.device,
+    budget: TimingBudget,
+    file: RecordFile,
+    say: Callable[[str], None] = print,
+) -> bool:
+    """Measure every size; False if a renderer failed or gsplat disagrees, which ends none of the others."""
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
+    backend, peer = resolve_backend("auto", device), gsplat_peer.find_gsplat(device)
+    say(f"{name}; backend {backend}; {peer if isinstance(peer, str) else 'gsplat ' + gsplat_peer.version(peer)}")
+    if device.type == "cuda" and backend == "reference":
+        say("nothing is measured: the dense reference would take hours at these sizes; install triton")
+        return False
+    records = []
+    for size in sizes:
+        for record in _measure_size(size, device, name, backend, peer, budget):
+            file.write("gpu", record)
+            say(line(record))
+            records.append(record)
+    good = sum(record.ok for record in records)
+    say(f"{good} of {len(records)} measured and in agreement")
+    return good == len(records)
+
+
+def _measure_size(
+    size: Size, device: torch.device, name: str, backend: str, peer: ModuleType | str, budget: TimingBudget
+) -> list[GpuRecord]:
+    camera = frustum_camera(size.width, size.height)
+    gaussians = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
+    workload = Workload(leaves(gaussians, torch.float32, device), camera)
+    draws: dict[str, Draw] = {f"sparsestreet {backend}": _ours(workload, backend)}
+    if isinstance(peer, ModuleType):
+        for packed, mode in ((True, "packed"), (False, "unpacked")):
+            draws[f"gsplat {gsplat_peer.version(peer)} {mode}"] = _theirs(workload, peer, packed)
+    records = []
+    for renderer, draw in draws.items():
+        record = measure(GpuRecord(renderer, name, size.rows, size.width, size.height), draw, workload, budget)
+        if isinstance(peer, ModuleType) and renderer.startswith("gsplat"):
+            record = compared(record, partial(gsplat_peer.parity, peer, workload.rows, workload.camera, backend))
+        else:
+            record = _counted(record, workload, backend)
+            if size.rows <= TRUTH_ROWS and find_library() is not None:
+                record = compared(record, partial(_against_truth, workload, backend))
+        records.append(record)
+    return records
+
+
+def _counted(record: GpuRecord, workload: Workload, backend: str) -> GpuRecord:
+    if record.failed is not None:
+        return record
+    pairs, samples = work_of(workload.rows, workload.camera, gsplat_peer.SETTINGS, backend)
+    return replace(record, pairs=pairs, samples=samples)
+
+
+def _ours(workload: Workload, backend: str) -> Draw:
+    def draw(rows: Gaussians) -> tuple[Tensor, Tensor]:
+        rendering = splat(rows, workload.camera, settings=gsplat_peer.SETTINGS, backend=backend)
+        return rendering.rgb, rendering.alpha
+
+    return draw
+
+
+def _theirs(workload: Workload, peer: ModuleType, packed: bool) -> Draw:
+    camera = on_device(workload.camera, workload.device)
+    return lambda rows: gsplat_peer.draw(peer, rows, camera, packed)[:2]
+
+
+def measure(record: GpuRecord, draw: Draw, workload: Workload, budget: TimingBudget) -> GpuRecord:
+    """Times, then memory, then stages. An error is put on record: it is a result about this renderer at this size."""
+    cotangent = Cotangent.of(workload.camera, workload.rows.means)
+
+    def step() -> None:
+        cotangent.backward(*draw(workload.rows))
+        drop_gradients(workload.rows)
+
+    try:
+        budget.warm_up(step)
+        forward, backward = _times(draw, cotangent, workload, budget)
+        record = replace(record, forward=forward, backward=backward, inference=_inference(draw, workload, budget))
+        if workload.device.type == "cuda":
+            before, peak = peak_megabytes(step)
+            record = replace(record, memory_before=before, memory_peak=peak, stages=kernel_milliseconds(step))
+    except Exception as error:  # a peer may raise anything
+        return replace(record, failed=_reason(error))
+    return record
+
+
+def compared(record: GpuRecord, compare: Callable[[], Errors]) -> GpuRecord:
+    """The record with its differences, or with the reason why there are none."""
+    try:
+        difference = compare()
+    except Exception as error:  # a peer may raise anything
+        return replace(record, failed=record.failed or _reason(error))
+    return replace(record, parity=difference, agrees=gsplat_peer.agrees(difference))
+
+
+def _against_truth(workload: Workload, backend: str) -> Errors:
+    """Us on the device against the C++ backend in float64."""
+    settings, kind = gsplat_peer.SETTINGS, workload.device.type
+    ours = answer(workload.rows, workload.camera, settings, backend, torch.float32, kind)
+    return errors(ours, answer(workload.rows, workload.camera, settings, "cpu", torch.float64))
+
+
+def _times(draw: Draw, cotangent: Cotangent, workload: Workload, budget: TimingBudget) -> tuple[Spread, Spread]:
+    taken: list[dict[str, float]] = []
+    budget.runs(lambda: taken.append(time_once(draw, cotangent, workload.rows)))
+    forward, backward = (spread([times[part] for times in taken]) for part in ("forward", "backward"))
+    return forward, backward
+
+
+@torch.no_grad()
+def _inference(draw: Draw, workload: Workload, budget: TimingBudget) -> Spread:
+    clock, seconds = clock_of(workload.device), []
+
+    def run() -> None:
+        start = clock.mark()
+        draw(workload.rows)
+        seconds.append(clock.seconds(start, clock.mark()))
+
+    budget.warm_up(run)
+    seconds.clear()
+    budget.runs(run)
+    return spread(seconds)
+
+
+def _reason(error: Exception) -> str:
+    text = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {text[0] if text else 'no message'}"
+
+
+def line(record: GpuRecord) -> str:
+    """One row of the table: medians, and how far apart the quartiles are."""
+    start = f"{record.renderer:<24}{record.rows:>9} {record.width}x{record.height:<6}"
+    if record.forward is None or record.backward is None:
+        return f"{start} FAILED: {record.failed}"
+    inference = _short(record.inference) if record.inference else "-"
+    text = f"{start} forward {_short(record.forward)}  backward {_short(record.backward)}  no grad {inference} ms"
+    if record.samples is not None:
+        text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
+    if record.memory_peak is not None:
+        text += f"  peak {record.memory_peak:7.0f} MB"
+    if record.stages:
+        text += "  [" + ", ".join(f"{name} {_short(value)}" for name, value in record.stages.items()) + "]"
+    if record.parity is not None:
+        psnr = record.parity.image.psnr
+        text += f"  {'agrees' if record.agrees else 'DISAGREES'}: {'equal' if psnr is None else f'{psnr:.1f} dB'}"
+    return text + (f"  FAILED: {record.failed}" if record.failed else "")
+
+
+def _short(value: Spread) -> str:
+    return f"{value.median:.3f}" + ("" if value.iqr is None else f" (iqr {value.iqr:.3f})")

@@ -1,0 +1,86 @@
+"""gsplat on the same splats: its rasterization with our semantics matched to it, timed and checked for parity.
+
+Written for gsplat 1.5.3, the newest release on PyPI. It lacks what its repository has since then: exact ellipse-tile
+intersection, the clamp at 0.99 and the kernel work of 2026. A comparison with 1.5.3 says nothing about those.
+"""
+
+import importlib
+from types import ModuleType
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.bench.accuracy import Errors, answer, collect, errors
+from sparsestreet.bench.timing import Cotangent, drop_gradients
+from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.types import Camera, Gaussians
+
+SETTINGS = SplatSettings.preset("gsplat15")
+"""What we render with beside it: its clamp, stop rule and near plane."""
+LEAST_PSNR = 60.0
+"""dB. Fast-math exponentials move a sample over the cut-off 1/255 in some pixels; if every thousandth pixel changed by
+1/255 that would be 78 dB."""
+LARGEST_GRADIENT_ERROR = 5e-3
+"""Relative L2 of a group. gsplat recovers transmittance from 1 - alpha, by division: up to 2e-3 in saturated pixels."""
+
+
+def find_gsplat(device: torch.device) -> ModuleType | str:
+    """The module, or why it cannot be timed here."""
+    if device.type != "cuda":
+        return "gsplat needs a CUDA device"
+    try:
+        return importlib.import_module("gsplat")
+    except ImportError as error:
+        return f"gsplat cannot be imported: {error}"
+
+
+def version(module: ModuleType) -> str:
+    """Its version, or "unknown"."""
+    return getattr(module, "__version__", "unknown")
+
+
+def draw(
+    module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
+) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], int]:
+    """Color (premultiplied), alpha and the number of (splat, tile) pairs.
+
+    ``absgrad`` is on, as our op always sums absolute screen gradients; ``packed`` trades time for memory.
+    """
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.sh.shape[1]]
+    colors, alphas, meta = module.rasterization(
+        means=gaussians.means,
+        quats=gaussians.quaternions,
+        scales=gaussians.scales,
+        opacities=gaussians.opacities,
+        colors=gaussians.sh,
+        viewmats=camera.camera_from_world.to(gaussians.means)[None],
+        Ks=camera.intrinsics.to(gaussians.means)[None],
+        width=camera.width,
+        height=camera.height,
+        near_plane=SETTINGS.near_plane,
+        eps2d=SETTINGS.eps2d,
+        sh_degree=degree,
+        packed=packed,
+        absgrad=True,
+        rasterize_mode="antialiased" if SETTINGS.antialias else "classic",
+    )
+    return colors[0], alphas[0, ..., 0], int(meta["flatten_ids"].shape[0])
+
+
+def parity(module: ModuleType, rows: Gaussians, camera: Camera, backend: str) -> Errors:
+    """gsplat's image and gradients against those of our ``backend``; leaves no gradient in ``rows``."""
+    drop_gradients(rows)
+    rgb, alpha, _ = draw(module, rows, camera, packed=False)
+    Cotangent.of(camera, rows.means).backward(rgb, alpha)
+    theirs = collect(rgb, rows)
+    drop_gradients(rows)
+    return errors(theirs, answer(rows, camera, SETTINGS, backend, rows.means.dtype, rows.means.device.type))
+
+
+def agrees(error: Errors) -> bool:
+    """Whether both draw the same image and have the same gradients, to the limits above."""
+    if error.image.psnr is not None and error.image.psnr < LEAST_PSNR:
+        return False
+    groups = [group.relative_l2 for group in error.gradients.values()]
+    return all(value is not None and value <= LARGEST_GRADIENT_ERROR for value in groups)

@@ -1,0 +1,53 @@
+"""Records of measurements: one strict JSON object a line, on disk as soon as it is measured."""
+
+import dataclasses
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.evaluation.records import Machine, Source
+from sparsestreet.evaluation.strict_json import Json, json_line, parsed
+from sparsestreet.ops.settings import SplatSettings
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """By which command, on what and from which code something was measured."""
+
+    command: str
+    threads: int
+    machine: Machine
+    source: Source
+
+
+class RecordFile:
+    """Writes records line by line; a sweep that is interrupted leaves the points it has measured."""
+
+    def __init__(self, path: Path, provenance: Provenance) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("", encoding="utf-8")
+        self.path = path
+        self._provenance = provenance
+
+    def write(self, kind: str, record: object) -> None:
+        """Append a frozen dataclass as one line with its kind, the machine's load and provenance.
+
+        Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
+        """
+        line = {"kind": kind, **vars(record), "load": os.getloadavg()[0], "provenance": self._provenance}
+        text = json_line(line, kind)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(text + "\n")
+
+
+def read_records(path: Path) -> list[dict[str, Json]]:
+    """All lines of a file. Raises RecordError, naming file and line, for anything that is not strict JSON."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [parsed(line, f"{path}:{number}") for number, line in enumerate(lines, start=1)]
+
+
+def settings_entries(settings: SplatSettings) -> dict[str, Json]:
+    """All fields; a max_sigma of infinity, which JSON cannot say, is None."""
+    finite = settings.max_sigma if math.isfinite(settings.max_sigma) else None
+    return dataclasses.asdict(settings) | {"max_sigma": finite}

@@ -1,0 +1,288 @@
+"""``sparsestreet bench knobs``: time, work and error of every knob on every scene, one record a point."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from sparsestreet.bench.accuracy import Answer, Errors, answer, errors, image_error
+from sparsestreet.bench.culling import Culling, compare_culling, compare_touched
+from sparsestreet.bench.effects import EffectsName, seen_through
+from sparsestreet.bench.knobs import DEFAULT, FIXED, Point, backend_points
+from sparsestreet.bench.records import RecordFile, settings_entries
+from sparsestreet.bench.scenes import BenchScene, Size
+from sparsestreet.bench.tile_sizes import build, with_tiles
+from sparsestreet.bench.timing import OpTimes, TimingBudget, leaves, time_op
+from sparsestreet.evaluation.strict_json import Json
+from sparsestreet.ops.backend import BACKENDS, resolve_backend
+from sparsestreet.ops.cpu.library import tile_size
+from sparsestreet.ops.settings import SplatSettings
+
+FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(64, 48, 400)
+"""Sizes of a sweep, of a trial, and of the copies that the dense reference bears: there it is timed, and is the oracle
+of truths and culling."""
+BUDGET = TimingBudget(repeats=20, seconds=2.0, least=3)
+QUICK_BUDGET = TimingBudget(repeats=2, seconds=0.1, least=1)
+DENSE_SAMPLES = 1 << 28
+"""(row, pixel) samples beyond which the dense reference is not timed: it takes about a second for each 10^8."""
+UNBOUNDED_PAIRS = 1 << 26
+"""(splat, tile) pairs of a view without any bound that are still computed: about 7 GB in float64."""
+_EXACT_BACKEND = "cpu"
+
+
+@dataclass(frozen=True)
+class KnobRecord:
+    """One point of one scene. Times are milliseconds."""
+
+    scene: str
+    source: str
+    rows: int
+    width: int
+    height: int
+    knob: str
+    value: str
+    preset: str | None
+    backend: str
+    dtype: str
+    settings: dict[str, Json]
+    """Fields of SplatSettings, as ``settings_entries`` writes them."""
+    distortion: list[float] | None
+    """Of the camera that was timed; the shutter's: translation, then rotation."""
+    shutter: list[float] | None
+    skipped: str | None
+    """Why there is no measurement; times and errors are then None."""
+    other_model: bool
+    """What is drawn differs by intention; ``model_psnr`` is then no error."""
+    model_psnr: float | None = None
+    """dB between this model without cut-offs and the default one without; None where they draw the same."""
+    times: OpTimes | None = None
+    exact: Errors | None = None
+    """Against this model in float64 without cut-offs (R0); None where that covers too many tiles to be held."""
+    same_cutoffs: Errors | None = None
+    """Against this model in float64 with the same cut-offs (R1): what rounding alone does."""
+    tiles_in_use: Errors | None = None
+    """A tile size against the library in use: the same image up to rounding, not a trade."""
+
+
+@dataclass(frozen=True)
+class CullingRecord:
+    """That culling by tiles is exact on this scene: identical images, not a trade."""
+
+    scene: str
+    rows: int
+    width: int
+    height: int
+    culling: Culling
+
+
+@dataclass(frozen=True)
+class OracleRecord:
+    """The exact model of the C++ backend in float64 against the dense reference, on a small copy of a scene."""
+
+    scene: str
+    rows: int
+    width: int
+    height: int
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class FixedRecord:
+    """What would be a knob but is a property of a backend."""
+
+    knob: str
+    backend: str
+    holds: str
+
+
+class Truths:
+    """Float64 answers of one scene, each computed once."""
+
+    def __init__(self, scene: BenchScene) -> None:
+        self._scene = scene
+        self._answers: dict[tuple[SplatSettings, EffectsName | None], Answer] = {}
+
+    def of(self, settings: SplatSettings, effects: EffectsName | None = None) -> Answer:
+        if not self._depths_between(settings.near_plane, DEFAULT.near_plane):
+            settings = replace(settings, near_plane=DEFAULT.near_plane)  # the same rows, the same answer
+        if (settings, effects) not in self._answers:
+            seen = seen_through(self._scene, effects)
+            truth = answer(seen.gaussians, seen.camera, settings, _EXACT_BACKEND, torch.float64)
+            self._answers[settings, effects] = truth
+        return self._answers[settings, effects]
+
+    def _depths_between(self, near: float, other: float) -> bool:
+        pose = self._scene.camera.camera_from_world
+        depths = self._scene.gaussians.means.double() @ pose[2, :3].double() + pose[2, 3].double()
+        return bool(((depths > min(near, other)) & (depths <= max(near, other))).any())
+
+
+def run_sweep(
+    scenes: Sequence[BenchScene],
+    small: Sequence[BenchScene],
+    points: Sequence[Point],
+    budget: TimingBudget,
+    file: RecordFile,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Measure all points of all scenes into ``file``; ``small`` are copies on which the truth itself is checked and
+    the dense reference is timed, with the C++ backend beside it (``small`` records).
+
+    Raises RuntimeError with the remedy if the C++ backend, which computes the truths, is not built.
+    """
+    resolve_backend(_EXACT_BACKEND, torch.device("cpu"))
+    for (knob, backend), holds in FIXED.items():
+        file.write("fixed", FixedRecord(knob, backend, holds))
+    for size in (point.tile for point in points if point.tile is not None):
+        say(f"tiles of {size} pixels: {build(size).missing or 'compiled'}")
+    for scene in small:
+        file.write("oracle", check_oracle(scene))
+        say(f"\nsmall copy of {title(scene)}")
+        _measure_points(scene, [Point("default", "default", DEFAULT), *backend_points()], budget, "small", file, say)
+    for scene in scenes:
+        say(f"\n{title(scene)}")
+        _measure_points(scene, points, budget, "knob", file, say)
+    for scene in small:
+        culling = compare_culling(scene.gaussians, scene.camera, DEFAULT)
+        _write_culling(scene, compare_touched(culling, scene.gaussians, scene.camera, DEFAULT), file, say)
+    for scene in scenes:
+        _write_culling(scene, compare_culling(scene.gaussians, scene.camera, DEFAULT), file, say)
+
+
+def _write_culling(scene: BenchScene, culling: Culling, file: RecordFile, say: Callable[[str], None]) -> None:
+    camera = scene.camera
+    file.write("culling", CullingRecord(scene.name, len(scene.gaussians), camera.width, camera.height, culling))
+    say(f"culling, {scene.name}, {camera.width}x{camera.height}: {culling}")
+
+
+def title(scene: BenchScene) -> str:
+    """What a scene is, for the terminal."""
+    return f"{scene.name}: {scene.source}; {len(scene.gaussians)} splats, {scene.camera.width}x{scene.camera.height}"
+
+
+def _measure_points(
+    scene: BenchScene,
+    points: Sequence[Point],
+    budget: TimingBudget,
+    kind: str,
+    file: RecordFile,
+    say: Callable[[str], None],
+) -> None:
+    truths = Truths(scene)
+    for point in points:
+        record = measure_point(scene, point, truths, budget)
+        file.write(kind, record)
+        say(describe(record))
+
+
+def measure_point(scene: BenchScene, point: Point, truths: Truths, budget: TimingBudget) -> KnobRecord:
+    """Time and error of one point, or why it cannot be had here."""
+    record = _unmeasured(scene, point)
+    if record.skipped is not None:
+        return record
+    if point.tile is None:
+        times, value = time_and_answer(seen_through(scene, point.effects), point, budget)
+    else:
+        times, value = with_tiles(point.tile, time_and_answer, scene, point, budget)
+        in_use = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype)
+        record = replace(record, tiles_in_use=errors(value, in_use))
+    record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs, point.effects)))
+    if not affordable(scene, point.exact):
+        return record
+    exact = truths.of(point.exact, point.effects)
+    record = replace(record, exact=errors(value, exact))
+    if not point.other_model:
+        return record
+    default = truths.of(Point("default", "default", DEFAULT).exact)
+    return replace(record, model_psnr=image_error(exact.image, default.image).psnr)
+
+
+def time_and_answer(scene: BenchScene, point: Point, budget: TimingBudget) -> tuple[OpTimes, Answer]:
+    """What is timed, and what it draws."""
+    device = "cuda" if point.backend == "triton" else "cpu"
+    rows = leaves(scene.gaussians, point.dtype, device)
+    times = time_op(rows, scene.camera, point.settings, point.backend, budget)
+    return times, answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype, device)
+
+
+def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
+    lens, shutter = (getattr(seen_through(scene, point.effects).camera, name) for name in ("distortion", "shutter"))
+    return KnobRecord(
+        scene=scene.name,
+        source=scene.source,
+        rows=len(scene.gaussians),
+        width=scene.camera.width,
+        height=scene.camera.height,
+        knob=point.knob,
+        value=point.value,
+        preset=point.preset,
+        backend=point.backend,
+        dtype=str(point.dtype).removeprefix("torch."),
+        settings=settings_entries(point.settings),
+        distortion=None if lens is None else lens.tolist(),
+        shutter=None if shutter is None else [*shutter.translation.tolist(), *shutter.rotation.tolist()],
+        skipped=unavailable(scene, point),
+        other_model=point.other_model,
+    )
+
+
+def affordable(scene: BenchScene, settings: SplatSettings) -> bool:
+    """Whether the pairs can be held where nothing bounds a splat, so that each covers every tile."""
+    side = tile_size()
+    tiles = -(-scene.camera.width // side) * -(-scene.camera.height // side)
+    bounded = settings.alpha_min > 0 or settings.max_sigma < float("inf")
+    return bounded or int((scene.gaussians.opacities > 0).sum()) * tiles <= UNBOUNDED_PAIRS
+
+
+def unavailable(scene: BenchScene, point: Point) -> str | None:
+    """Why a point cannot be timed here; None if it can."""
+    samples = len(scene.gaussians) * scene.camera.width * scene.camera.height
+    if point.backend == "reference" and samples > DENSE_SAMPLES:
+        return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed; see the small copies"
+    if not affordable(scene, point.settings):
+        return f"nothing bounds a splat: more than {UNBOUNDED_PAIRS:.2g} (splat, tile) pairs"
+    if point.tile is not None:
+        return build(point.tile).missing
+    if point.backend == "triton":
+        if "triton" not in BACKENDS:
+            return "this version has no triton backend"
+        if os.environ.get("TRITON_INTERPRET") == "1":
+            return "the interpreter is on: its times say nothing about a device"
+        if not torch.cuda.is_available():
+            return "no CUDA device"
+    return None
+
+
+def check_oracle(scene: BenchScene) -> OracleRecord:
+    """Truth against truth: two implementations of the exact model in float64."""
+    exact = SplatSettings.preset("exact")
+    fast, dense = (
+        answer(scene.gaussians, scene.camera, exact, backend, torch.float64)
+        for backend in (_EXACT_BACKEND, "reference")
+    )
+    camera = scene.camera
+    return OracleRecord(scene.name, len(scene.gaussians), camera.width, camera.height, errors(fast, dense))
+
+
+def describe(record: KnobRecord) -> str:
+    """One line for the terminal."""
+    name = f"  {record.knob} {record.value}" if record.knob != "default" else "  default"
+    if record.skipped is not None:
+        return f"{name:<34} -- {record.skipped}"
+    stages = record.times.stages
+    times = f"{name:<34}{stages['forward'].median:9.2f} + {stages['backward'].median:9.2f} ms"
+    if record.exact is None:
+        return f"{times}   no exact image: too many pairs"
+    psnr = record.exact.image.psnr
+    image = "equal" if psnr is None else f"{psnr:6.1f} dB"
+    note = f"  other model ({record.model_psnr:.1f} dB)" if record.model_psnr is not None else ""
+    if record.tiles_in_use is not None:
+        note = f"  {record.tiles_in_use.image.maximum:.0e} from the tiles in use"
+    return f"{times}   {image}   gradient {worst_gradient(record.exact):.1e}{note}"
+
+
+def worst_gradient(error: Errors) -> float:
+    """Relative L2 of the parameter group that is furthest off; infinite where a group's truth is zero."""
+    values = [group.relative_l2 for group in error.gradients.values()]
+    return float("inf") if None in values else max(values)

@@ -1,0 +1,213 @@
+"""The plumbing of device timings and of gsplat beside them, with a fake gsplat: no device needed."""
+
+import dataclasses
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import torch
+from torch.profiler import DeviceType
+
+from sparsestreet.bench import device_profile, gpu, gsplat_peer
+from sparsestreet.bench.accuracy import Errors, GradientError, ImageError
+from sparsestreet.bench.device_profile import stage_of
+from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.bench.gpu import GpuRecord
+from sparsestreet.bench.records import RecordFile, read_records
+from sparsestreet.bench.scenes import Size
+from sparsestreet.bench.timing import Spread, TimingBudget, leaves
+from sparsestreet.ops import splat
+from sparsestreet.types import Camera, Gaussians
+from tests.bench.test_records import PROVENANCE
+
+ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
+CPU = torch.device("cpu")
+# What gsplat 1.5.3's rasterization takes, of which we use these.
+TAKES = {
+    *("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height", "near_plane"),
+    *("eps2d", "sh_degree", "packed", "absgrad", "rasterize_mode"),
+}
+
+
+def fake_gsplat(brightness: float = 1.0) -> ModuleType:
+    """A module with gsplat's signature that renders with our op."""
+
+    def rasterization(**given):
+        assert set(given) == TAKES
+        assert given["viewmats"].shape == (1, 4, 4)
+        assert given["Ks"].shape == (1, 3, 3)
+        assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
+        fields = ("means", "quats", "scales", "opacities", "colors")
+        camera = Camera(given["viewmats"][0], given["Ks"][0], given["width"], given["height"])
+        rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=gsplat_peer.SETTINGS)
+        meta = {"flatten_ids": torch.zeros(7, dtype=torch.int32)}
+        return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
+
+    module = ModuleType("gsplat")
+    module.__version__ = "1.5.3"
+    module.rasterization = rasterization
+    return module
+
+
+@pytest.fixture
+def rows() -> Gaussians:
+    return leaves(frustum_gaussians(60, frustum_camera(48, 32), sigma_pixels=2.0, terms=9), torch.float32)
+
+
+def test_the_same_image_agrees(rows):
+    found = gsplat_peer.parity(fake_gsplat(), rows, frustum_camera(48, 32), "cpu")
+    assert found.image.psnr is None
+    assert gsplat_peer.agrees(found)
+    assert rows.means.grad is None
+    assert gsplat_peer.draw(fake_gsplat(), rows, frustum_camera(48, 32), packed=True)[2] == 7
+
+
+def test_another_image_or_another_gradient_disagrees(rows):
+    found = gsplat_peer.parity(fake_gsplat(brightness=1.02), rows, frustum_camera(48, 32), "cpu")
+    assert not gsplat_peer.agrees(found)
+    assert found.gradients["sh"].relative_l2 == pytest.approx(0.02, rel=1e-3)
+    # A thousandth of the colors is within the limits.
+    slight = gsplat_peer.parity(fake_gsplat(brightness=1.001), rows, frustum_camera(48, 32), "cpu")
+    assert gsplat_peer.agrees(slight)
+
+
+def test_a_gradient_alone_can_disagree():
+    image = ImageError(0.0, 0.0, None)
+    good, bad = GradientError(1e-3, 1e-3), GradientError(6e-3, 1e-3)
+    assert gsplat_peer.agrees(Errors(image, {"means": good, "sh": good}))
+    assert not gsplat_peer.agrees(Errors(image, {"means": good, "sh": bad}))
+    assert not gsplat_peer.agrees(Errors(image, {"means": GradientError(None, None)}))
+
+
+def test_settings_are_those_of_gsplat():
+    assert (gsplat_peer.SETTINGS.stop, gsplat_peer.SETTINGS.alpha_max, gsplat_peer.SETTINGS.near_plane) == (
+        "exclusive",
+        0.999,
+        0.01,
+    )
+
+
+def test_gsplat_is_looked_for_on_a_cuda_device_only(monkeypatch):
+    assert "CUDA" in gsplat_peer.find_gsplat(CPU)
+    monkeypatch.setitem(__import__("sys").modules, "gsplat", None)  # makes the import fail
+    assert "cannot be imported" in gsplat_peer.find_gsplat(torch.device("cuda"))
+    module = fake_gsplat()
+    monkeypatch.setitem(__import__("sys").modules, "gsplat", module)
+    assert gsplat_peer.find_gsplat(torch.device("cuda")) is module
+
+
+def test_both_renderers_get_a_record(tmp_path, monkeypatch):
+    module = fake_gsplat()
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    assert gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20)], CPU, ONCE, file, said.append)
+    records = read_records(file.path)
+    assert [record["renderer"] for record in records] == [
+        "sparsestreet cpu",
+        "gsplat 1.5.3 packed",
+        "gsplat 1.5.3 unpacked",
+    ] * 2
+    for record in records:
+        assert record["failed"] is None
+        assert record["forward"]["median"] > 0
+        assert record["inference"]["repeats"] == 1
+        assert record["stages"] is None  # no device, no kernels
+    assert [record["agrees"] for record in records] == [True, True, True] * 2
+    assert [record["pairs"] is None for record in records] == [False, True, True] * 2
+    assert records[0]["samples"] > records[0]["pairs"] >= 60
+    assert any("agrees: equal" in line for line in said)
+
+
+def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
+    module = fake_gsplat()
+
+    def broken(**given):
+        raise RuntimeError("no kernel image is available\nmore")
+
+    module.rasterization = broken
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append)
+    ours, *theirs = read_records(file.path)
+    assert ours["failed"] is None
+    assert [record["failed"] for record in theirs] == ["RuntimeError: no kernel image is available"] * 2
+    assert any("FAILED: RuntimeError" in line for line in said)
+
+
+def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
+    module = fake_gsplat(brightness=0.9)
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    said: list[str] = []
+    assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, RecordFile(tmp_path / "g.jsonl", PROVENANCE), said.append)
+    assert any("DISAGREES" in line for line in said)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stage"),
+    [
+        ("project_rows", "project"),
+        ("project_rows_backward", "project_backward"),
+        ("sum_slots", "project_backward"),
+        ("blend_tiles", "blend"),
+        ("blend_tiles_backward", "blend_backward"),
+        ("list_pairs", "bin"),
+        ("void at_cuda_detail::cub::DeviceRadixSortOnesweepKernel<...>", "sort"),
+        ("Memset (Device)", "other"),
+    ],
+)
+def test_kernels_belong_to_stages(kernel, stage):
+    assert stage_of(kernel) == stage
+
+
+def test_device_time_of_the_stages_and_its_spread(monkeypatch):
+    def kernel(name: str, microseconds: float, device: DeviceType) -> SimpleNamespace:
+        return SimpleNamespace(key=name, self_device_time_total=microseconds, device_type=device)
+
+    runs: list[int] = []
+
+    class Profiler:
+        """One run each: the first a second, then 2, 4, 3 and 9 ms, of which 1 ms is another kernel's."""
+
+        def __init__(self, activities: list) -> None: ...
+
+        def __enter__(self) -> "Profiler":
+            return self
+
+        def __exit__(self, *error: object) -> None: ...
+
+        def key_averages(self) -> list[SimpleNamespace]:
+            milliseconds = [1000.0, 2.0, 4.0, 3.0, 9.0][len(runs) - 1]
+            return [
+                kernel("blend_tiles", 1000.0 * (milliseconds - 1), DeviceType.CUDA),
+                kernel("raster_more", 1000.0, DeviceType.CUDA),
+                *([kernel("project_rows", 500.0, DeviceType.CUDA)] if len(runs) > 2 else []),
+                kernel("blend_tiles", 9000.0, DeviceType.CPU),  # the launch: not a time of the device
+            ]
+
+    monkeypatch.setattr(device_profile, "profile", Profiler)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    stages = device_profile.kernel_milliseconds(lambda: runs.append(1), repeats=4)
+    assert len(runs) == 5  # the first does not count: kernels are compiled
+    assert list(stages) == ["blend", "project"]
+    # Quartiles of 2, 3, 4, 9, linear between samples: 2.75 and 5.25.
+    assert (stages["blend"].median, stages["blend"].minimum, stages["blend"].iqr) == pytest.approx((3.5, 2.0, 2.5))
+    # A run without the kernel counts as zero: 0, 0.5, 0.5, 0.5.
+    assert (stages["project"].median, stages["project"].minimum) == pytest.approx((0.5, 0.0))
+    assert stages["project"].repeats == 4
+
+
+def test_a_line_has_medians_and_spreads():
+    value, single = Spread(1.25, 1.0, 0.125, 20), Spread(3.0, 3.0, None, 1)
+    record = GpuRecord("sparsestreet triton", "a device", 7, 8, 9, forward=value, backward=single)
+    record = dataclasses.replace(record, inference=value, stages={"sort": value, "other": single})
+    text = gpu.line(record)
+    assert "forward 1.250 (iqr 0.125)  backward 3.000  no grad 1.250 (iqr 0.125) ms" in text
+    assert "[sort 1.250 (iqr 0.125), other 3.000]" in text
+
+
+def test_a_device_without_a_fast_backend_is_not_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu, "resolve_backend", lambda name, device: "reference")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a device")
+    file, said = RecordFile(tmp_path / "g.jsonl", PROVENANCE), []
+    assert not gpu.run_gpu([Size(48, 32, 60)], torch.device("cuda"), ONCE, file, said.append)
+    assert read_records(file.path) == []
+    assert any("install triton" in line for line in said)
