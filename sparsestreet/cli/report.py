@@ -5,31 +5,52 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sparsestreet.evaluation.report import collect, markdown, tables
+from sparsestreet.evaluation.report import collect, figure, markdown, sections, tables
 from sparsestreet.evaluation.strict_json import RecordError
 
 USAGE = """\
-sparsestreet report DIR [DIR ...] [baseline=NAME] [markdown=FILE]
+sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [markdown=FILE] [figure=FILE.png]
 
-One table per scene of all runs below the folders; with a baseline, differences to it, paired by seed.
+Tables of all runs below the folders: one per scene, then the mean over scenes. Runs of one label and one configuration
+are repeats and share a column; a label's other configurations have columns named by the options that differ. With a
+baseline (label or name of a column), differences to it, paired by scene and seed. The figure shows PSNR against size.
 """
+
+OPTIONS = ("baseline", "sections", "markdown", "figure")
+SECTIONS = ("scenes", "mean", "all")
 
 
 def report(arguments: list[str]) -> int:
     """Print the tables; 2 on wrong usage, 1 if records are missing or malformed."""
-    options = dict(text.split("=", 1) for text in arguments if "=" in text)
-    roots = [Path(text) for text in arguments if "=" not in text and not text.startswith("-")]
-    if not roots or set(options) - {"baseline", "markdown"}:
+    if "--help" in arguments:
         print(USAGE)
-        return 0 if "--help" in arguments else 2
+        return 0
+    options, roots = {}, []
+    for text in arguments:
+        key, equals, value = text.partition("=")
+        if equals and key in OPTIONS:
+            options[key] = value
+        else:
+            roots.append(Path(text))
+    wanted = options.get("sections", "all")
+    # A run's folder may have an equals sign in its name; what has one and is no folder is a slip.
+    if not roots or wanted not in SECTIONS or any("=" in str(root) and not root.exists() for root in roots):
+        print(USAGE, file=sys.stderr)
+        return 2
     try:
         records = collect(roots)
-        drawn = tables(records, options.get("baseline"))
+        found = sections(records, options.get("baseline"))
+        if "figure" in options:
+            figure(records, Path(options["figure"]))
     except (RecordError, FileNotFoundError, ValueError) as error:
         print(f"sparsestreet report: {error}", file=sys.stderr)
         return 1
-    for table in drawn:
+    shown = [one for one in found if wanted in ("all", "mean" if one.over_scenes else "scenes")]
+    if not shown:
+        print("sparsestreet report: no configuration was run on two scenes, so there is no mean", file=sys.stderr)
+        return 1
+    for table in tables(shown):
         Console().print(table)
     if "markdown" in options:
-        Path(options["markdown"]).write_text(markdown(records, options.get("baseline")))
+        Path(options["markdown"]).write_text(markdown(shown))
     return 0

@@ -8,8 +8,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from sparsestreet.evaluation.records import RunSummary
-
 # Okabe and Ito's palette: distinguishable with any color vision.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _MARKERS = "osD^vP*X"
@@ -60,19 +58,21 @@ def plot_psnr(
     _finish(figure, axes, path)
 
 
-def plot_runs(path: Path, summaries: Sequence[RunSummary], title: str = "Quality against size") -> None:
-    """Draw every run as a point: held-out full-image PSNR (dB) against its number of Gaussians (logarithmic)."""
+def plot_runs(
+    path: Path, points: Mapping[str, Sequence[tuple[int, float]]], title: str = "Quality against size"
+) -> None:
+    """Draw every run as a point, name of a variant -> (Gaussians, held-out full-image PSNR in dB) of its runs."""
     figure, axes = _figure(title, "Gaussians", "held-out PSNR, full image (dB)")
-    for index, method in enumerate(dict.fromkeys(summary.run.method for summary in summaries)):
-        runs = [summary for summary in summaries if summary.run.method == method]
+    for index, (name, runs) in enumerate(points.items()):
+        gaussians, psnr = zip(*runs, strict=True)
         axes.scatter(
-            [summary.gaussians_total for summary in runs],
-            [summary.quality["psnr_full"].mean for summary in runs],
+            gaussians,
+            psnr,
             color=_COLORS[index % len(_COLORS)],
             marker=_MARKERS[index % len(_MARKERS)],
             s=46,
             alpha=0.85,
-            label=f"{method} (n={len(runs)})",
+            label=f"{name} (n={len(runs)})",
         )
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))

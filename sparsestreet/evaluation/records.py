@@ -1,21 +1,24 @@
-"""The files a run leaves in ``<run>/records/``, for other programs as for our report (no torch import).
+"""What identifies a run and what was measured of it, for other programs as for our report (no torch import).
 
-``quality.csv`` has one row per held-out image, ``summary.json`` everything else. Both are written whole or not at all.
+``RUN/run.json`` is written once, by training: what made the run. ``RUN/records/summary.json`` is written by each
+evaluation and holds the first unchanged. Both are written whole or not at all.
 """
 
-import csv
-import io
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
-from sparsestreet.evaluation.strict_json import RecordError, read_json, significant, write_atomically, write_json
-from sparsestreet.metrics.definitions import QUANTITIES, REGIONS, metric_id
+from sparsestreet.evaluation.configuration import Setting
+from sparsestreet.evaluation.quality import MetricSummary
+from sparsestreet.evaluation.strict_json import EXACT, read_json, version, write_json
 
-FORMAT = 1
+RUN_FORMAT = 1
+"""Version of ``run.json``; raised when a key changes its meaning."""
+
+FORMAT = 2
 """Version of ``summary.json``; raised when a key changes its meaning."""
+
+HELD_OUT, TRAINING = "held_out", "training"
+"""The splits whose views a record speaks of."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Machine:
-    """What the run ran on."""
+    """The host something ran on."""
 
     processor: str
     cores: int
@@ -66,26 +69,59 @@ class Source:
     """Whether tracked files differed from the commit."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunDescription:
-    """What identifies a run in a table."""
+    """The content of ``run.json``: what identifies a run and what made it. No evaluation changes it."""
 
+    format: int = version(RUN_FORMAT, "train the run again")
     method: str
+    """Which scene is trained, such as "streetgs"."""
+    sparsify: str
+    """What makes it small, such as "paper"; "none" for a plain run."""
+    label: str
+    """The run's column in a table, such as "streetgs+paper"."""
     scene: str
+    """Name of the log."""
     seed: int
     split: str
-    """Which images are held out, in words, such as "every 10th frame from 0, test"."""
+    """Which frames are held out, in words, such as "every 10th frame from 5"; "none"."""
+    config: dict[str, Setting] = field(metadata=EXACT)
+    """The resolved configuration, flat: dotted key -> value."""
+    config_hash: str
+    """``configuration.config_hash`` of it: equal for repeats."""
+    command: str
+    """The command that trained."""
+    device: str
+    """What trained, such as "cuda: NVIDIA H100" or "cpu: " and the processor."""
+    threads: int
+    steps: int
+    """Training steps taken; fewer than ``max_steps`` where the run was stopped."""
+    max_steps: int
     training_seconds: float | None
     """Wall clock of training without evaluation; None where it is not known."""
+    caps: dict[str, int]
+    """Nodes whose number of Gaussians was held down by their ``max_gaussians`` at least once -> that limit."""
+    machine: Machine
+    source: Source
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What measured a run."""
+
     command: str
+    machine: Machine
+    source: Source
+    device: str
+    threads: int
 
 
 @dataclass(frozen=True)
 class GuardCounts:
-    """On how many rows the guards of the splat op acted (``sparsestreet.ops.Guards``), summed over the views."""
+    """How many Gaussians the guards of the splat op acted on (``sparsestreet.ops.Guards``), summed over views."""
 
     rows: dict[str, int]
-    """Name of a guard -> rows, 0 included."""
+    """Name of a guard -> Gaussians, 0 included."""
     alarms: dict[str, int]
     """Those that a clean scene never needs and that acted; empty where all is well."""
 
@@ -95,34 +131,38 @@ class GuardCounts:
                 raise ValueError(f"alarms holds {name}: {count}, rows has {self.rows.get(name)}: evaluate again")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunSummary:
     """The content of ``summary.json``."""
 
-    format: int
+    format: int = version(FORMAT, "evaluate again")
     run: RunDescription
-    images: int
+    evaluated: Evaluation
+    images: dict[str, int]
+    """Split ("held_out", "training") -> number of its images that were evaluated; a split without views is absent."""
     resolutions: tuple[str, ...]
     """"WIDTHxHEIGHT" of the evaluated images, each once."""
-    quality: dict[str, MetricSummary]
-    """Id of a metric -> its summary over the images."""
+    quality: dict[str, dict[str, MetricSummary]]
+    """Split -> id of a metric -> its summary over the split's images."""
     definitions: dict[str, str]
     """Id of a metric -> what it is, in words."""
     gaussians: dict[str, int]
-    """Node class -> rows, all instances, visible or not."""
+    """Node -> Gaussians, all instances, visible or not."""
     gaussians_total: int
     bytes_by_part: dict[str, int]
     bytes_total: int
     latency: Latency
+    """Over the views of ``main_split``, on the device it names."""
     latency_protocol: str
-    machine: Machine
-    source: Source
-    guards: GuardCounts | None = None
-    """None in records from before they were counted."""
+    guards: GuardCounts
+    """Over the views of ``main_split``."""
 
     def __post_init__(self) -> None:
-        if self.format != FORMAT:
-            raise ValueError(f"the record has format {self.format}, this version reads {FORMAT}: evaluate again")
+        if not self.quality or set(self.quality) != set(self.images) or set(self.quality) - {HELD_OUT, TRAINING}:
+            raise ValueError(
+                f"quality speaks of the splits {sorted(self.quality)} and images of {sorted(self.images)}, expected "
+                f"{HELD_OUT}, {TRAINING} or both in both: evaluate again"
+            )
         for name, parts, total in (
             ("gaussians", self.gaussians, self.gaussians_total),
             ("bytes", self.bytes_by_part, self.bytes_total),
@@ -130,15 +170,35 @@ class RunSummary:
             if sum(parts.values()) != total:
                 raise ValueError(f"{name}_total is {total}, its parts sum to {sum(parts.values())}: {parts}")
 
+    @property
+    def main_split(self) -> str:
+        """The held-out views, or the training views of a run that holds out none."""
+        return HELD_OUT if HELD_OUT in self.quality else TRAINING
+
+    def mean(self, metric: str, split: str | None = None) -> float | None:
+        """Mean of a metric over the images of a split (of ``main_split``); None where it was not measured."""
+        found = self.quality.get(split or self.main_split, {}).get(metric)
+        return None if found is None else found.mean
+
+
+def run_path(run: Path) -> Path:
+    """Where a run says what it is."""
+    return run / "run.json"
+
+
+def write_run(path: Path, run: RunDescription) -> None:
+    """Write ``run.json`` atomically. Raises RecordError for values that JSON has no number for."""
+    write_json(path, run)
+
+
+def read_run(path: Path) -> RunDescription:
+    """Read ``run.json``. Raises RecordError naming the file and the entry that is wrong."""
+    return read_json(path, RunDescription)
+
 
 def summary_path(run: Path) -> Path:
     """Where a run keeps its summary."""
     return run / "records" / "summary.json"
-
-
-def quality_path(run: Path) -> Path:
-    """Where a run keeps its per-image metrics."""
-    return run / "records" / "quality.csv"
 
 
 def write_summary(path: Path, summary: RunSummary) -> None:
@@ -149,60 +209,3 @@ def write_summary(path: Path, summary: RunSummary) -> None:
 def read_summary(path: Path) -> RunSummary:
     """Read ``summary.json``. Raises RecordError naming the file and the entry that is wrong."""
     return read_json(path, RunSummary)
-
-
-_COLUMNS = (
-    *("frame", "camera", "width", "height"),
-    *(metric_id(quantity, region) for region in REGIONS for quantity in ("pixels", *QUANTITIES)),
-)
-
-
-def write_quality(path: Path, quality: Iterable[FrameQuality]) -> None:
-    """Write ``quality.csv`` atomically; a region's cells are blank where the data has no mask, and its metrics are
-    blank where the mask is empty (0 pixels)."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for image in quality:
-        row: list[object] = [image.frame, image.camera, image.width, image.height]
-        for region in (image.full, image.human, image.vehicle):
-            row += [""] * 4 if region is None else _region_cells(region, f"{path}: frame {image.frame}")
-        writer.writerow(row)
-    write_atomically(path, buffer.getvalue())
-
-
-def read_quality(path: Path) -> list[FrameQuality]:
-    """Read ``quality.csv``. Raises RecordError naming the file and the line that is wrong."""
-    if not path.is_file():
-        raise RecordError(f"{path}: does not exist; evaluate the run first")
-    lines = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
-    if not lines or tuple(lines[0]) != _COLUMNS:
-        raise RecordError(f"{path}: the header is {lines[:1]}, expected {','.join(_COLUMNS)}; evaluate the run again")
-    return [_parsed(cells, f"{path}, line {number}") for number, cells in enumerate(lines[1:], start=2)]
-
-
-def _region_cells(region: RegionQuality, where: str) -> list[object]:
-    metrics = (region.mse, region.psnr, region.ssim_uniform7)
-    return [region.pixels, *("" if value is None else significant(value, where) for value in metrics)]
-
-
-def _parsed(cells: list[str], where: str) -> FrameQuality:
-    if len(cells) != len(_COLUMNS):
-        raise RecordError(f"{where}: {len(cells)} cells, expected {len(_COLUMNS)}")
-    try:
-        full, human, vehicle = (_parsed_region(cells[start : start + 4]) for start in (4, 8, 12))
-        frame, camera, width, height = (int(cell) for cell in cells[:4])
-    except ValueError as error:
-        raise RecordError(f"{where}: {error}") from error
-    if full is None:
-        raise RecordError(f"{where}: the metrics of the full image are missing")
-    return FrameQuality(frame, camera, width, height, full, human, vehicle)
-
-
-def _parsed_region(cells: list[str]) -> RegionQuality | None:
-    if not any(cells):
-        return None
-    values = tuple(float(cell) if cell else None for cell in cells[1:])
-    if any(value is not None and not math.isfinite(value) for value in values):
-        raise ValueError(f"a metric is not a finite number: {cells[1:]}")
-    return RegionQuality(int(cells[0]), *values)

@@ -1,6 +1,7 @@
 """Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only (no torch).
 
-Only a field with a default may be missing: it is newer than some records.
+Only a field with a default may be missing: it is newer than some records. A field made with ``version`` is the number
+of the format; a record of another one is refused before its keys are looked at.
 """
 
 import json
@@ -9,15 +10,23 @@ import os
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, field, fields, is_dataclass
 from pathlib import Path
 
 Json = None | bool | int | float | str | list | dict
 Record = typing.TypeVar("Record")
 
+EXACT = types.MappingProxyType({"exact": True})
+"""Metadata of a field whose floats are settings, not measurements: written as they are, not rounded."""
+
 
 class RecordError(ValueError):
     """A record that cannot be written or read as it stands; names the file and the entry."""
+
+
+def version(number: int, remedy: str) -> typing.Any:
+    """The field ``format`` of a record: its number, and what to do about a file that has another."""
+    return field(default=number, metadata={"remedy": remedy})
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -76,28 +85,32 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a JSON number")
 
 
-def _encoded(value: object, where: str) -> Json:
+def _encoded(value: object, where: str, exact: bool = False) -> Json:
     if is_dataclass(value):
-        return {field.name: _encoded(getattr(value, field.name), f"{where}: {field.name}") for field in fields(value)}
+        return {
+            entry.name: _encoded(
+                getattr(value, entry.name), f"{where}: {entry.name}", entry.metadata.get("exact", exact)
+            )
+            for entry in fields(value)
+        }
     if isinstance(value, Mapping):
-        return {str(key): _encoded(entry, f"{where}: {key}") for key, entry in value.items()}
+        return {str(key): _encoded(entry, f"{where}: {key}", exact) for key, entry in value.items()}
     if isinstance(value, tuple | list):
-        return [_encoded(entry, f"{where}[{index}]") for index, entry in enumerate(value)]
+        return [_encoded(entry, f"{where}[{index}]", exact) for index, entry in enumerate(value)]
     if isinstance(value, float):
-        return significant(value, where)
+        return value if exact and math.isfinite(value) else significant(value, where)
     if value is None or isinstance(value, bool | int | str):
         return value
     raise RecordError(f"{where} is a {type(value).__name__}, which JSON cannot hold: convert it first")
 
 
 def _decoded(kind: object, value: Json, where: str) -> typing.Any:
-    """``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None or a plain type."""
+    """``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None, a plain type or any of several."""
     if is_dataclass(kind):
         return _decoded_dataclass(kind, value, where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
-        (inner,) = (argument for argument in arguments if argument is not types.NoneType)
-        return None if value is None else _decoded(inner, value, where)
+        return _decoded_union(arguments, value, where)
     if origin is dict:
         return {key: _decoded(arguments[1], entry, f"{where}: {key}") for key, entry in _of(dict, value, where).items()}
     if origin is tuple:
@@ -109,11 +122,28 @@ def _decoded(kind: object, value: Json, where: str) -> typing.Any:
     return _of(kind, value, where)
 
 
+def _decoded_union(kinds: tuple[type, ...], value: Json, where: str) -> typing.Any:
+    """None beside one kind of any sort, or one of several plain kinds."""
+    if type(value) in kinds:
+        return value
+    others = [kind for kind in kinds if kind is not types.NoneType]
+    if len(others) == 1:
+        return _decoded(others[0], value, where)
+    names = ", ".join(kind.__name__ for kind in kinds)
+    raise RecordError(f"{where}: expected one of {names}, got {type(value).__name__} {value!r}")
+
+
 def _decoded_dataclass(kind: type, value: Json, where: str) -> typing.Any:
     entries = _of(dict, value, where)
     hints = typing.get_type_hints(kind)
-    required = {field.name for field in fields(kind) if field.default is MISSING}
-    names = {field.name for field in fields(kind)}
+    for entry in fields(kind):
+        if "remedy" in entry.metadata and entries.get(entry.name) != entry.default:
+            raise RecordError(
+                f"{where}: the record has format {entries.get(entry.name)}, this version reads {entry.default}: "
+                f"{entry.metadata['remedy']}"
+            )
+    required = {entry.name for entry in fields(kind) if entry.default is MISSING}
+    names = {entry.name for entry in fields(kind)}
     missing, unknown = sorted(required - set(entries)), sorted(set(entries) - names)
     if missing or unknown:
         raise RecordError(f"{where}: {kind.__name__} lacks the keys {missing} and has unknown keys {unknown}")

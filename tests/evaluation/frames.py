@@ -2,9 +2,12 @@
 
 import torch
 
+from sparsestreet.evaluation.configuration import Setting, config_hash
 from sparsestreet.evaluation.quality import MetricSummary
 from sparsestreet.evaluation.records import (
-    FORMAT,
+    HELD_OUT,
+    TRAINING,
+    Evaluation,
     GuardCounts,
     Latency,
     Machine,
@@ -29,33 +32,85 @@ def make_frame(
     return Frame(camera, index / 10, index, camera_index, image=image, human=human, vehicle=vehicle)
 
 
-def make_summary(
-    method: str = "plain",
+MACHINE = Machine("test", 2, "Linux x86_64", "3.11", "2.13.0")
+CLEAN = Source("0123456789abcdef", False)
+
+
+def make_run(
+    label: str = "plain",
     seed: int = 0,
-    psnr: float = 25.0,
-    gaussians: dict[str, int] | None = None,
+    *,
     scene: str = "street",
+    split: str = "every 10th frame from 0",
+    training_seconds: float | None = 100.0,
+    config: dict[str, Setting] | None = None,
+    device: str = "cpu: test",
+    threads: int = 2,
+    steps: int = 60,
+    caps: dict[str, int] | None = None,
+    source: Source = CLEAN,
+    machine: Machine = MACHINE,
+    command: str | None = None,
+) -> RunDescription:
+    """What training writes, with a configuration of a few options beside the given ones."""
+    method, _, sparsify = label.partition("+")
+    whole = {"seed": seed, "schedule.max_steps": 60, "data.log.width": None, "data.log.settings.seed": seed} | (
+        config or {}
+    )
+    return RunDescription(
+        method=method,
+        sparsify=sparsify or "none",
+        label=label,
+        scene=scene,
+        seed=seed,
+        split=split,
+        config=whole,
+        config_hash=config_hash(whole),
+        command=command or f"sparsestreet train seed={seed}",
+        device=device,
+        threads=threads,
+        steps=steps,
+        max_steps=60,
+        training_seconds=training_seconds,
+        caps=caps or {},
+        machine=machine,
+        source=source,
+    )
+
+
+def make_quality(psnr: float, vehicle_psnr: float | None = 22.0) -> dict[str, MetricSummary]:
+    return {
+        "psnr_full": MetricSummary(psnr, 1.0, 6, 0),
+        "ssim_uniform7_full": MetricSummary(0.8, 0.1, 6, 0),
+        "psnr_vehicle": MetricSummary(vehicle_psnr, None, 0 if vehicle_psnr is None else 1, 0),
+    }
+
+
+def make_summary(
+    label: str = "plain",
+    seed: int = 0,
+    psnr: float | None = 25.0,
+    gaussians: dict[str, int] | None = None,
     vehicle_psnr: float | None = 22.0,
     milliseconds: float = 40.0,
-    training_seconds: float | None = 100.0,
-    split: str = "every 10th frame from 0",
     device: str = "cpu: test",
     alarms: dict[str, int] | None = None,
+    training_psnr: float | None = None,
+    evaluated: Evaluation | None = None,
+    **run: object,
 ) -> RunSummary:
-    """A record as a run writes it, with the numbers that a test wants to see in the table."""
+    """A record as a run writes it, with the numbers that a test wants to see in the table; ``run`` as in make_run."""
     gaussians = gaussians or {"background": 1000, "rigid": 200}
     parts = {name: 4 * 59 * rows for name, rows in gaussians.items()}
     latency = Latency(milliseconds, 1.5 * milliseconds, 2 * milliseconds, 50, 20, 6, device, 2)
+    means = {HELD_OUT: psnr, TRAINING: training_psnr}
+    quality = {split: make_quality(mean, vehicle_psnr) for split, mean in means.items() if mean is not None}
     return RunSummary(
-        format=FORMAT,
-        run=RunDescription(method, scene, seed, split, training_seconds, f"sparsestreet train seed={seed}"),
-        images=6,
+        run=make_run(label, seed, **run),
+        evaluated=evaluated or Evaluation("sparsestreet evaluate run=x", MACHINE, CLEAN, device, 2),
+        images=dict.fromkeys(quality, 6),
         resolutions=("64x48",),
-        quality={
-            "psnr_full": MetricSummary(psnr, 1.0, 6, 0),
-            "ssim_uniform7_full": MetricSummary(0.8, 0.1, 6, 0),
-            "psnr_vehicle": MetricSummary(vehicle_psnr, None, 0 if vehicle_psnr is None else 1, 0),
-        },
+        quality=quality,
         definitions={"psnr_full": "-10 log10(mse)"},
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
@@ -63,7 +118,5 @@ def make_summary(
         bytes_total=sum(parts.values()),
         latency=latency,
         latency_protocol=latency.protocol,
-        machine=Machine("test", 2, "Linux x86_64", "3.11", "2.13.0"),
-        source=Source(None, None),
         guards=GuardCounts({"drawn": 900, "overflowed": 0} | (alarms or {}), alarms or {}),
     )

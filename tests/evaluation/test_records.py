@@ -8,15 +8,19 @@ import os
 import pytest
 
 from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
+from sparsestreet.evaluation.quality_csv import quality_path, read_quality, write_quality
 from sparsestreet.evaluation.records import (
+    HELD_OUT,
+    TRAINING,
     GuardCounts,
-    read_quality,
+    read_run,
     read_summary,
-    write_quality,
+    run_path,
+    write_run,
     write_summary,
 )
 from sparsestreet.evaluation.strict_json import RecordError, significant, write_atomically
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import make_run, make_summary
 
 QUALITY = [
     FrameQuality(0, 1, 12, 9, RegionQuality(108, 0.00123456, 29.0849, 0.912345)),
@@ -40,6 +44,63 @@ def test_summary_round_trip(tmp_path):
     assert json.loads(path.read_text())["latency"]["p90"] == 60.0
 
 
+def test_run_description_round_trip(tmp_path):
+    config = {"loss.weight": 0.012345678901, "node": ["background", "rigid"], "data.width": None, "sky.on": True}
+    run = make_run("streetgs+paper", config=config, caps={"background": 130000}, training_seconds=12.5)
+    path = run_path(tmp_path / "run")
+    write_run(path, run)
+    assert path == tmp_path / "run" / "run.json"
+    assert read_run(path) == run  # settings with all their digits, ints as ints
+    assert [type(value) for value in read_run(path).config.values()] == [type(value) for value in run.config.values()]
+
+
+def test_a_summary_holds_the_run_unchanged(tmp_path):
+    summary = make_summary(config={"loss.weight": 0.012345678901})
+    write_summary(tmp_path / "summary.json", summary)
+    write_run(tmp_path / "run.json", summary.run)
+    entries = json.loads((tmp_path / "summary.json").read_text())["run"]
+    assert entries == json.loads((tmp_path / "run.json").read_text())
+    assert (entries["format"], entries["label"], entries["sparsify"]) == (1, "plain", "none")
+
+
+def test_the_main_split_is_the_held_out_one_where_there_is_one():
+    both, training = make_summary(training_psnr=31.0), make_summary(psnr=None, training_psnr=31.0)
+    assert (both.main_split, both.mean("psnr_full"), both.mean("psnr_full", TRAINING)) == (HELD_OUT, 25.0, 31.0)
+    assert (training.main_split, training.mean("psnr_full"), training.mean("psnr_full", HELD_OUT)) == (
+        TRAINING,
+        31.0,
+        None,
+    )
+    assert both.mean("psnr_human") is None
+
+
+def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
+    with pytest.raises(ValueError, match=r"splits \[\] and images of \[\], expected held_out, training or both"):
+        make_summary(psnr=None)
+    with pytest.raises(ValueError, match=r"splits \['test'\]"):
+        dataclasses.replace(make_summary(), quality={"test": {}}, images={"test": 0})
+    with pytest.raises(ValueError, match=r"images of \['training'\]"):
+        dataclasses.replace(make_summary(), images={TRAINING: 3})
+
+
+@pytest.mark.parametrize(
+    ("write", "read", "value", "remedy"),
+    [
+        (write_run, read_run, make_run(), "format 0, this version reads 1: train the run again"),
+        (write_summary, read_summary, make_summary(), "format 0, this version reads 2: evaluate again"),
+    ],
+)
+def test_another_format_is_named_before_its_keys(tmp_path, write, read, value, remedy):
+    path = tmp_path / "record.json"
+    write(path, value)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0, "new key": 1}))
+    with pytest.raises(RecordError, match=remedy):
+        read(path)
+    path.write_text("{}")
+    with pytest.raises(RecordError, match="format None"):
+        read(path)
+
+
 def test_floats_are_written_with_six_digits(tmp_path):
     summary = make_summary(psnr=25.123456789)
     write_summary(tmp_path / "summary.json", summary)
@@ -59,13 +120,15 @@ def test_quality_round_trip_and_plain_csv(tmp_path):
     assert (second["pixels_human"], second["psnr_human"], second["ssim_uniform7_vehicle"]) == ("0", "", "-0.25")
     write_quality(path, [])
     assert read_quality(path) == []
+    names = [quality_path(tmp_path, split).relative_to(tmp_path).as_posix() for split in (HELD_OUT, TRAINING)]
+    assert names == ["records/quality.csv", "records/quality_train.csv"]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_no_record_holds_a_number_that_is_none(tmp_path, value):
     summary = make_summary()
-    broken = dataclasses.replace(summary, quality={"psnr_full": MetricSummary(value, None, 1, 0)})
-    with pytest.raises(RecordError, match=r"summary\.json: quality: psnr_full: mean is (nan|inf)"):
+    broken = dataclasses.replace(summary, quality={HELD_OUT: {"psnr_full": MetricSummary(value, None, 1, 0)}})
+    with pytest.raises(RecordError, match=r"summary\.json: quality: held_out: psnr_full: mean is (nan|inf)"):
         write_summary(tmp_path / "summary.json", broken)
     with pytest.raises(RecordError, match=r"quality\.csv: frame 3 is (nan|inf)"):
         write_quality(tmp_path / "quality.csv", [FrameQuality(3, 0, 8, 8, RegionQuality(64, value, 20.0, 0.5))])
@@ -84,15 +147,6 @@ def test_alarms_are_among_the_guards():
         GuardCounts({"vanished": 0}, {"vanished": 0})
 
 
-def test_a_record_from_before_guards_were_counted_is_read(tmp_path):
-    path = tmp_path / "summary.json"
-    write_summary(path, make_summary())
-    entries = json.loads(path.read_text())
-    del entries["guards"]
-    path.write_text(json.dumps(entries))
-    assert read_summary(path) == dataclasses.replace(make_summary(), guards=None)
-
-
 def drop(entries, key):
     del entries[key]
 
@@ -102,16 +156,22 @@ def drop(entries, key):
     [
         (lambda entries: drop(entries, "images"), r"lacks the keys \['images'\]"),
         (lambda entries: entries.update(extra=1), r"unknown keys \['extra'\]"),
-        (lambda entries: entries.update(images="six"), r"images: expected int, got str 'six'"),
-        (lambda entries: entries.update(images=True), r"images: expected int, got bool"),
+        (lambda entries: entries["images"].update(held_out="six"), r"images: held_out: expected int, got str 'six'"),
+        (lambda entries: entries["images"].update(held_out=True), r"images: held_out: expected int, got bool"),
         (lambda entries: entries["latency"].update(p50=None), r"latency: p50: expected float, got NoneType"),
         (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
-        (lambda entries: entries["quality"]["psnr_full"].update(images=1.5), r"psnr_full: images: expected int"),
+        (
+            lambda entries: entries["quality"]["held_out"]["psnr_full"].update(images=1.5),
+            r"psnr_full: images: expected int",
+        ),
         (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
-        (lambda entries: entries.update(format=99), r"format 99, this version reads 1"),
+        (lambda entries: entries.update(format=99), r"format 99, this version reads 2"),
+        (lambda entries: entries["run"].update(format=99), r"run: the record has format 99, .* train the run again"),
+        (lambda entries: entries["run"]["config"].update(a={}), r"run: config: a: expected one of bool, .* got dict"),
+        (lambda entries: entries["run"].update(training_seconds="1"), r"training_seconds: expected float, got str '1'"),
         (lambda entries: entries["guards"]["alarms"].update(vanished=1), r"alarms holds vanished: 1, rows has N"),
         (lambda entries: drop(entries["guards"], "alarms"), r"guards: GuardCounts lacks the keys \['alarms'\]"),
-        (lambda entries: entries.update(machine=[]), r"machine: expected dict, got list"),
+        (lambda entries: entries["evaluated"].update(machine=[]), r"evaluated: machine: expected dict, got list"),
         (lambda entries: entries["run"].update(seed=float("nan")), r"is not strict JSON \(NaN"),
     ],
 )

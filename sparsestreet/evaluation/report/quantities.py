@@ -1,0 +1,59 @@
+"""What a table says of a run: heading, where the record holds it, how it is written."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sparsestreet.evaluation.records import HELD_OUT, TRAINING, RunSummary
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity of the table."""
+
+    heading: str
+    value: Callable[[RunSummary], float | None]
+    text: Callable[[float], str]
+    relative: bool
+    """How differences to the baseline read: in per cent of it (what remains), or as a signed difference."""
+    count: bool = False
+    """Whether it counts Gaussians, which a cap holds down."""
+
+
+_METRICS = (
+    ("PSNR", "psnr_full", "{:.2f}"),
+    ("SSIM", "ssim_uniform7_full", "{:.4f}"),
+    ("vehicle PSNR", "psnr_vehicle", "{:.2f}"),
+    ("vehicle SSIM", "ssim_uniform7_vehicle", "{:.4f}"),
+    ("human PSNR", "psnr_human", "{:.2f}"),
+)
+
+
+def quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
+    """Those that at least one of the runs has."""
+    nodes = dict.fromkeys(name for run in runs for name in run.gaussians)
+    known = (
+        *(Quantity(heading, _metric(name, HELD_OUT), text.format, False) for heading, name, text in _METRICS),
+        *_training_metrics(runs),
+        Quantity("Gaussians", lambda run: float(run.gaussians_total), "{:,.0f}".format, True, count=True),
+        *(Quantity(name, _node_count(name), "{:,.0f}".format, True, count=True) for name in nodes),
+        Quantity("MB", lambda run: run.bytes_total / 1e6, "{:.2f}".format, True),
+        Quantity("ms/frame", lambda run: run.latency.p50, "{:.1f}".format, True),
+        Quantity("train s", lambda run: run.run.training_seconds, "{:.0f}".format, True),
+    )
+    return tuple(quantity for quantity in known if any(quantity.value(run) is not None for run in runs))
+
+
+def _training_metrics(runs: Sequence[RunSummary]) -> list[Quantity]:
+    """PSNR beside that of held-out views, which shows overfitting; everything where no run holds out a view."""
+    shown = _METRICS if all(run.main_split == TRAINING for run in runs) else _METRICS[:1]
+    return [
+        Quantity(f"train-view {heading}", _metric(name, TRAINING), text.format, False) for heading, name, text in shown
+    ]
+
+
+def _metric(name: str, split: str) -> Callable[[RunSummary], float | None]:
+    return lambda run: run.mean(name, split)
+
+
+def _node_count(name: str) -> Callable[[RunSummary], float | None]:
+    return lambda run: float(run.gaussians[name]) if name in run.gaussians else None

@@ -1,0 +1,62 @@
+"""The table on the command line."""
+
+import pytest
+
+from sparsestreet.cli.report import report
+from sparsestreet.evaluation.records import summary_path, write_summary
+from tests.evaluation.frames import make_summary
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two streets, one of them with two configurations."""
+    for name, summary in {
+        "a": make_summary("plain", scene="a"),
+        "b": make_summary("plain", scene="b"),
+        "removal_db=0.1": make_summary("ours", scene="a", config={"schedule.removal_db": 0.1}),
+        "removal_db=0.2": make_summary("ours", scene="a", config={"schedule.removal_db": 0.2}),
+    }.items():
+        write_summary(summary_path(tmp_path / name), summary)
+    return tmp_path
+
+
+def test_tables_are_printed_and_written(runs, tmp_path, capsys):
+    table, picture = tmp_path / "table.md", tmp_path / "runs.png"
+    assert report([str(runs), "baseline=plain", f"markdown={table}", f"figure={picture}"]) == 0
+    text = table.read_text()
+    assert text.count("### ") == 3
+    assert "| ours schedule.removal_db=0.2 against plain |" in text
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "mean over scenes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("wanted", "titles"), [("scenes", ["a", "b"]), ("mean", ["mean"])])
+def test_sections_are_chosen(runs, tmp_path, wanted, titles):
+    table = tmp_path / "table.md"
+    assert report([str(runs), f"sections={wanted}", f"markdown={table}"]) == 0
+    found = [line.split()[1] for line in table.read_text().splitlines() if line.startswith("###")]
+    assert found == titles
+
+
+def test_a_folder_may_have_an_equals_sign(runs, capsys):
+    assert report([str(runs / "removal_db=0.1")]) == 0
+    assert "ours" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [[], ["basline=plain", "."], [".", "sections=none"]])
+def test_wrong_usage(arguments, capsys):
+    assert report(arguments) == 2
+    assert "sparsestreet report DIR" in capsys.readouterr().err
+
+
+def test_help(capsys):
+    assert report(["--help"]) == 0
+    assert "sparsestreet report DIR" in capsys.readouterr().out
+
+
+def test_errors_are_one_line(runs, tmp_path, capsys):
+    assert report([str(tmp_path / "nothing")]) == 1
+    assert report([str(runs), "baseline=ours"]) == 1
+    assert report([str(runs / "a"), "sections=mean"]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert [line.split(":")[0] for line in lines] == ["sparsestreet report"] * 3

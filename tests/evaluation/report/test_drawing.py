@@ -1,0 +1,91 @@
+"""Tables as they are printed and written."""
+
+import pytest
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from sparsestreet.evaluation.report import figure, markdown, sections, tables
+from tests.evaluation.frames import make_summary
+from tests.evaluation.report.test_sections import PLAIN_AND_OURS, STREETS, records, street
+
+
+def text_of(found, baseline=None):
+    return markdown(sections(found, baseline))
+
+
+def test_markdown_reads_as_written_by_hand():
+    lines = text_of(PLAIN_AND_OURS, "plain").splitlines()
+    assert lines[0] == "### street (64x48; held out: every 10th frame from 0)"
+    header, rule, plain, ours, difference = (line.split(" | ") for line in lines[2:7])
+    assert len(header) == len(rule) == len(plain) == len(ours) == len(difference)
+    assert header[:3] == ["| method", "runs", "PSNR"]
+    assert plain[:3] == ["| plain", "n=2 (seed 0,1)", "26.00 ± 1.41"]
+    assert ours[:3] == ["| ours", "n=2 (seed 0,1)", "25.75 ± 1.20"]
+    assert difference[2] == "-0.25 ± 0.21"
+    assert difference[header.index("Gaussians")] == "29.2 ± 5.9 %"
+    assert "**" not in text_of(PLAIN_AND_OURS, "plain")
+
+
+def test_a_single_run_says_so_and_has_no_spread():
+    text = text_of(PLAIN_AND_OURS[:1])
+    assert "| plain | n=1 (seed 0) | 25.00 |" in text
+    assert "n=1 has no spread" in text
+
+
+def test_cells_of_fewer_runs_than_the_row_carry_their_number():
+    assert "22.00 (n=1)" in text_of(records(make_summary(seed=0), make_summary(seed=1, vehicle_psnr=None)))
+    assert "| - |" in text_of(records(make_summary(), make_summary("ours", vehicle_psnr=None)))
+
+
+def test_counts_that_a_cap_held_down_are_marked():
+    capped = make_summary("streetgs", caps={"background": 1000})
+    text = text_of(records(capped, make_summary("streetgs+paper")), "streetgs")
+    plain, paper, difference = (line for line in text.splitlines() if line.startswith("| streetgs"))
+    assert plain.count("†") == difference.count("†") == 3  # the total and two nodes, nothing else
+    assert "1,200 †" in plain
+    assert "100.0 % †" in difference
+    assert "†" not in paper
+
+
+def printed(table, width):
+    console = Console(width=width)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()
+
+
+def test_a_few_methods_fit_a_terminal_of_80_characters():
+    (table,) = tables(sections(PLAIN_AND_OURS, "plain"))
+    text = printed(table, 80)
+    for cell in ("26.00 ± 1.41", "25.75 ± 1.20", "-0.25 ± 0.21", "29.2 ± 5.9 %", "1,400 ± 283", "every 10th frame"):
+        assert cell in text
+    assert "…" not in text
+
+
+def test_square_brackets_are_no_markup():
+    runs = [make_summary("m", config={"nodes": [name]}) for name in ("red", "blue")]
+    (table,) = tables(sections(records(*runs)))
+    text = printed(table, 200)
+    assert 'nodes=["red"]' in text
+    assert 'nodes=["blue"]' in text
+
+
+def test_many_methods_stand_below_each_other():
+    (table,) = tables(sections(records(*(make_summary(f"method{index}") for index in range(6)))))
+    assert table.row_count == 6
+    assert str(table.columns[0].header) == "method"
+
+
+def test_every_run_is_a_point_in_its_variants_color(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: drawn.append((self, path)))
+    runs = [street(*values) for values in STREETS]
+    figure(records(*runs, make_summary("blind", psnr=None, training_psnr=30.0)), tmp_path / "runs.png")
+    ((canvas, path),) = drawn
+    assert path == tmp_path / "runs.png"
+    ours, plain = canvas.axes[0].collections
+    assert plain.get_offsets().tolist() == [[100, 30], [200, 32], [300, 31]]
+    assert ours.get_offsets().tolist() == [[50, 29], [50, 32.5], [150, 30]]
+    assert [text.get_text() for text in canvas.axes[0].get_legend().get_texts()] == ["ours (n=3)", "plain (n=3)"]
+    with pytest.raises(ValueError, match="no run was evaluated on held-out views"):
+        figure(records(make_summary(psnr=None, training_psnr=30.0)), tmp_path / "runs.png")
