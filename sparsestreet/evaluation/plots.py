@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter
 # Okabe and Ito's palette: distinguishable with any color vision.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _MARKERS = "osD^vP*X"
+_DASHES = ("--", ":", "-.")
 
 
 def plot_counts(
@@ -18,15 +19,15 @@ def plot_counts(
     steps: Sequence[int],
     counts: Mapping[str, Sequence[int]],
     events: Sequence[tuple[int, str]] = (),
-    title: str = "Gaussians per node class",
+    title: str = "Gaussians per node",
 ) -> None:
-    """Draw the number of Gaussians of each node class over training steps, with prune events marked.
+    """Draw the number of Gaussians of each node over training steps, with prune events marked.
 
     Args:
         path: PNG to write.
         steps: training steps of the samples, increasing.
-        counts: node class -> number of rows at each step (logarithmic axis; zeros are not drawn).
-        events: (step, what happened), e.g. (2800, "background prune"); events of one name share a color.
+        counts: node -> number of Gaussians at each step (logarithmic axis; zeros are not drawn).
+        events: (step, what happened), e.g. (2800, "pruning"); events of one name share a color.
     """
     for name, values in counts.items():
         if len(values) != len(steps):
@@ -38,23 +39,23 @@ def plot_counts(
         # Counts jump at a step and stay: a slope between two samples would show Gaussians that never were.
         samples = zip(*drawn, strict=True) if drawn else ([], [])
         axes.plot(*samples, label=label, drawstyle="steps-post", **_line(index))
-    names = list(dict.fromkeys(name for _, name in events))
-    for step, name in events:
-        axes.axvline(step, color="0.55", linewidth=0.8, linestyle=("--", ":", "-.")[names.index(name) % 3], zorder=0)
-    for index, name in enumerate(names):
-        axes.plot([], [], color="0.55", linewidth=0.8, linestyle=("--", ":", "-.")[index % 3], label=name)
+    _mark(axes, events)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
     _finish(figure, axes, path)
 
 
 def plot_psnr(
-    path: Path, curves: Mapping[str, tuple[Sequence[int], Sequence[float]]], title: str = "PSNR over training"
+    path: Path,
+    curves: Mapping[str, tuple[Sequence[int], Sequence[float]]],
+    events: Sequence[tuple[int, str]] = (),
+    title: str = "PSNR over training",
 ) -> None:
-    """Draw PSNR in dB against training steps, one curve per name -> (steps, PSNR)."""
+    """Draw PSNR in dB against training steps, one curve per name -> (steps, PSNR), with (step, name) events marked."""
     figure, axes = _figure(title, "step", "PSNR (dB)")
     for index, (name, (steps, values)) in enumerate(curves.items()):
         axes.plot(steps, values, label=name, **_line(index))
+    _mark(axes, events)
     _finish(figure, axes, path)
 
 
@@ -91,6 +92,16 @@ def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def _mark(axes: Axes, events: Sequence[tuple[int, str]]) -> None:
+    """A vertical line at each event, one style and one entry of the legend for each name."""
+    names = list(dict.fromkeys(name for _, name in events))
+    style = {name: {"color": "0.55", "linewidth": 0.8, "linestyle": _DASHES[i % 3]} for i, name in enumerate(names)}
+    for step, name in events:
+        axes.axvline(step, zorder=0, **style[name])
+    for name in names:
+        axes.plot([], [], label=name, **style[name])
 
 
 def _line(index: int) -> dict[str, str | float]:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 
-from sparsestreet.metrics.definitions import QUANTITIES, REGIONS, metric_id
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING
 from sparsestreet.evaluation.strict_json import RecordError, significant, write_atomically
+from sparsestreet.metrics.definitions import QUANTITIES, REGIONS, metric_id
 
 _FILES = {HELD_OUT: "quality.csv", TRAINING: "quality_train.csv"}
 

@@ -4,7 +4,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from sparsestreet.evaluation.plots import plot_counts, plot_psnr, plot_runs
-from tests.evaluation.frames import make_summary
 
 
 @pytest.fixture
@@ -51,17 +50,17 @@ def test_plots_of_nothing_are_empty_not_errors(tmp_path, drawn):
 
 
 def test_psnr_curves(tmp_path, drawn):
-    plot_psnr(tmp_path / "psnr.png", {"plain": ([0, 5], [10.0, 20.0])})
-    (line,) = drawn[0].axes[0].lines
+    plot_psnr(tmp_path / "psnr.png", {"plain": ([0, 5], [10.0, 20.0])}, [(3, "mask")])
+    line, mark, _ = drawn[0].axes[0].lines
     assert list(line.get_ydata()) == [10.0, 20.0]
-    assert legend_of(drawn[0]) == ["plain"]
+    assert list(mark.get_xdata()) == [3, 3]
+    assert legend_of(drawn[0]) == ["plain", "mask"]
 
 
-def test_every_run_is_a_point(tmp_path, drawn):
-    summaries = [make_summary("plain", seed, psnr=25.0 + seed, gaussians={"a": 1000}) for seed in range(2)]
-    summaries.append(make_summary("ours", 0, psnr=24.0, gaussians={"a": 300, "b": 10}))
-    plot_runs(tmp_path / "runs.png", summaries)
+def test_runs_are_points_in_the_color_of_their_name(tmp_path, drawn):
+    plot_runs(tmp_path / "runs.png", {"plain": [(1000, 25.0), (1000, 26.0)], "ours": [(310, 24.0)]})
     plain, ours = drawn[0].axes[0].collections
     assert plain.get_offsets().tolist() == [[1000, 25], [1000, 26]]
     assert ours.get_offsets().tolist() == [[310, 24]]
+    assert plain.get_facecolor().tolist() != ours.get_facecolor().tolist()
     assert legend_of(drawn[0]) == ["plain (n=2)", "ours (n=1)"]
