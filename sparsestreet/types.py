@@ -1,6 +1,6 @@
 """The frozen values that the wings of the package hand to each other.
 
-Conventions, everywhere: world frame metric and right-handed, re-centerd at load; camera frame as in
+Conventions, everywhere: world frame metric and right-handed, re-centered at load; camera frame as in
 OpenCV (x right, y down, z forward); quaternions wxyz; ``a_from_b`` maps points of frame b to frame a;
 pixel centers at +0.5; time in [0, 1] beside the integer frame; images float32 in [0, 1] at the splat
 op and uint8 in storage.

@@ -1,83 +1,75 @@
-"""From a config to the objects of a run; training and evaluation assemble the same."""
+"""From a config to the objects of a run."""
 
 import shlex
 import sys
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 
 import torch
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.evaluation.history import draw_history
-from sparsestreet.evaluation.records import RunDescription, RunSummary
-from sparsestreet.evaluation.run import evaluate_run
-from sparsestreet.ops import guards
-from sparsestreet.scene.build import build_scene
-from sparsestreet.scene.centers import node_legend, project_centers
-from sparsestreet.scene.rendering import render
-from sparsestreet.training.system import StreetSystem
+from sparsestreet.evaluation.configuration import config_hash, flat_config
+from sparsestreet.evaluation.provenance import this_machine, this_source
+from sparsestreet.evaluation.records import RunDescription
+from sparsestreet.evaluation.speed import device_name
+from sparsestreet.training.recipe import Recipe
 
 
-@dataclass(frozen=True)
-class Assembly:
-    log: DrivingLog
-    datamodule: StreetData
-    system: StreetSystem
-
-
-def assemble(cfg: DictConfig) -> Assembly:
-    """Read the log, split it, seed the scene and wrap it for training."""
-    log = instantiate(cfg.data.log, _convert_="all")
-    datamodule = StreetData(log, stride=cfg.split.stride, offset=cfg.split.offset, seed=cfg.seed)
-    split = datamodule.split
-    scene = build_scene(
-        log,
-        split.train,
-        frozenset(frame.frame_index for frame in split.held_out),
-        instantiate(cfg.node, _convert_="all"),
-        instantiate(cfg.sky, _convert_="all") if cfg.sky else None,
-        cfg.seed,
-    )
-    system = StreetSystem(
-        scene,
-        instantiate(cfg.loss, _convert_="all"),
-        instantiate(cfg.optimizer, _convert_="all"),
-        radius=log.radius,
+def recipe_of(cfg: DictConfig) -> Recipe:
+    """The parts of a training, before any data is read. Raises ValueError where they do not fit together."""
+    recipe = Recipe(
+        nodes=instantiate(cfg.node, _convert_="all"),
+        sky=instantiate(cfg.sky, _convert_="all") if cfg.sky else None,
+        losses=instantiate(cfg.loss, _convert_="all"),
+        callbacks=instantiate(cfg.callback, _convert_="all"),
+        optimizer=instantiate(cfg.optimizer, _convert_="all"),
         options=instantiate(cfg.render, _convert_="all"),
         sh_interval=cfg.schedule.sh_interval,
+        seed=cfg.seed,
     )
-    return Assembly(log, datamodule, system)
+    problems = recipe.problems()
+    if problems:
+        raise ValueError("; ".join(problems))
+    return recipe
 
 
-@torch.no_grad()
-def evaluate_assembly(parts: Assembly, cfg: DictConfig, out: Path, training_seconds: float | None) -> RunSummary | None:
-    """Records and pictures of the held-out frames under ``out``; None where the split holds out nothing."""
-    held_out = parts.datamodule.split.held_out
-    if not held_out:
-        return None
-    system, scene = parts.system.cpu().eval(), parts.system.scene
-    summary = evaluate_run(
-        held_out,
-        render=lambda frame: render(scene, frame, options=system.options),
-        centers=lambda frame: project_centers(scene, frame),
-        guards=lambda frame: guards(
-            scene.gaussians_at(frame).gaussians, frame.camera, settings=system.options.settings
-        ),
-        gaussians=scene.counts(),
-        bytes_by_part=scene.bytes_by_part(),
-        run=RunDescription(
-            method=cfg.name,
-            scene=parts.log.name,
-            seed=cfg.seed,
-            split=f"every {cfg.split.stride}th frame from {cfg.split.offset}",
-            training_seconds=training_seconds,
-            command=shlex.join(["sparsestreet", *sys.argv[0].split()[1:], *sys.argv[1:]]),
-        ),
-        out=out,
-        legend=node_legend(scene.counts()),
+def data_of(cfg: DictConfig) -> StreetData:
+    """The log, and its split into views to train on and views held out."""
+    log = instantiate(cfg.data.log, _convert_="all")
+    return StreetData(log, **cfg.split, seed=cfg.seed)
+
+
+def description_of(cfg: DictConfig, log: DrivingLog, device: torch.device) -> RunDescription:
+    """What identifies a run that is about to start on a device."""
+    config = flat_config(OmegaConf.to_container(cfg, resolve=True))
+    return RunDescription(
+        method=cfg.method.name,
+        sparsify=cfg.sparsify.name,
+        label=cfg.name,
+        scene=log.name,
+        seed=cfg.seed,
+        split=split_in_words(cfg),
+        config=config,
+        config_hash=config_hash(config),
+        command=this_command(),
+        device=device_name(device),
+        threads=torch.get_num_threads(),
+        steps=0,
+        max_steps=cfg.schedule.max_steps,
+        training_seconds=None,
+        caps={},
+        machine=this_machine(),
+        source=this_source(),
     )
-    draw_history(out)
-    return summary
+
+
+def split_in_words(cfg: DictConfig) -> str:
+    """Which frames are held out."""
+    return f"every {cfg.split.stride}th frame from {cfg.split.offset}" if cfg.split.stride else "none"
+
+
+def this_command(words: Sequence[str] | None = None) -> str:
+    """What was typed: the words after ``sparsestreet``; None: those of the program's arguments."""
+    return shlex.join(["sparsestreet", *(sys.argv[0].split()[1:] + sys.argv[1:] if words is None else words)])

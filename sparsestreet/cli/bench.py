@@ -112,25 +112,20 @@ def _gpu(options: argparse.Namespace) -> bool:
 
 
 def trained_street(run: Path) -> BenchScene:
-    """A held-out view of a trained run, in the middle of its log, as ``evaluate`` would render it (without the sky).
+    """A recorded view of a trained run, in the middle of its log, as ``evaluate`` would render it (without the sky).
 
-    Raises FileNotFoundError if the folder holds no run or no checkpoint.
+    Raises FileNotFoundError if the folder holds no scene or no views.
     """
-    from sparsestreet.cli.assemble import assemble
-    from sparsestreet.cli.compose import load_run_config
+    from sparsestreet.export.views import FILE_NAME, read_views
+    from sparsestreet.scene.storage import load_scene
 
-    cfg = load_run_config(run)
-    parts = assemble(cfg)
-    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=True)
-    parts.system.load_state_dict(checkpoint["state_dict"])
-    split = parts.datamodule.split
-    frames = split.held_out or split.train
-    frame = frames[len(frames) // 2]
+    stored = load_scene(run)
+    views = read_views(run / FILE_NAME).all
+    view = views[len(views) // 2]
     with torch.no_grad():
-        gaussians = parts.system.eval().scene.gaussians_at(frame.time).gaussians
-    steps = checkpoint["global_step"]
-    source = f"trained: {cfg.name} on {parts.log.name}, seed {cfg.seed}, {steps} steps, frame {frame.frame_index}"
-    return BenchScene("trained street", source, gaussians, frame.camera)
+        gaussians = stored.scene.gaussians_at(view).gaussians
+    source = f"trained: {run.name} on {stored.name}, frame {view.frame_index}"
+    return BenchScene("trained street", source, gaussians, view.camera)
 
 
 def _file(options: argparse.Namespace) -> RecordFile:

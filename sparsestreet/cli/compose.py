@@ -43,6 +43,8 @@ class TrainSchema:
     render: Any = MISSING
     trainer: Any = MISSING
     logger: Any = None
+    out: str = MISSING
+    folder: str = MISSING
 
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
@@ -78,7 +80,10 @@ def override_problem(overrides: list[str], config_name: str = "train") -> str | 
         try:
             cfg = compose(config_name, single)
         except (HydraException, OmegaConfBaseException, ValueError) as error:
-            return _explain(str(error.__cause__ or error).splitlines()[0], single, config_name)
+            cause = error.__cause__ or error
+            key = getattr(cause, "full_key", None)
+            reason = str(cause).splitlines()[0]
+            return _explain(f"{key}: {reason}" if key and key not in reason else reason, single, config_name)
     return _masks_that_are_off(single, cfg)
 
 
@@ -100,17 +105,23 @@ def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:
 
 def _explain(reason: str, overrides: list[str], config_name: str) -> str:
     """Hydra's reason with the whole key and the key or option that was probably meant."""
+    if "Got NoneType" in reason:
+        group = next((key for key, _, value in (text.partition("=") for text in overrides) if value == "null"), "")
+        return f"no option null in conf/{group}: choose one of {', '.join(_options(group))}"
     option = re.search(r"Could not find '([^']+)/([^/']+)'|Could not load '([^']+)/([^/']+)'", reason)
     if option:
         group, name = (part for part in option.groups() if part)
-        choices = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-        return f"no option {name!r} in conf/{group}: choose one of {', '.join(choices)}"
+        return f"no option {name!r} in conf/{group}: choose one of {', '.join(_options(group))}"
     unknown = re.search(r"[Kk]ey '([^']+)' is not in struct|Key '([^']+)' not in|Could not override '([^']+)'", reason)
     if not unknown:
         return reason
     part = next(group for group in unknown.groups() if group)
     given = [text.partition("=")[0].lstrip("+~") for text in overrides]
     return _unknown_key(next((name for name in given if part in name.split(".") or name == part), part), config_name)
+
+
+def _options(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
 def _unknown_key(key: str, config_name: str) -> str:

@@ -1,72 +1,65 @@
 """``sparsestreet train``: compose, assemble, fit, evaluate, record."""
 
-import logging
+import os
 import sys
-import warnings
 from pathlib import Path
 
 import hydra
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
-from lightning import Callback, Trainer, seed_everything
+from hydra.errors import InstantiationException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from sparsestreet.cli.assemble import assemble, evaluate_assembly
-from sparsestreet.cli.compose import CONF, override_problem
-from sparsestreet.training.callbacks import Checkpoints, Clock, TrainingProgress
-
-log = logging.getLogger(__name__)
+from sparsestreet.cli.compose import CONF, configuration, override_problem
+from sparsestreet.cli.resume import resumed_overrides
 
 
 def train(arguments: list[str]) -> int:
-    """Run the Hydra app on these overrides; 2 if they name an unknown key."""
-    problem = override_problem(arguments) if "--help" not in arguments else None
-    if problem:
-        print(f"sparsestreet train: {problem}", file=sys.stderr)
-        return 2
+    """Run the Hydra app on these overrides; 2 if they are wrong, 1 if the data is, 130 or 143 if a signal ended it."""
+    if "--help" not in arguments:
+        try:
+            arguments = resumed_overrides(arguments)
+            problem = override_problem(arguments) or _problem_of_values(arguments)
+        except (FileNotFoundError, ValueError) as error:
+            problem = str(error)
+        if problem:
+            print(f"sparsestreet train: {problem}", file=sys.stderr)
+            return 2
     sys.argv = ["sparsestreet train", *arguments]
     app()
     return 0
 
 
+def _problem_of_values(arguments: list[str]) -> str | None:
+    """What the values of one run say that cannot be; sweeps and questions to Hydra are looked at job by job."""
+    from sparsestreet.cli.checks import config_problem
+
+    if any(text.startswith("-") for text in arguments):
+        return None
+    with configuration():
+        # The folder is known only to a running app.
+        given = [text for text in arguments if not text.startswith("hydra.run")]
+        return config_problem(compose("train", [*given, "folder=."]))
+
+
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def app(cfg: DictConfig) -> float:
-    """One training with its evaluation; returns the held-out full-image PSNR, for sweepers."""
-    out = Path(HydraConfig.get().runtime.output_dir)
-    seed_everything(cfg.seed, verbose=False)
-    silence_known_noise()
-    parts = assemble(cfg)
-    clock = Clock()
-    trainer = build_trainer(cfg, clock, out)
-    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
-    resume_options = {"ckpt_path": cfg.resume, "weights_only": False} if cfg.resume else {}
-    trainer.fit(parts.system, datamodule=parts.datamodule, **resume_options)
-    if trainer.fast_dev_run:
-        log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
-        return 0.0
-    summary = evaluate_assembly(parts, cfg, out, training_seconds=clock.seconds)
-    log.info("records and pictures in %s", out)
-    return summary.quality["psnr_full"].mean if summary else 0.0
+    """One training with its evaluation; returns a full-image PSNR for sweepers (held out, else of training views)."""
+    from sparsestreet.cli.run import run
+
+    try:
+        return run(cfg, Path(HydraConfig.get().runtime.output_dir))
+    except (InstantiationException, ValueError, OSError, ImportError) as error:
+        # In a sweep, and where somebody looks for a fault, Hydra's own report with the whole trace is better.
+        if HydraConfig.get().mode == RunMode.MULTIRUN or "HYDRA_FULL_ERROR" in os.environ:
+            raise
+        print(f"sparsestreet train: {_sentence(error)}", file=sys.stderr)
+        sys.exit(1)
 
 
-def build_trainer(cfg: DictConfig, clock: Clock, out: Path) -> Trainer:
-    callbacks: list[Callback] = list(instantiate(cfg.callback, _convert_="all").values())
-    standing = [TrainingProgress(), Checkpoints(out / "checkpoints")]
-    logger = instantiate(cfg.logger) if cfg.logger else False
-    return instantiate(
-        cfg.trainer,
-        callbacks=[clock, *callbacks, *standing],
-        logger=logger,
-        default_root_dir=str(out),
-        enable_model_summary=False,
-        enable_progress_bar=False,
-        enable_checkpointing=False,
-        max_epochs=-1,
-    )
-
-
-def silence_known_noise() -> None:
-    """Hints of Lightning that do not apply: frames are already in memory, a loader process would copy them."""
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+def _sentence(error: BaseException) -> str:
+    """The reason without Hydra's wrapping."""
+    while isinstance(error, InstantiationException) and error.__cause__ is not None:
+        error = error.__cause__
+    return str(error) or type(error).__name__

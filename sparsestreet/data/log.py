@@ -21,7 +21,7 @@ _QUANTILE_POINTS = 1_000_000
 
 @dataclass(frozen=True)
 class DrivingLog:
-    """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centerd near its start."""
+    """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centered near its start."""
 
     name: str
     frames: tuple[Frame, ...]
@@ -29,7 +29,7 @@ class DrivingLog:
     sweeps: tuple[Sweep, ...]
     """Ordered by index; empty where the log has no lidar."""
     tracks: tuple[Track, ...]
-    """Objects annotated in at least one of the frames; poses are in the re-centerd world."""
+    """Objects annotated in at least one of the frames; poses are in the re-centered world."""
     num_frames: int
     """Instants, not images: frame indices run over 0 .. num_frames - 1."""
     num_cameras: int

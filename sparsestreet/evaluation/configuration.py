@@ -18,6 +18,8 @@ IDENTITY_KEYS = (
     "name",
     "label",
     "resume",  # a resumed run is the run
+    "out",
+    "folder",
     "data.root",  # where a log lies; the scene's name says which it is
     "data.log.root",
     "callback.*.path",  # where something is written

@@ -7,7 +7,6 @@ closed is gone.
 
 import copy
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.sky import Sky
 from sparsestreet.types import View
+from sparsestreet.whole_file import whole_file
 
 VERSION = 1
 """Raised when an older program could not read the file."""
@@ -54,7 +54,6 @@ class StoredScene:
 
 def save_scene(path: Path | str, stored: StoredScene) -> None:
     """Write the whole file or nothing. A scene with masks is written as they leave it, and stays as it is."""
-    path = Path(path)
     scene = _without_masks(stored.scene)
     header = {
         "version": VERSION,
@@ -69,13 +68,8 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
     }
     # safetensors refuses what shares memory or is not contiguous.
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in scene.state_dict().items()}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with whole_file(Path(path)) as temporary:
         save_file(tensors, temporary, metadata={"sparsestreet": json.dumps(header)})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredScene:

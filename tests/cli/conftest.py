@@ -19,29 +19,36 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "data.log.settings.num_cameras=2",
         "data.log.settings.lidar_beams=24",
         "data.log.settings.lidar_azimuth_steps=300",
-        "scale.background.lidar_points=1500",
-        "scale.background.near_points=200",
-        "scale.background.far_points=300",
-        "scale.background.min_gaussians=200",
-        "scale.background.max_gaussians=6000",
-        "scale.background.min_gaussians=200",
-        "scale.background.max_gaussians=6000",
-        "scale.rigid={points_per_instance: 150, min_gaussians: 60, max_gaussians: 3000, mask_visible_only: true}",
-        "scale.sky_resolution=8",
+        "sky.resolution=8",
+        *TINY_BACKGROUND,
         "schedule.max_steps=60",
-        "schedule.densify_in.every=10",
-        "schedule.cull_in.every=10",
+        "schedule.refine_in.every=10",
         "schedule.mask_in.every=10",
         "trainer.val_check_interval=60",
     ]
 
 
+TINY_BACKGROUND = [
+    "node.background.num_lidar=1500",
+    "node.background.num_near=200",
+    "node.background.num_far=300",
+    "node.background.min_gaussians=200",
+    "node.background.max_gaussians=6000",
+]
+TINY_RIGID = [
+    "node.rigid.points_per_instance=150",
+    "node.rigid.min_gaussians=60",
+    "node.rigid.max_gaussians=3000",
+]
+
+
 @pytest.fixture
 def run_train(tiny_street):
-    """Train on the tiny street into a folder."""
+    """Train on the tiny street into a folder; a method without the rigid node is named by ``method=3dgs``."""
 
     def run(out: Path, *overrides: str) -> Path:
-        assert train([*tiny_street, f"hydra.run.dir={out}", *overrides]) == 0
+        rigid = [] if "method=3dgs" in overrides else TINY_RIGID
+        assert train([*tiny_street, *rigid, f"out={out}", *overrides]) == 0
         return out
 
     return run

@@ -1,8 +1,10 @@
 """What the command line makes of overrides before Hydra sees them."""
 
 import pytest
+from hydra import compose
 
-from sparsestreet.cli.compose import override_problem
+from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.compose import configuration, override_problem
 
 
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "hydra"], ["--info", "defaults"], ["-m"]])
@@ -10,9 +12,61 @@ def test_flags_of_hydra_and_their_words_pass(flags):
     assert override_problem([*flags, "seed=1"]) is None
 
 
-def test_a_word_that_is_no_override_is_named():
-    assert override_problem(["foo"]) == "'foo' is no override: write key=value"
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["foo"], "'foo' is no override: write key=value"),
+        (["trainer.fast_dev_runx=true"], "did you mean 'trainer.fast_dev_run'"),
+        (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
+        (["nod.background.num_lidar=5"], "did you mean 'node.background.num_lidar'"),
+        (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of importance, masks, none"),
+        (["experimant=capped"], "did you mean 'experiment'"),
+        (["+surprise=1"], "no key 'surprise'"),
+        (["seed=x"], "seed"),
+        (["node.background.mask.sparsity_weight=1e-3"], "has no effect with sparsify=none: choose sparsify=masks"),
+        (["schedule.lambda_m=3"], "has no effect with sparsify=none"),
+        (["sky=null"], "choose one of cube, none"),
+        (["logger=null"], "choose one of csv, none"),
+    ],
+)
+def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
+    problem = override_problem(overrides)
+    assert said in problem
+    assert len(problem.splitlines()) == 1
 
 
-def test_an_unknown_key_names_the_nearest_one():
-    assert "did you mean 'trainer.fast_dev_run'" in override_problem(["trainer.fast_dev_runx=true"])
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("schedule.max_steps=abc", "must be int, got 'abc'"),
+        ("node.background.num_lidar=many", "node.background.num_lidar must be int, got 'many'"),
+        ("node.background.learning_rates.means.initial=[1]", "learning_rates.means.initial must be float"),
+        ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
+        ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),
+        ("node.rigid.classes=Car", "node.rigid.classes must be"),
+        ("capacity=huge", "no capacity 'huge': choose one of small, paper"),
+        ("data=drivestudio", "data.root has no value: give data.root=..."),
+        ("trainer.devices=2", "training runs on one device, got trainer.devices=2"),
+    ],
+)
+def test_a_value_that_cannot_be_is_found_before_any_data_is_read(override, said):
+    with configuration():
+        cfg = compose("train", ["folder=.", override])
+    assert said in config_problem(cfg)
+
+
+@pytest.mark.parametrize(
+    "override", ["node.background.max_gaussians=null", "loss.sky.weight=1", "schedule.max_steps=5"]
+)
+def test_values_that_can_be_pass(override):
+    with configuration():
+        assert config_problem(compose("train", ["folder=.", override])) is None
+
+
+def test_a_gpu_that_is_not_there(monkeypatch):
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with configuration():
+        cfg = compose("train", ["folder=.", "trainer=gpu"])
+    assert "trainer=gpu needs a CUDA device" in config_problem(cfg)

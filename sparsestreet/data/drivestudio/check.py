@@ -15,7 +15,7 @@ from sparsestreet.data.drivestudio.poses import read_intrinsics, read_pose
 from sparsestreet.data.drivestudio.problems import LogError, Problem, attempt, fault, missing_files
 
 LARGEST_SCENE = 20_000.0
-"""Meters. Re-centerd coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""
+"""Meters. Re-centered coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""
 
 
 def check_drivestudio(
@@ -64,7 +64,7 @@ def _required(layout: Layout) -> list[Path]:
 
 
 def _pose_files(layout: Layout) -> list[Path]:
-    """Every pose that is read, once, among them the front camera's that the world is re-centerd on."""
+    """Every pose that is read, once, among them the front camera's that the world is re-centered on."""
     cameras = sorted({*layout.cameras, layout.front})
     poses = [layout.extrinsics(frame, camera) for frame in layout.frames for camera in cameras]
     if layout.waymo or layout.has_lidar:

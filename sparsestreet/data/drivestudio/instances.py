@@ -38,7 +38,7 @@ def read_instances(layout: Layout) -> list[Track]:
 
 
 def window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -> Track | None:
-    """The track inside the window, frames counted from its start, in the re-centerd world; None where it is absent.
+    """The track inside the window, frames counted from its start, in the re-centered world; None where it is absent.
 
     The size stays the mean over all of the log: an object does not change with the window.
     """

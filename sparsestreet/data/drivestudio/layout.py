@@ -23,7 +23,7 @@ class Layout:
     """Frames of the window, in the folder's own numbers."""
     cameras: tuple[int, ...]
     front: int
-    """Lowest camera number in the folder: the re-centerd world starts there, whichever cameras are read."""
+    """Lowest camera number in the folder: the re-centered world starts there, whichever cameras are read."""
     num_frames_on_disk: int
 
     @property

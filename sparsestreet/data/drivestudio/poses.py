@@ -60,7 +60,7 @@ def world_from_camera(layout: Layout, frame: int, camera: int) -> Float64[Tensor
 
 
 def world_origin(layout: Layout) -> Float64[Tensor, "3"]:
-    """The point of the data set's world that the log is re-centerd on; the axes are kept.
+    """The point of the data set's world that the log is re-centered on; the axes are kept.
 
     Position of the vehicle (Waymo) or the front camera (nuScenes) at the first frame read.
     """

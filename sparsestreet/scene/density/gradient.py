@@ -121,7 +121,7 @@ def outside_boxes(
 ) -> Bool[Tensor, " n"]:
     """Whether each row's center (meters, in the frame of its instance's box) is more than ``margin`` meters outside.
 
-    ``sizes``: length, width, height of each instance's box, which is centerd at the origin.
+    ``sizes``: length, width, height of each instance's box, which is centered at the origin.
     """
     return (means.detach().abs() > sizes[instances] / 2 + margin).any(dim=-1)
 

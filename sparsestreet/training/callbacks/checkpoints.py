@@ -5,15 +5,22 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.training.callbacks.graceful_stop import TornStop
+from sparsestreet.whole_file import whole_file
+
 log = logging.getLogger(__name__)
+
+LAST, INTERRUPTED = "last.ckpt", "interrupted.ckpt"
 
 
 class Checkpoints(Callback):
-    """Writes ``last.ckpt`` every ``every`` steps and at the end, ``interrupted.ckpt`` on an exception or Ctrl-C.
+    """Writes ``last.ckpt`` every ``every`` steps and at the end, ``interrupted.ckpt`` on an exception or a signal.
 
-    Configure it last, so that a checkpoint holds the rows as the other callbacks left them. (Lightning's
-    ModelCheckpoint has no notion of a plain last state without a monitored metric, and its OnExceptionCheckpoint
-    resumes from that file by itself in the next run.)
+    Each is written beside its place and renamed: whole or not at all, also on a full disk. Where a periodic one cannot
+    be written, training goes on; where the last one cannot, the error is raised. It stands behind the callbacks that
+    change rows, so that a checkpoint holds the rows as they left them. (Lightning's ModelCheckpoint has no notion of a
+    plain last state without a monitored metric, and its OnExceptionCheckpoint resumes from that file by itself in the
+    next run.)
     """
 
     def __init__(self, folder: str | Path, every: int = 1000) -> None:
@@ -24,14 +31,36 @@ class Checkpoints(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         if trainer.global_step % self.every == 0 and trainer.global_step < trainer.max_steps:
-            trainer.save_checkpoint(self.folder / "last.ckpt", weights_only=False)
+            self._try_to_save(trainer, LAST)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.interrupted:
-            trainer.save_checkpoint(self.folder / "last.ckpt", weights_only=False)
+            self._save(trainer, LAST)
+            (self.folder / INTERRUPTED).unlink(missing_ok=True)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        if trainer.global_step > 0:
-            path = self.folder / "interrupted.ckpt"
-            trainer.save_checkpoint(path, weights_only=False)
-            log.warning("stopped at step %d; go on with resume=%s", trainer.global_step, path)
+        if isinstance(exception, TornStop):
+            log.warning("stopped inside step %d: go on from the checkpoint before it", trainer.global_step + 1)
+        elif trainer.global_step > 0 and self._try_to_save(trainer, INTERRUPTED):
+            log.warning("stopped after step %d; go on with resume=%s", trainer.global_step, self.folder.parent)
+
+    def _try_to_save(self, trainer: Trainer, name: str) -> bool:
+        try:
+            self._save(trainer, name)
+        except OSError as error:
+            log.error("step %d: no checkpoint could be written (%s); the one before it is whole: %s",
+                      trainer.global_step, error, self.folder)  # fmt: skip
+            return False
+        return True
+
+    def _save(self, trainer: Trainer, name: str) -> None:
+        with whole_file(self.folder / name) as temporary:
+            trainer.save_checkpoint(temporary, weights_only=False)
+
+
+def newest_checkpoint(run: Path) -> Path:
+    """The checkpoint of a run's folder that was written last. Raises FileNotFoundError where there is none."""
+    found = [path for name in (LAST, INTERRUPTED) if (path := run / "checkpoints" / name).is_file()]
+    if not found:
+        raise FileNotFoundError(f"{run} has no checkpoint to go on from: give the folder of a run that was trained")
+    return max(found, key=lambda path: path.stat().st_mtime_ns)

@@ -50,7 +50,7 @@ def bin_box(rng: np.random.Generator) -> list[Part]:
 
 
 def house(rng: np.random.Generator, width: float, depth: float, road_side: int) -> list[Part]:
-    """A house with its front on the plane y = 0 and its body away from the road; centerd in x.
+    """A house with its front on the plane y = 0 and its body away from the road; centered in x.
 
     ``road_side`` is +1 where the road lies at +y.
     """

@@ -1,0 +1,82 @@
+"""What a composed configuration says that cannot be: values of a wrong type, missing ones, devices that are not there.
+
+Asked before any data is read, so that nobody waits for a street to hear of a slip of the pen.
+"""
+
+import inspect
+import re
+import typing
+from collections.abc import Iterator, Sequence
+
+import torch
+from beartype.door import is_bearable
+from beartype.roar import BeartypeException
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+Tree = typing.Any
+
+
+def config_problem(cfg: DictConfig) -> str | None:
+    """The first problem of a training's configuration in one sentence; None where there is none."""
+    try:
+        tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0]
+        missing = re.search(r"[Mm]issing mandatory value: (\S+)", reason)
+        key = missing[1] if missing else ""
+        return f"{key} has no value: give {key}=..." if missing else reason.partition("interpolation: ")[2] or reason
+    return next(_wrong_types(tree), None) or _device_problem(cfg)
+
+
+def _wrong_types(tree: Tree, path: str = "") -> Iterator[str]:
+    """Values that the classes and functions they are handed to do not take."""
+    if not isinstance(tree, dict):
+        return
+    hints = _hints(tree["_target_"]) if "_target_" in tree else {}
+    for name, value in tree.items():
+        key = f"{path}.{name}" if path else name
+        if name in hints and not isinstance(value, dict) and not _fits(value, hints[name]):
+            yield f"{key} must be {_in_words(hints[name])}, got {value!r}"
+        yield from _wrong_types(value, key)
+
+
+def _hints(target: str) -> dict[str, typing.Any]:
+    """Argument -> annotation of what a ``_target_`` names; nothing where it has none that can be read."""
+    found = get_object(target)
+    try:
+        function = found.__init__ if inspect.isclass(found) else found
+        return {name: hint for name, hint in typing.get_type_hints(function).items() if name != "return"}
+    except (NameError, TypeError):
+        return {}
+
+
+def _fits(value: Tree, hint: typing.Any) -> bool:
+    if isinstance(value, str) and typing.get_origin(hint) is Sequence:
+        return False  # a word is a sequence of letters, which nobody means
+    try:
+        if is_bearable(value, hint):
+            return True
+        # YAML writes 1 where a float is meant, and has lists only.
+        if isinstance(value, int) and not isinstance(value, bool):
+            return is_bearable(float(value), hint)
+        return isinstance(value, list) and is_bearable(tuple(value), hint)
+    except BeartypeException:
+        return True  # an annotation that cannot be checked at run time says nothing
+
+
+def _in_words(hint: typing.Any) -> str:
+    return hint.__name__ if inspect.isclass(hint) and not typing.get_args(hint) else str(hint).replace("typing.", "")
+
+
+def _device_problem(cfg: DictConfig) -> str | None:
+    devices = cfg.trainer.get("devices", 1)
+    if devices not in (1, "1", "auto"):
+        return (
+            f"training runs on one device, got trainer.devices={devices}: several would train on the same frames; "
+            "start one run a device, as a sweep does"
+        )
+    if cfg.trainer.get("accelerator") in ("gpu", "cuda") and not torch.cuda.is_available():
+        return "trainer=gpu needs a CUDA device and torch sees none: train with trainer=cpu, or check the driver"
+    return None

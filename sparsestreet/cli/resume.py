@@ -1,0 +1,47 @@
+"""Going on with a run: its own configuration, its own folder, exactly where it stopped."""
+
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from sparsestreet.cli.compose import load_run_config
+from sparsestreet.evaluation.configuration import IDENTITY_KEYS, flat_config, without
+
+
+def resumed_overrides(arguments: list[str]) -> list[str]:
+    """The overrides of the run that ``resume=RUN`` (or one of its checkpoints) names, then those that were given.
+
+    The run's folder is gone on in, unless ``out=`` names another. Without ``resume=`` they are as given.
+    Raises FileNotFoundError where no run is at that place, ValueError in a sweep.
+    """
+    given = next((text.partition("=")[2] for text in arguments if text.startswith("resume=")), "null")
+    if given in ("null", ""):
+        return arguments
+    if {"-m", "--multirun"} & set(arguments):
+        raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
+    run = run_of(Path(given))
+    load_run_config(run)  # says what a run's folder is, where this is none
+    overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
+    kept = [text for text in overrides if not text.startswith(("resume=", "out="))]
+    folder = [] if any(text.startswith("out=") for text in arguments) else [f"out={run}"]
+    return [*kept, *arguments, *folder]
+
+
+def run_of(path: Path) -> Path:
+    """The folder of a run, given as it is or by one of its checkpoints."""
+    if not path.exists():
+        raise FileNotFoundError(f"resume={path}: there is nothing; give a run's folder or one of its checkpoints")
+    return path if path.is_dir() else path.resolve().parents[1]
+
+
+def check_resumed(config: dict, run: Path) -> None:
+    """Raises ValueError, naming the options, where a run would go on with another configuration than its own."""
+    before = flat_config(OmegaConf.to_container(load_run_config(run), resolve=True))
+    now = flat_config(config)
+    old, new = (without(flat, (*IDENTITY_KEYS, "trainer.*")) for flat in (before, now))
+    changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
+    if before["seed"] != now["seed"]:
+        changed.insert(0, "seed")
+    if changed:
+        said = ", ".join(f"{key} ({old.get(key, before.get(key))} before)" for key in changed[:3])
+        raise ValueError(f"a run goes on as it began, but {len(changed)} options differ: {said}; start a new run")

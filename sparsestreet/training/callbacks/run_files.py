@@ -1,0 +1,68 @@
+"""What a training leaves for everybody else: the scene, the views it was made from, and what made it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from lightning import Callback, LightningModule, Trainer
+
+from sparsestreet.evaluation.records import RunDescription, run_path, write_run
+from sparsestreet.export import views
+from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
+from sparsestreet.training.callbacks.clock import Clock
+from sparsestreet.training.callbacks.graceful_stop import TornStop
+from sparsestreet.training.callbacks.resizing import RowChange, RowListener
+from sparsestreet.training.system import StreetSystem
+
+
+class RunFiles(Callback, RowListener):
+    """Writes ``scene.safetensors``, ``views.json`` and ``run.json`` when training ends, or is interrupted.
+
+    Args:
+        folder: of the run.
+        description: what is known of the run before it starts.
+        clock: the wall time of training.
+    """
+
+    def __init__(self, folder: Path, description: RunDescription, clock: Clock) -> None:
+        self.folder = folder
+        self.description = description
+        self.clock = clock
+        self.caps: dict[str, int] = {}
+        """Nodes that their limit held down -> the limit."""
+        self._limits: dict[str, int | None] = {}
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._limits = {name: node.settings.max_gaussians for name, node in pl_module.scene.nodes.items()}
+
+    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+        limit = self._limits[change.node]
+        # A split adds two: one row below the limit there is no room for it either.
+        if limit is not None and change.after > change.before and change.after >= limit - 1:
+            self.caps[change.node] = limit
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.interrupted:
+            self.write(trainer, pl_module)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if trainer.global_step > 0 and not isinstance(exception, TornStop | OSError):
+            self.write(trainer, pl_module)
+
+    def write(self, trainer: Trainer, system: StreetSystem) -> RunDescription:
+        """Leave the files as training stands now; answers with what ``run.json`` says."""
+        log, split = trainer.datamodule.driving_log, trainer.datamodule.split
+        stored = StoredScene(system.scene, system.options, log.name, log.num_frames)
+        save_scene(self.folder / FILE_NAME, stored)
+        views.write_views(self.folder / views.FILE_NAME, split.train, split.held_out)
+        description = replace(
+            self.description, steps=trainer.global_step, training_seconds=self.clock.seconds, caps=dict(self.caps)
+        )
+        write_run(run_path(self.folder), description)
+        return description
+
+    def state_dict(self) -> dict[str, object]:
+        return {"caps": self.caps}
+
+    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+        self.caps = dict(state_dict["caps"])

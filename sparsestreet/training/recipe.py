@@ -1,0 +1,62 @@
+"""What a configuration says of a training before any data is read, and the system that comes of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lightning import Callback
+
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.nodes import NodeSettings
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.sky import SkySettings
+from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining
+from sparsestreet.training.losses import Loss, MaskSparsity
+from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.system import StreetSystem
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The parts of a training by name: a method, and what makes it small."""
+
+    nodes: Mapping[str, NodeSettings]
+    sky: SkySettings | None
+    losses: Mapping[str, Loss]
+    callbacks: Mapping[str, Callback]
+    optimizer: OptimizerSettings
+    options: RenderOptions
+    sh_interval: float
+    """Fraction of the run after which one more degree of spherical harmonics is used."""
+    seed: int
+
+    def problems(self) -> list[str]:
+        """Parts that lack their counterpart, one sentence each; an empty list where all fits together."""
+        masked = [name for name, settings in self.nodes.items() if settings.mask_settings is not None]
+        found = []
+        for part, group, kind in (("losses", self.losses, MaskSparsity), ("callbacks", self.callbacks, MaskTraining)):
+            present = any(isinstance(value, kind) for value in group.values())
+            if masked and not present:
+                found.append(
+                    f"the masks of {', '.join(masked)} have no {kind.__name__} among the {part}: choose "
+                    "sparsify=masks, paper or removal, or set sparsify.masks=false"
+                )
+            if present and not masked:
+                found.append(f"{kind.__name__} is among the {part} but no node trains a mask: set sparsify.masks=true")
+        if self._has(BackgroundPruning) and not any(settings.prunable for settings in self.nodes.values()):
+            found.append("BackgroundPruning is among the callbacks but no node is prunable: set node.X.prunable=true")
+        if self._has(DensityControl) and all(settings.density is None for settings in self.nodes.values()):
+            found.append("DensityControl is among the callbacks but every node's density is null: leave it out")
+        return found
+
+    def build(self, data: StreetData) -> StreetSystem:
+        """Start the scene from the training part of the data, and wrap it for training."""
+        log, split = data.driving_log, data.split
+        held_out = frozenset(view.frame_index for view in split.held_out)
+        scene = build_scene(log, split.train, held_out, self.nodes, self.sky, self.seed)
+        return StreetSystem(
+            scene, self.losses, self.optimizer, radius=log.radius, options=self.options, sh_interval=self.sh_interval
+        )
+
+    def _has(self, kind: type[Callback]) -> bool:
+        return any(isinstance(callback, kind) for callback in self.callbacks.values())

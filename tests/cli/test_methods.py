@@ -1,0 +1,142 @@
+"""Every method with every sparsification, from one file each."""
+
+import csv
+import itertools
+
+import pytest
+import torch
+from hydra import compose
+from omegaconf import OmegaConf
+
+from sparsestreet.cli.assemble import recipe_of
+from sparsestreet.cli.compose import CONF, configuration, override_problem
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
+from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, RowLedger
+
+
+METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
+SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+
+
+def composed(*overrides: str):
+    with configuration():
+        return compose("train", ["folder=.", *overrides])
+
+
+def test_the_options_that_tables_need_are_there():
+    assert {"3dgs", "streetgs"} <= set(METHODS)
+    assert {"none", "masks", "importance", "paper", "removal"} == set(SPARSIFY)
+
+
+@pytest.mark.parametrize(("method", "sparsify"), itertools.product(METHODS, SPARSIFY))
+def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
+    """Masks, their loss and their callback come together; what a method has stays with every sparsification."""
+    cfg = composed(f"method={method}", f"sparsify={sparsify}")
+    recipe, plain = recipe_of(cfg), recipe_of(composed(f"method={method}"))
+    masked = sparsify in ("masks", "paper", "removal")
+    assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
+    assert list(recipe.losses) == [*plain.losses, *(["mask_sparsity"] if masked else [])]
+    rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
+    added = ([MaskTraining] if masked else []) + ([BackgroundPruning] if sparsify in rules else [])
+    assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, *added]
+    if sparsify in rules:
+        pruning = recipe.callbacks["background_pruning"]
+        assert type(pruning.rule) is rules[sparsify]
+        # The paper prunes once, at 28,000 of 30,000 steps, whatever the schedule.
+        assert sparsify == "removal" or pruning.at == (0.93334,)
+    assert cfg.name == method + ("" if sparsify == "none" else f"+{sparsify}")
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_experiment_composes(experiment: str, method: str):
+    recipe_of(composed(f"experiment={experiment}", f"method={method}"))
+
+
+@pytest.mark.parametrize("schedule", ["short", "paper"])
+@pytest.mark.parametrize("capacity", ["small", "paper"])
+def test_schedules_and_capacities(schedule: str, capacity: str):
+    recipe = recipe_of(composed(f"schedule={schedule}", f"capacity={capacity}", "sparsify=paper"))
+    expected = {"small": (4000, 130_000, 1000, 8000), "paper": (40_000, None, 10_000, None)}[capacity]
+    background, rigid = recipe.nodes["background"], recipe.nodes["rigid"]
+    limits = (background.min_gaussians, background.max_gaussians, rigid.min_gaussians, rigid.max_gaussians)
+    assert limits == expected
+
+
+def test_k_min_has_one_home():
+    cfg = composed("sparsify=paper", "node.background.min_gaussians=2000")
+    text = OmegaConf.to_yaml(cfg, resolve=True)
+    assert "min_gaussians: 2000" in text
+    assert "4000" not in text.replace("num_far: 4000", "")
+    settings = recipe_of(cfg).nodes["background"]
+    assert settings.min_gaussians == 2000
+    assert settings.mask_settings.build(settings.min_gaussians, ()).min_gaussians == 2000
+
+
+def test_every_preset_of_the_op_is_an_option():
+    from sparsestreet.ops import SplatSettings
+    from sparsestreet.ops.settings import _PRESETS
+
+    for name in _PRESETS:
+        settings = recipe_of(composed(f"render={name}")).options.settings
+        assert settings == SplatSettings.preset(name), name
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "node.background.mask.threshold=0.1",
+        "node.background.mask.sparsity_weight=1e-3",
+        "node.rigid.density.grad_threshold=1e-4",
+        "node.background.learning_rates.means.initial=1e-4",
+        "node.rigid.learning_rates.mask_logits.initial=0.1",
+        "node.background.initial_opacity=0.2",
+        "render.settings.alpha_min=0.01",
+        "sky.learning_rate.initial=0.02",
+        "loss.depth.nearest=1.0",
+        "render=fast",
+        "sky=none",
+        "logger=none",
+    ],
+)
+def test_every_option_can_be_set_without_plus_signs(override: str):
+    assert override_problem(["sparsify=paper", override]) is None
+    recipe_of(composed("sparsify=paper", override))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["sparsify=masks", "~loss.mask_sparsity"], "no MaskSparsity among the losses"),
+        (["sparsify=masks", "~callback.mask_training"], "no MaskTraining among the callbacks"),
+        (["sparsify=masks", "sparsify.masks=false"], "no node trains a mask"),
+        (["sparsify=importance", "node.background.prunable=false"], "no node is prunable"),
+        (["node.background.density=null", "node.rigid.density=null"], "every node's density is null"),
+    ],
+)
+def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: str):
+    with pytest.raises(ValueError, match=said):
+        recipe_of(composed(*overrides))
+
+
+@pytest.mark.parametrize(("method", "sparsify"), itertools.product(METHODS, SPARSIFY))
+def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: str, run_train, tmp_path):
+    """20 steps in which densification, masking and pruning each come once; strong masks, so that rows do go."""
+    masks = ["schedule.mask_learning_rate=2.0", "schedule.lambda_m=1e5"]
+    out = run_train(
+        tmp_path,
+        f"method={method}",
+        f"sparsify={sparsify}",
+        "trainer.fast_dev_run=20",
+        "schedule.refine_in.every=5",
+        "schedule.mask_in.every=5",
+        "node.background.density.grad_threshold=1e-6",
+        *(masks if sparsify in ("masks", "paper", "removal") else []),
+    )
+    with (out / "records" / "counts.csv").open() as file:
+        reasons = {row["reason"] for row in csv.DictReader(file)}
+    assert {"start", "densify"} <= reasons
+    assert ("mask" in reasons) == (sparsify in ("masks", "paper", "removal"))
+    assert ("background pruning" in reasons) == (sparsify in ("importance", "paper", "removal"))
+    assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["global_step"] == 20
