@@ -1,57 +1,52 @@
-"""Renders against held-out images, one at a time: nothing is kept but numbers."""
+"""Renders against recorded images, one at a time: nothing is kept but numbers."""
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
+from collections.abc import Iterable, Iterator
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from sparsestreet.data.device import to_device
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.metrics import image as metrics
-from sparsestreet.types import Frame
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.types import Frame, View
 
 
-class RenderedImage(Protocol):
-    """What evaluation needs of a rendering."""
-
-    @property
-    def rgb(self) -> Tensor:
-        """Float [h, w, 3]; values outside [0, 1] are clamped, as a screen would."""
-
-
-def clamped_render(render: Callable[[Frame], RenderedImage], frame: Frame) -> Float[Tensor, "h w 3"]:
-    """The frame's render as a screen shows it: float32 in [0, 1], without gradients.
+@torch.no_grad()
+def screen_image(scene: SceneGraph, view: View, options: RenderOptions) -> Float[Tensor, "h w 3"]:
+    """A view's render as a screen shows it: float32 in [0, 1], without gradients, on the scene's device.
 
     Raises ValueError if the render has a NaN or an infinity: clamping would turn the latter into plain white.
     """
-    with torch.no_grad():
-        rgb = render(frame).rgb.detach().float()
+    rgb = render(scene, view, options=options).rgb.float()
     finite = torch.isfinite(rgb)
     if not bool(finite.all()):
         raise ValueError(
-            f"the render of frame {frame.frame_index}, camera {frame.camera_index} has {int((~finite).sum())} values "
-            "that are not finite: look for rows with NaN parameters in the scene"
+            f"the render of frame {view.frame_index}, camera {view.camera_index} has {int((~finite).sum())} values "
+            "that are not finite: look for Gaussians with NaN parameters in the scene"
         )
     return rgb.clamp(0, 1)
 
 
-def evaluate_frames(render: Callable[[Frame], RenderedImage], frames: Iterable[Frame]) -> Iterator[FrameQuality]:
-    """The quality of each frame's render, in order; holds one frame at a time.
+def evaluate_frames(scene: SceneGraph, frames: Iterable[Frame], options: RenderOptions) -> Iterator[FrameQuality]:
+    """The quality of each frame's render, in order; holds one frame at a time, and moves it to the scene's device.
 
     Args:
-        render: a frame to its rendering, of the frame's own size.
-        frames: held-out frames; may load its images while iterating.
+        scene: what is rendered.
+        frames: recorded views; may load its images while iterating.
+        options: how it is rendered.
 
-    Raises ValueError for a render that is not finite or of another size than the image.
+    Raises ValueError for a render that is not finite.
     """
     for frame in frames:
-        yield frame_quality(clamped_render(render, frame), frame)
+        yield frame_quality(screen_image(scene, frame, options), to_device(frame, scene.device))
 
 
 def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame) -> FrameQuality:
-    """Compare one clamped render [0, 1] with the frame's image, in full and within its masks."""
-    truth = frame.image.to(rgb.device).float() / 255
+    """Compare one clamped render [0, 1] with the frame's image, in full and within its masks; both on one device."""
+    truth = frame.image.float() / 255
     similarity = metrics.ssim_map(rgb, truth)
     error = metrics.mse(rgb, truth)
     height, width = frame.image.shape[:2]
@@ -73,7 +68,6 @@ def _region_quality(
     similarity: Float64[Tensor, "h w 3"],
     mask: Bool[Tensor, "h w"],
 ) -> RegionQuality:
-    mask = mask.to(rgb.device)
     error = metrics.masked_mse(rgb, truth, mask)
     if error is None:
         return RegionQuality(0, None, None, None)

@@ -1,101 +1,114 @@
-"""Everything that is measured of a finished run, and the files it leaves."""
+"""Everything that is measured of a trained scene, and the files it leaves."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sparsestreet.evaluation.evaluate import RenderedImage, clamped_render, evaluate_frames
-from sparsestreet.evaluation.pictures import KINDS, Legend, Picture, picture_sheet, write_picture, write_png
+from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
+from sparsestreet.evaluation.pictures import KINDS, Picture, write_picture, write_png
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, summarize
+from sparsestreet.evaluation.quality_csv import quality_path, write_quality
 from sparsestreet.evaluation.records import (
-    FORMAT,
+    HELD_OUT,
+    TRAINING,
+    Evaluation,
     GuardCounts,
     Latency,
     RunDescription,
     RunSummary,
-    quality_path,
     summary_path,
-    write_quality,
     write_summary,
 )
+from sparsestreet.evaluation.sheets import Legend, picture_sheet
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.ops import Guards
+from sparsestreet.ops import Guards, guards
+from sparsestreet.scene.centers import node_legend, project_centers
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Frame
 
-Render = Callable[[Frame], RenderedImage]
-Centers = Callable[[Frame], Tensor]
-CountGuards = Callable[[Frame], Guards]
 
-
-def evaluate_run(
-    frames: Sequence[Frame],
+@torch.no_grad()
+def evaluate_scene(
+    scene: SceneGraph,
+    held_out: Sequence[Frame],
+    training: Sequence[Frame],
     *,
-    render: Render,
-    centers: Centers,
-    guards: CountGuards,
-    gaussians: dict[str, int],
-    bytes_by_part: dict[str, int],
     run: RunDescription,
+    options: RenderOptions,
     out: Path,
-    legend: Legend | None = None,
+    command: str,
+    device: torch.device | str,
     pictures: int = 4,
     warmup: int = 20,
     repeats: int = 50,
 ) -> RunSummary:
-    """Measure quality, speed and size on held-out frames; write ``out/records`` and ``out/pictures``.
+    """Measure quality, speed and size of a scene; write ``out/records`` and ``out/pictures``.
+
+    Speed, guards and pictures are of the held-out views, or of the training views where none is held out.
 
     Args:
-        frames: held-out frames; a sequence that loads images when indexed is fine, none is kept.
-        render: a frame to its rendering [h, w, 3].
-        centers: a frame to a picture of the Gaussians' centers, Float [h, w, 3] in [0, 1].
-        guards: a frame to the guards of the op that its render needs.
-        gaussians: node class -> number of rows.
-        bytes_by_part: part of the scene -> bytes of its parameters.
-        run: what identifies the run.
+        scene: moved to ``device``, where it stays.
+        held_out: views that training never saw; may be empty.
+        training: views that it saw; may be empty. Both may load images when indexed, since none is kept.
+        run: what identifies the run; goes into the record as it is.
+        options: how the scene is rendered.
         out: the run's folder.
-        legend: node class -> RGB in [0, 255] of its centers, for the picture sheet.
-        pictures: how many held-out images become pictures.
+        command: that this evaluation was asked for with.
+        device: where it is rendered and timed.
+        pictures: how many views become pictures.
         warmup, repeats: of the latency protocol.
 
-    Raises ValueError without frames, or for renders that are not finite or of the wrong size.
+    Raises ValueError without any view, or for renders that are not finite.
     """
-    if not frames:
-        raise ValueError("there are no held-out frames to evaluate: choose a split that leaves some out")
-    quality = list(evaluate_frames(render, frames))
-    latency = measure_latency(render, frames, warmup=warmup, repeats=repeats)
-    summary = _summary(quality, latency, _guard_counts(guards, frames), gaussians, bytes_by_part, run)
-    chosen = [_picture(frames[index], render, centers) for index in choose_pictures(quality, pictures)]
-    _write_pictures(chosen, summary, legend, out / "pictures")
-    write_quality(quality_path(out), quality)
+    views = {split: frames for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
+    if not views:
+        raise ValueError(f"there is no view to evaluate {run.label} on: give held-out views, training views or both")
+    scene = scene.to(torch.device(device)).eval()
+    quality = {split: list(evaluate_frames(scene, frames, options)) for split, frames in views.items()}
+    main, frames = next(iter(views.items()))
+    latency = measure_latency(scene, frames, options, warmup=warmup, repeats=repeats)
+    summary = _summary(scene, quality, latency, _guard_counts(scene, frames, options), run, command)
+    chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
+    _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
+    for split in (HELD_OUT, TRAINING):
+        quality_path(out, split).unlink(missing_ok=True)  # of an earlier evaluation, perhaps on more views
+    for split, images in quality.items():
+        write_quality(quality_path(out, split), images)
     write_summary(summary_path(out), summary)
     return summary
 
 
-def _guard_counts(guards: CountGuards, frames: Sequence[Frame]) -> GuardCounts:
-    total = sum((guards(frame) for frame in frames), Guards())
+def _guard_counts(scene: SceneGraph, frames: Sequence[Frame], options: RenderOptions) -> GuardCounts:
+    total = Guards()
+    for frame in frames:
+        total += guards(scene.gaussians_at(frame).gaussians, frame.camera, settings=options.settings)
     return GuardCounts(asdict(total), total.alarms)
 
 
 def _summary(
-    quality: Sequence[FrameQuality],
+    scene: SceneGraph,
+    quality: Mapping[str, Sequence[FrameQuality]],
     latency: Latency,
-    guards: GuardCounts,
-    gaussians: dict[str, int],
-    bytes_by_part: dict[str, int],
+    guard_counts: GuardCounts,
     run: RunDescription,
+    command: str,
 ) -> RunSummary:
+    gaussians, bytes_by_part = scene.counts(), scene.bytes_by_part()
+    sizes = {f"{image.width}x{image.height}" for images in quality.values() for image in images}
     return RunSummary(
-        format=FORMAT,
         run=run,
-        images=len(quality),
-        resolutions=tuple(sorted({f"{image.width}x{image.height}" for image in quality})),
-        quality=summarize(quality),
+        evaluated=Evaluation(command, this_machine(), this_source(), latency.device, latency.threads),
+        images={split: len(images) for split, images in quality.items()},
+        resolutions=tuple(sorted(sizes)),
+        quality={split: summarize(images) for split, images in quality.items()},
         definitions=DEFINITIONS,
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
@@ -103,9 +116,7 @@ def _summary(
         bytes_total=sum(bytes_by_part.values()),
         latency=latency,
         latency_protocol=latency.protocol,
-        machine=this_machine(),
-        source=this_source(),
-        guards=guards,
+        guards=guard_counts,
     )
 
 
@@ -136,7 +147,7 @@ def _vehicle_pixels(image: FrameQuality) -> int:
     return 0 if image.vehicle is None else image.vehicle.pixels
 
 
-def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Legend | None, folder: Path) -> None:
+def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Legend, folder: Path) -> None:
     """Single PNGs of the chosen images and one sheet of all of them."""
     for kind in KINDS:
         for stale in folder.glob(f"[0-9]*_[0-9]*_{kind}.png"):  # of an earlier evaluation, perhaps on another split
@@ -145,21 +156,22 @@ def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Lege
         return
     for picture in chosen:
         write_picture(folder, picture)
+    views = "held-out" if summary.main_split == HELD_OUT else "training"
     title = (
-        f"{summary.run.scene}, {summary.run.method}, seed {summary.run.seed}: "
-        f"{summary.quality['psnr_full'].mean:.2f} dB over {summary.images} held-out images, "
+        f"{summary.run.scene}, {summary.run.label}, seed {summary.run.seed}: "
+        f"{summary.mean('psnr_full'):.2f} dB over {summary.images[summary.main_split]} {views} images, "
         f"{summary.gaussians_total:,} Gaussians"
     )
     write_png(folder / "sheet.png", picture_sheet(chosen, title=title, legend=legend))
 
 
-def _picture(frame: Frame, render: Render, centers: Centers) -> Picture:
+def _picture(scene: SceneGraph, frame: Frame, options: RenderOptions) -> Picture:
     return Picture(
         frame.frame_index,
         frame.camera_index,
         frame.image.cpu().numpy(),
-        _uint8(clamped_render(render, frame)),
-        _uint8(centers(frame)),
+        _uint8(screen_image(scene, frame, options)),
+        _uint8(project_centers(scene, frame)),
     )
 
 

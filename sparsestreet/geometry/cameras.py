@@ -22,11 +22,12 @@ def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
 def project(
     camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Pixel coordinates, depth along the optical axis (meters) and whether each world point is in the image."""
-    in_camera = transform_points(camera.camera_from_world.to(points.dtype), points)
+    """Pixel coordinates, depth along the optical axis (meters) and whether each world point is in the image; on any
+    device, while the camera is on the host."""
+    in_camera = transform_points(camera.camera_from_world.to(points), points)
     depth = in_camera[:, 2]
     safe = depth.clamp(min=near)
-    pixels = (in_camera @ camera.intrinsics.to(points.dtype).T)[:, :2] / safe[:, None]
+    pixels = (in_camera @ camera.intrinsics.to(points).T)[:, :2] / safe[:, None]
     inside = (depth > near) & (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     return pixels, depth, inside
 

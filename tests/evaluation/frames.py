@@ -28,7 +28,8 @@ def make_frame(
     """A frame with a random image (seeded by frame and camera) and the given masks."""
     generator = torch.Generator().manual_seed(100 * index + camera_index)
     image = torch.randint(0, 256, (*size, 3), generator=generator, dtype=torch.uint8)
-    camera = Camera(torch.eye(4), torch.eye(3), size[1], size[0])
+    intrinsics = torch.tensor([[10.0, 0.0, size[1] / 2], [0.0, 10.0, size[0] / 2], [0.0, 0.0, 1.0]])
+    camera = Camera(torch.eye(4), intrinsics, size[1], size[0])
     return Frame(camera, index / 10, index, camera_index, image=image, human=human, vehicle=vehicle)
 
 

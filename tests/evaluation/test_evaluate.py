@@ -1,35 +1,46 @@
 """Frame by frame evaluation and its summary."""
 
+import dataclasses
 import statistics
 import weakref
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
 
+from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality, summarize
 from sparsestreet.metrics.definitions import DEFINITIONS
+from sparsestreet.ops import SplatSettings
+from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame
+from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
+
+SCENE = small_scene()
 
 
-def noisy(frame):
+def noisy(view):
     """A render that leaves [0, 1] on both sides."""
-    generator = torch.Generator().manual_seed(frame.frame_index)
-    noise = 0.3 * torch.randn(frame.image.shape, generator=generator)
-    return SimpleNamespace(rgb=frame.image.float() / 255 + noise)
+    generator = torch.Generator().manual_seed(view.frame_index)
+    return view.image.float() / 255 + 0.3 * torch.randn(view.image.shape, generator=generator)
 
 
+@pytest.fixture
+def noise(monkeypatch):
+    replace_render(monkeypatch, noisy)
+
+
+@pytest.mark.usefixtures("noise")
 def test_a_frame_is_compared_with_its_clamped_render():
     vehicle = torch.zeros(9, 12, dtype=torch.bool)
     vehicle[2:5, 3:11] = True
     frame = make_frame(7, 2, vehicle=vehicle)
-    (quality,) = evaluate_frames(noisy, [frame])
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS)
 
     truth = frame.image.double().numpy() / 255
-    render = np.clip(noisy(frame).rgb.double().numpy(), 0, 1)
+    render = np.clip(noisy(frame).double().numpy(), 0, 1)
     error = (render - truth) ** 2
     _, similarity = structural_similarity(render, truth, data_range=1, channel_axis=-1, full=True)
     chosen = vehicle.numpy()
@@ -45,13 +56,27 @@ def test_a_frame_is_compared_with_its_clamped_render():
     assert quality.human is None
 
 
+@pytest.mark.usefixtures("noise")
 def test_an_empty_mask_is_told_from_no_mask():
     empty = torch.zeros(9, 12, dtype=torch.bool)
-    (quality,) = evaluate_frames(noisy, [make_frame(human=empty)])
+    (quality,) = evaluate_frames(SCENE, [make_frame(human=empty)], OPTIONS)
     assert quality.human == RegionQuality(0, None, None, None)
     assert quality.vehicle is None
 
 
+def test_the_scene_is_what_is_compared():
+    """No render is replaced here: its options reach it, and an image of the scene itself is met."""
+    frame = make_frame()
+    for black in (OPTIONS, RenderOptions(SplatSettings(near_plane=50.0), "reference")):
+        rgb = render(SCENE, frame, options=black).rgb.detach()
+        seen = dataclasses.replace(frame, image=(rgb.clamp(0, 1) * 255).round().byte())
+        (quality,) = evaluate_frames(SCENE, [seen], black)
+        assert quality.full.psnr > 50  # 8 bits: at worst 54.2 dB away, half a level everywhere
+    (quality,) = evaluate_frames(SCENE, [seen], OPTIONS)
+    assert quality.full.psnr < 50
+
+
+@pytest.mark.usefixtures("noise")
 def test_frames_are_let_go_one_by_one():
     alive = []
 
@@ -63,32 +88,36 @@ def test_frames_are_let_go_one_by_one():
             yield frame
             del frame
 
-    assert len(list(evaluate_frames(noisy, stream()))) == 4
+    assert len(list(evaluate_frames(SCENE, stream(), OPTIONS))) == 4
 
 
-def test_rendering_takes_no_gradients():
-    parameter = torch.tensor(0.5, requires_grad=True)
+@pytest.mark.usefixtures("noise")
+def test_each_frame_is_moved_to_the_scenes_device(monkeypatch):
+    moved = []
+    monkeypatch.setattr(evaluate, "to_device", lambda frame, device: moved.append((frame, device)) or frame)
+    frames = [make_frame(0), make_frame(1)]
+    list(evaluate_frames(SCENE, frames, OPTIONS))
+    assert moved == [(frame, torch.device("cpu")) for frame in frames]
+
+
+def test_rendering_takes_no_gradients(monkeypatch):
     seen = []
-
-    def render(frame):
-        rgb = parameter.expand(*frame.image.shape) * 1.0
-        seen.append(rgb.requires_grad)
-        return SimpleNamespace(rgb=rgb)
-
-    list(evaluate_frames(render, [make_frame()]))
+    replace_render(monkeypatch, lambda view: seen.append(torch.is_grad_enabled()) or noisy(view))
+    list(evaluate_frames(SCENE, [make_frame()], OPTIONS))
     assert seen == [False]
     assert torch.is_grad_enabled()
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_a_render_that_is_not_finite_is_refused(value):
-    def render(frame):
-        rgb = noisy(frame).rgb
+def test_a_render_that_is_not_finite_is_refused(monkeypatch, value):
+    def broken(view):
+        rgb = noisy(view)
         rgb[1, 2, 0] = value
-        return SimpleNamespace(rgb=rgb)
+        return rgb
 
+    replace_render(monkeypatch, broken)
     with pytest.raises(ValueError, match="frame 3, camera 1 has 1 values that are not finite"):
-        list(evaluate_frames(render, [make_frame(3, 1)]))
+        list(evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS))
 
 
 def test_summary_takes_means_over_the_images_that_have_the_region():

@@ -1,83 +1,150 @@
-"""A whole evaluation on fake renders: numbers, files, chosen pictures."""
+"""A whole evaluation of a small scene: numbers, files, chosen pictures."""
 
-from types import SimpleNamespace
+import dataclasses
+import shutil
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from sparsestreet.evaluation import run as run_module
+from sparsestreet.evaluation.pictures import picture_path
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
-from sparsestreet.evaluation.records import RunDescription, quality_path, read_quality, read_summary, summary_path
-from sparsestreet.evaluation.run import choose_pictures, evaluate_run
-from sparsestreet.ops import Guards
-from tests.evaluation.frames import make_frame
+from sparsestreet.evaluation.quality_csv import quality_path, read_quality
+from sparsestreet.evaluation.records import (
+    HELD_OUT,
+    TRAINING,
+    read_run,
+    read_summary,
+    run_path,
+    summary_path,
+    write_run,
+)
+from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
+from sparsestreet.ops import Guards, SplatSettings
+from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.rendering import RenderOptions
+from tests.evaluation.frames import make_frame, make_run
+from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 
-RUN = RunDescription("plain", "street", 3, "every 10th frame from 0", 12.5, "sparsestreet train")
+RUN = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
 
 
-def darker(frame):
-    return SimpleNamespace(rgb=frame.image.float() / 255 * 0.9)
+def darker(view):
+    return view.image.float() / 255 * 0.9
 
 
-def dots(frame):
-    image = torch.zeros(frame.image.shape)
-    image[0, 0] = torch.tensor([0.2, 0.4, 1.0])
-    return image
+@pytest.fixture
+def dark(monkeypatch):
+    replace_render(monkeypatch, darker)
 
 
-def evaluate(out, frames, pictures=2):
-    return evaluate_run(
-        frames,
-        render=darker,
-        centers=dots,
-        guards=lambda frame: Guards(
-            drawn=frame.frame_index, near=frame.camera_index, vanished=int(frame.frame_index == 20)
-        ),
-        gaussians={"background": 30, "rigid": 12},
-        bytes_by_part={"background": 300, "rigid": 120, "sky": 5},
-        run=RUN,
+def evaluate(out, held_out, training=(), pictures=2, device="cpu", **replaced):
+    return evaluate_scene(
+        small_scene(),
+        held_out,
+        training,
         out=out,
+        device=device,
         pictures=pictures,
-        warmup=1,
-        repeats=4,
+        **{"run": RUN, "options": OPTIONS, "command": "sparsestreet evaluate run=x", "warmup": 1, "repeats": 4}
+        | replaced,
     )
 
 
-def make_frames(count: int = 5):
+def make_frames(count: int = 5, first: int = 0):
     frames = []
     for index in range(count):
         vehicle = torch.zeros(9, 12, dtype=torch.bool)
         vehicle[:, : 2 * index] = True
-        frames.append(make_frame(10 * index, index % 2, vehicle=vehicle))
+        frames.append(make_frame(first + 10 * index, index % 2, vehicle=vehicle))
     return frames
 
 
+def expected_psnr(frames):
+    truths = [frame.image.double().numpy() / 255 for frame in frames]
+    return np.mean([-10 * np.log10(np.mean((0.1 * truth) ** 2)) for truth in truths])
+
+
+@pytest.mark.usefixtures("dark")
 def test_a_run_leaves_its_records(tmp_path):
-    frames = make_frames()
-    summary = evaluate(tmp_path, frames)
+    held_out, training = make_frames(), make_frames(3, first=1)
+    summary = evaluate(tmp_path, held_out, training)
     on_disk = read_summary(summary_path(tmp_path))
     assert on_disk.run == RUN
-    assert on_disk.gaussians == {"background": 30, "rigid": 12}
-    assert (on_disk.gaussians_total, on_disk.bytes_total, on_disk.images) == (42, 425, 5)
-    assert on_disk.resolutions == ("12x9",)
-    assert (on_disk.latency.repeats, on_disk.latency.views) == (4, 5)
-    assert set(on_disk.quality) == set(on_disk.definitions)
-    counted = {name: count for name, count in on_disk.guards.rows.items() if count}
-    assert counted == {"drawn": 0 + 10 + 20 + 30 + 40, "near": 2, "vanished": 1}
-    assert set(on_disk.guards.rows) == set(vars(Guards()))
-    assert on_disk.guards.alarms == {"vanished": 1}
-    assert on_disk.quality["psnr_full"].mean == pytest.approx(summary.quality["psnr_full"].mean, rel=1e-5)
-
+    assert on_disk.gaussians == {"road": 2, "cars": 2}
+    assert on_disk.gaussians_total == 4
+    assert on_disk.bytes_by_part == {"road": 2 * 14 * 4, "cars": 2 * 14 * 4, "poses": 0, "sky": 6 * 2 * 2 * 3 * 4}
+    assert (on_disk.images, on_disk.resolutions) == ({HELD_OUT: 5, TRAINING: 3}, ("12x9",))
+    assert (on_disk.latency.warmup, on_disk.latency.repeats, on_disk.latency.views) == (1, 4, 5)
+    assert (on_disk.evaluated.command, on_disk.evaluated.threads) == (
+        "sparsestreet evaluate run=x",
+        torch.get_num_threads(),
+    )
+    assert on_disk.evaluated.device == on_disk.latency.device
+    assert on_disk.latency.device.startswith("cpu: ")
+    assert set(on_disk.quality[HELD_OUT]) == set(on_disk.quality[TRAINING]) == set(on_disk.definitions)
+    # 6 significant digits on disk, float32 renders.
+    assert on_disk.mean("psnr_full") == pytest.approx(expected_psnr(held_out), abs=1e-4)
+    assert on_disk.mean("psnr_full", TRAINING) == pytest.approx(expected_psnr(training), abs=1e-4)
+    assert summary.quality[HELD_OUT]["psnr_vehicle"].images == 4
+    assert summary.quality[HELD_OUT]["psnr_human"].images == 0
     rows = read_quality(quality_path(tmp_path))
     assert [(row.frame, row.camera) for row in rows] == [(0, 0), (10, 1), (20, 0), (30, 1), (40, 0)]
-    truths = [frame.image.double().numpy() / 255 for frame in frames]
-    expected = np.mean([-10 * np.log10(np.mean((0.1 * truth) ** 2)) for truth in truths])
-    assert summary.quality["psnr_full"].mean == pytest.approx(expected, abs=1e-4)  # float32 renders
-    assert summary.quality["psnr_vehicle"].images == 4
-    assert summary.quality["psnr_human"].images == 0
+    assert [row.frame for row in read_quality(quality_path(tmp_path, TRAINING))] == [1, 11, 21]
 
 
+@pytest.mark.usefixtures("dark")
+def test_a_run_that_holds_out_nothing_is_measured_on_its_training_views(tmp_path):
+    evaluate(tmp_path, make_frames(), make_frames(2, first=1))
+    training = make_frames(3)
+    evaluate(tmp_path, [], training)
+    on_disk = read_summary(summary_path(tmp_path))
+    assert (on_disk.main_split, on_disk.images) == (TRAINING, {TRAINING: 3})
+    assert on_disk.mean("psnr_full") == pytest.approx(expected_psnr(training), abs=1e-4)
+    assert on_disk.latency.views == 3
+    assert not quality_path(tmp_path, HELD_OUT).exists()  # it was of the earlier evaluation
+    assert [row.frame for row in read_quality(quality_path(tmp_path, TRAINING))] == [0, 10, 20]
+    assert picture_path(tmp_path / "pictures", 20, 0, "render").exists()
+
+
+def test_a_run_can_be_measured_again_without_its_records(tmp_path):
+    """What trained it, and for how long, is in run.json, which no evaluation writes."""
+    write_run(run_path(tmp_path), RUN)
+    written = run_path(tmp_path).read_bytes()
+    first = evaluate(tmp_path, make_frames(2), run=read_run(run_path(tmp_path)), command="sparsestreet train")
+    shutil.rmtree(tmp_path / "records")
+    again = evaluate(tmp_path, make_frames(2), run=read_run(run_path(tmp_path)), command="sparsestreet evaluate")
+    assert (first.evaluated.command, again.evaluated.command) == ("sparsestreet train", "sparsestreet evaluate")
+    on_disk = read_summary(summary_path(tmp_path))
+    assert on_disk.run == first.run == RUN
+    assert (on_disk.run.training_seconds, on_disk.run.command) == (12.5, "sparsestreet train seed=3")
+    assert run_path(tmp_path).read_bytes() == written
+
+
+def test_the_scene_itself_is_measured(tmp_path):
+    """No render is replaced here: guards and centers are those of the scene, under the options that are given."""
+    frames = make_frames(3)
+    counted = evaluate(tmp_path, frames).guards
+    rows = {name: count for name, count in counted.rows.items() if count}
+    assert (rows["drawn"], rows["near"]) == (3 * 3, 3)  # three ahead and one behind, in each of three views
+    assert set(counted.rows) == set(vars(Guards()))
+    far = RenderOptions(SplatSettings(near_plane=50.0), "reference")
+    assert evaluate(tmp_path / "far", frames, options=far).guards.rows["near"] == 12
+    with Image.open(picture_path(tmp_path / "pictures", 20, 0, "centers")) as image:
+        colors = {tuple(int(value) for value in pixel) for pixel in np.asarray(image).reshape(-1, 3)}
+    assert set(node_legend(["road", "cars"]).values()) < colors
+
+
+def test_alarms_are_recorded(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_module, "guards", lambda *arguments, settings: Guards(drawn=2, vanished=1))
+    counted = evaluate(tmp_path, make_frames(3)).guards
+    assert counted.alarms == {"vanished": 3}
+    assert counted.rows["drawn"] == 6
+
+
+@pytest.mark.usefixtures("dark")
 def test_a_run_leaves_pictures_in_full_resolution(tmp_path):
     frames = make_frames()
     (tmp_path / "pictures").mkdir()
@@ -93,16 +160,43 @@ def test_a_run_leaves_pictures_in_full_resolution(tmp_path):
     with Image.open(tmp_path / "pictures" / "040_0_render.png") as image:
         rounded = (frames[4].image.double() * 0.9).numpy()
         assert np.abs(np.asarray(image) - rounded).max() <= 0.5 + 1e-4  # rounded, not truncated
-    with Image.open(tmp_path / "pictures" / "040_0_centers.png") as image:
-        assert tuple(np.asarray(image)[0, 0]) == (51, 102, 255)
 
 
-def test_no_frames_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match="no held-out frames"):
+def test_no_view_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"no view to evaluate streetgs\+paper on"):
         evaluate(tmp_path, [])
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="where there is a GPU, the next test runs on it")
+def test_a_device_that_is_absent_is_an_error(tmp_path):
+    """Never silently the CPU."""
+    with pytest.raises((RuntimeError, AssertionError), match=r"CUDA|NVIDIA"):
+        evaluate(tmp_path, make_frames(2), device="cuda")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_speed_is_measured_where_it_is_asked_for(tmp_path):
+    options = dataclasses.replace(OPTIONS, backend="auto")
+    on_gpu = evaluate(tmp_path / "gpu", make_frames(2), device="cuda", options=options)
+    on_cpu = evaluate(tmp_path / "cpu", make_frames(2))
+    assert on_gpu.latency.device.startswith("cuda: ")
+    assert on_gpu.mean("psnr_full") == pytest.approx(on_cpu.mean("psnr_full"), abs=1e-2)
+
+
+@pytest.mark.usefixtures("dark")
+def test_the_scene_is_moved_to_the_device_it_is_told(tmp_path, monkeypatch):
+    scene, moved = small_scene().train(), []
+    move = type(scene).to
+    monkeypatch.setattr(type(scene), "to", lambda self, device: moved.append(device) or move(self, device))
+    device = torch.device("cpu", 0)
+    evaluate_scene(scene, make_frames(2), [], run=RUN, options=OPTIONS, out=tmp_path, command="c", device=device)
+    assert moved == [device]
+    assert not scene.training
+
+
+@pytest.mark.usefixtures("dark")
 def test_a_run_without_pictures(tmp_path):
     evaluate(tmp_path, make_frames(2), pictures=0)
     assert list((tmp_path / "pictures").glob("*")) == []

@@ -61,3 +61,9 @@ def test_no_points():
     pixels, depth, inside = project(camera_of(0), torch.zeros(0, 3, dtype=torch.float64))
     assert pixels.shape == (0, 2)
     assert depth.shape == inside.shape == (0,)
+
+
+def test_points_may_be_on_any_device():
+    camera = Camera(torch.eye(4), torch.eye(3), 8, 6)
+    found = project(camera, torch.zeros(5, 3, device="meta"))  # which computes nothing, but refuses to mix devices
+    assert [tensor.device.type for tensor in found] == ["meta"] * 3

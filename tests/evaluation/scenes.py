@@ -1,0 +1,56 @@
+"""A scene of a few Gaussians, and renders that a test knows."""
+
+from types import SimpleNamespace
+
+import torch
+
+from sparsestreet.evaluation import evaluate
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.nodes import Background, BackgroundSettings
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.sky import Sky, SkySettings
+
+OPTIONS = RenderOptions(backend="reference")
+
+SETTINGS = BackgroundSettings(
+    num_lidar=0,
+    num_near=0,
+    num_far=0,
+    min_gaussians=0,
+    max_gaussians=None,
+    sh_degree=0,
+    mask=None,
+    masked=False,
+    density=None,
+    prunable=False,
+    learning_rates={"rows": LearningRate(0.1)},
+)
+
+
+def node_of(points: list[list[float]]) -> Background:
+    """Dark Gaussians of 0.2 m at some points."""
+    count = len(points)
+    columns = {
+        "means": torch.tensor(points).reshape(count, 3),
+        "log_scales": torch.full((count, 3), -1.6),
+        "quaternions": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        "opacity_logits": torch.full((count,), 2.0),
+        "sh_dc": torch.full((count, 1, 3), -1.0),
+        "sh_rest": torch.zeros(count, 0, 3),
+    }
+    return Background(SETTINGS, Rows(columns))
+
+
+def small_scene() -> SceneGraph:
+    """Three Gaussians ahead and one behind the cameras of ``frames.make_frame``, which look along z; a gray sky."""
+    ahead = [[0.4, 0.3, 2.0], [0.6, 0.5, 3.0]]
+    return SceneGraph(
+        {"road": node_of(ahead), "cars": node_of([[0.2, 0.6, 1.5], [0.0, 0.0, -2.0]])}, Sky(SkySettings(2))
+    )
+
+
+def replace_render(monkeypatch, colors, module=evaluate) -> None:
+    """Let a module see ``colors(view)`` [h, w, 3] instead of a scene's render."""
+    monkeypatch.setattr(module, "render", lambda scene, view, options: SimpleNamespace(rgb=colors(view)))
