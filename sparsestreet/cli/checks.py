@@ -13,7 +13,7 @@ from beartype.door import is_bearable
 from beartype.roar import BeartypeException
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 Tree = typing.Any
 
@@ -25,8 +25,10 @@ def config_problem(cfg: DictConfig) -> str | None:
     except OmegaConfBaseException as error:
         reason = str(error).splitlines()[0]
         missing = re.search(r"[Mm]issing mandatory value: (\S+)", reason)
-        key = missing[1] if missing else ""
-        return f"{key} has no value: give {key}=..." if missing else reason.partition("interpolation: ")[2] or reason
+        if missing:
+            key = error.full_key if isinstance(error, MissingMandatoryValue) else missing[1]
+            return f"{key} has no value: give {key}=..."
+        return reason.partition("interpolation: ")[2] or reason
     return next(_wrong_types(tree), None) or _device_problem(cfg)
 
 

@@ -16,6 +16,7 @@ from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, M
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
+PAIRS = list(itertools.product(METHODS, SPARSIFY))
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 
@@ -29,7 +30,7 @@ def test_the_options_that_tables_need_are_there():
     assert {"none", "masks", "importance", "paper", "removal"} == set(SPARSIFY)
 
 
-@pytest.mark.parametrize(("method", "sparsify"), itertools.product(METHODS, SPARSIFY))
+@pytest.mark.parametrize(("method", "sparsify"), PAIRS)
 def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     """Masks, their loss and their callback come together; what a method has stays with every sparsification."""
     cfg = composed(f"method={method}", f"sparsify={sparsify}")
@@ -120,7 +121,7 @@ def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: 
         recipe_of(composed(*overrides))
 
 
-@pytest.mark.parametrize(("method", "sparsify"), itertools.product(METHODS, SPARSIFY))
+@pytest.mark.parametrize(("method", "sparsify"), PAIRS)
 def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: str, run_train, tmp_path):
     """20 steps in which densification, masking and pruning each come once; strong masks, so that rows do go."""
     masks = ["schedule.mask_learning_rate=2.0", "schedule.lambda_m=1e5"]
