@@ -13,6 +13,8 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet train resume=RUN/checkpoints/last.ckpt ...                       go on after an interruption
   sparsestreet evaluate run=RUN                       measure a trained run again, without training
   sparsestreet report DIR [DIR ...]                   tables from the records of runs, one a scene
+  sparsestreet render scene=RUN out=drive.mp4         a video of a trained street, along its log or beside it
+  sparsestreet export scene=RUN out=street.ply        its Gaussians for viewers, at a time, or one object of it
   sparsestreet data check data.root=DIR               everything that is wrong with a log, at once
   sparsestreet data make seed=1                       write a synthetic street to disk
   sparsestreet bench                                  what the splat op costs in time, memory and accuracy
@@ -45,6 +47,14 @@ def _run(command: str, rest: list[str]) -> int:
         from sparsestreet.cli.report import report
 
         return report(rest)
+    if command == "render":
+        from sparsestreet.cli.render import render
+
+        return render(rest)
+    if command == "export":
+        from sparsestreet.cli.export import export
+
+        return export(rest)
     if command == "data":
         from sparsestreet.cli.data import data
 

@@ -1,0 +1,56 @@
+"""``sparsestreet export scene=RUN time=0.5 out=street.ply``: Gaussians of a trained street for viewers."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.cli.options import run_command
+
+USAGE = """\
+sparsestreet export scene=RUN out=FILE.ply [key=value ...]     Gaussians of a trained street, as viewers read them
+
+  sparsestreet export scene=outputs/RUN out=street.ply                     the whole street, at the start of its log
+  sparsestreet export scene=outputs/RUN out=street.ply time=0.5            half way through the log
+  sparsestreet export scene=outputs/RUN out=empty.ply nodes=background     without what moves
+  sparsestreet export scene=outputs/RUN out=car.ply time=0.5 instance=12   one object, where it is at that time
+
+  scene      a run's folder, or a scene.safetensors
+  out        a .ply in the layout of 3DGS (binary; opens in SuperSplat and others)
+  time       0 to 1: first to last frame of the log (default: 0)
+  nodes      [background,rigid]: only these nodes of the scene
+  instance   only this object, by the name of its track; a name that does not exist lists those that do
+"""
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """The command's options. Raises ValueError where they contradict each other."""
+
+    scene: Path
+    out: Path
+    time: float = 0.0
+    nodes: tuple[str, ...] | None = None
+    instance: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.nodes is not None and self.instance is not None:
+            raise ValueError("nodes and instance exclude each other: leave one out")
+        if self.out.suffix != ".ply":
+            raise ValueError(f"the file must end in .ply, got {self.out.name!r}")
+
+
+def export(arguments: list[str]) -> int:
+    """Write the file; 2 on wrong usage, 1 if something is missing."""
+    return run_command("export", USAGE, arguments, ExportRequest, _export)
+
+
+def _export(request: ExportRequest) -> None:
+    # Imported here: torch takes a second, and --help needs none of it.
+    from sparsestreet.export.ply import scene_gaussians, write_ply
+    from sparsestreet.scene.storage import load_scene
+
+    stored = load_scene(request.scene)
+    instances = None if request.instance is None else [request.instance]
+    gaussians = scene_gaussians(stored, request.time, nodes=request.nodes, instances=instances)
+    count = write_ply(request.out, gaussians)
+    megabytes = request.out.stat().st_size / 1e6
+    print(f"{request.out}: {count:,} Gaussians at time {request.time:g}, {megabytes:.1f} MB")

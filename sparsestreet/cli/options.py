@@ -1,0 +1,146 @@
+"""``key=value`` words of a command as a frozen dataclass: strict in keys and types, one line where one is wrong."""
+
+import difflib
+import math
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+Options = TypeVar("Options")
+
+_WORDS = {"true": True, "false": False}
+
+
+class OptionError(ValueError):
+    """Words that do not fit a command; says in one line which, and what would."""
+
+
+def run_command(
+    name: str,
+    usage: str,
+    words: Sequence[str],
+    kind: type[Options],
+    action: Callable[[Options], None],
+    positional: str | None = None,
+) -> int:
+    """Parse the words of ``sparsestreet NAME`` and act on them.
+
+    Returns 0, or 2 for words that do not fit, 1 where the action finds something missing or malformed (OSError,
+    ValueError, ImportError: its sentence is printed), 130 after Ctrl-C. Without words, and for --help, the usage is
+    printed.
+    """
+    if not words or "--help" in words or "-h" in words:
+        print(usage)
+        return 0 if words else 2
+    try:
+        action(parse_options(words, kind, positional))
+    except OptionError as error:
+        print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        return 2
+    except (OSError, ValueError, ImportError) as error:
+        print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"sparsestreet {name}: stopped, nothing was written", file=sys.stderr)
+        return 130
+    return 0
+
+
+def parse_options(words: Sequence[str], kind: type[Options], positional: str | None = None) -> Options:
+    """The dataclass that the words describe; a field without default must be given.
+
+    Args:
+        words: ``key=value``, each key once.
+        kind: a dataclass; its fields are str, int, float, bool, Path, slice (``0:40``), a Literal, ``tuple[X, ...]``
+            (``[a,b]`` or ``a,b``) or one of them or None.
+        positional: a field, tuple[X, ...], that takes the words without a key; None: there are no such words.
+
+    Raises OptionError.
+    """
+    hints = typing.get_type_hints(kind)
+    names = [field.name for field in fields(kind) if field.name != positional]
+    given: dict[str, Any] = {}
+    loose = []
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals or not key.isidentifier():
+            loose.append(word)
+        elif key not in names:
+            raise OptionError(unknown_key(key, names))
+        elif key in given:
+            raise OptionError(f"{key} is given twice: choose one")
+        else:
+            given[key] = _value(key, text, hints[key])
+    if loose and positional is None:
+        raise OptionError(f"{loose[0]!r} is no option: write key=value, with one of {', '.join(names)}")
+    if positional is not None:
+        given[positional] = tuple(_value(positional, word, typing.get_args(hints[positional])[0]) for word in loose)
+    for field in fields(kind):
+        if field.default is MISSING and field.name not in given:
+            raise OptionError(f"{field.name}=... is missing")
+    try:
+        return kind(**given)
+    except ValueError as error:
+        raise OptionError(str(error)) from error
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """One line about a key that does not exist, with the one that was probably meant."""
+    known = list(known)
+    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(known)}")
+
+
+def _value(key: str, text: str, kind: Any) -> Any:
+    """``text`` as ``kind``."""
+    if not text:
+        raise OptionError(f"{key} has no value: write {key}=..., or leave it out")
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:
+        (inner,) = (argument for argument in arguments if argument is not types.NoneType)
+        return _value(key, text, inner)
+    if origin is tuple:
+        bare = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+        return tuple(_value(key, part.strip(), arguments[0]) for part in bare.split(","))
+    if origin is typing.Literal:
+        return _chosen(key, text, {str(choice): choice for choice in arguments})
+    if kind is bool:
+        return _chosen(key, text, _WORDS)
+    try:
+        return _CONVERSIONS[kind](text)
+    except ValueError as error:
+        raise OptionError(f"{key} must be {_NAMES[kind]}, got {text!r}") from error
+
+
+def _chosen(key: str, text: str, choices: Mapping[str, Any]) -> Any:
+    if text not in choices:
+        raise OptionError(f"{key} must be one of {', '.join(choices)}, got {text!r}")
+    return choices[text]
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+def _slice(text: str) -> slice:
+    start, colon, stop = text.partition(":")
+    if not colon:
+        raise ValueError(text)
+    return slice(int(start) if start else None, int(stop) if stop else None)
+
+
+_CONVERSIONS: Mapping[type, Callable[[str], Any]] = {
+    str: str,
+    int: int,
+    float: _finite,
+    Path: lambda text: Path(text).expanduser(),
+    slice: _slice,
+}
+_NAMES = {int: "a whole number", float: "a number", slice: "a range like 0:40"}

@@ -1,0 +1,156 @@
+"""Where a camera drives: along the recorded views, beside them, and between them."""
+
+import math
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.transforms import inverse
+from sparsestreet.types import Camera, View
+
+Rig = tuple[View, ...]
+"""The cameras of one instant, lowest index first unless they were chosen in another order."""
+
+CameraPath = tuple[Rig, ...]
+"""Rigs of the same cameras in order of time."""
+
+_SAME = 1e-3
+"""Of a step: an instant so near a recorded one is the recorded one."""
+
+
+def recorded(views: Sequence[View]) -> CameraPath:
+    """The views as they were recorded. Raises ValueError without any, or where an instant lacks a camera."""
+    if not views:
+        raise ValueError("a path needs views, got none: check that the log's views were written")
+    instants = defaultdict(list)
+    for view in views:
+        instants[view.time].append(view)
+    path = tuple(tuple(sorted(instants[time], key=lambda view: view.camera_index)) for time in sorted(instants))
+    everywhere = _indices(path[0])
+    for rig in path:
+        if _indices(rig) != everywhere:
+            raise ValueError(
+                f"every instant of a path has the same cameras, but frame {rig[0].frame_index} has {_indices(rig)} and "
+                f"frame {path[0][0].frame_index} {everywhere}: leave out the views of the incomplete one"
+            )
+    return path
+
+
+def of_frames(path: CameraPath, frames: slice) -> CameraPath:
+    """The instants whose frame index lies in start:stop. Raises ValueError where there is none."""
+    indices = [rig[0].frame_index for rig in path]
+    start = 0 if frames.start is None else frames.start
+    stop = math.inf if frames.stop is None else frames.stop
+    chosen = tuple(rig for rig, index in zip(path, indices, strict=True) if index is not None and start <= index < stop)
+    if not chosen:
+        raise ValueError(f"no view lies in frames {start} to {stop}: the path has {indices[0]} to {indices[-1]}")
+    return chosen
+
+
+def of_cameras(path: CameraPath, cameras: Sequence[int]) -> CameraPath:
+    """Only these cameras, in the order they are named. Raises ValueError for an unknown one."""
+    unknown = [index for index in cameras if index not in _indices(path[0])]
+    if unknown or not cameras:
+        raise ValueError(f"no cameras {unknown}: the path has {_indices(path[0])}")
+    return tuple(tuple(next(view for view in rig if view.camera_index == index) for index in cameras) for rig in path)
+
+
+def left_to_right(rig: Rig) -> list[int]:
+    """Camera indices by the yaw of their optical axes, seen from the camera of the lowest index: leftmost first."""
+    world_to_front = _front(rig).camera.camera_from_world[:3, :3].double()
+
+    def yaw(view: View) -> float:
+        """To the right of the front camera, radians; the third row of camera_from_world is the axis in the world."""
+        x, _, z = (world_to_front @ view.camera.camera_from_world[2, :3].double()).tolist()
+        return round(math.atan2(x, z), 6)
+
+    return [view.camera_index for view in sorted(rig, key=lambda view: (yaw(view), view.camera_index))]
+
+
+def shifted(path: CameraPath, offset: float) -> CameraPath:
+    """Every rig moved sideways as one, ``offset`` meters to the right of its camera of the lowest index.
+
+    The views keep time and camera, but lose their frame index: nobody recorded them. Shift before choosing cameras.
+    """
+
+    def beside(rig: Rig) -> Rig:
+        vector = offset * _front(rig).camera.camera_from_world[0, :3].double()
+        return tuple(replace(_bare(view), camera=_moved(view.camera, vector), frame_index=None) for view in rig)
+
+    return tuple(beside(rig) for rig in path)
+
+
+def resampled(path: CameraPath, step: float) -> CameraPath:
+    """An instant every ``step`` in normalized time from the first to the last, poses interpolated between the given.
+
+    Positions are interpolated linearly, rotations by slerp. Where an instant of the path is met, it is taken as it is;
+    the others have no frame index. Raises ValueError for a step that is not above 0.
+    """
+    if not step > 0:
+        raise ValueError(f"a path is resampled in steps above 0, got {step}: use more frames a second")
+    times = [rig[0].time for rig in path]
+    count = math.floor((times[-1] - times[0]) / step + _SAME) + 1
+    return tuple(_rig_at(path, times, times[0] + index * step, step) for index in range(count))
+
+
+def resized(path: CameraPath, width: int) -> CameraPath:
+    """All cameras with images ``width`` pixels wide, the height in proportion."""
+    if width < 1:
+        raise ValueError(f"an image is at least 1 pixel wide, got width {width}")
+    return _each_camera(path, lambda camera: _scaled(camera, width))
+
+
+def _indices(rig: Rig) -> list[int | None]:
+    return [view.camera_index for view in rig]
+
+
+def _front(rig: Rig) -> View:
+    return min(rig, key=lambda view: view.camera_index)
+
+
+def _bare(view: View) -> View:
+    """Without a Frame's pixels, which belong to its recorded pose."""
+    return View(view.camera, view.time, view.frame_index, view.camera_index)
+
+
+def _each_camera(path: CameraPath, change: Callable[[Camera], Camera]) -> CameraPath:
+    return tuple(tuple(replace(_bare(view), camera=change(view.camera)) for view in rig) for rig in path)
+
+
+def _scaled(camera: Camera, width: int) -> Camera:
+    height = max(round(camera.height * width / camera.width), 1)
+    factors = torch.tensor([width / camera.width, height / camera.height, 1.0], dtype=camera.intrinsics.dtype)
+    # Pixel centers lie at +0.5, so a change of size is a change of unit and nothing else.
+    return replace(camera, intrinsics=factors[:, None] * camera.intrinsics, width=width, height=height)
+
+
+def _moved(camera: Camera, vector: Tensor) -> Camera:
+    pose = camera.camera_from_world.double().clone()
+    pose[:3, 3] -= pose[:3, :3] @ vector
+    return replace(camera, camera_from_world=pose.to(camera.camera_from_world.dtype))
+
+
+def _rig_at(path: CameraPath, times: Sequence[float], time: float, step: float) -> Rig:
+    before = min(max(bisect_right(times, time) - 1, 0), len(path) - 1)
+    after = min(before + 1, len(path) - 1)
+    for index in (before, after):
+        if abs(times[index] - time) <= _SAME * step:
+            return path[index]
+    fraction = (time - times[before]) / (times[after] - times[before])
+    return tuple(_between(a, b, fraction) for a, b in zip(path[before], path[after], strict=True))
+
+
+def _between(a: View, b: View, fraction: float) -> View:
+    first, second = (inverse(view.camera.camera_from_world.double()) for view in (a, b))
+    world_from_camera = first.clone()
+    rotations = (quat.from_matrix(pose[:3, :3]) for pose in (first, second))
+    world_from_camera[:3, :3] = quat.to_matrix(quat.slerp(*rotations, torch.tensor(fraction, dtype=torch.float64)))
+    world_from_camera[:3, 3] = torch.lerp(first[:3, 3], second[:3, 3], fraction)
+    pose = inverse(world_from_camera).to(a.camera.camera_from_world.dtype)
+    time = a.time + fraction * (b.time - a.time)
+    return View(replace(a.camera, camera_from_world=pose), time, None, a.camera_index)

@@ -1,0 +1,157 @@
+"""Gaussians as a .ply file in the layout of 3DGS, which viewers and converters of the field read."""
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from sparsestreet.geometry.quaternions import normalized
+from sparsestreet.scene.graph import SceneGaussians
+from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.state import FINISHED
+from sparsestreet.scene.storage import StoredScene
+from sparsestreet.types import Camera, Gaussians, View
+from sparsestreet.whole_file import whole_file
+
+_ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
+"""Nodes ask a view without indices for its time alone."""
+
+_FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
+
+_LARGEST_OPACITY = 1 - 2.0**-25
+"""Halfway between the largest float32 below 1 and 1: its logit is finite, and the sigmoid of that is 1 again."""
+
+_SMALLEST_SCALE = 1e-30
+"""Meters; a scale of 0 has no logarithm."""
+
+
+def write_ply(path: Path | str, gaussians: Gaussians) -> int:
+    """Write the Gaussians whose opacity is above 0, the whole file or nothing; returns their number.
+
+    Binary, little endian, float32, one vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (all of red,
+    then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). Raises ValueError for
+    values that are not finite or where no Gaussian is left, OSError where the file cannot be written.
+    """
+    table = _vertices(gaussians)
+    if not len(table):
+        raise ValueError("a ply needs a Gaussian with an opacity above 0, got none: choose more, or another time")
+    broken = np.flatnonzero(~np.isfinite(table).all(1))
+    if len(broken):
+        raise ValueError(
+            f"all values of a ply must be finite, but {len(broken)} Gaussians have others, the first of them in row "
+            f"{broken[0]} of those with an opacity: the scene is damaged, train it again"
+        )
+    with whole_file(Path(path)) as temporary, temporary.open("wb") as file:
+        file.write(_header(len(table), gaussians.sh.shape[1]).encode("ascii"))
+        file.write(table.tobytes())
+    return len(table)
+
+
+@torch.no_grad()
+def scene_gaussians(
+    stored: StoredScene,
+    time: float,
+    *,
+    nodes: Collection[str] | None = None,
+    instances: Collection[str] | None = None,
+) -> Gaussians:
+    """The scene's Gaussians in the world at a time in [0, 1], all of them or some.
+
+    Args:
+        stored: an opened scene file.
+        time: normalized; 0 is the log's first frame, 1 its last.
+        nodes: names of the nodes whose Gaussians are wanted (``["background"]``: nothing that moves); None: all.
+        instances: names of tracks; only their Gaussians are given. Not together with ``nodes``.
+
+    Raises ValueError, naming what there is, for an unknown node or instance and for one that is absent at that time.
+    """
+    if not 0 <= time <= 1:
+        raise ValueError(f"time runs from 0 (first frame of the log) to 1 (its last), got {time}")
+    if nodes is not None and instances is not None:
+        raise ValueError("Gaussians are chosen by nodes or by instances, got both: leave one out")
+    placed = stored.scene.gaussians_at(View(_ANYWHERE, time))
+    if instances is not None:
+        keep = _rows_of_instances(stored, placed, instances, time)
+    else:
+        keep = _rows_of_nodes(placed, placed.spans if nodes is None else nodes)
+    chosen = placed.gaussians
+    return Gaussians(*(getattr(chosen, name)[keep] for name in _FIELDS))
+
+
+def instance_names(stored: StoredScene) -> list[str]:
+    """The tracks whose Gaussians can be had by themselves."""
+    objects = [node.instances() for node in stored.scene.nodes.values()]
+    return [name for some in objects if some is not None for name in some.names]
+
+
+def _rows_of_nodes(placed: SceneGaussians, names: Collection[str]) -> Bool[Tensor, " n"]:
+    _known("node", names, list(placed.spans))
+    keep = torch.zeros_like(placed.gaussians.opacities, dtype=torch.bool)
+    for name in names:
+        keep[placed.spans[name]] = True
+    return keep
+
+
+def _rows_of_instances(
+    stored: StoredScene, placed: SceneGaussians, names: Collection[str], time: float
+) -> Bool[Tensor, " n"]:
+    _known("instance", names, instance_names(stored))
+    keep = torch.zeros_like(placed.gaussians.opacities, dtype=torch.bool)
+    for node_name, node in stored.scene.nodes.items():
+        objects = node.instances()
+        for name in () if objects is None else sorted(set(names) & set(objects.names)):
+            rows = objects.ids == objects.names.index(name)
+            if not bool((placed.gaussians.opacities[placed.spans[node_name]][rows] > 0).any()):
+                raise ValueError(f"{name} is not in the scene at time {time:g}: {_presence(stored, node, rows)}")
+            keep[placed.spans[node_name]] |= rows
+    return keep
+
+
+def _presence(stored: StoredScene, node: Node, rows: Bool[Tensor, " n"]) -> str:
+    """From when to when some Gaussians have an opacity, asked at the frames of the log."""
+    last = max(stored.num_frames - 1, 1)
+    times = [frame / last for frame in range(stored.num_frames)]
+    seen = [time for time in times if bool((_at(node, time).opacities[rows] > 0).any())]
+    return f"it is there from {seen[0]:.3f} to {seen[-1]:.3f}" if seen else "it has no Gaussians"
+
+
+def _at(node: Node, time: float) -> Gaussians:
+    return node.gaussians_at(View(_ANYWHERE, time), FINISHED)
+
+
+def _known(kind: str, names: Collection[str], known: Collection[str]) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        listed = ", ".join(known) or "none"
+        raise ValueError(f"the scene has no {kind} {unknown[0]!r}; it has {listed}")
+
+
+def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
+    """One row a vertex, its properties in the order of the header, little endian."""
+    keep = gaussians.opacities > 0
+    values = {name: getattr(gaussians, name).detach()[keep].cpu() for name in _FIELDS}
+    opacities = values["opacities"].double().clamp(max=_LARGEST_OPACITY)
+    columns = (
+        values["means"],
+        torch.zeros_like(values["means"]),
+        values["sh"][:, 0],
+        # From [term, color] to [color, term]: all terms of red come first.
+        values["sh"][:, 1:].mT.flatten(1),
+        torch.logit(opacities)[:, None],
+        values["scales"].double().clamp(min=_SMALLEST_SCALE).log(),
+        normalized(values["quaternions"].double()),
+    )
+    return torch.cat([column.float() for column in columns], dim=1).numpy().astype("<f4")
+
+
+def _header(rows: int, terms: int) -> str:
+    properties = ["x", "y", "z", "nx", "ny", "nz"]
+    properties += [f"f_dc_{index}" for index in range(3)]
+    properties += [f"f_rest_{index}" for index in range(3 * (terms - 1))]
+    properties += ["opacity", *(f"scale_{index}" for index in range(3)), *(f"rot_{index}" for index in range(4))]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}"]
+    lines += [f"property float {name}" for name in properties]
+    return "\n".join([*lines, "end_header", ""])

@@ -1,0 +1,120 @@
+"""What a scene shows along a path of cameras, as a video or as single pictures."""
+
+import itertools
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from sparsestreet.export.path import CameraPath
+from sparsestreet.scene.storage import StoredScene
+from sparsestreet.whole_file import whole_file, whole_folder
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+_COLORS = ["-vf", "scale=out_color_matrix=bt709"]
+_COLORS += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
+"""Said in the file, because players guess differently where nothing is said."""
+_STREAMABLE = ["-movflags", "+faststart"]
+
+
+def path_pictures(stored: StoredScene, path: CameraPath) -> Iterator[Picture]:
+    """One picture an instant, the images of its cameras side by side; rendered when it is asked for."""
+    for rig in path:
+        images = [stored.render(view).rgb for view in rig]
+        yield side_by_side([(image.clamp(0, 1) * 255).round().byte().cpu().numpy() for image in images])
+
+
+def side_by_side(images: Sequence[Picture]) -> Picture:
+    """One row of images; lower ones stand in the middle, between black."""
+    height = max(image.shape[0] for image in images)
+
+    def framed(image: Picture) -> Picture:
+        above = (height - image.shape[0]) // 2
+        return np.pad(image, ((above, height - image.shape[0] - above), (0, 0), (0, 0)))
+
+    return np.concatenate([framed(image) for image in images], axis=1)
+
+
+def check_destination(out: Path) -> None:
+    """Raise ValueError for a name that is neither a .mp4 nor without an ending, ImportError where ffmpeg is missing."""
+    if out.suffix == ".mp4":
+        _ffmpeg()
+    elif out.suffix:
+        raise ValueError(f"a video ends in .mp4, a folder of PNGs has no ending, got {out.name!r}")
+
+
+def write_pictures(out: Path | str, pictures: Iterable[Picture], *, fps: float, quality: float = 7) -> int:
+    """A .mp4 where ``out`` ends so, else a folder of PNGs, whole or not at all; returns how many pictures there were.
+
+    Args:
+        out: the file, or a folder that is new or empty.
+        pictures: all of one size.
+        fps: pictures a second of the video.
+        quality: of the video, 1 to 10 (10 hardly loses anything).
+
+    Raises ValueError for another ending, no pictures or pictures of different sizes, ImportError where ffmpeg is
+    missing, OSError where nothing can be written.
+    """
+    out = Path(out)
+    check_destination(out)
+    if out.suffix:
+        with whole_file(out) as temporary:
+            return _write_video(temporary, pictures, fps, quality)
+    with whole_folder(out) as temporary:
+        return _write_pngs(temporary, pictures)
+
+
+def _write_video(path: Path, pictures: Iterable[Picture], fps: float, quality: float) -> int:
+    pictures = iter(pictures)
+    first = next(pictures, None)
+    if first is None:
+        raise ValueError("a video needs pictures, got none")
+    height, width = (size + size % 2 for size in first.shape[:2])
+    writer: Generator = _ffmpeg().write_frames(
+        str(path),
+        (width, height),
+        fps=float(fps),
+        quality=quality,
+        codec="libx264",
+        macro_block_size=1,
+        output_params=[*_COLORS, *_STREAMABLE],
+    )
+    count = 0
+    with closing(writer):
+        writer.send(None)
+        for picture in itertools.chain([first], pictures):
+            if picture.shape != first.shape:
+                raise ValueError(f"pictures of a video have one size, got {picture.shape} after {first.shape}")
+            writer.send(_even(picture))
+            count += 1
+    return count
+
+
+def _write_pngs(folder: Path, pictures: Iterable[Picture]) -> int:
+    count = 0
+    for picture in pictures:
+        Image.fromarray(picture).save(folder / f"{count:05d}.png")
+        count += 1
+    return count
+
+
+def _even(picture: Picture) -> Picture:
+    """H.264 stores color for pairs of pixels: a last odd row or column is shown twice."""
+    height, width = picture.shape[:2]
+    return np.ascontiguousarray(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
+
+
+def _ffmpeg() -> ModuleType:
+    try:
+        import imageio_ffmpeg
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "a video needs imageio-ffmpeg, which is not installed: pip install 'sparsestreet[video]', or give "
+            "out=FOLDER, without an ending, for PNGs"
+        ) from error
+    return imageio_ffmpeg
