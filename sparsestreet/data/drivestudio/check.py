@@ -7,12 +7,12 @@ from pathlib import Path
 
 import torch
 
-from sparsestreet.data.drivestudio.images import image_size, read_image, read_mask
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout, find_layout
-from sparsestreet.data.drivestudio.lidar import check_sweep_size, read_sweep
 from sparsestreet.data.drivestudio.poses import read_intrinsics, read_pose
-from sparsestreet.data.drivestudio.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.drivestudio.sweeps import check_sweep_size, read_sweep
+from sparsestreet.data.images import image_size, read_image, read_mask
+from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 
 LARGEST_SCENE = 20_000.0
 """Meters. Re-centerd coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""

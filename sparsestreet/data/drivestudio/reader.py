@@ -9,13 +9,14 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.drivestudio.check import check_layout
-from sparsestreet.data.drivestudio.images import image_size, read_image, read_mask
 from sparsestreet.data.drivestudio.instances import read_instances, window
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
-from sparsestreet.data.drivestudio.lidar import color_points, depth_image, read_sweep
 from sparsestreet.data.drivestudio.poses import read_intrinsics, world_from_camera, world_origin
-from sparsestreet.data.drivestudio.problems import LogError
+from sparsestreet.data.drivestudio.sweeps import read_sweep
+from sparsestreet.data.images import image_size, read_image, read_mask
+from sparsestreet.data.lidar import color_points, depth_image
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.problems import LogError
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera, Frame, Sweep, Track
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.data.drivestudio import check_drivestudio, read_drivestudio
-from sparsestreet.data.drivestudio.lidar import visible_pixels
+from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import Frame

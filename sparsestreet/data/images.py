@@ -8,7 +8,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from torch import Tensor
 
-from sparsestreet.data.drivestudio.problems import LogError, fault
+from sparsestreet.data.problems import LogError, fault
 
 _REMEDY = "write the file again from its source"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TypeVar
 
 _SHOWN = 5
-"""Problems an error message spells out; `check_drivestudio` returns all of them."""
+"""Problems an error message spells out; a check returns all of them."""
 
 T = TypeVar("T")
 
