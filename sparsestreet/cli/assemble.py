@@ -30,13 +30,13 @@ class Assembly:
 
 def assemble(cfg: DictConfig) -> Assembly:
     """Read the log, split it, seed the scene and wrap it for training."""
-    log = instantiate(cfg.data.log, _convert_="all")
+    log = instantiate(cfg.data.log, _convert_="all").read()
     datamodule = StreetData(log, stride=cfg.split.stride, offset=cfg.split.offset, seed=cfg.seed)
     split = datamodule.split
     scene = build_scene(
         log,
         split.train,
-        frozenset(frame.frame_index for frame in split.held_out),
+        split.held_out_indices,
         instantiate(cfg.node, _convert_="all"),
         instantiate(cfg.sky, _convert_="all") if cfg.sky else None,
         cfg.seed,

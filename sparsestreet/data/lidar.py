@@ -28,6 +28,14 @@ def color_points(
     return colors, colored
 
 
+def seen_points(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+    """Which points any of the cameras sees: those that ``color_points`` colors."""
+    seen = torch.zeros(points.shape[0], dtype=torch.bool)
+    for camera in cameras:
+        seen[visible_pixels(camera, points)[0]] = True
+    return seen
+
+
 def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
     """Depth along the optical axis in meters of the nearest point in each pixel; 0 where there is none."""
     _, pixels, depths = visible_pixels(camera, points)

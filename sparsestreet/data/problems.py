@@ -57,7 +57,10 @@ def missing_files(paths: Iterable[Path]) -> list[Problem]:
     for path in paths:
         if not path.is_file():
             absent.setdefault(path.parent, []).append(path)
-    remedy = "write the missing files, or load only complete frames (first_frame, last_frame) and cameras (cameras)"
+    remedy = (
+        "write the missing files, or read only complete frames (data.log.first_frame, .last_frame) and cameras "
+        "(data.log.cameras)"
+    )
     problems = []
     for files in absent.values():
         names = ", ".join(path.name for path in files[:_SHOWN]) + (", ..." if len(files) > _SHOWN else "")
