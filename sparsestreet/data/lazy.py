@@ -38,7 +38,7 @@ class Frames(LazySequence):
     """Recorded views. Their pixels are read when a frame is indexed; ``views`` tells the rest without."""
 
     @classmethod
-    def of(cls, frames: "Frames | tuple[Frame, ...]") -> "Frames":
+    def of(cls, frames: "Frames | Sequence[Frame]") -> "Frames":
         """Frames in memory as such a sequence; one that is one already as it is."""
         return frames if isinstance(frames, Frames) else cls(frames, lambda frame: frame)
 
