@@ -37,7 +37,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
 
 def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out."""
-    log = instantiate(cfg.data.log, _convert_="all")
+    log = instantiate(cfg.data.log, _convert_="all").read()
     return StreetData(log, **cfg.split, seed=cfg.seed)
 
 

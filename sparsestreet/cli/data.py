@@ -3,41 +3,76 @@
 import sys
 
 from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.compose import CONF, override_problem
+from sparsestreet.data.check import report_check
+from sparsestreet.data.reader import LogReader
 
 USAGE = """\
-sparsestreet data check data.root=DIR     print everything that is wrong with a log (exit status 1), or its summary
-sparsestreet data make [seed=N] [data.log.settings.width=W ...]     write a synthetic street; prints where it lies
+sparsestreet data check DIR [data.log.cameras=[0] data.log.last_frame=50 ...]
+    print everything that is wrong with a log, or with the part that is chosen (exit status 1), or its summary
+sparsestreet data make [seed=N] [data.log.settings.width=W ...]
+    write a synthetic street, and print where it lies
 """
+
+
+class _UsageError(ValueError):
+    """The command is not one that can be followed."""
 
 
 def data(arguments: list[str]) -> int:
     """Run the sub-command; 2 on wrong usage."""
-    verb, overrides = (arguments[0], arguments[1:]) if arguments else ("", [])
-    if verb not in ("check", "make") or "--help" in overrides:
+    verb, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
+    if verb not in ("check", "make") or "--help" in rest:
         print(USAGE)
-        return 0 if arguments and (verb in ("-h", "--help") or "--help" in overrides) else 2
-    if verb == "check" and not any(text.startswith("data=") for text in overrides):
+        return 0 if verb in ("-h", "--help") or "--help" in rest else 2
+    try:
+        return _check(rest) if verb == "check" else _make(rest)
+    except (ValueError, OSError) as error:
+        print(f"sparsestreet data {verb}: {error}", file=sys.stderr)
+        return 2
+
+
+def _check(arguments: list[str]) -> int:
+    folders = [text for text in arguments if "=" not in text and not text.startswith("-")]
+    overrides = [text for text in arguments if text not in folders]
+    if not any(text.startswith("data=") for text in overrides):
         overrides = ["data=drivestudio", *overrides]
+    cfg = _compose(overrides)
+    if folders and ("root" not in cfg.data or len(folders) > 1):
+        raise _UsageError(f"one recorded log is checked at a time, got {' '.join(arguments)}: name one folder")
+    if folders:
+        # Not as an override: Hydra's grammar would want some characters of a path in quotes.
+        OmegaConf.update(cfg, "data.root", folders[0])
+    if OmegaConf.is_missing(cfg.data, "root"):
+        raise _UsageError("no log is named: say sparsestreet data check DIR, DIR being the folder of one scene")
+    return report_check(_reader(cfg))
+
+
+def _make(overrides: list[str]) -> int:
+    cfg = _compose(overrides)
+    if "root" in cfg.data:
+        raise _UsageError("only data=synthetic can be made; a recorded drive is read as it is")
+    reader = _reader(cfg)
+    log = reader.read()
+    print(f"{reader.folder}: {log.num_frames} frames of {log.num_cameras} cameras")
+    return 0
+
+
+def _compose(overrides: list[str]) -> DictConfig:
     problem = override_problem(overrides)
     if problem:
-        print(f"sparsestreet data {verb}: {problem}", file=sys.stderr)
-        return 2
+        raise _UsageError(problem)
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", overrides)
-    return _check(cfg) if verb == "check" else _make(cfg)
+        return compose("train", overrides)
 
 
-def _check(cfg: DictConfig) -> int:
-    from sparsestreet.data.check import report_problems
-
-    return report_problems(cfg.data.log.root)
-
-
-def _make(cfg: DictConfig) -> int:
-    log = instantiate(cfg.data.log, _convert_="all")
-    print(f"{cfg.data.log.root}: {log.num_frames} frames of {log.num_cameras} cameras")
-    return 0
+def _reader(cfg: DictConfig) -> LogReader:
+    try:
+        return instantiate(cfg.data.log, _convert_="all")
+    except InstantiationException as error:
+        # Hydra's own words name the target; the cause says what to do.
+        raise error.__cause__ or error from None

@@ -7,25 +7,26 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sparsestreet.data.drivestudio import Problem, check_drivestudio, read_drivestudio
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.problems import Problem
+from sparsestreet.data.reader import LogReader
 
 
-def report_problems(root: Path | str, *, ignore_distortion: bool = False, console: Console | None = None) -> int:
-    """Print all problems of a log in DriveStudio's layout, or a summary of it; 1 where there are problems, else 0."""
+def report_check(reader: LogReader, console: Console | None = None) -> int:
+    """Print all problems of what the reader would read, or a summary of it; 1 where there are problems, else 0."""
     console = Console() if console is None else console
-    problems = check_drivestudio(root, ignore_distortion=ignore_distortion)
+    problems = reader.check()
     if problems:
-        console.print(_problem_table(Path(root), problems))
-        console.print(f"[bold red]{len(problems)} to repair[/] in {escape(str(root))}")
+        console.print(_problem_table(reader.folder, problems))
+        console.print(f"[bold red]{len(problems)} to repair[/] in {escape(str(reader.folder))}")
         return 1
-    log = read_drivestudio(root, ignore_distortion=ignore_distortion)
+    log = reader.read()
     console.print(_summary(log))
     if log.tracks:
         console.print(_track_table(log))
     for note in log.notes:
         console.print(f"[yellow]note[/] {escape(note)}")
-    console.print(f"[bold green]ready to train[/]: {escape(str(root))}")
+    console.print(f"[bold green]ready to train[/]: {escape(str(reader.folder))}")
     return 0
 
 
@@ -39,9 +40,9 @@ def _problem_table(root: Path, problems: Sequence[Problem]) -> Table:
 
 def _summary(log: DrivingLog) -> Table:
     table = Table("log", escape(log.name), title="What the log holds")
-    sizes = sorted({(frame.camera.width, frame.camera.height) for frame in log.frames}, reverse=True)
-    points = sum(len(sweep.points) for sweep in log.sweeps)
-    colored = sum(int(sweep.colored.sum()) for sweep in log.sweeps)
+    sizes = sorted({(view.camera.width, view.camera.height) for view in log.views}, reverse=True)
+    counts = [(len(sweep.points), int(sweep.colored.sum())) for sweep in log.sweeps.gray()]
+    points, colored = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     table.add_row("frames x cameras", f"{log.num_frames} x {log.num_cameras}")
     table.add_row("image size", ", ".join(f"{width}x{height}" for width, height in sizes))
     table.add_row("lidar points", f"{points:,} ({colored:,} seen by a camera)" if log.sweeps else "none")

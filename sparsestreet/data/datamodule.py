@@ -1,58 +1,65 @@
 """Frames in the order that training and validation want them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from lightning import LightningDataModule
 
 from sparsestreet.data.device import to_device
+from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog, split
-from sparsestreet.types import Frame
+from sparsestreet.types import Frame, View
 
 
 class ShuffledFrames:
     """All frames in a new random order each epoch, given by seed and epoch alone; endless if asked again and again.
 
-    An iterator that is dropped half way is taken up again by the next one, and the place is part of checkpoints
-    (Lightning asks for ``state_dict``): a resumed training sees the frames that an uninterrupted one would have seen.
+    An iterator that is dropped half way is taken up again by the next one. The place is part of checkpoints (Lightning
+    asks for ``state_dict``): a resumed training sees the frames that an uninterrupted one would have seen.
     """
 
-    def __init__(self, frames: Sequence[Frame], seed: int) -> None:
+    def __init__(self, frames: Sequence[Frame], seed: int, finished: Callable[[], int] | None = None) -> None:
+        """
+        Args:
+            frames: of an epoch.
+            seed: of the order.
+            finished: with how many frames training has finished since its start. A frame that was drawn for a step
+                which was interrupted is to be drawn again, and only training knows. None: with all that were drawn.
+        """
         self.frames = frames
         self.seed = seed
-        self.epoch = 0
-        self.position = 0
+        self._drawn = 0
+        self._finished = finished
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __iter__(self) -> Iterator[Frame]:
-        if self.position >= len(self.frames):
-            self.epoch, self.position = self.epoch + 1, 0
-        order = self._order()
-        while self.position < len(self.frames):
-            self.position += 1
-            yield self.frames[order[self.position - 1]]
+        epoch, position = divmod(self._drawn, len(self.frames))
+        for index in self._order(epoch)[position:]:
+            self._drawn += 1
+            yield self.frames[index]
 
-    def _order(self) -> list[int]:
+    def _order(self, epoch: int) -> list[int]:
         # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
         generator = torch.Generator().manual_seed(self.seed)
-        for _ in range(self.epoch):
+        for _ in range(epoch):
             torch.randperm(len(self.frames), generator=generator)
         return torch.randperm(len(self.frames), generator=generator).tolist()
 
     def state_dict(self) -> dict[str, int]:
-        return {"epoch": self.epoch, "position": self.position}
+        return {"finished": self._drawn if self._finished is None else self._finished()}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        self.epoch, self.position = state["epoch"], state["position"]
+        self._drawn = state["finished"]
 
 
 class OrderedFrames:
-    """Frames as they come, from the start each time. (Lightning takes a bare tuple for several loaders.)"""
+    """Frames as they come, from the start each time. (Lightning takes a bare sequence for several loaders.)"""
 
-    def __init__(self, frames: Sequence[Frame]) -> None:
-        self.frames = frames
+    def __init__(self, frames: Frames, limit: int | None = None) -> None:
+        """``limit``: so many of the frames, spread evenly over all of them, the first and the last included."""
+        self.frames = frames if limit is None else Frames(_spread(frames.views, limit), frames.load)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -61,25 +68,51 @@ class OrderedFrames:
         return iter(self.frames)
 
 
-class StreetData(LightningDataModule):
-    """A log, split into frames to train on and frames to hold out; each batch is one Frame.
+def _spread(views: Sequence[View], limit: int) -> list[View]:
+    """Every view if there are no more than ``limit``.
 
-    The loaders are plain iterables: frames lie in memory, so that worker processes would only copy them.
+    From the first to the last: of c cameras in turn, an even step then never meets the same camera only, because the
+    number of views less one shares no factor with c.
+    """
+    if limit >= len(views):
+        return list(views)
+    last, gaps = len(views) - 1, limit - 1
+    return [views[(2 * place * last + gaps) // (2 * gaps)] for place in range(limit)] if gaps else [views[last // 2]]
+
+
+class StreetData(LightningDataModule):
+    """A log, split into frames to train on and frames to hold out; each batch is one Frame, each step takes one.
+
+    The loaders are plain iterables: frames are decoded once and kept in memory, which worker processes do not share.
     """
 
-    def __init__(self, log: DrivingLog, *, stride: int = 10, offset: int = 5, seed: int = 0) -> None:
+    def __init__(
+        self, log: DrivingLog, *, stride: int = 10, offset: int = 5, seed: int = 0, val_frames: int | None = None
+    ) -> None:
+        """
+        Args:
+            log: what to train on.
+            stride: as in ``split``.
+            offset: as in ``split``.
+            seed: of the order of the training frames.
+            val_frames: images that each validation looks at, spread over the held-out ones; None: all.
+        """
         super().__init__()
+        if val_frames is not None and val_frames < 1:
+            raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
         self.driving_log = log
         self.split = split(log, stride=stride, offset=offset)
         self.seed = seed
+        self.val_frames = val_frames
 
     def train_dataloader(self) -> ShuffledFrames:
         """One training frame a step; an epoch is all of them in random order."""
-        return ShuffledFrames(self.split.train, self.seed)
+        trainer = self.trainer
+        return ShuffledFrames(self.split.train, self.seed, None if trainer is None else lambda: trainer.global_step)
 
     def val_dataloader(self) -> OrderedFrames:
-        """The held-out frames in the order of the log."""
-        return OrderedFrames(self.split.held_out)
+        """The held-out frames in the order of the log, or ``val_frames`` of them."""
+        return OrderedFrames(self.split.held_out, self.val_frames)
 
     def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
         """The frame on the device (Lightning itself cannot move a frozen dataclass)."""

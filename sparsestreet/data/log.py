@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from sparsestreet.types import Frame, Sweep, Track
+from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.types import Frame, Sweep, Track, View
 
 _QUANTILES = (0.02, 0.98)
 _MARGIN = 1.1
@@ -24,10 +25,10 @@ class DrivingLog:
     """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centered near its start."""
 
     name: str
-    frames: tuple[Frame, ...]
-    """Ordered by (index, camera_index)."""
-    sweeps: tuple[Sweep, ...]
-    """Ordered by index; empty where the log has no lidar."""
+    frames: Frames | tuple[Frame, ...]
+    """Ordered by (frame_index, camera_index), decoded when indexed; a tuple holds frames that are in memory."""
+    sweeps: Sweeps | tuple[Sweep, ...]
+    """Ordered by index, read when indexed; empty where the log has no lidar. A tuple: as for the frames."""
     tracks: tuple[Track, ...]
     """Objects annotated in at least one of the frames; poses are in the re-centered world."""
     num_frames: int
@@ -38,20 +39,29 @@ class DrivingLog:
     notes: tuple[str, ...] = ()
     """What is absent, and what a run does without it, one sentence each."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frames", Frames.of(self.frames))
+        object.__setattr__(self, "sweeps", Sweeps.of(self.sweeps))
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Cameras, times and indices of the frames, for whoever needs no pixels: none is decoded."""
+        return self.frames.views
+
     @cached_property
     def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
         """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.
 
         Points that some camera sees count (DriveStudio's rule); without lidar, what lies 50 m ahead of each camera.
         """
-        centers = torch.stack([frame.camera.position for frame in self.frames]).double().numpy()
+        centers = torch.stack([view.camera.position for view in self.views]).double().numpy()
         low, high = centers.min(axis=0), centers.max(axis=0)
         points = _seen_points(self.sweeps)
         if len(points):
             around = np.quantile(points, _QUANTILES, axis=0)
         else:
             # The third row of camera_from_world is the optical axis in the world.
-            axes = torch.stack([frame.camera.camera_from_world[2, :3] for frame in self.frames]).double().numpy()
+            axes = torch.stack([view.camera.camera_from_world[2, :3] for view in self.views]).double().numpy()
             ahead = centers + _SEEN_AHEAD * axes
             around = np.stack((ahead.min(axis=0), ahead.max(axis=0)))
         return np.minimum(low, around[0]), np.maximum(high, around[1])
@@ -73,23 +83,31 @@ class DrivingLog:
 class Split:
     """Which images are trained on and which are only looked at; no instant is in both."""
 
-    train: tuple[Frame, ...]
-    held_out: tuple[Frame, ...]
+    train: Frames
+    held_out: Frames
+
+    @property
+    def held_out_indices(self) -> frozenset[int]:
+        """Integer frames whose images, sweeps and boxes must not be trained on."""
+        return frozenset(view.frame_index for view in self.held_out.views)
 
 
 def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:
     """Hold out every ``stride``-th instant with all its cameras: indices offset, offset + stride, ...
 
-    ``stride=0`` holds out nothing. Raises ValueError where no training frame, or no held-out one, would be left.
+    ``offset=stride`` starts at ``stride``, so that frame 0 is trained on (DriveStudio's split). ``stride=0`` holds out
+    nothing. Raises ValueError where no training frame, or no held-out one, would be left. Decodes no image.
     """
     if stride == 0:
-        return Split(log.frames, ())
-    if not 0 <= offset < stride:
+        return Split(log.frames, Frames.of(()))
+    if not 0 <= offset <= stride:
         raise ValueError(
-            f"a split needs 0 <= offset < stride, got offset {offset} and stride {stride}: lower the offset"
+            f"a split needs 0 <= offset <= stride, got offset {offset} and stride {stride}: offset is the first frame "
+            "that is held out, and the next one comes stride frames later"
         )
-    held_out = tuple(frame for frame in log.frames if frame.frame_index % stride == offset)
-    train = tuple(frame for frame in log.frames if frame.frame_index % stride != offset)
+    instants = frozenset(range(offset, log.num_frames, stride))
+    held_out = log.frames.where(lambda view: view.frame_index in instants)
+    train = log.frames.where(lambda view: view.frame_index not in instants)
     if not train:
         raise ValueError(f"stride {stride} holds out all {log.num_frames} frames of {log.name!r}: take a larger stride")
     if not held_out:
@@ -100,11 +118,19 @@ def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:
     return Split(train, held_out)
 
 
-def _seen_points(sweeps: Sequence[Sweep]) -> Float[np.ndarray, "n 3"]:
+def _seen_points(sweeps: Sweeps) -> Float[np.ndarray, "n 3"]:
     """Lidar points that a camera sees, or all where none is seen; every k-th of very many."""
-    if not sweeps:
-        return np.zeros((0, 3), dtype=np.float32)
-    points = torch.cat([sweep.points[sweep.colored] for sweep in sweeps])
-    if not len(points):
-        points = torch.cat([sweep.points for sweep in sweeps])
-    return points[:: len(points) // _QUANTILE_POINTS + 1].numpy()
+    seen = [sweep.points[sweep.colored] for sweep in sweeps.gray()]
+    if not any(map(len, seen)):
+        seen = [sweep.points for sweep in sweeps.gray()]
+    return _every(sum(map(len, seen)) // _QUANTILE_POINTS + 1, seen)
+
+
+def _every(step: int, parts: Sequence[Float[Tensor, "_ 3"]]) -> Float[np.ndarray, "n 3"]:
+    """Every ``step``-th point of all parts together, counted from the first, without a copy of them all."""
+    taken = [np.zeros((0, 3), dtype=np.float32)]
+    passed = 0
+    for part in parts:
+        taken.append(part[-passed % step :: step].numpy())
+        passed += len(part)
+    return np.concatenate(taken)

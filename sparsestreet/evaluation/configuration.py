@@ -22,6 +22,9 @@ IDENTITY_KEYS = (
     "folder",
     "data.root",  # where a log lies; the scene's name says which it is
     "data.log.root",
+    "data.log.parent",
+    "data.log.cache_mb",
+    "split.val_frames",
     "callback.*.path",  # where something is written
     "logger",
     "logger.*",

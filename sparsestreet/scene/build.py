@@ -7,20 +7,21 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
+from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.assignment import Assignment, assign_tracks
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.sky import Sky, SkySettings
-from sparsestreet.types import Frame
+from sparsestreet.types import Track
 
 _log = logging.getLogger(__name__)
 
 
 def build_scene(
     log: DrivingLog,
-    train_frames: Sequence[Frame],
+    train_frames: Frames,
     held_out: frozenset[int],
     nodes: Mapping[str, NodeSettings],
     sky: SkySettings | None,
@@ -63,6 +64,6 @@ def _report(assignment: Assignment) -> None:
         _log.info("no node takes %s: they are part of the background", _by_class(assignment.unclaimed))
 
 
-def _by_class(tracks: Sequence) -> str:
+def _by_class(tracks: Sequence[Track]) -> str:
     """As "3 Vehicle, 1 Cyclist"."""
     return ", ".join(f"{count} {name}" for name, count in Counter(track.class_name for track in tracks).items())

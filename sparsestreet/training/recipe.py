@@ -52,8 +52,7 @@ class Recipe:
     def build(self, data: StreetData) -> StreetSystem:
         """Start the scene from the training part of the data, and wrap it for training."""
         log, split = data.driving_log, data.split
-        held_out = frozenset(view.frame_index for view in split.held_out)
-        scene = build_scene(log, split.train, held_out, self.nodes, self.sky, self.seed)
+        scene = build_scene(log, split.train, split.held_out_indices, self.nodes, self.sky, self.seed)
         return StreetSystem(
             scene, self.losses, self.optimizer, radius=log.radius, options=self.options, sh_interval=self.sh_interval
         )

@@ -13,7 +13,6 @@ from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
 from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, RowLedger
 
-
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
 PAIRS = list(itertools.product(METHODS, SPARSIFY))

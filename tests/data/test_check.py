@@ -5,7 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from sparsestreet.data.check import report_problems
+from sparsestreet.data.check import report_check
+from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 
 
@@ -16,7 +17,7 @@ def console() -> Console:
 
 @pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 def test_a_sound_log_is_summed_up(make, tmp_path, console):
-    assert report_problems(make(tmp_path), console=console) == 0
+    assert report_check(DriveStudioReader(make(tmp_path)), console) == 0
     printed = console.file.getvalue()
     for words in ("3 x 2", "40x24", "15 (1", "Vehicle", "ready to train"):
         assert words in printed
@@ -27,7 +28,7 @@ def test_what_is_absent_is_said(tmp_path, console):
     for path in (tmp_path / "instances").iterdir():
         path.unlink()
     (tmp_path / "instances").rmdir()
-    assert report_problems(tmp_path, console=console) == 0
+    assert report_check(DriveStudioReader(tmp_path), console) == 0
     assert "no boxes" in console.file.getvalue()
 
 
@@ -35,7 +36,7 @@ def test_every_problem_is_printed_with_its_remedy(tmp_path, console):
     make_nuscenes(tmp_path, frames=12)
     for frame in range(9):
         (tmp_path / f"lidar_pose/{frame:03d}.txt").write_text("[bold] 1 2\n")
-    assert report_problems(tmp_path, console=console) == 1
+    assert report_check(DriveStudioReader(tmp_path), console) == 1
     printed = console.file.getvalue()
     assert "9 to repair" in printed
     for frame in range(9):
@@ -44,5 +45,5 @@ def test_every_problem_is_printed_with_its_remedy(tmp_path, console):
 
 
 def test_a_folder_that_is_not_there_is_a_problem(tmp_path, console):
-    assert report_problems(tmp_path / "nowhere", console=console) == 1
+    assert report_check(DriveStudioReader(tmp_path / "nowhere"), console) == 1
     assert "no images/" in console.file.getvalue()

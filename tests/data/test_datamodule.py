@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import lightning
 import pytest
@@ -9,7 +10,8 @@ import torch
 
 from sparsestreet.data.datamodule import ShuffledFrames, StreetData
 from sparsestreet.data.device import to_device
-from sparsestreet.types import Frame
+from sparsestreet.data.lazy import Frames
+from sparsestreet.types import Frame, View
 from tests.data.streets import make_log
 
 
@@ -24,6 +26,12 @@ def test_an_epoch_is_every_training_frame_once_in_a_new_order():
     assert len(loader) == len(first) == 18
     assert sorted(first) == sorted(second) == keys(data.split.train)
     assert first != second != keys(data.split.train)
+
+
+def test_no_two_epochs_have_the_same_order():
+    loader = StreetData(make_log(), seed=1).train_dataloader()
+    epochs = [tuple(keys(loader)) for _ in range(5)]
+    assert len(set(epochs)) == 5
 
 
 def test_the_order_is_given_by_the_seed():
@@ -48,6 +56,41 @@ def test_held_out_frames_come_in_order_every_time():
     loader = StreetData(make_log(), stride=4, offset=1).val_dataloader()
     assert keys(loader) == keys(loader) == [(index, camera) for index in (1, 5, 9) for camera in range(2)]
     assert len(loader) == 6
+
+
+@pytest.mark.parametrize("limit", [1, 2, 5, 11, 12, 59, 60, 61])
+def test_validation_looks_at_frames_from_the_whole_drive(limit):
+    """60 held-out images of 20 instants: the gaps differ by one at most, and from two on both ends are among them."""
+    data = StreetData(make_log(200, 3), stride=10, offset=5, val_frames=limit)
+    loader = data.val_dataloader()
+    everything = keys(data.split.held_out)
+    places = [everything.index(key) for key in keys(loader)]
+    assert len(loader) == len(places) == min(limit, 60)
+    gaps = {after - before for before, after in itertools.pairwise(places)}
+    assert not gaps or max(gaps) - min(gaps) <= 1
+    assert {places[0], places[-1]} == ({29} if limit == 1 else {0, 59})
+
+
+@pytest.mark.parametrize("num_cameras", [2, 3, 5])
+def test_validation_meets_every_camera(num_cameras):
+    """Also where every k-th held-out image would be of one camera."""
+    data = StreetData(make_log(12 * num_cameras * 10, num_cameras), stride=10, offset=5, val_frames=12)
+    assert len(data.split.held_out) == 12 * num_cameras**2
+    assert {camera for _, camera in keys(data.val_dataloader())} == set(range(num_cameras))
+
+
+def test_validation_needs_an_image():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        StreetData(make_log(), val_frames=0)
+
+
+def test_choosing_what_to_validate_decodes_nothing():
+    def load(view: View) -> Frame:
+        raise AssertionError("decoded")
+
+    log = make_log(40)
+    data = StreetData(dataclasses.replace(log, frames=Frames(log.views, load)), val_frames=2)
+    assert len(data.val_dataloader()) == 2
 
 
 @pytest.mark.parametrize("steps", [0, 5, 18, 20, 40])
@@ -87,7 +130,7 @@ def test_moving_keeps_values_and_types():
 
 
 class Recorder(lightning.LightningModule):
-    """Learns nothing; remembers the frames it was given."""
+    """Learns nothing; remembers the frames of the updates that it made."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -96,8 +139,12 @@ class Recorder(lightning.LightningModule):
         self.validated: list[tuple[int, int]] = []
 
     def training_step(self, batch: Frame, batch_index: int) -> torch.Tensor:
-        self.seen += keys([batch])
+        self.key = keys([batch])
         return self.weight * batch.image.float().mean()
+
+    def optimizer_step(self, *arguments, **options) -> None:
+        super().optimizer_step(*arguments, **options)
+        self.seen += self.key
 
     def validation_step(self, batch: Frame, batch_index: int) -> None:
         self.validated += keys([batch])
@@ -106,29 +153,81 @@ class Recorder(lightning.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def fit(data: StreetData, folder, steps: int, checkpoint: str | None = None) -> Recorder:
+class StopError(Exception):
+    """What interrupts a training in these tests."""
+
+
+class Interruption(lightning.Callback):
+    """Raises at a moment of a step, which is counted from 1, and leaves a checkpoint to go on from."""
+
+    def __init__(self, moment: str, step: int, checkpoint: Path) -> None:
+        self.checkpoint = checkpoint
+        setattr(self, moment, self._stop)
+        self._updates = step - 1 if moment in BEFORE_UPDATE else step
+
+    def _stop(self, trainer: lightning.Trainer, *arguments) -> None:
+        if trainer.global_step == self._updates:
+            raise StopError
+
+    def on_exception(self, trainer: lightning.Trainer, module: Recorder, exception: BaseException) -> None:
+        trainer.save_checkpoint(self.checkpoint)
+
+
+def fit(
+    data: StreetData, steps: int, checkpoint: Path | None = None, callback: lightning.Callback | None = None
+) -> tuple[Recorder, lightning.Trainer]:
     model = Recorder()
     trainer = lightning.Trainer(
         accelerator="cpu",
         max_steps=steps,
+        callbacks=callback,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
+        val_check_interval=3,
+        check_val_every_n_epoch=None,
     )
-    trainer.fit(model, data, ckpt_path=checkpoint)
-    trainer.save_checkpoint(folder / "last.ckpt")
-    return model
+    try:
+        trainer.fit(model, data, ckpt_path=checkpoint)
+    except StopError:
+        assert callback is not None
+    return model, trainer
+
+
+def small_street() -> StreetData:
+    return StreetData(make_log(6, 1), stride=6, offset=2)
 
 
 # Lightning 2.6 asks torch about tree leaves in a way that torch 2.13 has deprecated.
 @pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")
-def test_lightning_resumes_in_the_middle_of_an_epoch_with_the_frames_that_were_left(tmp_path):
-    log = make_log(6, 1)
-    whole = fit(StreetData(log, stride=6, offset=2), tmp_path, steps=12)
+@pytest.mark.parametrize("steps", [4, 5, 7])
+def test_lightning_resumes_with_the_frames_that_were_left(steps, tmp_path):
+    """Epochs have 5 frames, so that 7 steps end within one and 5 at its end."""
+    whole, _ = fit(small_street(), 12)
     assert len(whole.seen) == 12
     assert set(whole.validated) == {(2, 0)}
-    first = fit(StreetData(log, stride=6, offset=2), tmp_path, steps=7)
-    second = fit(StreetData(log, stride=6, offset=2), tmp_path, steps=12, checkpoint=str(tmp_path / "last.ckpt"))
+    first, trainer = fit(small_street(), steps)
+    trainer.save_checkpoint(tmp_path / "last.ckpt")
+    second, _ = fit(small_street(), 12, tmp_path / "last.ckpt")
+    assert first.seen + second.seen == whole.seen
+
+
+BEFORE_UPDATE = ("on_train_batch_start", "on_after_backward")
+MOMENTS = [
+    *itertools.product((*BEFORE_UPDATE, "on_train_batch_end"), (1, 3, 5, 6, 9, 10, 11)),
+    *itertools.product(("on_validation_start",), (3, 6, 9)),
+]
+
+
+@pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")
+@pytest.mark.parametrize(("moment", "step"), MOMENTS)
+def test_a_training_interrupted_anywhere_in_a_step_goes_on_as_if_it_had_not_been(moment, step, tmp_path):
+    """A step whose update was made is not made again, one whose update was not is made with the same frame."""
+    whole, _ = fit(small_street(), 12)
+    checkpoint = tmp_path / "interrupted.ckpt"
+    first, _ = fit(small_street(), 12, callback=Interruption(moment, step, checkpoint))
+    assert len(first.seen) == (step - 1 if moment in BEFORE_UPDATE else step)
+    second, _ = fit(small_street(), 12, checkpoint)
     assert first.seen + second.seen == whole.seen

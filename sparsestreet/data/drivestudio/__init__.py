@@ -1,7 +1,5 @@
 """Logs in DriveStudio's processed layout: Waymo and nuScenes flavour."""
 
-from sparsestreet.data.drivestudio.check import check_drivestudio
-from sparsestreet.data.drivestudio.problems import LogError, Problem
-from sparsestreet.data.drivestudio.reader import read_drivestudio
+from sparsestreet.data.drivestudio.reader import DriveStudioReader
 
-__all__ = ["LogError", "Problem", "check_drivestudio", "read_drivestudio"]
+__all__ = ["DriveStudioReader"]

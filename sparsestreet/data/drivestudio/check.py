@@ -1,46 +1,27 @@
 """The schema check: everything that is wrong with a log, at once."""
 
 from collections import Counter
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import torch
 
-from sparsestreet.data.drivestudio.images import image_size, read_image, read_mask
 from sparsestreet.data.drivestudio.instances import read_instances
-from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout, find_layout
-from sparsestreet.data.drivestudio.lidar import check_sweep_size, read_sweep
+from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
 from sparsestreet.data.drivestudio.poses import read_intrinsics, read_pose
-from sparsestreet.data.drivestudio.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.drivestudio.sweeps import check_sweep_size, read_sweep
+from sparsestreet.data.images import check_pixels, image_size
+from sparsestreet.data.problems import Problem, attempt, fault, missing_files
 
 LARGEST_SCENE = 20_000.0
 """Meters. Re-centered coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""
 
 
-def check_drivestudio(
-    root: Path | str,
-    *,
-    cameras: Sequence[int] | None = None,
-    first_frame: int = 0,
-    last_frame: int = -1,
-    ignore_distortion: bool = False,
-    contents: bool = True,
-) -> list[Problem]:
-    """Every problem of the chosen cameras and frames; an empty list means that ``read_drivestudio`` will succeed.
-
-    ``contents=False`` trusts pixels and lidar points and looks at files' headers and sizes only, which is quick.
-    Raises ValueError where cameras or frames are asked for that the log lacks.
-    """
-    try:
-        layout = find_layout(Path(root), cameras=cameras, first_frame=first_frame, last_frame=last_frame)
-    except LogError as error:
-        return list(error.problems)
-    return check_layout(layout, ignore_distortion=ignore_distortion, contents=contents)
-
-
 def check_layout(layout: Layout, *, ignore_distortion: bool, contents: bool) -> list[Problem]:
-    """As ``check_drivestudio``, for a layout that is found already."""
+    """Every problem of the frames and cameras that are read; an empty list means that reading will succeed.
+
+    ``contents=False`` is quick: it trusts lidar points of the right size, and images that are not cut short.
+    """
     return [
         *missing_files(_required(layout)),
         *_check_cameras(layout, ignore_distortion),
@@ -80,7 +61,7 @@ def _check_cameras(layout: Layout, ignore_distortion: bool) -> list[Problem]:
             message = (
                 f"the lens distortion k1 k2 p1 p2 k3 = {camera[1].tolist()} is not zero; images must be undistorted"
             )
-            remedy = "undistort the images and write zeros, or accept the error with ignore_distortion=True"
+            remedy = "undistort the images and write zeros, or accept the error with data.log.ignore_distortion=true"
             problems.append(Problem(path, message, remedy))
     return problems
 
@@ -110,7 +91,7 @@ def _check_extent(placed: list[tuple[Path, torch.Tensor]]) -> list[Problem]:
         return []
     strayed = int((positions - positions.median(0).values).norm(dim=-1).argmax())
     message = f"poses span {extent / 1000:.1f} km, more than the {LARGEST_SCENE / 1000:g} km that float32 can hold"
-    remedy = "repair this pose, the farthest from the others, or read fewer frames (first_frame, last_frame)"
+    remedy = "repair this pose, the farthest from the others, or read fewer frames (data.log.first_frame, .last_frame)"
     return [Problem(placed[strayed][0], message, remedy)]
 
 
@@ -127,8 +108,8 @@ def _check_images(layout: Layout, contents: bool) -> list[Problem]:
             if size is not None and size != common:
                 message = f"the image is {size[0]}x{size[1]}, the others of camera {camera} are {common[0]}x{common[1]}"
                 problems.append(Problem(path, message, "write all images of a camera at one size"))
-            elif size is not None and contents:
-                attempt(problems, partial(read_image, path, size))
+            elif size is not None:
+                attempt(problems, partial(check_pixels, path, decode=contents))
         problems += _check_masks(layout, camera, common, contents)
     return problems
 
@@ -147,8 +128,7 @@ def _check_mask(path: Path, size: tuple[int, int], contents: bool) -> None:
     if found != size:
         message = f"the mask is {found[0]}x{found[1]}, the camera's images are {size[0]}x{size[1]}"
         raise fault(path, message, "write masks at the size of the images")
-    if contents:
-        read_mask(path, size, sky=False)
+    check_pixels(path, decode=contents)
 
 
 def _check_sweeps(layout: Layout, contents: bool) -> list[Problem]:

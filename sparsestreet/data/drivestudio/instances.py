@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import check_rigid
-from sparsestreet.data.drivestudio.problems import LogError, Problem, fault
+from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.types import Track
 
 _COLUMNS = ("frame_idx", "obj_to_world", "box_size")

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.data.drivestudio.problems import fault
+from sparsestreet.data.problems import fault
 
 _FRAME = re.compile(r"(\d+)")
 _CAMERA = re.compile(r"(\d+)")

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.data.drivestudio.layout import Layout
-from sparsestreet.data.drivestudio.problems import fault
+from sparsestreet.data.problems import fault
 from sparsestreet.geometry.transforms import rigidity_error
 
 RIGIDITY_TOLERANCE = 1e-4

@@ -9,8 +9,8 @@
    ``lidar``), all of it to pictures and truth (``render``), frames to disk (``write``).
 """
 
-from sparsestreet.data.synthetic.open import open_street
+from sparsestreet.data.synthetic.reader import StreetReader
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import make_street
 
-__all__ = ["StreetSettings", "make_street", "open_street"]
+__all__ = ["StreetReader", "StreetSettings", "make_street"]

@@ -1,6 +1,7 @@
 """Making a street: all frames rendered and written, or nothing."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import shutil
@@ -46,6 +47,14 @@ def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, i
         if partial.exists():
             shutil.rmtree(partial)
     return root
+
+
+def street_name(settings: StreetSettings) -> str:
+    """A folder's name for the street: its size, a hash of all that makes it but the seed, and the seed."""
+    label = _label(settings)
+    label["settings"].pop("seed")
+    digest = hashlib.sha256(json.dumps(label, sort_keys=True).encode()).hexdigest()[:8]
+    return f"{settings.width}x{settings.height}x{settings.num_frames}_{digest}_seed{settings.seed}"
 
 
 def _holds_street(root: Path, settings: StreetSettings) -> bool:

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.types import Frame, Sweep, Track, View
+from sparsestreet.types import Track, View
 
 
 @dataclass(frozen=True)
@@ -12,8 +13,8 @@ class TrainingData:
     """A log seen through its split, and which of its objects move on their own."""
 
     log: DrivingLog
-    frames: Sequence[Frame]
-    """Views to train on."""
+    frames: Frames
+    """Views to train on; pixels are read when one is indexed."""
     held_out: frozenset[int]
     """Integer frames whose sweeps and boxes must not be used."""
     tracks: tuple[Track, ...] = ()
@@ -24,7 +25,7 @@ class TrainingData:
     @property
     def views(self) -> Sequence[View]:
         """Cameras and times of the training views."""
-        return self.frames
+        return self.frames.views
 
     @property
     def times(self) -> Sequence[float]:
@@ -32,6 +33,6 @@ class TrainingData:
         return sorted({view.time for view in self.views})
 
     @property
-    def sweeps(self) -> Sequence[Sweep]:
-        """Lidar of the training instants, loaded one at a time."""
-        return [sweep for sweep in self.log.sweeps if sweep.index not in self.held_out]
+    def sweeps(self) -> Sweeps:
+        """Lidar of the training instants; one is read when it is indexed."""
+        return self.log.sweeps.where(lambda index: index not in self.held_out)

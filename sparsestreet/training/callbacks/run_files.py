@@ -54,7 +54,7 @@ class RunFiles(Callback, RowListener):
         log, split = trainer.datamodule.driving_log, trainer.datamodule.split
         stored = StoredScene(system.scene, system.options, log.name, log.num_frames)
         save_scene(self.folder / FILE_NAME, stored)
-        views.write_views(self.folder / views.FILE_NAME, split.train, split.held_out)
+        views.write_views(self.folder / views.FILE_NAME, split.train.views, split.held_out.views)
         description = replace(
             self.description, steps=trainer.global_step, training_seconds=self.clock.seconds, caps=dict(self.caps)
         )

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparsestreet.data.drivestudio import LogError, check_drivestudio, read_drivestudio
+from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.problems import LogError
 from tests.data.drivestudio.folders import (
     HEIGHT,
     WIDTH,
@@ -136,26 +138,52 @@ CORRUPTIONS = {
 
 @pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 def test_a_sound_log_has_no_problems(make, tmp_path):
-    assert check_drivestudio(make(tmp_path)) == []
+    assert DriveStudioReader(make(tmp_path)).check() == []
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)
 def test_the_broken_file_is_named_and_the_reader_refuses_it(name, tmp_path):
     corrupt, file, fragment = CORRUPTIONS[name]
     corrupt(make_nuscenes(tmp_path))
-    problems = check_drivestudio(tmp_path)
+    problems = DriveStudioReader(tmp_path).check()
     assert file in [problem.path.relative_to(tmp_path).as_posix() for problem in problems]
     assert fragment in " ".join(problem.message for problem in problems)
     assert all(problem.remedy for problem in problems)
     with pytest.raises(LogError, match=file) as caught:
-        read_drivestudio(tmp_path)
+        _use(DriveStudioReader(tmp_path).read())
     assert list(caught.value.problems) == problems
+
+
+def _use(log: DrivingLog) -> None:
+    """What every training does before its first step: only broken points and pixels can show there."""
+    assert log.radius > 0
+
+
+def test_pixels_that_break_later_are_reported_with_all_others_when_they_are_asked_for(tmp_path):
+    log = DriveStudioReader(make_nuscenes(tmp_path)).read()
+    for name in ("images/001_0.jpg", "images/002_1.jpg"):
+        truncate(name, -20)(tmp_path)
+    assert log.frames[0].image.shape == (HEIGHT, WIDTH, 3)
+    with pytest.raises(LogError) as caught:
+        log.frames[2]
+    assert list(caught.value.problems) == DriveStudioReader(tmp_path).check()
+    assert len(caught.value.problems) == 2
+    with pytest.raises(LogError, match="2 problems"):
+        log.sweeps[2]
+
+
+def test_bytes_behind_the_end_of_an_image_do_no_harm(tmp_path):
+    make_nuscenes(tmp_path)
+    for name in ("images/001_0.jpg", "sky_masks/001_0.png"):
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes() + b"padding")
+    assert DriveStudioReader(tmp_path).check() == []
+    assert DriveStudioReader(tmp_path).read().frames[2].sky.any()
 
 
 @pytest.mark.parametrize("name", sorted(set(CORRUPTIONS) - {"more sweeps than images"}))
 def test_one_fault_is_one_problem(name, tmp_path):
     CORRUPTIONS[name][0](make_nuscenes(tmp_path))
-    assert len(check_drivestudio(tmp_path)) == 1
+    assert len(DriveStudioReader(tmp_path).check()) == 1
 
 
 def test_all_problems_are_found_at_once(tmp_path):
@@ -163,17 +191,17 @@ def test_all_problems_are_found_at_once(tmp_path):
     names = ["missing image", "mirrored pose", "cut mask", "NaN lidar point", "negative focal length", "negative box"]
     for name in names:
         CORRUPTIONS[name][0](tmp_path)
-    found = {problem.path.relative_to(tmp_path).as_posix() for problem in check_drivestudio(tmp_path)}
+    found = {problem.path.relative_to(tmp_path).as_posix() for problem in DriveStudioReader(tmp_path).check()}
     assert found == {CORRUPTIONS[name][1] for name in names}
-    with pytest.raises(LogError, match="4 problems"):  # pixels and points are only decoded once the rest is sound
-        read_drivestudio(tmp_path)
+    with pytest.raises(LogError, match="5 problems"):  # points are only read once the rest is sound
+        DriveStudioReader(tmp_path).read()
 
 
 def test_every_object_at_fault_is_reported(tmp_path):
     make_nuscenes(tmp_path)
     info = json.loads((tmp_path / INFO).read_text())
     write_json(tmp_path / INFO, {key: {"class_name": "Vehicle"} for key in ("0", "1", "2")} | {"3": info["0"]})
-    messages = [problem.message for problem in check_drivestudio(tmp_path)]
+    messages = [problem.message for problem in DriveStudioReader(tmp_path).check()]
     assert [message.split(" cannot")[0] for message in messages] == ["object 0", "object 1", "object 2"]
 
 
@@ -183,7 +211,7 @@ def test_the_waymo_flavour_is_checked_by_its_own_files(tmp_path):
     edit_matrix("extrinsics/1.txt", put(0, 0, 1.2))(tmp_path)
     remove("ego_pose/002.txt")(tmp_path)
     write_rows(tmp_path / "lidar/000.bin", np.ones((3, 4)))  # rows of the other flavour
-    found = {problem.path.relative_to(tmp_path).as_posix() for problem in check_drivestudio(tmp_path)}
+    found = {problem.path.relative_to(tmp_path).as_posix() for problem in DriveStudioReader(tmp_path).check()}
     assert found == {"ego_pose/001.txt", "extrinsics/1.txt", "ego_pose/002.txt", "lidar/000.bin"}
 
 
@@ -191,7 +219,7 @@ def test_missing_files_of_one_folder_are_one_problem(tmp_path):
     make_nuscenes(tmp_path, frames=8)
     for frame in range(1, 8):
         remove(f"lidar/{frame:03d}.bin")(tmp_path)
-    (problem,) = check_drivestudio(tmp_path)
+    (problem,) = DriveStudioReader(tmp_path).check()
     assert problem.path == tmp_path / "lidar/001.bin"
     assert problem.message == ("7 files of the folder are missing: 001.bin, 002.bin, 003.bin, 004.bin, 005.bin, ...")
 
@@ -200,16 +228,15 @@ def test_what_is_not_read_is_not_checked(tmp_path):
     make_nuscenes(tmp_path)
     CORRUPTIONS["cut image"][0](tmp_path)
     CORRUPTIONS["negative focal length"][0](tmp_path)
-    assert check_drivestudio(tmp_path, cameras=[0], first_frame=2) == []
-    assert len(check_drivestudio(tmp_path, contents=False)) == 1
+    assert DriveStudioReader(tmp_path, cameras=[0], first_frame=2).check() == []
 
 
 @pytest.mark.parametrize("build", [lambda root: None, lambda root: (root / "images").mkdir()])
 def test_a_folder_that_is_no_log_is_one_problem(build, tmp_path):
     build(tmp_path)
-    assert len(check_drivestudio(tmp_path)) == 1
+    assert len(DriveStudioReader(tmp_path).check()) == 1
     with pytest.raises(LogError):
-        read_drivestudio(tmp_path)
+        DriveStudioReader(tmp_path).read()
 
 
 @pytest.mark.parametrize(
@@ -218,4 +245,4 @@ def test_a_folder_that_is_no_log_is_one_problem(build, tmp_path):
 )
 def test_a_choice_the_log_cannot_give_is_an_error(choice, tmp_path):
     with pytest.raises(ValueError, match="log's"):
-        read_drivestudio(make_nuscenes(tmp_path), **choice)
+        DriveStudioReader(make_nuscenes(tmp_path), **choice).read()

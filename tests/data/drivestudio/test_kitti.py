@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from sparsestreet.data.drivestudio import check_drivestudio, read_drivestudio
-from sparsestreet.data.drivestudio.lidar import visible_pixels
+from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import Frame
@@ -16,13 +16,13 @@ from sparsestreet.types import Frame
 
 @pytest.fixture(scope="module")
 def log(kitti: Path) -> DrivingLog:
-    return read_drivestudio(kitti)
+    return DriveStudioReader(kitti).read()
 
 
 def test_it_is_sound_and_quick_to_read(kitti):
-    assert check_drivestudio(kitti, contents=False) == []
+    assert DriveStudioReader(kitti).check() == []
     start = time.process_time()
-    read_drivestudio(kitti)
+    DriveStudioReader(kitti).read()
     # 0.8 s of one thread, 1.1 s with shape checks; CPU time, since a wall clock would measure the neighbors.
     assert time.process_time() - start < 3
 

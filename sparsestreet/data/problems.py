@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TypeVar
 
 _SHOWN = 5
-"""Problems an error message spells out; `check_drivestudio` returns all of them."""
+"""Problems an error message spells out; a check returns all of them."""
 
 T = TypeVar("T")
 
@@ -57,7 +57,10 @@ def missing_files(paths: Iterable[Path]) -> list[Problem]:
     for path in paths:
         if not path.is_file():
             absent.setdefault(path.parent, []).append(path)
-    remedy = "write the missing files, or load only complete frames (first_frame, last_frame) and cameras (cameras)"
+    remedy = (
+        "write the missing files, or read only complete frames (data.log.first_frame, .last_frame) and cameras "
+        "(data.log.cameras)"
+    )
     problems = []
     for files in absent.values():
         names = ", ".join(path.name for path in files[:_SHOWN]) + (", ..." if len(files) > _SHOWN else "")

@@ -2,7 +2,7 @@
 
 import torch
 
-from sparsestreet.data.drivestudio.lidar import color_points, depth_image
+from sparsestreet.data.lidar import color_points, depth_image
 from sparsestreet.types import Camera
 
 # At the origin, looking along z; a point (x, y, z) falls on pixel (2 x/z + 1.5, 2 y/z + 1).

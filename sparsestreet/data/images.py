@@ -1,5 +1,6 @@
 """Images and masks, brought to the size that is asked for."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from torch import Tensor
 
-from sparsestreet.data.drivestudio.problems import LogError, fault
+from sparsestreet.data.problems import LogError, fault
 
+_JPEG_END = b"\xff\xd9"
+_PNG_END = b"IEND\xae\x42\x60\x82"
 _REMEDY = "write the file again from its source"
 
 
@@ -20,6 +23,19 @@ def image_size(path: Path) -> tuple[int, int]:
             return image.size
     except OSError as error:
         raise _unreadable(path, error) from error
+
+
+def check_pixels(path: Path, *, decode: bool) -> None:
+    """Raises LogError where the file cannot be decoded; without ``decode`` only what looks cut short is tried."""
+    if decode or not _ends_well(path):
+        _decode(path, "RGB", None, Image.Resampling.NEAREST)
+
+
+def _ends_well(path: Path) -> bool:
+    """Whether the file ends as whole JPEG and PNG files do."""
+    with path.open("rb") as file:
+        file.seek(-min(len(_PNG_END), path.stat().st_size), os.SEEK_END)
+        return file.read().endswith((_JPEG_END, _PNG_END))
 
 
 def read_image(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "h w 3"]:
@@ -36,11 +52,11 @@ def read_mask(path: Path, size: tuple[int, int], *, sky: bool) -> Bool[Tensor, "
     return torch.from_numpy(_decode(path, "L", size, resampling) > 0)
 
 
-def _decode(path: Path, mode: str, size: tuple[int, int], resampling: Image.Resampling) -> np.ndarray:
+def _decode(path: Path, mode: str, size: tuple[int, int] | None, resampling: Image.Resampling) -> np.ndarray:
     try:
         with Image.open(path) as image:
             pixels = image.convert(mode)
-        return np.array(pixels if pixels.size == size else pixels.resize(size, resampling))
+        return np.array(pixels if size in (None, pixels.size) else pixels.resize(size, resampling))
     except (OSError, SyntaxError, ValueError) as error:  # Pillow reports a broken PNG chunk as SyntaxError
         raise _unreadable(path, error) from error
 

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from sparsestreet.data.synthetic import StreetSettings, open_street
+from sparsestreet.data.synthetic import StreetReader, StreetSettings
 from sparsestreet.data.synthetic.world import Actor, build_world
 from sparsestreet.geometry.cameras import project
 
@@ -14,7 +14,7 @@ SETTINGS = StreetSettings(
 
 
 def test_a_street_opens_as_a_log(tmp_path):
-    log = open_street(SETTINGS, tmp_path / "street")
+    log = StreetReader(SETTINGS, tmp_path / "street").read()
     assert (log.num_frames, log.num_cameras, len(log.sweeps)) == (2, 2, 2)
     world = build_world(SETTINGS)
     ego_from_world = torch.linalg.inv(torch.from_numpy(world.ego.pose(0.0)))
@@ -40,7 +40,7 @@ def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:
 
 
 def test_sweeps_fall_on_the_pixels_that_color_them(tmp_path):
-    log = open_street(SETTINGS, tmp_path / "street")
+    log = StreetReader(SETTINGS, tmp_path / "street").read()
     sweep = log.sweeps[0]
     assert sweep.colored.any()
     frame = log.frames[0]

@@ -1,0 +1,109 @@
+"""Sequences whose items are read when they are asked for, and the memory that they may keep."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from typing import Any, Generic, TypeVar
+
+from sparsestreet.types import Frame, Sweep, View
+
+K = TypeVar("K", bound=Hashable)
+T = TypeVar("T")
+
+
+class LazySequence(Sequence):
+    """For each key, what ``load`` makes of it: at each access anew. Slices load nothing.
+
+    Not generic: a runtime check of a generic sequence would load an item.
+    """
+
+    def __init__(self, keys: Iterable[Any], load: Callable[[Any], Any]) -> None:
+        self.keys = tuple(keys)
+        self.load = load
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __getitem__(self, index: int | slice) -> Any:
+        return self._of(self.keys[index]) if isinstance(index, slice) else self.load(self.keys[index])
+
+    def where(self, keep: Callable[[Any], bool]) -> Any:
+        """The items whose keys are wanted, in their order; none is loaded."""
+        return self._of(filter(keep, self.keys))
+
+    def _of(self, keys: Iterable[Any]) -> Any:
+        return type(self)(keys, self.load)
+
+
+class Frames(LazySequence):
+    """Recorded views. Their pixels are read when a frame is indexed; ``views`` tells the rest without."""
+
+    @classmethod
+    def of(cls, frames: "Frames | Sequence[Frame]") -> "Frames":
+        """Frames in memory as such a sequence; one that is one already as it is."""
+        return frames if isinstance(frames, Frames) else cls(frames, lambda frame: frame)
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """Cameras, times and indices of all frames."""
+        return self.keys
+
+
+class Sweeps(LazySequence):
+    """Lidar sweeps, keyed by their integer frames. They are read, and colored from images, when one is indexed."""
+
+    def __init__(
+        self, indices: Iterable[int], load: Callable[[int], Sweep], load_gray: Callable[[int], Sweep] | None = None
+    ) -> None:
+        """``load_gray`` makes the same sweep without its colors, where that is cheaper."""
+        super().__init__(indices, load)
+        self.load_gray = load if load_gray is None else load_gray
+
+    @classmethod
+    def of(cls, sweeps: "Sweeps | tuple[Sweep, ...]") -> "Sweeps":
+        """Sweeps in memory as such a sequence; one that is one already as it is. Raises ValueError for twins."""
+        if isinstance(sweeps, Sweeps):
+            return sweeps
+        by_index = {sweep.index: sweep for sweep in sweeps}
+        if len(by_index) < len(sweeps):
+            raise ValueError(
+                f"a log has one sweep an instant, got {[sweep.index for sweep in sweeps]}: join those of one instant"
+            )
+        return cls(by_index, by_index.__getitem__)
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Integer frames of all sweeps."""
+        return self.keys
+
+    def gray(self) -> Iterator[Sweep]:
+        """All sweeps: their points and which of them a camera sees. Colors mean nothing, and no image is decoded."""
+        return map(self.load_gray, self.keys)
+
+    def _of(self, keys: Iterable[int]) -> "Sweeps":
+        return Sweeps(keys, self.load, self.load_gray)
+
+
+class RecentlyUsed(Generic[K, T]):
+    """What ``load`` makes of a key, remembered while there is room; what was not used for longest makes way."""
+
+    def __init__(self, load: Callable[[K], T], size: Callable[[T], int], room: int) -> None:
+        """``room`` is in the unit of ``size``; a value that is larger on its own is not remembered."""
+        self._load = load
+        self._size = size
+        self._room = room
+        self._held: OrderedDict[K, T] = OrderedDict()
+        self._used = 0
+
+    def __call__(self, key: K) -> T:
+        if key in self._held:
+            self._held.move_to_end(key)
+            return self._held[key]
+        value = self._load(key)
+        size = self._size(value)
+        if size > self._room:
+            return value
+        self._held[key] = value
+        self._used += size
+        while self._used > self._room:
+            self._used -= self._size(self._held.popitem(last=False)[1])
+        return value

@@ -1,0 +1,54 @@
+"""Lidar points and images: the colors that points take from pixels, and the depth they give to them."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from sparsestreet.geometry.cameras import project
+from sparsestreet.types import Camera
+
+
+def color_points(
+    points: Float[Tensor, "n 3"], views: Sequence[tuple[Camera, UInt8[Tensor, "_ _ 3"]]]
+) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
+    """RGB in [0, 1] from the pixel each point falls into, and which points any camera sees; the others are gray.
+
+    Where several cameras see a point the first one counts. As in DriveStudio nothing tests whether the camera's view
+    of the point is blocked: lidar and cameras sit close together.
+    """
+    colors = torch.full((points.shape[0], 3), 0.5)
+    colored = torch.zeros(points.shape[0], dtype=torch.bool)
+    for camera, image in views:
+        rows, pixels, _ = visible_pixels(camera, points)
+        new = ~colored[rows]
+        colors[rows[new]] = image.reshape(-1, 3)[pixels[new]].float() / 255
+        colored[rows] = True
+    return colors, colored
+
+
+def seen_points(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+    """Which points any of the cameras sees: those that ``color_points`` colors."""
+    seen = torch.zeros(points.shape[0], dtype=torch.bool)
+    for camera in cameras:
+        seen[visible_pixels(camera, points)[0]] = True
+    return seen
+
+
+def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
+    """Depth along the optical axis in meters of the nearest point in each pixel; 0 where there is none."""
+    _, pixels, depths = visible_pixels(camera, points)
+    nearest = torch.full((camera.height * camera.width,), torch.inf)
+    nearest.scatter_reduce_(0, pixels, depths.float(), "amin")
+    return torch.where(nearest.isinf(), 0.0, nearest).view(camera.height, camera.width)
+
+
+def visible_pixels(
+    camera: Camera, points: Float[Tensor, "n 3"]
+) -> tuple[Int[Tensor, " v"], Int[Tensor, " v"], Float[Tensor, " v"]]:
+    """For the points inside the image: their rows, the pixel (row-major) each falls into, and its depth in meters."""
+    positions, depths, inside = project(camera, points)
+    rows = torch.nonzero(inside).squeeze(-1)
+    column, line = positions[rows].long().unbind(-1)
+    return rows, line * camera.width + column, depths[rows]

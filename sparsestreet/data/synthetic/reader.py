@@ -1,0 +1,47 @@
+"""The embedded default: a street that is made when it is first asked for, and read like any other log."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.problems import Problem
+from sparsestreet.data.reader import LogReader
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.street import make_street, street_name
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StreetReader(LogReader):
+    """Makes the street in its folder, unless it is there, and reads it as a recorded drive is read.
+
+    Both verbs raise FileExistsError where the folder holds anything else.
+    """
+
+    settings: StreetSettings
+    root: Path | str | None = None
+    """The street's folder; None: one under ``parent`` that is named after the settings, all of them."""
+    parent: Path | str = "outputs/streets"
+    cache_mb: int = 512
+    """Decoded frames kept in memory, MB (1e6 bytes)."""
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.parent) / street_name(self.settings) if self.root is None else Path(self.root)
+
+    def check(self) -> list[Problem]:
+        return self._made().check()
+
+    def read(self) -> DrivingLog:
+        return self._made().read()
+
+    def _made(self) -> DriveStudioReader:
+        return DriveStudioReader(make_street(self.settings, self.folder, self._report), cache_mb=self.cache_mb)
+
+    def _report(self, done: int, total: int) -> None:
+        """A line when a quarter more is traced."""
+        if done * 4 // total > (done - 1) * 4 // total:
+            log.info("tracing a street into %s: %d of %d frames", self.folder.absolute(), done, total)
