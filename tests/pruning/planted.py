@@ -204,7 +204,7 @@ def _append(rows: Rows, proposals: list[RowPlan]) -> RowPlan:
 def _resized(rows: Rows, plan: RowPlan) -> Rows:
     """A resized copy."""
     parameters, buffers = dict(rows.named_parameters()), dict(rows.named_buffers())
-    copy = Rows(parameters, buffers)
+    copy = Rows(parameters, buffers, rows.transient)
     copy.resize(plan)
     return copy
 

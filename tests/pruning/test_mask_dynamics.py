@@ -4,12 +4,11 @@ import math
 
 import pytest
 import torch
-from torch import nn
 
-from sparsestreet.pruning import keep_by_mask
-from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.gaussians import Rows
+from tests.scene.street import static_mask
 
-MASK = StaticMask(weight=1.0, min_gaussians=0)
+MASK = static_mask()
 LEARNING_RATE = 0.01
 WEIGHTS = torch.tensor([2.5e-3, 1e-4, 1e-5])  # the paper's lambda_n: background, rigid, people
 ROWS_IN_SCENE = 1_500_000
@@ -17,16 +16,16 @@ ROWS_IN_SCENE = 1_500_000
 
 def steps_to_removal(epsilon: float, limit: int) -> list[int]:
     """For an unseen Gaussian of each weight: the step at which the rule drops it (``limit`` if it survives)."""
-    logits = nn.Parameter(MASK.initial_logits(len(WEIGHTS)))
-    adam = torch.optim.Adam([logits], lr=LEARNING_RATE, eps=epsilon)
+    rows = Rows(MASK.initial_columns(len(WEIGHTS)))
+    adam = torch.optim.Adam(rows.parameters(), lr=LEARNING_RATE, eps=epsilon)
     removed_at = [limit] * len(WEIGHTS)
     for step in range(1, limit):
         adam.zero_grad()
         # Only the sparsity term: sum_n lambda_n sum_k sigma(m_k) / K
-        loss = (WEIGHTS * MASK.scores(logits)).sum() / ROWS_IN_SCENE
+        loss = (WEIGHTS * MASK.scores(rows)).sum() / ROWS_IN_SCENE
         loss.backward()
         adam.step()
-        keep = keep_by_mask(MASK.scores(logits.detach()), MASK.threshold, MASK.min_gaussians).keep
+        keep = MASK.keep(rows).keep
         removed_at = [min(at, step) if not kept else at for at, kept in zip(removed_at, keep.tolist(), strict=True)]
         if not keep.any():
             break
@@ -36,7 +35,7 @@ def steps_to_removal(epsilon: float, limit: int) -> list[int]:
 def scalar_adam(weight: float, epsilon: float) -> int:
     """The same for one row, written out in Python floats (Kingma & Ba 2015, algorithm 1)."""
     logit, first, second, step = 1.0, 0.0, 0.0, 0
-    while 1 / (1 + math.exp(-logit)) > MASK.threshold:
+    while 1 / (1 + math.exp(-logit)) > MASK.settings.threshold:
         step += 1
         score = 1 / (1 + math.exp(-logit))
         gradient = weight / ROWS_IN_SCENE * score * (1 - score)
@@ -65,4 +64,4 @@ def test_bfloat16_logits_would_never_close():
     logit = torch.tensor(1.0, dtype=torch.bfloat16)
     for _ in range(2000):
         logit -= LEARNING_RATE
-    assert torch.sigmoid(logit.float()) > MASK.threshold
+    assert torch.sigmoid(logit.float()) > MASK.settings.threshold

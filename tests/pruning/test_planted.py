@@ -8,11 +8,11 @@ import torch
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.ops import splat
-from sparsestreet.pruning import keep_by_importance, keep_by_mask, measure_importance
+from sparsestreet.pruning import keep_by_importance, measure_importance
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMask
 from sparsestreet.types import Camera
 from tests.pruning.planted import NOTICEABLE, Views, activated, contributions_of, joint_change, judge, plant
+from tests.scene.street import static_mask
 
 BACKEND = "reference"
 RECALL, VISIBLE_LOST = 0.95, 0.02
@@ -40,7 +40,8 @@ def wall(generator: torch.Generator) -> Rows:
             "sh_dc": sh_dc,
             "sh_rest": torch.zeros(len(means), 0, 3),
             "mask_logits": torch.ones(len(means)),
-        }
+        },
+        transient=["mask_logits"],
     )
 
 
@@ -99,26 +100,26 @@ def test_trained_masks_remove_what_was_planted_and_nothing_visible(planted_wall)
     views = Views(activated(rows), cameras(), BACKEND)
     visible = views.visible(torch.nonzero(~planted).squeeze(-1))
     generator = torch.Generator().manual_seed(1)
-    mask = StaticMask(weight=2.5e-3, min_gaussians=0)
-    logits = torch.nn.Parameter(mask.initial_logits(len(rows)))
+    mask = static_mask(sparsity_weight=2.5e-3)
+    learned = Rows(mask.initial_columns(len(rows)))
     # Ten times the learning rate of a real run: unseen rows cross the threshold after about 141 steps, not 1410.
-    adam = torch.optim.Adam([logits], lr=0.1, eps=1e-15)
+    adam = torch.optim.Adam(learned.parameters(), lr=0.1, eps=1e-15)
+    everything = torch.ones(len(rows), dtype=torch.bool)
     for step in range(160):
         index = step % len(views.cameras)
-        scores = mask.scores(logits)
-        multipliers = mask.multipliers(scores)
+        multipliers = mask.multipliers(learned, 0.0)
         gaussians = views.gaussians
         masked = replace(
             gaussians, opacities=gaussians.opacities * multipliers, scales=gaussians.scales * multipliers[:, None]
         )
         image = splat(masked, views.cameras[index], backend=BACKEND).rgb
         noise = 0.02 * torch.randn(image.shape, generator=generator)
-        loss = (image - views.images[index] - noise).abs().mean() + mask.weight * scores.sum() / len(rows)
+        sparsity = mask.sparsity_weight * mask.sparsity(learned, 0.0, everything) / len(rows)
+        loss = (image - views.images[index] - noise).abs().mean() + sparsity
         adam.zero_grad()
         loss.backward()
         adam.step()
-    keep = keep_by_mask(mask.scores(logits.detach()), mask.threshold, mask.min_gaussians).keep
-    verdict = judge(keep, planted, visible)
+    verdict = judge(mask.keep(learned).keep, planted, visible)
     assert verdict.recall >= RECALL
     assert verdict.visible_lost <= VISIBLE_LOST
 

@@ -1,22 +1,25 @@
-"""The leave_one_out rule on a scene whose answer is known, and both rules' errors."""
+"""The leave-one-out rule on a scene whose answer is known, and both rules' errors."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, View
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, Look, PruningRule
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes.background import Background
-from sparsestreet.scene.rendering import render
+from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.scene.sky import Sky
 from sparsestreet.types import Camera, Frame
+from tests.scene.street import background
 
-VIEW = View(SplatSettings(), "reference")
+OPTIONS = RenderOptions(backend="reference")
+LOOK = Look(options=OPTIONS)
 
 
-def scene_of(opacities: list[float], depths: list[float]) -> SceneGraph:
+def scene_of(
+    opacities: list[float], depths: list[float], *, min_gaussians: int = 0, sky: Sky | None = None
+) -> SceneGraph:
     """Large white discs across the view, one behind the other."""
     n = len(opacities)
     rows = Rows(
@@ -29,7 +32,7 @@ def scene_of(opacities: list[float], depths: list[float]) -> SceneGraph:
             "sh_rest": torch.zeros(n, 0, 3),
         }
     )
-    return SceneGraph({"background": Background(rows, None)}, sky=None)
+    return SceneGraph({"background": background(rows, min_gaussians=min_gaussians)}, sky)
 
 
 def frame_of(scene: SceneGraph, offset: int) -> Frame:
@@ -37,7 +40,7 @@ def frame_of(scene: SceneGraph, offset: int) -> Frame:
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 4.5], [0, 40.0, 3.5], [0, 0, 1]]), 9, 7)
     blank = Frame(camera, 0.0, 0, 0, image=torch.zeros(7, 9, 3, dtype=torch.uint8))
     with torch.no_grad():
-        rgb = render(scene, camera, 0.0, backend="reference").rgb.clamp(0, 1)
+        rgb = render(scene, blank, options=OPTIONS).rgb.clamp(0, 1)
     return replace(blank, image=((rgb * 255).round() - offset).clamp(0, 255).to(torch.uint8))
 
 
@@ -51,7 +54,7 @@ def test_a_budget_buys_the_cheapest_rows_and_no_more():
     value = 0.5 + 1.7 * 0.28209479177387814
     costs = [3 * 63 * (value * through * o / (1 - o)) ** 2 for o in opacities]
     with torch.no_grad():
-        image = render(scene, frame.camera, 0.0, backend="reference").rgb
+        image = render(scene, frame, options=OPTIONS).rgb
     error = float((image.clamp(0, 1) - frame.image / 255).square().sum())
     for allowed, kept in (
         (0.9 * costs[0], [True, True, True]),
@@ -61,16 +64,16 @@ def test_a_budget_buys_the_cheapest_rows_and_no_more():
     ):
         allowed_db = float(10 * torch.log10(torch.tensor(1 + allowed / error)))
         rule = LeaveOneOutRule(allowed_db, noticeable=0.0)
-        assert rule.select(scene, [frame], {"background": 0}, VIEW)["background"].keep.tolist() == kept
+        assert rule.select(scene, [frame], LOOK)["background"].keep.tolist() == kept
 
 
 def test_without_a_budget_only_what_nobody_sees_goes():
     # Two discs behind an opaque one: 0.01 of the light gets through, and of that 0.3 and 0.7 * 0.5: 0.9 steps of 255.
     scene = scene_of([0.99, 0.3, 0.5], [2.0, 3.0, 4.0])
-    selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"]
+    selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], LOOK)["background"]
     assert selection.keep.tolist() == [True, False, False]
     strict = LeaveOneOutRule(0.0, noticeable=0.0)
-    assert strict.select(scene, [frame_of(scene, 5)], {"background": 0}, VIEW)["background"].removed == 0
+    assert strict.select(scene, [frame_of(scene, 5)], LOOK)["background"].removed == 0
 
 
 def test_a_row_seen_in_one_view_of_two_stays():
@@ -81,8 +84,8 @@ def test_a_row_seen_in_one_view_of_two_stays():
     pose[2, 3] = -2.5
     behind = replace(front, camera=replace(front.camera, camera_from_world=pose))
     rule = LeaveOneOutRule(0.0)
-    assert rule.select(scene, [front], {"background": 0}, VIEW)["background"].keep.tolist() == [True, False]
-    assert rule.select(scene, [front, behind], {"background": 0}, VIEW)["background"].removed == 0
+    assert rule.select(scene, [front], LOOK)["background"].keep.tolist() == [True, False]
+    assert rule.select(scene, [front, behind], LOOK)["background"].removed == 0
 
 
 def test_what_shows_a_vehicle_costs_more():
@@ -97,7 +100,7 @@ def test_what_shows_a_vehicle_costs_more():
     for vehicle, kept in ((halves, [False, True]), (halves.flip(1), [True, False])):
         marked = replace(frame, vehicle=vehicle)
         budgets = [LeaveOneOutRule(db, noticeable=0.0) for db in torch.linspace(0.1, 25, 250).tolist()]
-        selections = [rule.select(scene, [marked], {"background": 0}, VIEW)["background"] for rule in budgets]
+        selections = [rule.select(scene, [marked], LOOK)["background"] for rule in budgets]
         first = next(selection for selection in selections if selection.removed)
         assert first.keep.tolist() == kept
 
@@ -109,13 +112,16 @@ def test_a_scene_without_error_loses_nothing_that_is_seen():
         scene.nodes["background"].rows.sh_dc.fill_(9.0)
     frame = frame_of(scene, 0)
     assert (frame.image == 255).all()
-    assert LeaveOneOutRule(0.1).select(scene, [frame], {"background": 0}, VIEW)["background"].removed == 0
+    assert LeaveOneOutRule(0.1).select(scene, [frame], LOOK)["background"].removed == 0
 
 
 def test_the_floor_holds():
-    scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0])
+    scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0], min_gaussians=2)
     for rule in (LeaveOneOutRule(50.0), ImportanceRule()):
-        assert int(rule.select(scene, [frame_of(scene, 5)], {"background": 2}, VIEW)["background"].keep.sum()) >= 2
+        selection = rule.select(scene, [frame_of(scene, 5)], LOOK)["background"]
+        assert int(selection.keep.sum()) == 2
+        assert selection.floor_hit
+        assert isinstance(rule, PruningRule)
 
 
 @pytest.mark.parametrize(("allowed_db", "noticeable"), [(-0.1, 0.0), (float("nan"), 0.0), (0.1, -1.0)])

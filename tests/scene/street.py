@@ -8,10 +8,81 @@ from torch import Tensor
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.scene.assignment import assign_tracks
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import Mask, StaticMask, StaticMaskSettings
+from sparsestreet.scene.nodes import Background, BackgroundSettings, NodeSettings, Rigid, RigidSettings
 from sparsestreet.scene.nodes.trajectory import Trajectories
-from sparsestreet.types import Camera, Frame, Sweep, Track
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Camera, Frame, Sweep, Track, View
+
+RATES = {
+    name: LearningRate(0.01)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest", "mask_logits")
+}
+"""Every column that a node's table may have."""
+
+POSE_RATES = {"rotation_deltas": LearningRate(0.001), "translation_deltas": LearningRate(0.001)}
+
+
+def background_settings(**changes) -> BackgroundSettings:
+    """No limits, no mask, no density control, no points, unless said."""
+    said = {"num_lidar": 0, "num_near": 0, "num_far": 0, "learning_rates": RATES, "prunable": True}
+    return BackgroundSettings(**(_UNLIMITED | said | changes))
+
+
+def rigid_settings(**changes) -> RigidSettings:
+    """The cars of ``street_log`` that move; no limits, no mask, no density control, unless said."""
+    said = {"classes": ("Car",), "min_path_length": 1.0, "learning_rates": RATES | POSE_RATES, "prunable": False}
+    return RigidSettings(**(_UNLIMITED | said | changes))
+
+
+_UNLIMITED = {"min_gaussians": 0, "max_gaussians": None, "mask": None, "masked": False, "density": None}
+
+
+def static_mask(min_gaussians: int = 0, *, sparsity_weight: float = 1.0, **changes) -> StaticMask:
+    return StaticMaskSettings(sparsity_weight, **changes).build(min_gaussians)
+
+
+def background(rows: Rows, mask: Mask | None = None, **changes) -> Background:
+    return Background(background_settings(**changes), rows, mask)
+
+
+def rigid(
+    rows: Rows,
+    keyframes: Trajectories,
+    sizes: Tensor | None = None,
+    *,
+    mask: Mask | None = None,
+    names: list[str] | None = None,
+    max_gap: float = 0.05,
+    **changes,
+) -> Rigid:
+    """Boxes of 1 m, unless said."""
+    sizes = torch.ones_like(keyframes.translations[:, 0]) if sizes is None else sizes
+    return Rigid(rigid_settings(**changes), rows, keyframes, sizes, mask=mask, names=names, max_gap=max_gap)
+
+
+def view_at(time: float, camera: Camera | None = None) -> View:
+    """A view of no recorded frame."""
+    return View(camera_at(0.0) if camera is None else camera, time)
+
+
+def degree(sh_degree: int) -> SceneState:
+    """A finished scene of which only some harmonics are in use."""
+    return SceneState(sh_degree=sh_degree)
+
+
+def training_data(
+    log: DrivingLog | None = None, held_out: frozenset[int] = frozenset(), movers: NodeSettings | None = None
+) -> TrainingData:
+    """What a node sees of a log; ``movers`` says which of its tracks move (none, if nobody says)."""
+    log = street_log() if log is None else log
+    taken = () if movers is None else assign_tracks(log.tracks, {"movers": movers}).claimed
+    frames = [frame for frame in log.frames if frame.frame_index not in held_out]
+    return TrainingData(log, frames, held_out, tracks=taken, moving=taken)
 
 
 def random_rows(
@@ -19,11 +90,11 @@ def random_rows(
     seed: int,
     *,
     sh_degree: int = 1,
-    mask: StaticMask | None = None,
+    mask: Mask | None = None,
     instances: Tensor | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Rows:
-    """Rows with different values in every entry, a few meters around the origin."""
+    """Rows with different values in every entry, a few meters around the origin; the mask's columns at their start."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -37,9 +108,8 @@ def random_rows(
         "sh_dc": normal(count, 1, 3),
         "sh_rest": normal(count, (sh_degree + 1) ** 2 - 1, 3) * 0.3,
     }
-    if mask is not None:
-        parameters["mask_logits"] = mask.initial_logits(count)
-    return Rows(parameters, {} if instances is None else {"instances": instances})
+    learned = {} if mask is None else mask.initial_columns(count)
+    return Rows(parameters | learned, {} if instances is None else {"instances": instances}, transient=learned.keys())
 
 
 def pose(yaw: float, translation: tuple[float, float, float]) -> Float[Tensor, "4 4"]:

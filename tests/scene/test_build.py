@@ -1,14 +1,15 @@
 import logging
 
+import pytest
 import torch
 
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.seeds import BackgroundSettings, RigidSettings
 from sparsestreet.scene.sky import SkySettings
-from tests.scene.street import street_log
+from tests.scene.street import background_settings, rigid_settings, street_log, view_at
 
-BACKGROUND = BackgroundSettings(lidar_points=30, near_points=10, far_points=10)
+BACKGROUND = background_settings(num_lidar=30, num_near=10, num_far=10)
+CARS = rigid_settings()
 
 
 def build(nodes: dict, sky: SkySettings | None = None, seed: int = 0) -> SceneGraph:
@@ -17,23 +18,46 @@ def build(nodes: dict, sky: SkySettings | None = None, seed: int = 0) -> SceneGr
 
 
 def test_all_parts():
-    scene = build({"background": BACKGROUND, "rigid": RigidSettings(("Car",))}, SkySettings(4))
+    scene = build({"background": BACKGROUND, "rigid": CARS}, SkySettings(4))
     assert scene.counts() == {"background": 50, "rigid": 1000}
     assert scene.sky.texels.shape == (6, 4, 4, 3)
-    assert len(scene.gaussians_at(0.3).gaussians) == 1050
+    assert len(scene.gaussians_at(view_at(0.3)).gaussians) == 1050
 
 
 def test_a_class_without_instance_is_left_out_and_reported(caplog):
     with caplog.at_level(logging.WARNING):
-        scene = build({"background": BACKGROUND, "trams": RigidSettings(("Tram",))})
+        scene = build({"background": BACKGROUND, "trams": rigid_settings(classes=("Tram",))})
     assert list(scene.nodes) == ["background"]
     assert scene.sky is None
     assert "node 'trams' has no instance in hand-made" in caplog.text
 
 
 def test_a_node_does_not_depend_on_its_neighbors():
-    alone = build({"background": BACKGROUND})
-    both = build({"rigid": RigidSettings(("Car",)), "background": BACKGROUND})
-    assert torch.equal(alone.nodes["background"].rows.means, both.nodes["background"].rows.means)
-    other = build({"background": BACKGROUND}, seed=1)
-    assert not torch.equal(alone.nodes["background"].rows.means, other.nodes["background"].rows.means)
+    first = build({"background": BACKGROUND, "cars": CARS})
+    second = build({"trees": BACKGROUND, "cars": CARS, "background": BACKGROUND})
+    for name in ("background", "cars"):
+        assert torch.equal(first.nodes[name].rows.means, second.nodes[name].rows.means)
+    assert not torch.equal(second.nodes["trees"].rows.means, second.nodes["background"].rows.means)
+    other = build({"background": BACKGROUND, "cars": CARS}, seed=1)
+    assert not torch.equal(first.nodes["background"].rows.means, other.nodes["background"].rows.means)
+
+
+def test_what_no_node_takes_stays_in_the_background():
+    lidar = background_settings(num_lidar=10_000)
+    with_cars, without = build({"background": lidar}), build({"background": lidar, "cars": CARS})
+    # 60 returns of the moving car in each of the four sweeps that are not held out; its box takes a little road, too.
+    assert len(with_cars.nodes["background"].rows) - len(without.nodes["background"].rows) >= 4 * 60
+    assert with_cars.counts()["background"] == 4 * (50 + 60)
+
+
+def test_the_log_says_who_takes_what(caplog):
+    with caplog.at_level(logging.INFO):
+        build({"background": BACKGROUND, "cars": CARS})
+    assert "node 'cars' takes 1 Car" in caplog.text
+    assert "no node takes 1 Car, 1 Cyclist: they are part of the background" in caplog.text
+    assert "node 'background' starts with 50 Gaussians" in caplog.text
+
+
+def test_two_nodes_that_claim_one_track_are_an_error():
+    with pytest.raises(ValueError, match=r"track 'driving' .* can belong to one node only"):
+        build({"background": BACKGROUND, "cars": CARS, "trucks": CARS})

@@ -4,7 +4,7 @@ from sparsestreet.scene.centers import BACKGROUND_COLOR, NODE_COLORS, project_ce
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background
-from tests.scene.street import camera_at
+from tests.scene.street import background, camera_at, view_at
 
 
 def node_at(points: list[list[float]], opacity_logit: float = 0.0) -> Background:
@@ -17,14 +17,14 @@ def node_at(points: list[list[float]], opacity_logit: float = 0.0) -> Background
         "sh_dc": torch.zeros(count, 1, 3),
         "sh_rest": torch.zeros(count, 0, 3),
     }
-    return Background(Rows(columns), None)
+    return background(Rows(columns))
 
 
 def test_dots_where_the_centers_project_the_nearest_on_top():
     camera = camera_at(0.0)  # 33 x 21, focal length 16.5, looking along +x from 1.5 m above the ground
     first = node_at([[10.0, 0.0, 1.5], [10.0, 5.0, 1.5], [-10.0, 0.0, 1.5]])
     second = node_at([[5.0, 0.0, 1.5], [20.0, 10.0, 1.5], [10.0, 0.0, -1.5]])
-    image = project_centers(SceneGraph({"a": first, "b": second}), camera, 0.0)
+    image = project_centers(SceneGraph({"a": first, "b": second}), view_at(0.0, camera))
     assert image.shape == (21, 33, 3)
     expected = torch.full((21, 33, 3), BACKGROUND_COLOR)
     expected[10, 16] = torch.tensor(NODE_COLORS[1])  # b at 5 m hides a at 10 m
@@ -35,5 +35,5 @@ def test_dots_where_the_centers_project_the_nearest_on_top():
 
 def test_faint_rows_are_not_drawn():
     scene = SceneGraph({"a": node_at([[10.0, 0.0, 1.5]], opacity_logit=-6.0)})
-    assert (project_centers(scene, camera_at(0.0), 0.0) == BACKGROUND_COLOR).all()
-    assert (project_centers(scene, camera_at(0.0), 0.0, minimum_opacity=0.001) != BACKGROUND_COLOR).any()
+    assert (project_centers(scene, view_at(0.0)) == BACKGROUND_COLOR).all()
+    assert (project_centers(scene, view_at(0.0), min_opacity=0.001) != BACKGROUND_COLOR).any()

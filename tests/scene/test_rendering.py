@@ -1,15 +1,23 @@
 import torch
 
 from sparsestreet.geometry.cameras import ray_directions
-from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes import Background, Rigid
-from sparsestreet.scene.rendering import SceneRendering, render
+from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.sky import Sky, SkySettings
-from tests.scene.street import camera_at, keyframes, pose, random_rows, track
+from tests.scene.street import (
+    background,
+    camera_at,
+    keyframes,
+    pose,
+    random_rows,
+    rigid,
+    static_mask,
+    track,
+    view_at,
+)
 
-MASK = StaticMask(weight=0.1, min_gaussians=0)
+MASK = static_mask(sparsity_weight=0.1)
 CAMERA = camera_at(-6.0, width=17, height=11)
 
 
@@ -18,26 +26,26 @@ def scene_of(road_rows: int = 9, car_rows: int = 5, mask: StaticMask | None = MA
     instances = torch.zeros(car_rows, dtype=torch.int64)
     car = track("car", [0, 1], [pose(0.0, (0.0, -1.0, 1.0)), pose(0.4, (0.0, 1.0, 1.0))])
     rows = random_rows(car_rows, 1, instances=instances, mask=mask, dtype=dtype)
-    cars = Rigid(rows, keyframes([car], 2, dtype=dtype), torch.ones(1, 3, dtype=dtype), mask, max_gap=1.0)
+    cars = rigid(rows, keyframes([car], 2, dtype=dtype), mask=mask, max_gap=1.0)
     sky = Sky(SkySettings(4)).to(dtype)
     with torch.no_grad():
         sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
-    return SceneGraph({"road": Background(random_rows(road_rows, 0, mask=mask, dtype=dtype), mask), "cars": cars}, sky)
+    road = background(random_rows(road_rows, 0, mask=mask, dtype=dtype), mask)
+    return SceneGraph({"road": road, "cars": cars}, sky)
 
 
 def rendered(scene: SceneGraph, time: float = 0.5) -> SceneRendering:
-    return render(scene, CAMERA, time, backend="reference")
+    return render(scene, view_at(time, CAMERA), options=RenderOptions(backend="reference"))
 
 
 def test_fields_and_shapes():
     result = rendered(scene_of())
     assert result.rgb.shape == (11, 17, 3)
     assert result.alpha.shape == result.depth.shape == (11, 17)
-    assert result.rows == {"road": slice(0, 9), "cars": slice(9, 14)}
+    assert result.spans == {"road": slice(0, 9), "cars": slice(9, 14)}
     assert result.splats.radii.shape == (14,)
     assert result.splats.visible.any()
     assert 0.1 < result.alpha.max() <= 1
-    assert {name: term.scores.shape for name, term in result.mask_terms.items()} == {"road": (9,), "cars": (5,)}
 
 
 def test_the_sky_shines_through_what_alpha_leaves():
@@ -64,7 +72,7 @@ def test_masked_rows_change_no_bit_of_the_image_when_they_go():
         scene.nodes["cars"].rows.mask_logits[1:3] = -6.0
     masked = rendered(scene)
     for node in scene.nodes.values():
-        node.rows.resize(RowPlan.keep(node.mask_scores() > MASK.threshold))
+        node.rows.resize(MASK.keep(node.rows).plan())
     removed = rendered(scene)
     assert scene.counts() == {"road": 4, "cars": 3}
     for name in ("rgb", "alpha", "depth"):
@@ -129,4 +137,5 @@ def test_bfloat16_autocast_changes_nothing():
     with torch.autocast("cpu", torch.bfloat16):
         result = rendered(scene)
     assert torch.equal(result.rgb, expected.rgb)
-    assert result.mask_terms["road"].scores.dtype == torch.float32
+    with torch.autocast("cpu", torch.bfloat16):
+        assert MASK.scores(scene.nodes["road"].rows).dtype == torch.float32

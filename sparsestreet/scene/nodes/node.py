@@ -131,10 +131,10 @@ class Node(nn.Module, ABC):
 
     def __init__(self, settings: NodeSettings, rows: Rows, mask: Mask | None = None) -> None:
         super().__init__()
-        held = sorted(rows.transient)
-        if held != sorted(mask.columns if mask is not None else ()):
+        held, wanted = sorted(rows.transient), sorted(mask.columns if mask is not None else ())
+        if held != wanted:
             raise ValueError(
-                f"a mask and its columns come together, got mask={mask} with the mask columns {held}: "
+                f"a mask and its columns come together, but the mask needs {wanted} and the table has {held}: "
                 "make the table with NodeSettings.start, or leave both out"
             )
         self.settings = settings

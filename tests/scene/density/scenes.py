@@ -1,8 +1,8 @@
 """Small tables of rows with every column a node has."""
 
 import torch
-from sparsestreet.training.density import DensityStatistics
 
+from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import Rows
 
 
@@ -19,6 +19,7 @@ def make_rows(number: int, generator: torch.Generator, scale: float = 0.1) -> Ro
             "mask_logits": torch.randn(number, generator=generator),
         },
         buffers={"instances": torch.arange(number) % 3},
+        transient=["mask_logits"],
     )
 
 

@@ -7,17 +7,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
-from sparsestreet.training.density import (
-    DensityStatistics,
-    GradientDensity,
-    cull,
-    densify,
-    outside_boxes,
-    reset_opacity,
-)
 
-from sparsestreet.scene.gaussians import Rows
-from tests.training.density.scenes import make_rows, with_statistics
+from sparsestreet.scene.density import DensityStatistics, DensityStrategy, GradientDensity, outside_boxes
+from sparsestreet.scene.gaussians import RowPlan, Rows
+from tests.scene.density.scenes import make_rows, with_statistics
 
 RADIUS = 10.0  # meters; split_scale 0.003 R = 0.03 m, cull_scale 0.5 R = 5 m
 HIGH, LOW = 0.001, 0.0001
@@ -25,6 +18,30 @@ HIGH, LOW = 0.001, 0.0001
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def densified(
+    density: GradientDensity,
+    rows: Rows,
+    statistics: DensityStatistics,
+    *,
+    seed: int = 0,
+    max_gaussians: int | None = None,
+    progress: float = 0.5,
+) -> RowPlan:
+    """By default past the time in which sizes on screen count."""
+    return density.densify(
+        rows,
+        statistics,
+        radius=RADIUS,
+        progress=progress,
+        max_gaussians=max_gaussians,
+        generator=seeded(seed),
+    )
+
+
+def test_it_is_a_density_strategy():
+    assert isinstance(GradientDensity(), DensityStrategy)
 
 
 def rows_of_scales(largest: list[float]) -> Rows:
@@ -49,8 +66,9 @@ STATISTICS = ([LOW, HIGH, LOW, HIGH, HIGH], [0.0, 0.0, 0.9, 0.0, 0.06])
     ],
 )
 def test_small_rows_are_cloned_and_large_ones_split(keep_parent, use_screen_size, source, num_survivors):
-    density = GradientDensity(keep_parent=keep_parent)
-    plan = densify(rows_of_scales(SCALES), with_statistics(*STATISTICS), density, RADIUS, seeded(), use_screen_size)
+    density = GradientDensity(keep_parent=keep_parent, screen_size_until=0.3)
+    progress = 0.3 if use_screen_size else 0.31
+    plan = densified(density, rows_of_scales(SCALES), with_statistics(*STATISTICS), progress=progress)
     assert plan.source.tolist() == source
     assert plan.fresh.tolist() == [row >= num_survivors for row in range(len(source))]
 
@@ -58,7 +76,7 @@ def test_small_rows_are_cloned_and_large_ones_split(keep_parent, use_screen_size
 def test_columns_of_survivors_clones_and_children():
     rows = rows_of_scales(SCALES)
     before = {name: column.detach().clone() for name, column in rows.columns().items()}
-    plan = densify(rows, with_statistics(*STATISTICS), GradientDensity(), RADIUS, seeded(), use_screen_size=False)
+    plan = densified(GradientDensity(), rows, with_statistics(*STATISTICS))
     rows.resize(plan)
     source = torch.tensor([0, 1, 2, 3, 4, 1, 4, 3, 3])
     for name in ("quaternions", "opacity_logits", "sh_dc", "sh_rest", "mask_logits", "instances"):
@@ -83,7 +101,7 @@ def test_children_are_drawn_from_their_parent():
         }
     )
     density = GradientDensity(split_children=children, keep_parent=False)
-    means = densify(rows, with_statistics([HIGH]), density, RADIUS, seeded(), False).edits["means"].double()
+    means = densified(density, rows, with_statistics([HIGH])).edits["means"].double()
     rotation = Rotation.from_quat(quaternion[0, [1, 2, 3, 0]].double().numpy()).as_matrix()
     whitened = (means - torch.tensor([1.0, 2.0, 3.0])) @ torch.from_numpy(rotation) / scales[0]
     # Standard errors: 1/sqrt(N) = 0.005 of the mean, sqrt(2/N) = 0.007 of a variance; four of each.
@@ -94,7 +112,7 @@ def test_children_are_drawn_from_their_parent():
 def test_the_same_seed_gives_the_same_children_and_another_other_ones():
     rows, statistics = rows_of_scales(SCALES), with_statistics(*STATISTICS)
     first, same, other = (
-        densify(rows, statistics, GradientDensity(), RADIUS, seeded(seed), False).edits["means"] for seed in (1, 1, 2)
+        densified(GradientDensity(), rows, statistics, seed=seed).edits["means"] for seed in (1, 1, 2)
     )
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
@@ -116,14 +134,14 @@ def test_the_same_seed_gives_the_same_children_and_another_other_ones():
 def test_a_cap_takes_the_highest_gradients(maximum, grown):
     rows = rows_of_scales([0.02, 0.02, 0.02, 0.04, 0.04])
     statistics = with_statistics([LOW, HIGH, 2 * HIGH, HIGH, 3 * HIGH])
-    plan = densify(rows, statistics, GradientDensity(max_gaussians=maximum), RADIUS, seeded(), False)
+    plan = densified(GradientDensity(), rows, statistics, max_gaussians=maximum)
     assert plan.source.tolist() == [0, 1, 2, 3, 4, *grown]
     assert len(plan.source) <= max(maximum, 5)
 
 
 def test_a_cap_counts_a_replaced_parent_as_room():
-    density = GradientDensity(max_gaussians=3, keep_parent=False)
-    plan = densify(rows_of_scales([0.04, 0.04]), with_statistics([HIGH, HIGH]), density, RADIUS, seeded(), False)
+    density = GradientDensity(keep_parent=False)
+    plan = densified(density, rows_of_scales([0.04, 0.04]), with_statistics([HIGH, HIGH]), max_gaussians=3)
     assert plan.source.tolist() == [1, 0, 0]
 
 
@@ -135,7 +153,10 @@ def test_cull_drops_faint_huge_and_close_rows():
     statistics = with_statistics([0.0] * 5, screens=[0.0, 0.0, 0.0, 0.2, 0.1])
 
     def kept(use_scale: bool, use_screen: bool) -> list[int]:
-        return cull(rows, statistics, GradientDensity(), RADIUS, use_scale, use_screen).source.tolist()
+        density = GradientDensity(
+            cull_scale_from=0.39 if use_scale else 0.4, screen_size_until=0.4 if use_screen else 0.39
+        )
+        return density.cull(rows, statistics, radius=RADIUS, progress=0.4).source.tolist()
 
     assert kept(False, False) == [1, 2, 3, 4]
     assert kept(True, False) == [1, 3, 4]
@@ -157,12 +178,13 @@ def test_reset_lowers_opacities_only_where_they_are_higher():
     with torch.no_grad():
         rows.opacity_logits.copy_(torch.logit(torch.tensor([0.005, 0.01, 0.5, 0.999])))
     before = rows.opacity_logits.detach().clone()
-    rows.resize(reset_opacity(rows, 0.01))
+    rows.resize(GradientDensity(reset_opacity_to=0.01).reset(rows))
     assert torch.equal(rows.opacity_logits[:1], before[:1])
     # float32 logit and sigmoid round to about 1e-7 relative
     torch.testing.assert_close(rows.opacity_logits.sigmoid()[1:], torch.full((3,), 0.01), rtol=1e-6, atol=0)
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        reset_opacity(rows, 0.0)
+    for impossible in (0.0, 1.0):
+        with pytest.raises(ValueError, match="between 0 and 1"):
+            GradientDensity(reset_opacity_to=impossible)
 
 
 @settings(max_examples=100, deadline=None)
@@ -173,22 +195,25 @@ def test_plans_are_well_formed(data):
     density = GradientDensity(
         split_children=data.draw(st.integers(2, 4)),
         keep_parent=data.draw(st.booleans()),
-        max_gaussians=data.draw(st.none() | st.integers(0, 20)),
+        cull_scale_from=0.0,
+        screen_size_until=0.5,
     )
+    max_gaussians = data.draw(st.none() | st.integers(0, 20))
     rows = make_rows(number, seeded(number), scale=0.03)
     statistics = with_statistics(gradients)
-    plan = densify(rows, statistics, density, RADIUS, seeded(), use_screen_size=data.draw(st.booleans()))
+    progress = 0.3 if data.draw(st.booleans()) else 0.7
+    plan = densified(density, rows, statistics, max_gaussians=max_gaussians, progress=progress)
     survivors, copies = plan.source[~plan.fresh].tolist(), plan.source[plan.fresh].tolist()
     assert all(0 <= row < number for row in plan.source.tolist())
     assert survivors == sorted(set(survivors))  # each once, in order
     assert plan.source.tolist() == survivors + copies
     assert set(range(number)) == set(survivors) | set(copies)  # nobody vanishes: a replaced parent leaves children
     assert all(gradients[row] > density.grad_threshold for row in copies)
-    if density.max_gaussians is not None:
-        assert len(plan.source) <= max(number, density.max_gaussians)
+    if max_gaussians is not None:
+        assert len(plan.source) <= max(number, max_gaussians)
     rows.resize(plan)
     statistics.resize(plan)
-    culled = cull(rows, statistics, density, RADIUS, use_scale=True, use_screen=True).source.tolist()
+    culled = density.cull(rows, statistics, radius=RADIUS, progress=0.4).source.tolist()
     assert culled == sorted(set(culled))
     assert all(0 <= row < len(rows) for row in culled)
     assert all(column.isfinite().all() for column in rows.columns().values())
@@ -197,9 +222,9 @@ def test_plans_are_well_formed(data):
 def test_statistics_of_other_rows_are_refused():
     rows = make_rows(3, seeded())
     with pytest.raises(ValueError, match="3 rows but its statistics 2"):
-        densify(rows, DensityStatistics(2), GradientDensity(), RADIUS, seeded(), False)
+        densified(GradientDensity(), rows, DensityStatistics(2))
     with pytest.raises(ValueError, match="3 rows but its statistics 2"):
-        cull(rows, DensityStatistics(2), GradientDensity(), RADIUS, False, False)
+        GradientDensity().cull(rows, DensityStatistics(2), radius=RADIUS, progress=0.5)
 
 
 def test_impossible_settings_are_refused():

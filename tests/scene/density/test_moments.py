@@ -7,12 +7,12 @@ import copy
 from dataclasses import dataclass
 
 import torch
-from sparsestreet.training.density import GradientDensity, cull, densify, reset_opacity
 from torch import Tensor
 
-from sparsestreet.pruning import keep_by_mask
-from sparsestreet.scene.gaussians import Rows
-from tests.training.density.scenes import make_rows, with_statistics
+from sparsestreet.scene.density import DensityStatistics, GradientDensity
+from sparsestreet.scene.gaussians import RowPlan, Rows
+from tests.scene.density.scenes import make_rows, with_statistics
+from tests.scene.street import static_mask
 
 LEARNING_RATE, EPSILON = 0.01, 1e-15
 RADIUS = 10.0
@@ -87,6 +87,12 @@ class Simulation:
                 torch.testing.assert_close(state["exp_avg_sq"][index], row.second[name], rtol=1e-12, atol=1e-15)
 
 
+def densified(run: Simulation, density: GradientDensity, statistics: DensityStatistics) -> RowPlan:
+    return density.densify(
+        run.rows, statistics, radius=RADIUS, progress=0.5, max_gaussians=None, generator=run.generator
+    )
+
+
 def test_moments_through_densify_cull_reset_and_pruning():
     run = Simulation(7)
     run.train(4)
@@ -98,7 +104,7 @@ def test_moments_through_densify_cull_reset_and_pruning():
             run.rows.log_scales[row] = torch.tensor(scale).log()
         run.simulated[row].values["log_scales"] = torch.full((3,), scale).log().double()
     statistics = with_statistics([0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0], screens=[0.0, 0.5, 0, 0, 0, 0, 0])
-    plan = densify(run.rows, statistics, GradientDensity(), RADIUS, run.generator, use_screen_size=False)
+    plan = densified(run, GradientDensity(), statistics)
     run.rows.resize(plan, run.adam)
     statistics.resize(plan)
     clone, children = run.simulated[5].twin(), [run.simulated[2].twin(), run.simulated[2].twin()]
@@ -114,13 +120,14 @@ def test_moments_through_densify_cull_reset_and_pruning():
     # Cull: row 1 was huge on screen, row 4 is faint; the oracle forgets both.
     with torch.no_grad():
         run.rows.opacity_logits[4] = -10.0
-    run.rows.resize(cull(run.rows, statistics, GradientDensity(), RADIUS, True, True), run.adam)
+    density = GradientDensity(cull_scale_from=0.1, screen_size_until=0.5)
+    run.rows.resize(density.cull(run.rows, statistics, radius=RADIUS, progress=0.5), run.adam)
     run.simulated = [row for index, row in enumerate(run.simulated) if index not in (1, 4)]
     run.check()
     run.train(2)
 
     # Opacity reset: values lowered, opacity moments gone, all other moments untouched.
-    run.rows.resize(reset_opacity(run.rows, 0.1), run.adam)
+    run.rows.resize(GradientDensity(reset_opacity_to=0.1).reset(run.rows), run.adam)
     limit = torch.logit(torch.tensor(0.1, dtype=torch.float64))
     for row in run.simulated:
         row.values["opacity_logits"] = torch.minimum(row.values["opacity_logits"], limit)
@@ -130,9 +137,9 @@ def test_moments_through_densify_cull_reset_and_pruning():
     run.train(2)
 
     # Pruning by mask: the two lowest go.
-    scores = torch.sigmoid(run.rows.mask_logits.detach())
-    selection = keep_by_mask(scores, float(scores.sort().values[1]), min_gaussians=1)
-    run.rows.resize(selection.plan(), run.adam)
+    scores = static_mask().scores(run.rows).detach()
+    mask = static_mask(1, threshold=float(scores.sort().values[1]))
+    run.rows.resize(mask.keep(run.rows).plan(), run.adam)
     lowest = sorted(run.simulated, key=lambda row: float(row.values["mask_logits"]))[:2]
     run.simulated = [row for row in run.simulated if all(row is not gone for gone in lowest)]
     run.check()
@@ -147,8 +154,7 @@ def test_replaced_parents_leave_no_moments_behind():
     with torch.no_grad():
         run.rows.log_scales.zero_()  # 1 m, large
     statistics = with_statistics([0.0, 0.01, 0.0])
-    density = GradientDensity(keep_parent=False)
-    plan = densify(run.rows, statistics, density, RADIUS, run.generator, use_screen_size=False)
+    plan = densified(run, GradientDensity(keep_parent=False), statistics)
     run.rows.resize(plan, run.adam)
     assert plan.source.tolist() == [0, 2, 1, 1]
     for name, parameter in run.rows.named_parameters():

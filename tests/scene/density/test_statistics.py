@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from sparsestreet.training.density import DensityStatistics
 
+from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan
 
 

@@ -2,11 +2,9 @@ import pytest
 import torch
 
 from sparsestreet.scene.gaussians import RowPlan, Rows
-from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes import Background
-from tests.scene.street import random_rows
+from tests.scene.street import background, random_rows, static_mask
 
-MASK = StaticMask(weight=1.0, min_gaussians=0)
+MASK = static_mask()
 
 
 def trained(count: int = 6, steps: int = 3) -> tuple[Rows, torch.optim.Adam]:
@@ -161,8 +159,8 @@ def test_a_dropped_column_leaves_the_optimizer():
 
 
 def test_a_checkpoint_brings_its_own_number_of_rows():
-    saved = Background(random_rows(9, 3, mask=MASK), MASK)
-    resumed = Background(random_rows(2, 4, mask=MASK), MASK)
+    saved = background(random_rows(9, 3, mask=MASK), MASK)
+    resumed = background(random_rows(2, 4, mask=MASK), MASK)
     resumed.load_state_dict(saved.state_dict())
     for name, column in saved.rows.columns().items():
         assert torch.equal(resumed.rows.columns()[name], column)

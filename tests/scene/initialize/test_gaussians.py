@@ -1,21 +1,24 @@
 import pytest
 import torch
-from sparsestreet.scene.seeds.rows import neighbor_scales, seed_rows
 from torch import Tensor
 
-from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.initialize.gaussians import init_gaussians, neighbor_scales
+from tests.scene.street import static_mask
 
 
-def seeded(points: Tensor, colors: Tensor, opacity: float = 0.1, sh_degree: int = 3, mask: StaticMask | None = None):
+def seeded(
+    points: Tensor, colors: Tensor, opacity: float = 0.1, sh_degree: int = 3, mask_columns: dict | None = None
+) -> Rows:
     generator = torch.Generator().manual_seed(0)
-    return seed_rows(
+    return init_gaussians(
         points,
         colors,
         neighbor_scales(points),
         sh_degree=sh_degree,
         initial_opacity=opacity,
-        mask=mask,
         generator=generator,
+        mask_columns=mask_columns,
     )
 
 
@@ -42,7 +45,7 @@ def test_coincident_points_have_a_logarithm():
     torch.testing.assert_close(rows.log_scales, torch.full((6, 3), 1e-3).log())
 
 
-def test_rows_of_seeds():
+def test_rows_of_points():
     colors = torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.3, 0.4]])
     rows = seeded(torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]), colors)
     # color = 0.5 + basis_0 sh_0 with basis_0 = 0.28209479
@@ -56,8 +59,10 @@ def test_rows_of_seeds():
 
 
 def test_a_mask_brings_its_logits():
-    mask = StaticMask(weight=1.0, min_gaussians=0, initial_logit=2.0)
-    assert seeded(torch.rand(3, 3), torch.rand(3, 3), mask=mask).mask_logits.tolist() == [2.0] * 3
+    rows = seeded(torch.rand(3, 3), torch.rand(3, 3), mask_columns=static_mask(initial_logit=2.0).initial_columns(3))
+    assert rows.mask_logits.tolist() == [2.0] * 3
+    assert rows.mask_logits.requires_grad
+    assert rows.transient == {"mask_logits"}
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1.0, -0.1])

@@ -1,7 +1,7 @@
 import torch
-from sparsestreet.scene.seeds.points import Points, far_positions, near_positions, random_points, seen_points
 
 from sparsestreet.geometry.cameras import project
+from sparsestreet.scene.initialize.points import Points, far_positions, near_positions, random_points, seen_points
 from tests.scene.street import frame_at
 
 CENTER = torch.tensor([1.0, -2.0, 3.0])

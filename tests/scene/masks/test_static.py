@@ -1,37 +1,64 @@
+"""Scores, multipliers and what is kept: values, gradients, thresholds and the floor."""
+
 import math
 
+import hypothesis.strategies as st
 import pytest
 import torch
+from hypothesis import given, settings
 
-from sparsestreet.scene.masks import StaticMask, straight_through
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.masks import StaticMaskSettings, straight_through
+from tests.scene.gaussians.oracle import by_hand
+from tests.scene.street import static_mask
+
+# A coarse grid, so that ties and hits of the threshold are common; sigmoid(-150) is 0 in float32.
+GRID = [-150.0, -6.0, -4.5, -4.0, 0.0, 1.0, 30.0]
+logit_lists = st.lists(st.sampled_from(GRID), max_size=12)
+
+
+def rows_of(logits: list[float] | torch.Tensor) -> Rows:
+    """A table of nothing but a mask's column."""
+    return Rows({"mask_logits": torch.as_tensor(logits, dtype=torch.float32)}, transient=["mask_logits"])
+
+
+def score_of(logit: float) -> float:
+    """The score of a logit as the mask knows it."""
+    return float(static_mask().scores(rows_of([logit])).detach())
+
+
+def rows_with(scores: list[float]) -> Rows:
+    """Rows whose scores come near the given ones."""
+    return rows_of(torch.tensor(scores, dtype=torch.float64).logit())
+
+
+def opened(mask, rows: Rows) -> list[float]:
+    return mask.multipliers(rows, 0.5).tolist()
 
 
 def test_one_sigmoid_only():
     logits = [-30.0, -4.6, 0.0, 1.0, 7.5]
-    scores = StaticMask(weight=1.0, min_gaussians=0).scores(torch.tensor(logits))
     expected = torch.tensor([1 / (1 + math.exp(-x)) for x in logits])
-    torch.testing.assert_close(scores, expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(static_mask().scores(rows_of(logits)).detach(), expected, rtol=1e-6, atol=0)
 
 
 def test_everything_can_be_pruned():
     """Two sigmoids would never fall below 0.5, far above the threshold."""
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    scores = mask.scores(torch.full((4,), -5.0))
-    assert mask.multipliers(scores).tolist() == [0.0] * 4
+    assert opened(static_mask(), rows_of([-5.0] * 4)) == [0.0] * 4
 
 
 def test_the_start_is_the_logit_1_everywhere():
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    logits = mask.initial_logits(3)
+    mask = static_mask()
+    (logits,) = mask.initial_columns(3).values()
+    assert list(mask.initial_columns(3)) == list(mask.columns) == ["mask_logits"]
     assert logits.dtype == torch.float32
     assert logits.tolist() == [1.0] * 3
-    assert mask.multipliers(mask.scores(logits)).tolist() == [1.0] * 3
+    assert opened(mask, rows_of(logits)) == [1.0] * 3
 
 
 def test_strictly_above_the_threshold():
-    mask = StaticMask(weight=1.0, min_gaussians=0, threshold=0.25)
-    scores = torch.tensor([0.0, 0.25, 0.25 + 2**-20, 1.0])
-    assert mask.multipliers(scores).tolist() == [0.0, 0.0, 1.0, 1.0]
+    mask = static_mask(threshold=score_of(-1.0))
+    assert opened(mask, rows_of([-150.0, -1.0, -1.0 + 2**-20, 30.0])) == [0.0, 0.0, 1.0, 1.0]
 
 
 def test_values_are_exactly_0_and_1_for_any_score():
@@ -48,28 +75,124 @@ def test_gradient_passes_through_open_and_closed_rows_alike():
 
 def test_scores_stay_float32_under_bfloat16():
     """Near -4.6 bfloat16 logits are 1/32 apart, and an Adam step of 0.01 would be lost."""
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    logits = torch.tensor([-4.6, -4.59])
+    mask, rows = static_mask(), rows_of([-4.6, -4.59])
     with torch.autocast("cpu", torch.bfloat16):
-        scores = mask.scores(logits)
+        scores = mask.scores(rows)
     assert scores.dtype == torch.float32
     assert scores[0] < scores[1]
-    assert mask.scores(logits.bfloat16()).dtype == torch.float32
+    assert mask.scores(rows.bfloat16()).dtype == torch.float32
 
 
 @pytest.mark.parametrize(("floor", "open_rows"), [(0, [0]), (1, [0]), (2, [0, 3]), (3, [0, 1, 3]), (5, [0, 1, 2, 3])])
 def test_the_best_rows_reopen_below_the_floor(floor: int, open_rows: list[int]):
-    mask = StaticMask(weight=1.0, min_gaussians=floor)
-    scores = torch.tensor([0.5, 0.002, 0.001, 0.003])
-    assert torch.nonzero(mask.multipliers(scores)).flatten().tolist() == open_rows
+    multipliers = static_mask(floor).multipliers(rows_with([0.5, 0.002, 0.001, 0.003]), 0.5)
+    assert torch.nonzero(multipliers).flatten().tolist() == open_rows
+
+
+def test_a_floor_that_holds_is_counted():
+    mask, rows = static_mask(2), rows_with([0.5, 0.002, 0.001])
+    for firings in (1, 2):
+        mask.multipliers(rows, 0.5)
+        assert mask.floor_firings == firings
+    mask.multipliers(rows_with([0.5, 0.6, 0.001]), 0.5)
+    mask.keep(rows)
+    assert mask.floor_firings == 2
+    assert static_mask(2).floor_firings == 0
 
 
 def test_ties_at_the_floor_all_stay_open():
-    mask = StaticMask(weight=1.0, min_gaussians=2)
-    assert mask.multipliers(torch.full((5,), 0.001)).tolist() == [1.0] * 5
+    assert opened(static_mask(2), rows_of([-6.9] * 5)) == [1.0] * 5
 
 
 def test_scores_of_zero_can_reopen():
     """sigma(-200) is 0 in float32; the threshold has to go below it."""
-    mask = StaticMask(weight=1.0, min_gaussians=1)
-    assert mask.multipliers(mask.scores(torch.full((3,), -200.0))).tolist() == [1.0] * 3
+    assert opened(static_mask(1), rows_of([-200.0] * 3)) == [1.0] * 3
+
+
+@settings(max_examples=300, deadline=None)
+@given(logit_lists, st.sampled_from(GRID[1:-1]), st.integers(0, 14))
+def test_the_lowest_are_removed_one_by_one(logits, threshold, floor):
+    mask, rows = static_mask(floor, threshold=score_of(threshold)), rows_of(logits)
+    selection = mask.keep(rows)
+    scores = mask.scores(rows).tolist()
+    unwanted = [score <= score_of(threshold) for score in scores]
+    assert unwanted == [logit <= threshold for logit in logits]
+    assert selection.keep.tolist() == by_hand(scores, unwanted, floor)
+    assert selection.removed == len(logits) - int(selection.keep.sum())
+    assert selection.floor_hit == (selection.removed < sum(unwanted))
+
+
+@settings(max_examples=100, deadline=None)
+@given(logit_lists, st.integers(0, 14))
+def test_the_plan_keeps_survivors_in_order_with_their_moments(logits, floor):
+    selection = static_mask(floor).keep(rows_of(logits))
+    plan = selection.plan()
+    assert plan.source.tolist() == [row for row in range(len(logits)) if selection.keep[row]]
+    assert not plan.fresh.any()
+    assert not plan.edits
+    assert not plan.reset_moments
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(-8, 2, width=32), max_size=12, unique=True), st.integers(0, 14))
+def test_rows_dropped_are_exactly_those_the_mask_has_closed(logits, floor):
+    """Removal loses nothing: the rasterizer drew exactly the rows that are kept (scores without ties)."""
+    mask, rows = static_mask(floor), rows_of(logits)
+    if len(set(mask.scores(rows).tolist())) == len(logits):
+        assert mask.keep(rows).keep.tolist() == (mask.multipliers(rows, 0.5) == 1).tolist()
+
+
+def test_a_score_at_the_threshold_is_closed_for_both():
+    """float32(sigma) compared in float64 with a threshold of float64 would open the row in one of the two."""
+    threshold = 0.1
+    rows = rows_with([threshold])
+    assert score_of(float(rows.mask_logits.detach())) == float(torch.tensor(threshold, dtype=torch.float32))
+    mask = static_mask(threshold=threshold)
+    assert not mask.keep(rows).keep.item()
+    assert opened(mask, rows) == [0.0]
+
+
+def test_all_scores_equal():
+    equal = rows_of([-5.5] * 5)  # 0.004
+    assert static_mask(2).keep(equal).keep.tolist() == [True, True, False, False, False]
+    assert static_mask(2, threshold=0.001).keep(equal).keep.all()
+
+
+@pytest.mark.parametrize("floor", [0, 7])
+def test_a_node_without_rows(floor: int):
+    mask = static_mask(floor)
+    selection = mask.keep(rows_of([]))
+    assert selection.keep.shape == (0,)
+    assert selection.removed == 0
+    assert not selection.floor_hit
+    assert selection.plan().source.shape == (0,)
+    assert opened(mask, rows_of([])) == []
+    assert mask.sparsity(rows_of([]), 0.5, torch.zeros(0, dtype=torch.bool)).item() == 0.0
+
+
+def test_a_floor_above_the_rows_there_are_removes_nothing():
+    selection = static_mask(10).keep(rows_with([0.001, 0.5, 0.002]))
+    assert selection.keep.all()
+    assert selection.floor_hit
+
+
+def test_nan_logits_are_refused():
+    with pytest.raises(ValueError, match="row 1 of 2 is NaN"):
+        static_mask().keep(rows_of([0.5, float("nan")]))
+
+
+def test_a_negative_floor_is_refused():
+    with pytest.raises(ValueError, match="min_gaussians must be >= 0, got -1"):
+        static_mask(-1).keep(rows_of([0.0, 0.0]))
+
+
+@pytest.mark.parametrize("weight", [-0.1, float("nan")])
+def test_a_negative_weight_is_refused(weight: float):
+    with pytest.raises(ValueError, match="sparsity_weight must be >= 0"):
+        StaticMaskSettings(weight)
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.0, float("nan")])
+def test_a_threshold_that_is_no_sigmoid_is_refused(threshold: float):
+    with pytest.raises(ValueError, match=r"must lie in \[0, 1\)"):
+        StaticMaskSettings(1.0, threshold=threshold)

@@ -1,10 +1,8 @@
 import pytest
 import torch
 
-from sparsestreet.scene.gaussians import RowPlan, Rows
-from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes import Background
-from tests.scene.street import random_rows
+from sparsestreet.scene.gaussians import Rows
+from tests.scene.street import background, degree, random_rows, static_mask, view_at
 
 
 def test_activations_by_hand():
@@ -16,7 +14,7 @@ def test_activations_by_hand():
         "sh_dc": torch.tensor([[[0.1, 0.2, 0.3]]]),
         "sh_rest": torch.arange(24.0).reshape(1, 8, 3),
     }
-    gaussians = Background(Rows(columns), None).gaussians_at(0.7, 1)
+    gaussians = background(Rows(columns)).gaussians_at(view_at(0.7), degree(1))
     assert torch.equal(gaussians.means, columns["means"])
     torch.testing.assert_close(gaussians.scales, torch.tensor([[0.5, 1.0, 2.0]]))
     torch.testing.assert_close(gaussians.opacities, torch.tensor([0.75]))
@@ -27,35 +25,36 @@ def test_activations_by_hand():
 
 @pytest.mark.parametrize(("active", "terms"), [(0, 1), (1, 4), (2, 9), (3, 9)])
 def test_sh_terms_up_to_the_stored_degree(active: int, terms: int):
-    assert Background(random_rows(5, 0, sh_degree=2), None).gaussians_at(0.0, active).sh.shape == (5, terms, 3)
+    node = background(random_rows(5, 0, sh_degree=2))
+    assert node.gaussians_at(view_at(0.0), degree(active)).sh.shape == (5, terms, 3)
 
 
 def test_extreme_opacity_logits_stay_finite():
     rows = random_rows(2, 0)
     with torch.no_grad():
         rows.opacity_logits.copy_(torch.tensor([1e4, -1e4]))
-    opacities = Background(rows, None).gaussians_at(0.0, 0).opacities
+    opacities = background(rows).gaussians_at(view_at(0.0), degree(0)).opacities
     assert torch.isfinite(opacities).all()
     assert 0 < opacities[1] < 1e-6
     assert 1 - 1e-6 < opacities[0] <= 1
 
 
 def test_mask_and_its_logits_come_together():
-    mask = StaticMask(weight=1.0, min_gaussians=0)
+    mask = static_mask()
     with pytest.raises(ValueError, match="mask_logits"):
-        Background(random_rows(2, 0), mask)
+        background(random_rows(2, 0), mask)
     with pytest.raises(ValueError, match="mask_logits"):
-        Background(random_rows(2, 0, mask=mask), None)
+        background(random_rows(2, 0, mask=mask))
 
 
 def test_masked_rows_vanish_and_the_table_stays_unmasked():
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    node = Background(random_rows(6, 0, mask=mask), mask)
+    mask = static_mask()
+    node = background(random_rows(6, 0, mask=mask), mask)
     hidden = torch.tensor([False, True, False, False, True, True])
-    plain = Background(random_rows(6, 0), None).gaussians_at(0.0, 1)
+    plain = background(random_rows(6, 0)).gaussians_at(view_at(0.0), degree(1))
     with torch.no_grad():
         node.rows.mask_logits[hidden] = -5.0  # 0.0067 < 0.01
-    gaussians = node.gaussians_at(0.0, 1)
+    gaussians = node.gaussians_at(view_at(0.0), degree(1))
     assert (gaussians.opacities[hidden] == 0).all()
     assert (gaussians.scales[hidden] == 0).all()
     # Multiplying by exactly 1 changes no bit.
@@ -66,12 +65,12 @@ def test_masked_rows_vanish_and_the_table_stays_unmasked():
 
 def test_the_mask_multiplies_opacity_and_scale_in_the_gradient():
     """d/dm of sum(c_o o M + c_s . s M) = (c_o o + c_s . s) sigma'(m), by the straight-through rule."""
-    mask = StaticMask(weight=1.0, min_gaussians=0)
+    mask = static_mask()
     rows = random_rows(5, 1, mask=mask)
-    node = Background(rows, mask)
+    node = background(rows, mask)
     generator = torch.Generator().manual_seed(2)
     opacity_weight, scale_weight = torch.randn(5, generator=generator), torch.randn(5, 3, generator=generator)
-    gaussians = node.gaussians_at(0.0, 0)
+    gaussians = node.gaussians_at(view_at(0.0), degree(0))
     loss = (gaussians.opacities * opacity_weight).sum() + (gaussians.scales * scale_weight).sum()
     loss.backward()
     sigma = torch.sigmoid(rows.mask_logits.detach().double())
@@ -81,38 +80,40 @@ def test_the_mask_multiplies_opacity_and_scale_in_the_gradient():
     torch.testing.assert_close(rows.mask_logits.grad.double(), by_hand, rtol=1e-5, atol=1e-6)  # float32 sums
 
 
-def test_dropped_logits_end_the_masking():
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    node = Background(random_rows(3, 0, mask=mask), mask)
+def test_a_finished_mask_ends_the_masking():
+    mask = static_mask()
+    node = background(random_rows(3, 0, mask=mask), mask)
     with torch.no_grad():
         node.rows.mask_logits[0] = -9.0
     node.rows.drop_column("mask_logits")
-    assert node.mask_scores() is None
-    assert (node.gaussians_at(0.0, 0).opacities > 0).all()
+    node.mask = mask.finish()
+    assert node.mask is None
+    assert (node.gaussians_at(view_at(0.0), degree(0)).opacities > 0).all()
 
 
 def test_the_image_of_a_masked_table_after_removal_is_the_same_gaussians():
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    node = Background(random_rows(7, 3, mask=mask), mask)
+    mask = static_mask()
+    node = background(random_rows(7, 3, mask=mask), mask)
     with torch.no_grad():
         node.rows.mask_logits[::2] = -6.0
-    before = node.gaussians_at(0.0, 1)
+    before = node.gaussians_at(view_at(0.0), degree(1))
     alive = before.opacities > 0
-    node.rows.resize(RowPlan.keep(node.mask_scores() > mask.threshold))
-    after = node.gaussians_at(0.0, 1)
+    node.rows.resize(mask.keep(node.rows).plan())
+    after = node.gaussians_at(view_at(0.0), degree(1))
     for name in ("means", "quaternions", "scales", "opacities", "sh"):
         assert torch.equal(getattr(before, name)[alive], getattr(after, name))
 
 
 def test_sizes_are_float32_without_the_mask():
-    mask = StaticMask(weight=1.0, min_gaussians=0)
-    node = Background(random_rows(3, 0, sh_degree=3, mask=mask), mask)
+    mask = static_mask()
+    node = background(random_rows(3, 0, sh_degree=3, mask=mask), mask)
     assert node.row_bytes() == 3 * 59 * 4  # 3 + 3 + 4 + 1 + 48, the 59 numbers of 3DGS
     assert node.pose_bytes() == 0
 
 
 def test_an_empty_node():
-    mask = StaticMask(weight=1.0, min_gaussians=5)
-    node = Background(random_rows(0, 0, mask=mask), mask)
-    assert len(node.gaussians_at(0.0, 1)) == 0
-    assert node.mask_scores().shape == (0,)
+    mask = static_mask(5)
+    node = background(random_rows(0, 0, mask=mask), mask)
+    assert len(node.gaussians_at(view_at(0.0), degree(1))) == 0
+    assert node.mask.scores(node.rows).shape == (0,)
+    assert mask.keep(node.rows).removed == 0

@@ -2,22 +2,34 @@ from dataclasses import replace
 
 import pytest
 import torch
-from sparsestreet.scene.seeds import BackgroundSettings
-from sparsestreet.scene.seeds.rows import SH_CONSTANT
 
 from sparsestreet.geometry.transforms import inverse, transform_points
-from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes import Background
+from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
+from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.nodes import Background, BackgroundSettings, RigidSettings
 from sparsestreet.types import Sweep
-from tests.scene.street import CAR_COLOR, NUM_FRAMES, ROAD_COLOR, street_log
+from tests.scene.street import (
+    CAR_COLOR,
+    NUM_FRAMES,
+    ROAD_COLOR,
+    background_settings,
+    rigid_settings,
+    street_log,
+    training_data,
+)
 
-LIDAR_ONLY = BackgroundSettings(lidar_points=10_000, near_points=0, far_points=0)
+LIDAR_ONLY = background_settings(num_lidar=10_000)
+MOVERS = rigid_settings(classes=("Car", "Cyclist"))
 
 
-def build(seeds: BackgroundSettings, held_out: frozenset[int] = frozenset(), seed: int = 0, log=None) -> Background:
-    log = log or street_log()
-    frames = [frame for frame in log.frames if frame.frame_index not in held_out]
-    return seeds.build(log, frames, held_out, torch.Generator().manual_seed(seed))
+def build(
+    settings: BackgroundSettings,
+    held_out: frozenset[int] = frozenset(),
+    seed: int = 0,
+    log=None,
+    movers: RigidSettings = MOVERS,
+) -> Background:
+    return settings.build(training_data(log, held_out, movers), torch.Generator().manual_seed(seed))
 
 
 def colors(node: Background) -> torch.Tensor:
@@ -38,10 +50,10 @@ def test_lidar_outside_moving_boxes_keeps_its_color():
 
 def test_what_does_not_move_or_is_of_another_class_stays():
     everything = sum(int(sweep.colored.sum()) for sweep in street_log().sweeps)
-    assert len(build(replace(LIDAR_ONLY, min_path_length=100.0)).rows) == everything
-    assert len(build(replace(LIDAR_ONLY, moving_classes=("Tram",))).rows) == everything
+    assert len(build(LIDAR_ONLY, movers=replace(MOVERS, min_path_length=100.0)).rows) == everything
+    assert len(build(LIDAR_ONLY, movers=replace(MOVERS, classes=("Tram",))).rows) == everything
     # Cars only: the driving one is cut out; the cyclist's box takes no points of its own away.
-    cars = build(replace(LIDAR_ONLY, moving_classes=("Car",)))
+    cars = build(LIDAR_ONLY, movers=replace(MOVERS, classes=("Car",)))
     assert len(build(LIDAR_ONLY).rows) <= len(cars.rows) < everything
     assert not (colors(cars) - torch.tensor(CAR_COLOR)).abs().max(dim=1).values.lt(1e-3).any()
 
@@ -55,8 +67,7 @@ def test_held_out_sweeps_are_not_used():
 
 
 def test_the_number_of_points_of_each_kind():
-    seeds = BackgroundSettings(lidar_points=40, near_points=30, far_points=20, sh_degree=1)
-    node = build(seeds)
+    node = build(background_settings(num_lidar=40, num_near=30, num_far=20, sh_degree=1))
     log = street_log()
     assert len(node.rows) == 90
     assert node.rows.sh_rest.shape == (90, 3, 3)
@@ -69,8 +80,8 @@ def test_the_number_of_points_of_each_kind():
 
 
 def test_the_same_seed_gives_the_same_rows():
-    seeds = BackgroundSettings(lidar_points=40, near_points=30, far_points=20)
-    first, second, other = build(seeds), build(seeds), build(seeds, seed=1)
+    settings = background_settings(num_lidar=40, num_near=30, num_far=20)
+    first, second, other = build(settings), build(settings), build(settings, seed=1)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
     assert not torch.equal(first.rows.means, other.rows.means)
 
@@ -85,17 +96,26 @@ def test_duplicated_returns_start_finite():
 
 
 def test_a_mask_arrives_at_the_node():
-    mask = StaticMask(weight=0.5, min_gaussians=3)
-    node = build(replace(LIDAR_ONLY, mask=mask))
-    assert node.mask is mask
-    assert node.mask_scores().shape == (len(node.rows),)
+    settings = replace(LIDAR_ONLY, mask=StaticMaskSettings(0.5), min_gaussians=3, masked=True)
+    node = build(settings)
+    assert node.settings is settings
+    assert node.mask.settings is settings.mask
+    assert node.mask.min_gaussians == 3
+    assert node.mask.sparsity_weight == 0.5
+    assert node.mask.scores(node.rows).shape == (len(node.rows),)
+
+
+def test_a_mask_that_is_not_trained_in_this_run_leaves_no_column():
+    node = build(replace(LIDAR_ONLY, mask=StaticMaskSettings(0.5), masked=False))
+    assert node.mask is None
+    assert "mask_logits" not in node.rows.columns()
 
 
 def test_a_log_without_lidar_starts_from_random_points():
-    node = build(BackgroundSettings(near_points=10, far_points=5), log=replace(street_log(), sweeps=()))
+    node = build(background_settings(num_lidar=40, num_near=10, num_far=5), log=replace(street_log(), sweeps=()))
     assert len(node.rows) == 15
 
 
 def test_nothing_to_start_from_is_an_error():
-    with pytest.raises(ValueError, match="background of 'hand-made' has no seeds"):
+    with pytest.raises(ValueError, match="background of 'hand-made' has nothing to start from"):
         build(LIDAR_ONLY, held_out=frozenset(range(NUM_FRAMES)))

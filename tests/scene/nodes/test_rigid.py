@@ -6,7 +6,7 @@ import torch
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.nodes import Rigid
-from tests.scene.street import keyframes, pose, random_rows, track
+from tests.scene.street import degree, keyframes, pose, random_rows, rigid, track, view_at
 
 FRAMES = 11
 """Frame f is at time f / 10."""
@@ -15,8 +15,7 @@ FRAMES = 11
 def rigid_of(tracks, rows_per_instance=3, dtype=torch.float64, held_out=frozenset(), max_gap=0.2, seed=0) -> Rigid:
     instances = torch.arange(len(tracks)).repeat_interleave(rows_per_instance)
     rows = random_rows(len(instances), seed, instances=instances, dtype=dtype)
-    sizes = torch.ones(len(tracks), 3, dtype=dtype)
-    return Rigid(rows, keyframes(tracks, FRAMES, held_out, dtype), sizes, max_gap=max_gap)
+    return rigid(rows, keyframes(tracks, FRAMES, held_out, dtype), max_gap=max_gap)
 
 
 def covariances(gaussians) -> torch.Tensor:
@@ -37,8 +36,8 @@ def test_a_quarter_turn_and_a_shift_by_hand():
         {"instances": torch.tensor([0])},
     )
     turned = track("car", [0], [pose(math.pi / 2, (10.0, 20.0, 1.0))])
-    node = Rigid(rows, keyframes([turned], FRAMES, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64))
-    gaussians = node.gaussians_at(0.0, 1)
+    node = rigid(rows, keyframes([turned], FRAMES, dtype=torch.float64))
+    gaussians = node.gaussians_at(view_at(0.0), degree(1))
     # The length axis x now points along world y. Trajectories are stored as float32: 1e-6 of 20 m.
     torch.testing.assert_close(gaussians.means, torch.tensor([[10.0, 22.0, 1.5]]).double(), atol=2e-5, rtol=0)
     expected = torch.diag(torch.tensor([1.0, 9.0, 0.25])).double()[None]
@@ -55,7 +54,8 @@ def test_means_and_covariances_follow_general_poses():
         matrix[:3, 3] = torch.randn(3, generator=generator, dtype=torch.float64)
         matrices.append(matrix)
     node = rigid_of([track(str(i), [4], [matrix]) for i, matrix in enumerate(matrices)])
-    local, world = node.activated(1), node.gaussians_at(0.4, 1)
+    view, state = view_at(0.4), degree(1)
+    local, world = node.activated(view, state), node.gaussians_at(view, state)
     for row, instance in enumerate(node.rows.instances.tolist()):
         rotation, translation = matrices[instance][:3, :3], matrices[instance][:3, 3]
         # Trajectories are float32: 1e-6 of values of a few meters.
@@ -99,10 +99,10 @@ def test_absent_outside_the_annotated_span():
     presence = {0.0: (0, 1), 0.2: (0, 1), 0.3: (1, 0), 0.35: (1, 0), 0.4: (1, 0), 0.5: (0, 0), 0.8: (0, 1), 1.0: (0, 1)}
     for time, (car, tram) in presence.items():
         assert node.pose_at(time)[2].tolist() == [bool(car), bool(tram)], time
-        opacities = node.gaussians_at(time, 1).opacities
+        opacities = node.gaussians_at(view_at(time), degree(1)).opacities
         assert ((opacities > 0) == torch.tensor([car] * 3 + [tram] * 3, dtype=torch.bool)).all()
-        assert torch.isfinite(node.gaussians_at(time, 1).means).all()
-    assert node.gaussians_at(0.6, 1).opacities.tolist() == [0.0] * 6
+        assert torch.isfinite(node.gaussians_at(view_at(time), degree(1)).means).all()
+    assert node.gaussians_at(view_at(0.6), degree(1)).opacities.tolist() == [0.0] * 6
 
 
 def test_a_track_of_one_frame():
@@ -117,7 +117,7 @@ def test_every_frame_time_of_an_odd_log_is_a_knot():
     """60 frames: 1/59 has no exact float, so presence at the ends of a span needs the tolerance."""
     tracks = [track("car", list(range(7, 53)), [pose(0.01 * f, (float(f), 0.0, 0.0)) for f in range(7, 53)])]
     rows = random_rows(1, 0, instances=torch.zeros(1, dtype=torch.int64))
-    node = Rigid(rows, keyframes(tracks, 60), torch.ones(1, 3), max_gap=0.0)
+    node = rigid(rows, keyframes(tracks, 60), max_gap=0.0)
     for frame in range(60):
         _, translations, active = node.pose_at(frame / 59)
         assert active.item() == (7 <= frame < 53)
@@ -181,7 +181,7 @@ def test_gradients_reach_rows_and_corrections():
         state = dict(
             zip([f"rows.{name}" for name in names] + ["rotation_deltas", "translation_deltas"], values, strict=True)
         )
-        gaussians = torch.func.functional_call(node, state, (0.15, 1))
+        gaussians = torch.func.functional_call(node, state, (view_at(0.15), degree(1)))
         return tuple(field for field in vars(gaussians).values() if field is not None)
 
     node.forward = node.gaussians_at  # functional_call goes through the module's call
@@ -191,7 +191,7 @@ def test_gradients_reach_rows_and_corrections():
 def test_gradients_are_zero_not_nan_at_the_start():
     """Zero corrections, equal neighbors: the places where norms and arc cosines have no derivative."""
     node = rigid_of([track("car", [0, 1], [pose(0.5, (1.0, 0.0, 0.0))] * 2)], dtype=torch.float32)
-    gaussians = node.gaussians_at(0.05, 1)
+    gaussians = node.gaussians_at(view_at(0.05), degree(1))
     cotangent = torch.randn(gaussians.quaternions.shape, generator=torch.Generator().manual_seed(0))
     (gaussians.quaternions * cotangent).sum().backward()
     assert torch.isfinite(node.rotation_deltas.grad).all()
@@ -201,26 +201,26 @@ def test_gradients_are_zero_not_nan_at_the_start():
 def test_instance_counts_include_empty_instances():
     rows = random_rows(4, 0, instances=torch.tensor([2, 0, 2, 2]))
     tracks = [track(str(i), [0], [pose(0, (0, 0, 0))]) for i in range(4)]
-    node = Rigid(rows, keyframes(tracks, FRAMES), torch.ones(4, 3))
-    assert node.instance_counts().tolist() == [1, 0, 3, 0]
+    node = rigid(rows, keyframes(tracks, FRAMES))
+    assert node.instances().counts().tolist() == [1, 0, 3, 0]
 
 
 def test_a_node_without_rows_and_one_without_instances():
     rows = random_rows(0, 0, instances=torch.zeros(0, dtype=torch.int64))
-    node = Rigid(rows, keyframes([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES), torch.ones(1, 3))
-    assert len(node.gaussians_at(0.0, 3)) == 0
-    node = Rigid(rows, keyframes([], FRAMES), torch.ones(0, 3))
-    assert len(node.gaussians_at(0.0, 3)) == 0
+    node = rigid(rows, keyframes([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES))
+    assert len(node.gaussians_at(view_at(0.0), degree(3))) == 0
+    node = rigid(rows, keyframes([], FRAMES))
+    assert len(node.gaussians_at(view_at(0.0), degree(3))) == 0
 
 
 def test_instances_that_do_not_exist_are_an_error():
     rows = random_rows(2, 0, instances=torch.tensor([0, 1]))
     with pytest.raises(ValueError, match="rows name instances 0 to 1, but there are 1"):
-        Rigid(rows, keyframes([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES), torch.ones(1, 3))
+        rigid(rows, keyframes([track("car", [0], [pose(0, (0, 0, 0))])], FRAMES))
 
 
 def test_poses_stay_float32_under_autocast():
     node = rigid_of([track("car", [0], [pose(0.3, (123.4, 0.0, 0.0))])], dtype=torch.float32)
-    expected = node.gaussians_at(0.0, 1).means
+    expected = node.gaussians_at(view_at(0.0), degree(1)).means
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(node.gaussians_at(0.0, 1).means, expected)
+        assert torch.equal(node.gaussians_at(view_at(0.0), degree(1)).means, expected)

@@ -1,26 +1,35 @@
 from dataclasses import replace
 
 import torch
-from sparsestreet.scene.seeds import RigidSettings
-from sparsestreet.scene.seeds.rigid import box_surface_points
-from sparsestreet.scene.seeds.rows import SH_CONSTANT
 
-from sparsestreet.scene.nodes import Rigid
-from tests.scene.street import CAR_COLOR, NUM_FRAMES, car_pose, street_log, track
+from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
+from sparsestreet.scene.nodes import Rigid, RigidSettings
+from tests.scene.street import (
+    CAR_COLOR,
+    NUM_FRAMES,
+    car_pose,
+    degree,
+    rigid_settings,
+    street_log,
+    track,
+    training_data,
+)
 
-CARS = RigidSettings(classes=("Car",), box_points=50)
+CARS = rigid_settings(box_points=50)
 
 
-def build(seeds: RigidSettings, held_out: frozenset[int] = frozenset(), log=None) -> Rigid | None:
-    log = log or street_log()
-    frames = [frame for frame in log.frames if frame.frame_index not in held_out]
-    return seeds.build(log, frames, held_out, torch.Generator().manual_seed(0))
+def build(settings: RigidSettings, held_out: frozenset[int] = frozenset(), log=None) -> Rigid | None:
+    return settings.build(training_data(log, held_out, movers=settings), torch.Generator().manual_seed(0))
+
+
+def instance_counts(node: Rigid) -> list[int]:
+    return node.instances().counts().tolist()
 
 
 def test_only_what_moves_and_is_of_the_classes():
     node = build(CARS)
     assert node.sizes.tolist() == [[4.0, 2.0, 1.5]]
-    assert node.instance_counts().tolist() == [60 * NUM_FRAMES]
+    assert instance_counts(node) == [60 * NUM_FRAMES]
     assert build(replace(CARS, classes=("Car", "Cyclist"))).sizes.shape == (2, 3)
     assert build(replace(CARS, classes=("Tram",))) is None
     assert build(replace(CARS, min_path_length=50.0)) is None
@@ -36,19 +45,19 @@ def test_points_lie_in_the_box_in_the_cars_color():
 def test_the_node_puts_the_points_back_where_lidar_saw_them():
     """The box poses, the pooling and the node's motion undo each other: sweep 2 must be found again at its time."""
     node, log = build(CARS), street_log()
-    world = node.gaussians_at(log.frames[2].time, 0).means
+    world = node.gaussians_at(log.frames[2], degree(0)).means
     seen = log.sweeps[2].points[50:110]
     nearest = (seen[:, None] - world[None]).norm(dim=2).min(1).values
     assert nearest.max() < 1e-4  # float32 keyframes and points at 20 m
 
 
 def test_a_sample_of_many_points():
-    assert build(replace(CARS, points_per_instance=70)).instance_counts().tolist() == [70]
+    assert instance_counts(build(replace(CARS, points_per_instance=70))) == [70]
 
 
 def test_few_points_are_filled_up_on_the_box():
     node = build(replace(CARS, box_points=50), log=street_log(car_points=2))
-    assert node.instance_counts().tolist() == [50]
+    assert instance_counts(node) == [50]
     added = node.rows.means[2 * NUM_FRAMES :]
     on_a_face = ((added.abs() - node.sizes[0] / 2).abs() < 1e-5).any(1)
     assert on_a_face.all()
@@ -58,7 +67,7 @@ def test_few_points_are_filled_up_on_the_box():
 
 def test_an_instance_that_lidar_never_hit_is_a_gray_box():
     node = build(CARS, log=replace(street_log(), sweeps=()))
-    assert node.instance_counts().tolist() == [50]
+    assert instance_counts(node) == [50]
     assert (node.rows.sh_dc.abs() < 1e-6).all()
 
 
@@ -67,14 +76,14 @@ def test_scales_are_those_of_each_instance_alone():
     log = street_log()
     twin = track("twin", list(range(NUM_FRAMES)), [car_pose(frame) for frame in range(NUM_FRAMES)])
     alone, both = build(CARS), build(CARS, log=replace(log, tracks=(*log.tracks, twin)))
-    assert both.instance_counts().tolist() == [300, 300]
+    assert instance_counts(both) == [300, 300]
     for instance in (0, 1):
         torch.testing.assert_close(both.rows.log_scales[both.rows.instances == instance], alone.rows.log_scales)
 
 
 def test_held_out_frames_give_neither_points_nor_poses():
     node = build(CARS, held_out=frozenset({2}))
-    assert node.instance_counts().tolist() == [60 * (NUM_FRAMES - 1)]
+    assert instance_counts(node) == [60 * (NUM_FRAMES - 1)]
     assert node.keyframe_valid.sum().item() == NUM_FRAMES - 1
     assert node.pose_at(0.5)[2].tolist() == [True]
 
@@ -87,15 +96,3 @@ def test_the_gap_is_counted_in_frames():
     tracks = (track("car", [0, 4], [car_pose(0), car_pose(4)]),)
     node = build(replace(CARS, max_gap=1), log=replace(street_log(), tracks=tracks))
     assert [node.pose_at(frame / 4)[2].item() for frame in range(5)] == [True, True, False, True, True]
-
-
-def test_box_points_are_spread_by_area():
-    size = torch.tensor([4.0, 2.0, 1.0])
-    points = box_surface_points(9000, size, torch.Generator().manual_seed(0))
-    on_face = (points.abs() - size / 2).abs() < 1e-6
-    assert (on_face.sum(1) == 1).all()
-    assert (points.abs() <= size / 2 + 1e-6).all()
-    share = on_face.float().mean(0)
-    # Areas 2, 4, 8 of 14; standard deviation of a share of 9,000 draws is 0.005.
-    torch.testing.assert_close(share, torch.tensor([2.0, 4.0, 8.0]) / 14, atol=0.02, rtol=0)
-    assert ((points[:, 2] > 0).float().mean() - 0.5).abs() < 0.03
