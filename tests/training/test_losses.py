@@ -125,6 +125,55 @@ def test_saturated_pixels_keep_their_gradient():
     assert bool((rgb.grad > 0).all())
 
 
+def half_sky() -> Tensor:
+    sky = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    sky[:4] = True
+    return sky
+
+
+@pytest.mark.parametrize(
+    ("alpha", "in_the_sky"),
+    # -log((1 - alpha + 0.001) / 1.001) and -log((alpha + 0.001) / 1.001), by hand.
+    [(0.0, (0.0, 6.9087548)), (0.5, (0.6921486, 0.6921486)), (1.0, (6.9087548, 0.0)), (0.9991, (6.2669008, 0.0008995))],
+)
+def test_sky_by_hand(alpha, in_the_sky):
+    sky = half_sky()
+    share = float(sky.float().mean())
+    seen = rendering(alpha=torch.full((HEIGHT, WIDTH), alpha, dtype=torch.float64))
+    loss = SkyMask(weight=0.3)(seen, frame(sky=sky), SCENE)
+    assert loss.item() == pytest.approx(0.3 * (share * in_the_sky[0] + (1 - share) * in_the_sky[1]), abs=1e-7)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-4, 0.3, 0.9989, 0.9991, 1.0])
+def test_sky_pushes_alpha_out_of_the_sky_and_up_elsewhere_at_any_alpha(alpha):
+    sky = half_sky()
+    values = torch.full((HEIGHT, WIDTH), alpha, requires_grad=True)
+    SkyMask(weight=0.3, eps=1e-3)(rendering(alpha=values), frame(sky=sky), SCENE).backward()
+    # Per pixel 1 / (error + eps) and no more than 1 / eps; float32 knows 1 - alpha + eps to 6e-8 of 1e-3.
+    gradient = values.grad * sky.numel() / 0.3
+    assert gradient[sky].unique().tolist() == pytest.approx([1 / (1 - alpha + 1e-3)], rel=1e-4)
+    assert gradient[~sky].unique().tolist() == pytest.approx([-1 / (alpha + 1e-3)], rel=1e-4)
+
+
+def test_sky_gradient_equals_finite_differences(generator):
+    sky = torch.rand(HEIGHT, WIDTH, generator=generator) > 0.5
+    alpha = torch.rand(HEIGHT, WIDTH, generator=generator)
+    check_gradient(lambda values: SkyMask(weight=0.7)(rendering(alpha=values), frame(sky=sky), SCENE), alpha, generator)
+
+
+def test_sky_approaches_the_plain_cross_entropy_as_eps_vanishes(generator):
+    sky = torch.rand(HEIGHT, WIDTH, generator=generator) > 0.5
+    alpha = (0.1 + 0.8 * torch.rand(HEIGHT, WIDTH, generator=generator)).double()
+    loss = SkyMask(weight=1.0, eps=1e-9)(rendering(alpha=alpha), frame(sky=sky), SCENE)
+    plain = torch.nn.functional.binary_cross_entropy(alpha, (~sky).double())
+    torch.testing.assert_close(loss, plain, rtol=1e-7, atol=0)  # eps / 0.1
+
+
+def test_sky_without_eps_is_refused():
+    with pytest.raises(ValueError, match="eps > 0"):
+        SkyMask(eps=0.0)
+
+
 def test_depth_compares_only_measured_pixels():
     measured = torch.zeros(HEIGHT, WIDTH)
     measured[2, 3], measured[5, 5], measured[7, 7] = 4.0, 200.0, 0.1
