@@ -83,7 +83,7 @@ def test_the_groups_hold_every_parameter_once_under_its_name(visible_only):
 
 def test_the_longest_name_wins_and_a_missing_one_is_an_error():
     rates = {"means": LearningRate(1.0), "rows.means": LearningRate(2.0)}
-    with pytest.raises(ValueError, match="'rows.log_scales' has no learning rate: add one to node.background"):
+    with pytest.raises(ValueError, match=r"'rows\.log_scales' has no learning rate: add one to node\.background"):
         OptimizerSettings().build(SceneGraph({"background": background(2, learning_rates=rates)}), 1.0)
     rates["rows"] = LearningRate(3.0)
     by_name = groups(OptimizerSettings().build(SceneGraph({"background": background(2, learning_rates=rates)}), 1.0))
