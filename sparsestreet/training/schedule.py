@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+ROUNDING = 1e-6
+"""Steps by which a fraction times max_steps may lie beside the step that is meant: 0.29 * 100 is 28.999999999999996."""
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -26,7 +29,8 @@ class Interval:
 
     def due(self, step: int, max_steps: int) -> bool:
         """Whether the event happens after ``step`` (1 is the first) of ``max_steps`` optimizer steps."""
-        return self.start * max_steps <= step <= self.stop * max_steps and step % self.every == 0
+        begun = step >= self.start * max_steps - ROUNDING
+        return begun and step <= self.last(max_steps) and step % self.every == 0
 
     def closes(self, step: int, max_steps: int) -> bool:
         """Whether ``step`` is the last one inside the interval."""
@@ -34,11 +38,16 @@ class Interval:
 
     def last(self, max_steps: int) -> int:
         """The last step inside the interval."""
-        return int(self.stop * max_steps)
+        return last_step(self.stop, max_steps)
+
+
+def last_step(fraction: float, max_steps: int) -> int:
+    """The last step up to a fraction of the run, itself included."""
+    return int(fraction * max_steps + ROUNDING)
 
 
 def milestone(fraction: float, max_steps: int) -> int:
     """The step (at least 1) of a single event at a fraction of the run."""
     if not 0 <= fraction <= 1:
         raise ValueError(f"a milestone of the run is a fraction in [0, 1], got {fraction}")
-    return max(1, int(fraction * max_steps))
+    return max(1, last_step(fraction, max_steps))

@@ -1,35 +1,65 @@
+"""The terms of the loss against hand values, other libraries and finite differences, with random cotangents."""
+
 import inspect
-from dataclasses import replace
+from collections.abc import Callable
 
 import kornia
+import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from sparsestreet.ops.ssim import ssim
-from sparsestreet.scene.graph import MaskTerm
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.rendering import SceneRendering
-from sparsestreet.training.losses import InverseDepth, MaskSparsity, Photometric, SkyMask
-from sparsestreet.types import Camera, Frame, Rendering
+from sparsestreet.training.losses import InverseDepth, Loss, MaskSparsity, Photometric, SkyMask
+from sparsestreet.types import Frame, Rendering
+from tests.training.stubs import background, frame_at, rigid, set_rows
 
 HEIGHT, WIDTH = 13, 17
+SCENE = SceneGraph({"background": background(1)})
+"""Of the losses only the masks' asks the scene anything."""
 
 
-def frame(generator, **known) -> Frame:
-    camera = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
-    image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), dtype=torch.uint8, generator=generator)
-    return Frame(frame_index=0, time=0.0, camera_index=0, camera=camera, image=image, **known)
+def frame(**known: Tensor) -> Frame:
+    return frame_at(0, WIDTH, HEIGHT, **known)
 
 
-def rendering(rgb=None, alpha=None, depth=None, rows=None, mask_terms=None) -> SceneRendering:
+def rendering(
+    rgb: Tensor | None = None,
+    alpha: Tensor | None = None,
+    depth: Tensor | None = None,
+    radii: Tensor | None = None,
+    spans: dict[str, slice] | None = None,
+) -> SceneRendering:
     rgb = torch.zeros(HEIGHT, WIDTH, 3) if rgb is None else rgb
     alpha = torch.zeros(HEIGHT, WIDTH) if alpha is None else alpha
     depth = torch.ones(HEIGHT, WIDTH) if depth is None else depth
-    splats = Rendering(rgb, alpha, depth, torch.zeros(0), torch.zeros(0, 2))
-    return SceneRendering(rgb, alpha, depth, splats, rows or {}, mask_terms or {})
+    radii = torch.zeros(0) if radii is None else radii
+    splats = Rendering(rgb, alpha, depth, radii, torch.zeros(len(radii), 2))
+    return SceneRendering(rgb, alpha, depth, splats, spans or {})
+
+
+def check_gradient(term: Callable[[Tensor], Tensor], values: Tensor, generator: torch.Generator) -> None:
+    """A random cotangent of the term against central differences in float64, in a random direction and everywhere."""
+    values = values.double().requires_grad_()
+    cotangent = torch.randn((), dtype=torch.float64, generator=generator)
+    (gradient,) = torch.autograd.grad(term(values), values, cotangent)
+    step = 1e-6
+    for direction in (
+        torch.randn(values.shape, dtype=torch.float64, generator=generator),
+        torch.ones_like(values),
+        torch.nn.functional.one_hot(torch.tensor(values.numel() // 2), values.numel()).reshape(values.shape).double(),
+    ):
+        ahead, behind = term(values.detach() + step * direction), term(values.detach() - step * direction)
+        expected = cotangent * (ahead - behind) / (2 * step)
+        # The difference of two numbers of size 1 is known to 1e-16 / 1e-6, its curvature to step squared.
+        torch.testing.assert_close((gradient * direction).sum(), expected, rtol=1e-6, atol=1e-8)
 
 
 @pytest.fixture
-def generator():
+def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
@@ -60,85 +90,206 @@ def test_ssim_of_images_of_different_sizes_is_an_error():
         inspect.unwrap(ssim)(torch.zeros(11, 12, 3), torch.zeros(12, 11, 3))
 
 
-def test_photometric_mixes_l1_and_dissimilarity(generator):
-    seen = frame(generator)
+def test_photometric_mixes_l1_and_dissimilarity():
+    seen = frame()
     truth = seen.image.float() / 255
     rgb = truth + 0.1
-    l1_only = Photometric(weight=2.0, lambda_dssim=0.0)(rendering(rgb), seen)
+    l1_only = Photometric(weight=2.0, lambda_dssim=0.0)(rendering(rgb), seen, SCENE)
     assert float(l1_only) == pytest.approx(0.2, abs=1e-6)
-    mixed = Photometric(weight=1.0, lambda_dssim=0.25)(rendering(rgb), seen)
+    mixed = Photometric(weight=1.0, lambda_dssim=0.25)(rendering(rgb), seen, SCENE)
     assert float(mixed) == pytest.approx(0.75 * 0.1 + 0.25 * (1 - float(ssim(rgb, truth))), abs=1e-6)
 
 
-def test_saturated_pixels_keep_their_gradient(generator):
-    seen = frame(generator)
+def test_photometric_and_its_gradient_equal_numpy_and_kornia(generator):
+    """Value and gradient of the whole term, with a random cotangent."""
+    seen = frame()
+    rgb = torch.rand(HEIGHT, WIDTH, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    truth = seen.image.double() / 255
+    planes = (rgb.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
+    dissimilarity = 1 - kornia.metrics.ssim(*planes, window_size=11, padding="valid").mean()
+    difference = rgb.detach().numpy() - truth.numpy()
+    expected = 3.0 * (0.7 * np.abs(difference).mean() + 0.3 * dissimilarity.item())
+    ours = Photometric(weight=3.0, lambda_dssim=0.3)(rendering(rgb), seen, SCENE)
+    assert ours.item() == pytest.approx(expected, rel=1e-8)
+    cotangent = torch.randn((), dtype=torch.float64, generator=generator)
+    l1_gradient = 3.0 * 0.7 * torch.from_numpy(np.sign(difference)) / difference.size
+    ssim_gradient = 3.0 * 0.3 * torch.autograd.grad(dissimilarity, rgb)[0]
+    (gradient,) = torch.autograd.grad(ours, rgb, cotangent)
+    # kornia adds 1e-12 to the denominator.
+    torch.testing.assert_close(gradient, cotangent * (l1_gradient + ssim_gradient), rtol=1e-6, atol=1e-12)
+
+
+def test_saturated_pixels_keep_their_gradient():
     rgb = torch.full((HEIGHT, WIDTH, 3), 1.5, requires_grad=True)
-    Photometric(lambda_dssim=0.0)(rendering(rgb), seen).backward()
+    Photometric(lambda_dssim=0.0)(rendering(rgb), frame(), SCENE).backward()
     assert bool((rgb.grad > 0).all())
 
 
-def test_sky_pushes_alpha_out_of_the_sky_and_up_elsewhere(generator):
+def half_sky() -> Tensor:
     sky = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     sky[:4] = True
-    alpha = torch.full((HEIGHT, WIDTH), 0.5, requires_grad=True)
-    loss = SkyMask(weight=0.3)(rendering(alpha=alpha), frame(generator, sky=sky))
-    assert loss.item() == pytest.approx(0.3 * 0.6931472, rel=1e-6)
-    loss.backward()
-    assert bool((alpha.grad[sky] > 0).all())
-    assert bool((alpha.grad[~sky] < 0).all())
+    return sky
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_sky_is_finite_at_alpha_zero_and_one(generator, value):
-    alpha = torch.full((HEIGHT, WIDTH), value, requires_grad=True)
+@pytest.mark.parametrize(
+    ("alpha", "in_the_sky"),
+    # -log((1 - alpha + 0.001) / 1.001) and -log((alpha + 0.001) / 1.001), by hand.
+    [(0.0, (0.0, 6.9087548)), (0.5, (0.6921486, 0.6921486)), (1.0, (6.9087548, 0.0)), (0.9991, (6.2669008, 0.0008995))],
+)
+def test_sky_by_hand(alpha, in_the_sky):
+    sky = half_sky()
+    share = float(sky.float().mean())
+    seen = rendering(alpha=torch.full((HEIGHT, WIDTH), alpha, dtype=torch.float64))
+    loss = SkyMask(weight=0.3)(seen, frame(sky=sky), SCENE)
+    assert loss.item() == pytest.approx(0.3 * (share * in_the_sky[0] + (1 - share) * in_the_sky[1]), abs=1e-7)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-4, 0.3, 0.9989, 0.9991, 1.0])
+def test_sky_pushes_alpha_out_of_the_sky_and_up_elsewhere_at_any_alpha(alpha):
+    sky = half_sky()
+    values = torch.full((HEIGHT, WIDTH), alpha, requires_grad=True)
+    SkyMask(weight=0.3, eps=1e-3)(rendering(alpha=values), frame(sky=sky), SCENE).backward()
+    # Per pixel 1 / (error + eps) and no more than 1 / eps; float32 knows 1 - alpha + eps to 6e-8 of 1e-3.
+    gradient = values.grad * sky.numel() / 0.3
+    assert gradient[sky].unique().tolist() == pytest.approx([1 / (1 - alpha + 1e-3)], rel=1e-4)
+    assert gradient[~sky].unique().tolist() == pytest.approx([-1 / (alpha + 1e-3)], rel=1e-4)
+
+
+def test_sky_gradient_equals_finite_differences(generator):
     sky = torch.rand(HEIGHT, WIDTH, generator=generator) > 0.5
-    loss = SkyMask()(rendering(alpha=alpha), frame(generator, sky=sky))
-    loss.backward()
-    assert bool(loss.isfinite())
-    assert bool(alpha.grad.isfinite().all())
+    alpha = torch.rand(HEIGHT, WIDTH, generator=generator)
+    check_gradient(lambda values: SkyMask(weight=0.7)(rendering(alpha=values), frame(sky=sky), SCENE), alpha, generator)
 
 
-def test_depth_compares_only_measured_pixels(generator):
+def test_sky_approaches_the_plain_cross_entropy_as_eps_vanishes(generator):
+    sky = torch.rand(HEIGHT, WIDTH, generator=generator) > 0.5
+    alpha = (0.1 + 0.8 * torch.rand(HEIGHT, WIDTH, generator=generator)).double()
+    loss = SkyMask(weight=1.0, eps=1e-9)(rendering(alpha=alpha), frame(sky=sky), SCENE)
+    plain = torch.nn.functional.binary_cross_entropy(alpha, (~sky).double())
+    torch.testing.assert_close(loss, plain, rtol=1e-7, atol=0)  # eps / 0.1
+
+
+def test_sky_without_eps_is_refused():
+    with pytest.raises(ValueError, match="eps > 0"):
+        SkyMask(eps=0.0)
+
+
+def test_depth_compares_only_measured_pixels():
     measured = torch.zeros(HEIGHT, WIDTH)
     measured[2, 3], measured[5, 5], measured[7, 7] = 4.0, 200.0, 0.1
     depth = torch.full((HEIGHT, WIDTH), 2.0, requires_grad=True)
-    loss = InverseDepth(weight=0.5)(rendering(depth=depth), frame(generator, depth=measured))
+    loss = InverseDepth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
     assert loss.item() == pytest.approx(0.5 * abs(1 / 2 - 1 / 4))
     loss.backward()
     assert torch.nonzero(depth.grad).tolist() == [[2, 3]]
 
 
-def test_depth_of_an_image_without_returns_is_zero(generator):
+def test_depth_leaves_out_measured_pixels_in_which_nothing_is_rendered():
+    """The op answers depth 0 where no Gaussian is: such a pixel neither counts nor makes anything infinite."""
+    measured = torch.zeros(HEIGHT, WIDTH)
+    measured[2, 3], measured[6, 8] = 4.0, 5.0
+    depth = torch.full((HEIGHT, WIDTH), 2.0)
+    depth[6, 8] = 0.0
+    depth.requires_grad_()
+    loss = InverseDepth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
+    assert loss.item() == pytest.approx(0.5 * (1 / 2 - 1 / 4))  # the mean of one pixel, not of two
+    loss.backward()
+    assert bool(depth.grad.isfinite().all())
+    assert torch.nonzero(depth.grad).tolist() == [[2, 3]]
+
+
+def test_depth_limits_by_numpy(generator):
+    """The returns inside the limits, and only those: the mean over them, one by one."""
+    depth = 0.4 + 10 * torch.rand(HEIGHT, WIDTH, generator=generator).double()
+    measured = torch.rand(HEIGHT, WIDTH, generator=generator) * 12
+    depth[0, :2], measured[0, :2] = 3.0, torch.tensor([1.999, 2.001])
+    depth[1, :2], measured[1, :2] = 3.0, torch.tensor([8.999, 9.001])
+    seen = frame(depth=measured)
+    terms = [
+        abs(1 / rendered - 1 / lidar)
+        for rendered, lidar in zip(depth.flatten().tolist(), measured.flatten().tolist(), strict=True)
+        if 2.0 < lidar < 9.0 and rendered > 2.0
+    ]
+    loss = InverseDepth(weight=0.25, nearest=2.0, farthest=9.0)(rendering(depth=depth), seen, SCENE)
+    assert loss.item() == pytest.approx(0.25 * sum(terms) / len(terms), rel=1e-6)  # lidar is float32
+
+
+def test_depth_gradient_equals_finite_differences(generator):
+    depth = 2 + 10 * torch.rand(HEIGHT, WIDTH, generator=generator)
+    measured = torch.rand(HEIGHT, WIDTH, generator=generator) * 12
+    check_gradient(
+        lambda values: InverseDepth(weight=0.7)(rendering(depth=values), frame(depth=measured), SCENE), depth, generator
+    )
+
+
+def test_depth_of_an_image_without_returns_is_zero():
     depth = torch.ones(HEIGHT, WIDTH, requires_grad=True)
-    loss = InverseDepth()(rendering(depth=depth), frame(generator, depth=torch.zeros(HEIGHT, WIDTH)))
+    loss = InverseDepth()(rendering(depth=depth), frame(depth=torch.zeros(HEIGHT, WIDTH)), SCENE)
     loss.backward()
     assert loss.item() == 0.0
     assert bool((depth.grad == 0).all())
 
 
-def test_terms_apply_only_where_the_data_has_them(generator):
-    assert not SkyMask().applies(frame(generator))
-    assert not InverseDepth().applies(frame(generator))
+@pytest.mark.parametrize(
+    ("loss", "without", "known"),
+    [
+        (SkyMask(), False, {"sky": torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)}),
+        (InverseDepth(), False, {"depth": torch.zeros(HEIGHT, WIDTH)}),
+        (Photometric(), True, {}),
+        (MaskSparsity(), True, {}),
+    ],
+)
+def test_terms_apply_only_where_the_data_has_them(loss: Loss, without: bool, known: dict[str, Tensor]):
+    assert loss.applies(frame()) is without
+    assert loss.applies(frame(**known))
 
 
-def test_mask_sparsity_is_the_papers_formula(generator):
-    scores = {"background": torch.tensor([0.5, 0.25]), "rigid": torch.tensor([1.0])}
-    terms = {"background": MaskTerm(scores["background"], 2.5e-3), "rigid": MaskTerm(scores["rigid"], 1e-4)}
-    rows = {"background": slice(0, 2), "rigid": slice(2, 3), "unmasked": slice(3, 10)}
-    loss = MaskSparsity(weight=2.0)(rendering(rows=rows, mask_terms=terms), frame(generator))
-    assert loss.item() == pytest.approx(2.0 * (2.5e-3 * 0.75 + 1e-4 * 1.0) / 10, rel=1e-6)
+def masked_scene(visible_only: bool = False) -> SceneGraph:
+    """3 masked rows, 4 without a mask, 2 masked ones."""
+    nodes = {
+        "background": background(3, mask=StaticMaskSettings(2.5e-3)),
+        "unmasked": background(4),
+        "rigid": rigid(2, mask=StaticMaskSettings(1e-4, visible_only=visible_only)),
+    }
+    set_rows(nodes["background"], "mask_logits", {0: 0.0, 1: 2.0, 2: -1.0})
+    set_rows(nodes["rigid"], "mask_logits", {0: 1.0, 1: -3.0})
+    return SceneGraph(nodes)
 
 
-def test_mask_sparsity_of_what_is_visible_only(generator):
-    """The same K, but rows that the view does not draw add nothing and get no gradient."""
-    scores = torch.tensor([0.5, 0.25, 0.75], requires_grad=True)
-    seen = rendering(rows={"rigid": slice(1, 4)}, mask_terms={"rigid": MaskTerm(scores, 2.0, visible_only=True)})
-    splats = replace(seen.splats, radii=torch.tensor([1.0, 0.0, 3.0, 2.0]), screen_offsets=torch.zeros(4, 2))
-    loss = MaskSparsity()(replace(seen, splats=splats), frame(generator))
-    assert loss.item() == pytest.approx(2.0 * (0.25 + 0.75) / 3)
+SPANS = {"background": slice(0, 3), "unmasked": slice(3, 7), "rigid": slice(7, 9)}
+
+
+def sigmoid(*logits: float) -> np.ndarray:
+    return 1 / (1 + np.exp(-np.array(logits)))
+
+
+def test_mask_sparsity_is_the_papers_formula():
+    """(lambda_m / K) sum_n lambda_n sum_k sigma(m_k), K over all rows of all nodes, with its gradient."""
+    scene = masked_scene()
+    loss = MaskSparsity(weight=2.0)(rendering(radii=torch.zeros(9), spans=SPANS), frame(), scene)
+    standing, moving = sigmoid(0.0, 2.0, -1.0), sigmoid(1.0, -3.0)
+    assert loss.item() == pytest.approx(2.0 / 9 * (2.5e-3 * standing.sum() + 1e-4 * moving.sum()), rel=1e-6)
+    loss.backward(torch.tensor(-1.7))
+    for name, weight, scores in (("background", 2.5e-3, standing), ("rigid", 1e-4, moving)):
+        expected = -1.7 * 2.0 / 9 * weight * scores * (1 - scores)
+        assert scene.nodes[name].rows.mask_logits.grad.tolist() == pytest.approx(expected.tolist(), rel=1e-5), name
+
+
+def test_mask_sparsity_of_what_is_visible_only():
+    """The same K, but rows of such a mask that the view does not draw add nothing and get no gradient."""
+    scene = masked_scene(visible_only=True)
+    radii = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 2.0])
+    loss = MaskSparsity()(rendering(radii=radii, spans=SPANS), frame(), scene)
+    standing, moving = sigmoid(0.0, 2.0, -1.0), sigmoid(-3.0)
+    assert loss.item() == pytest.approx((2.5e-3 * standing.sum() + 1e-4 * moving.sum()) / 9, rel=1e-6)
     loss.backward()
-    assert scores.grad.tolist() == pytest.approx([0.0, 2 / 3, 2 / 3])
+    gradient = scene.nodes["rigid"].rows.mask_logits.grad
+    assert gradient[0] == 0
+    assert float(gradient[1]) == pytest.approx(1e-4 / 9 * float(moving[0] * (1 - moving[0])), rel=1e-5)
 
 
-def test_mask_sparsity_of_a_scene_without_rows_or_masks_is_zero(generator):
-    assert float(MaskSparsity()(rendering(), frame(generator))) == 0.0
+def test_mask_sparsity_of_a_scene_without_rows_or_masks_is_zero():
+    empty = SceneGraph({"background": background(0, mask=StaticMaskSettings(1.0))})
+    nothing = rendering(spans={"background": slice(0, 0)})
+    assert MaskSparsity()(nothing, frame(), empty).item() == 0.0
+    assert MaskSparsity()(rendering(), frame(), SCENE).item() == 0.0

@@ -1,48 +1,114 @@
+"""One group a parameter, with the rate that its node says; what decays, what rests, what scales with the scene."""
+
 import pytest
 import torch
-from torch import nn
 
-from sparsestreet.training.optimizer import LearningRate, OptimizerSettings
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.sky import Sky, SkySettings
+from sparsestreet.training.optimizer import OptimizerSettings, set_rates
+from sparsestreet.training.visible_adam import VisibleAdam
+from tests.training.stubs import background, rigid
+
+RATES = {
+    "rows": LearningRate(1e-3),
+    "means": LearningRate(1.6e-4, 1.6e-6, scale_by_scene_radius=True),
+    "sh_rest": LearningRate(2e-2, 5e-3, start=0.4),
+}
 
 
-class Scene(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.rows = nn.Module()
-        self.rows.means = nn.Parameter(torch.zeros(2, 3))
-        self.texels = nn.Parameter(torch.zeros(4))
+def scene() -> SceneGraph:
+    rates = {
+        "rows": LearningRate(3e-3),
+        "rotation_deltas": LearningRate(1e-5),
+        "translation_deltas": LearningRate(2e-5),
+    }
+    nodes = {"background": background(3, learning_rates=RATES), "rigid": rigid(4, learning_rates=rates)}
+    return SceneGraph(nodes, Sky(SkySettings(resolution=2, learning_rate=LearningRate(1e-2))))
+
+
+def groups(optimizer: torch.optim.Optimizer) -> dict[str, dict]:
+    return {group["name"]: group for group in optimizer.param_groups}
 
 
 def test_rates_scale_with_the_scene_and_decay_log_linearly():
-    optimization = OptimizerSettings(
-        {"means": LearningRate(1.6e-4, 1.6e-6, scale_by_scene_radius=True), "texels": LearningRate(1e-2)}
-    )
-    scene = Scene()
-    optimizer = optimization.build(scene, radius=10.0)
-    by_name = {group["name"]: group for group in optimizer.param_groups}
-    assert by_name["rows.means"]["lr"] == pytest.approx(1.6e-3)
-    optimization.set_rates(optimizer, 0.5)
-    assert by_name["rows.means"]["lr"] == pytest.approx(1.6e-4)  # half way in the logarithm
-    assert by_name["texels"]["lr"] == pytest.approx(1e-2)
+    street = scene()
+    optimizer = OptimizerSettings().build(street, radius=10.0)
+    by_name = groups(optimizer)
+    assert by_name["nodes.background.rows.means"]["lr"] == pytest.approx(1.6e-3)
+    for progress, means in ((0.0, 1.6e-3), (0.5, 1.6e-4), (0.75, 1.6e-3 * 10**-1.5), (1.0, 1.6e-5)):
+        set_rates(optimizer, street, progress)
+        assert by_name["nodes.background.rows.means"]["lr"] == pytest.approx(means)
+        assert by_name["nodes.background.rows.sh_dc"]["lr"] == pytest.approx(1e-3)
+        assert by_name["sky.texels"]["lr"] == pytest.approx(1e-2)
 
 
-def test_the_groups_hold_every_parameter_once():
-    scene = Scene()
-    optimizer = OptimizerSettings({"means": LearningRate(1.0), "texels": LearningRate(1.0)}).build(scene, 1.0)
-    held = [id(parameter) for group in optimizer.param_groups for parameter in group["params"]]
-    assert sorted(held) == sorted(id(parameter) for parameter in scene.parameters())
+def test_every_node_has_rates_of_its_own():
+    by_name = groups(OptimizerSettings().build(scene(), radius=10.0))
+    assert by_name["nodes.rigid.rows.means"]["lr"] == 3e-3  # neither the background's nor times the radius
+    assert by_name["nodes.rigid.rotation_deltas"]["lr"] == 1e-5
+    assert by_name["nodes.rigid.translation_deltas"]["lr"] == 2e-5
+
+
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_a_parameter_with_a_start_rests_before_and_moves_after(visible_only):
+    street = scene()
+    optimizer = OptimizerSettings(visible_only=visible_only).build(street, radius=1.0)
+    resting, moving = (street.nodes["background"].rows.get_parameter(name) for name in ("sh_rest", "sh_dc"))
+    first, first_moving = resting.detach().clone(), moving.detach().clone()
+    for progress in (0.0, 0.2, 0.39):
+        take_step(optimizer, street, progress)
+        assert torch.equal(resting, first), progress
+    assert not torch.equal(moving, first_moving)
+    take_step(optimizer, street, 0.4)
+    # The decay counts from the start of the run: 2e-2 * (1/4)^0.4; Adam's step is about one rate.
+    assert groups(optimizer)["nodes.background.rows.sh_rest"]["lr"] == pytest.approx(2e-2 * 0.25**0.4)
+    torch.testing.assert_close(resting.detach(), first - 2e-2 * 0.25**0.4)
+
+
+def take_step(optimizer: torch.optim.Optimizer, street: SceneGraph, progress: float) -> None:
+    for parameter in street.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    set_rates(optimizer, street, progress)
+    optimizer.step()
+
+
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_the_groups_hold_every_parameter_once_under_its_name(visible_only):
+    street = scene()
+    optimizer = OptimizerSettings(visible_only=visible_only).build(street, 1.0)
+    held = [(group["name"], id(parameter)) for group in optimizer.param_groups for parameter in group["params"]]
+    assert sorted(held) == sorted((name, id(parameter)) for name, parameter in street.named_parameters())
 
 
 def test_the_longest_name_wins_and_a_missing_one_is_an_error():
-    optimization = OptimizerSettings({"means": LearningRate(1.0), "rigid.rows.means": LearningRate(2.0)})
-    assert optimization.rate_of("nodes.rigid.rows.means").initial == 2.0
-    assert optimization.rate_of("nodes.background.rows.means").initial == 1.0
-    with pytest.raises(ValueError, match="log_scales' has no learning rate"):
-        optimization.rate_of("nodes.rigid.rows.log_scales")
-    with pytest.raises(ValueError, match="no learning rate"):
-        optimization.rate_of("submeans")
+    rates = {"means": LearningRate(1.0), "rows.means": LearningRate(2.0)}
+    with pytest.raises(ValueError, match=r"'rows\.log_scales' has no learning rate: add one to node\.background"):
+        OptimizerSettings().build(SceneGraph({"background": background(2, learning_rates=rates)}), 1.0)
+    rates["rows"] = LearningRate(3.0)
+    by_name = groups(OptimizerSettings().build(SceneGraph({"background": background(2, learning_rates=rates)}), 1.0))
+    assert by_name["nodes.background.rows.means"]["lr"] == 2.0
+    assert by_name["nodes.background.rows.log_scales"]["lr"] == 3.0
 
 
-def test_adams_epsilon_is_small_enough_for_mask_logits():
-    optimizer = OptimizerSettings({"means": LearningRate(1.0), "texels": LearningRate(1.0)}).build(Scene(), 1.0)
-    assert optimizer.defaults["eps"] == 1e-15
+@pytest.mark.parametrize(("visible_only", "kind"), [(False, torch.optim.Adam), (True, VisibleAdam)])
+def test_settings_choose_the_optimizer_and_its_epsilon(visible_only, kind):
+    """The default is small enough for mask logits, whose only gradient may be lambda_n / K."""
+    default = OptimizerSettings(visible_only=visible_only).build(scene(), 1.0)
+    coarse = OptimizerSettings(eps=1e-3, visible_only=visible_only).build(scene(), 1.0)
+    assert type(default) is kind
+    assert {group["eps"] for group in default.param_groups} == {1e-15}
+    assert {group["eps"] for group in coarse.param_groups} == {1e-3}
+
+
+@pytest.mark.parametrize("visible_only", [False, True])
+@pytest.mark.parametrize("eps", [1e-15, 1e-3])
+def test_epsilon_slows_what_has_a_small_gradient(eps, visible_only):
+    """Adam's first step by hand: rate * g / (|g| + eps)."""
+    street = scene()
+    optimizer = OptimizerSettings(eps=eps, visible_only=visible_only).build(street, 1.0)
+    texels = street.sky.texels
+    texels.grad = torch.full_like(texels, 1e-3)
+    optimizer.step()
+    moved = 0.5 - float(texels.detach()[0, 0, 0, 0])
+    assert moved == pytest.approx(1e-2 * 1e-3 / (1e-3 + eps), rel=1e-4)  # 0.5 is known to 3e-8

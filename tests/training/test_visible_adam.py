@@ -12,11 +12,14 @@ from torch import Tensor, nn
 from sparsestreet.cli.compose import CONF
 from sparsestreet.ops import splat
 from sparsestreet.scene.gaussians import RowPlan, Rows
-from sparsestreet.training.optimizer import LearningRate, OptimizerSettings
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.visible_adam import VisibleAdam, seen_rows
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import camera, cast, random_gaussians
-from tests.training.density.scenes import make_rows
+from tests.training.stubs import background
 
 LR = 0.01
 
@@ -26,11 +29,16 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def table(generator: torch.Generator, number: int = 9) -> tuple[Rows, torch.optim.Optimizer]:
-    """Rows in float64 under the optimizer that the configuration chooses."""
-    rows = make_rows(number, generator).double()
-    rates = {name: LearningRate(LR) for name, _ in rows.named_parameters()}
-    return rows, OptimizerSettings(rates, visible_only=True).build(rows, 1.0)
+def scene(number: int = 9) -> SceneGraph:
+    """Masked rows in float64."""
+    rates = {"rows": LearningRate(LR)}
+    return SceneGraph({"background": background(number, mask=StaticMaskSettings(1.0), learning_rates=rates)}).double()
+
+
+def table() -> tuple[Rows, torch.optim.Optimizer]:
+    """Its rows under the optimizer that the configuration chooses."""
+    street = scene()
+    return street.nodes["background"].rows, OptimizerSettings(visible_only=True).build(street, 1.0)
 
 
 def give_gradients(rows: nn.Module, seen: Tensor, generator: torch.Generator) -> None:
@@ -55,7 +63,7 @@ class OneRow:
 
 
 def test_moments_follow_their_rows_through_a_plan(generator):
-    rows, optimizer = table(generator)
+    rows, optimizer = table()
     simulated = {name: [OneRow(value) for value in column.detach()] for name, column in rows.named_parameters()}
     plan = RowPlan(9, torch.tensor([8, 1, 1, 4, 2]), torch.tensor([False, False, True, False, False]))
     for count in range(1, 7):
@@ -80,7 +88,7 @@ def test_moments_follow_their_rows_through_a_plan(generator):
 
 
 def test_rows_without_gradient_keep_every_bit(generator):
-    rows, optimizer = table(generator)
+    rows, optimizer = table()
     give_gradients(rows, torch.ones(9, dtype=torch.bool), generator)
     optimizer.step()
     seen = torch.arange(9) % 2 == 0
@@ -128,12 +136,12 @@ def test_it_goes_on_from_its_own_checkpoint_and_from_adams(generator):
     ends = []
     for first, second in (("adam", "adam"), ("adam", "visible"), ("visible", "visible")):
         generator.manual_seed(4)
-        rows = make_rows(5, generator).double()
-        rates = {name: LearningRate(LR) for name, _ in rows.named_parameters()}
-        kinds = {kind: OptimizerSettings(rates, visible_only=kind == "visible") for kind in ("adam", "visible")}
+        street = scene(5)
+        rows = street.nodes["background"].rows
+        kinds = {kind: OptimizerSettings(visible_only=kind == "visible") for kind in ("adam", "visible")}
         state = None
         for kind in (first, second):
-            optimizer = kinds[kind].build(rows, 1.0)
+            optimizer = kinds[kind].build(street, 1.0)
             if state is not None:
                 optimizer.load_state_dict(state)
             for _ in range(3):
@@ -165,11 +173,9 @@ def test_a_closure_computes_gradients_and_parameters_without_any_rest(generator)
 @pytest.mark.parametrize(("override", "kind"), [("adam", torch.optim.Adam), ("visible_adam", VisibleAdam)])
 def test_the_configuration_chooses(override, kind):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        chosen = compose("train", [f"optimization={override}"]).optimization
-        default = compose("train").optimization
-    parameter = nn.ParameterDict({"means": nn.Parameter(torch.zeros(2, 3))})
-    optimizer = instantiate(chosen, _convert_="all").build(parameter, 1.0)
+        chosen = compose("train", [f"optimizer={override}"]).optimizer
+        default = compose("train").optimizer
+    optimizer = instantiate(chosen, _convert_="all").build(scene(2), 1.0)
     assert type(optimizer) is kind
     assert optimizer.defaults["eps"] == 1e-15
-    assert chosen.rates == default.rates
     assert (chosen == default) == (override == "adam")

@@ -6,7 +6,7 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowChange, RowListener, resize_rows
-from sparsestreet.training.schedule import Interval
+from sparsestreet.training.schedule import Interval, last_step
 from sparsestreet.training.system import StreetSystem
 
 
@@ -87,7 +87,7 @@ class DensityControl(Callback, RowListener):
         node, statistics = system.scene.nodes[name], self.statistics[name]
         strategy = node.settings.density
         when = {"radius": system.radius, "progress": step / steps}
-        if step <= int(self.densify_until * steps):
+        if step <= last_step(self.densify_until, steps):
             limit = node.settings.max_gaussians
             plan = strategy.densify(node.rows, statistics, max_gaussians=limit, generator=self.generator, **when)
             resize_rows(trainer, system, name, plan, "densify")

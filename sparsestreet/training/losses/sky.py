@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy
 
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
@@ -14,14 +13,31 @@ from sparsestreet.types import Frame
 
 @dataclass(frozen=True)
 class SkyMask:
+    """Mean over the pixels of a cross entropy that is finite, and pulls, at every alpha.
+
+    With a = alpha, y = 0 in the sky and 1 elsewhere::
+
+        -(y log((a + eps) / (1 + eps)) + (1 - y) log((1 - a + eps) / (1 + eps)))
+
+    Its derivative is -1 / (a + eps) outside the sky and 1 / (1 - a + eps) in it: it never vanishes. Its magnitude grows
+    from 1 / (1 + eps) where alpha is right to 1 / eps where it is most wrong, the value from 0 to log((1 + eps) / eps).
+    Clamping alpha bounds both as well, but lets no gradient through where alpha is most wrong. DriveStudio's
+    ``safe_bce`` stops the value at -log 0.1, where alpha is wrong by 0.9, and keeps a gradient beyond: value and
+    gradient are then those of two functions, and here of one.
+
+    Raises ValueError for an ``eps`` that is not positive.
+    """
+
     weight: float = 0.05
-    margin: float = 1e-3
-    """Alpha is clamped to [margin, 1 - margin]: the cross entropy of an exact 0 or 1 is infinite."""
+    eps: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not self.eps > 0:
+            raise ValueError(f"the cross entropy of an alpha of 0 or 1 is finite for eps > 0 only, got {self.eps}")
 
     def applies(self, frame: Frame) -> bool:
         return frame.sky is not None
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
-        alpha = rendering.alpha.clamp(self.margin, 1 - self.margin)
-        occupied = torch.logical_not(frame.sky).to(alpha.dtype)
-        return self.weight * binary_cross_entropy(alpha, occupied)
+        right = torch.where(frame.sky, 1 - rendering.alpha, rendering.alpha)
+        return -self.weight * ((right + self.eps) / (1 + self.eps)).log().mean()

@@ -1,0 +1,304 @@
+"""When nodes are refined and reset, on which statistics, which rows go, and what a resumed run knows of it."""
+
+import copy
+
+import pytest
+import torch
+from torch import Tensor
+
+from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.nodes import Node
+from sparsestreet.scene.rendering import SceneRendering
+from sparsestreet.training.callbacks import DensityControl
+from sparsestreet.training.callbacks.resizing import resize_rows
+from sparsestreet.training.schedule import Interval
+from sparsestreet.training.system import StreetSystem
+from sparsestreet.types import Rendering
+from tests.training.stubs import (
+    AskedStrategy,
+    Listener,
+    StubTrainer,
+    background,
+    frame_at,
+    labels,
+    make_system,
+    rigid,
+    set_rows,
+)
+
+NEVER = Interval(0.0, 0.0)
+KEEPS_ALL = GradientDensity(grad_threshold=1e9, cull_opacity=0.0, cull_scale=1e9)
+
+
+def every_ten(reset_in: Interval = NEVER, *, pause: int = 0, seed: int = 0, densify_until: float = 0.9) -> DensityControl:
+    """Refines at 10, 20 ... 90 of 100 steps."""
+    return DensityControl(Interval(0.1, 0.9, every=10), densify_until, reset_in, pause_after_reset=pause, seed=seed)
+
+
+def started(control: DensityControl, **nodes: Node) -> tuple[StubTrainer, StreetSystem, Listener]:
+    listener = Listener()
+    system = make_system(nodes)
+    trainer = StubTrainer(system, [control, listener])
+    trainer.start()
+    return trainer, system, listener
+
+
+def asked_at(strategy: AskedStrategy, what: str) -> list[int]:
+    return [round(100 * given["progress"]) for given in strategy.asked if given["what"] == what]
+
+
+def test_densify_until_its_fraction_and_cull_to_the_end_of_the_interval():
+    strategy = AskedStrategy()
+    trainer, _, _ = started(every_ten(densify_until=0.5), background=background(density=strategy))
+    trainer.walk(100)
+    assert asked_at(strategy, "densify") == [10, 20, 30, 40, 50]
+    assert asked_at(strategy, "cull") == [10, 20, 30, 40, 50, 60, 70, 80, 90]
+    assert [given["what"] for given in strategy.asked[:4]] == ["densify", "cull", "densify", "cull"]
+
+
+def test_a_reset_is_followed_by_a_pause():
+    """Resets at 30 and 60, after the refinement that is due as well; none up to 20 steps later."""
+    listener, strategy = Listener(), AskedStrategy()
+    control = DensityControl(Interval(0.1, 0.9, every=10), 0.9, Interval(0.3, 0.6, every=30), pause_after_reset=20)
+    system = make_system({"background": background(density=strategy)})
+    trainer = StubTrainer(system, [control, listener])
+    trainer.start()
+    trainer.walk(100)
+    assert asked_at(strategy, "cull") == asked_at(strategy, "densify") == [10, 20, 30, 60, 90]
+    resets = [step for step, _, reason in listener.reasons if reason == "opacity reset"]
+    assert resets == [30, 60]
+    assert [reason for step, _, reason in listener.reasons if step == 30] == ["densify", "cull", "opacity reset"]
+
+
+def test_the_strategy_is_told_radius_cap_and_the_callbacks_generator():
+    strategy, control = AskedStrategy(), every_ten()
+    node = background(density=strategy, max_gaussians=77)
+    trainer, system, _ = started(control, background=node)
+    trainer.walk(10)
+    densify, cull = strategy.asked
+    assert densify["generator"] is control.generator
+    assert densify["max_gaussians"] == 77
+    assert densify["radius"] == cull["radius"] == system.radius == 10.0
+
+
+def test_every_node_has_its_own_strategy_and_one_without_keeps_its_rows():
+    first, second = AskedStrategy(), AskedStrategy()
+    nodes = {"near": background(3, density=first), "far": background(5, density=second), "rest": background(7)}
+    control = every_ten()
+    trainer, _, listener = started(control, **nodes)
+    trainer.walk(10)
+    assert [len(strategy.asked[0]["statistics"]) for strategy in (first, second)] == [3, 5]
+    assert {node for _, node, _ in listener.reasons} == {"near", "far"}
+    assert set(control.statistics) == {"near", "far"}
+
+
+def seen(system: StreetSystem, gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+    """Put a rendering with these row-wise answers where the system keeps its newest one."""
+    offsets = torch.zeros_like(gradient, requires_grad=True)
+    offsets.grad = gradient
+    image, plane = torch.zeros(height, width, 3), torch.zeros(height, width)
+    spans, start = {}, 0
+    for name, count in system.scene.counts().items():
+        spans[name] = slice(start, start + count)
+        start += count
+    system.rendering = SceneRendering(image, plane, plane, Rendering(image, plane, plane, radii, offsets), spans)
+
+
+def test_statistics_of_a_wide_image_by_hand():
+    """|(g_x W/2, g_y H/2)| of each node's own rows; radii as fractions of the width."""
+    control = every_ten()
+    nodes = {"bare": background(2), "first": background(1, density=KEEPS_ALL), "second": background(2, density=KEEPS_ALL)}
+    trainer, system, _ = started(control, **nodes)
+    # Half image: 320 by 100 pixels.
+    gradient = torch.tensor([[9.0, 9.0], [9.0, 9.0], [3 / 320, 4 / 100], [5 / 320, 12 / 100], [1.0, 1.0]])
+    seen(system, gradient, torch.tensor([9.0, 9.0, 64.0, 32.0, 0.0]), 640, 200)
+    control.on_after_backward(trainer, system)
+    torch.testing.assert_close(control.statistics["first"].mean_gradients(), torch.tensor([5.0]))
+    torch.testing.assert_close(control.statistics["second"].mean_gradients(), torch.tensor([13.0, 0.0]))
+    assert control.statistics["first"].largest_screen.tolist() == pytest.approx([0.1])
+    assert control.statistics["second"].largest_screen.tolist() == pytest.approx([0.05, 0.0])
+    assert control.statistics["second"].visits.tolist() == [1, 0]
+
+
+def test_statistics_are_those_of_the_renderings_of_the_steps():
+    """Three real steps, the gradients read from what the system rendered, against a sum of our own."""
+    control = every_ten()
+    nodes = {"first": background(6, density=KEEPS_ALL), "second": background(9, seed=3, density=KEEPS_ALL)}
+    trainer, system, _ = started(control, **nodes)
+    sums, visits = torch.zeros(15), torch.zeros(15)
+    for _ in range(3):
+        trainer.train(1, frame_at(width=40, height=16))
+        splats = system.rendering.splats
+        sums += splats.screen_offsets.grad.mul(torch.tensor([20.0, 8.0])).square().sum(1).sqrt() * (splats.radii > 0)
+        visits += splats.radii > 0
+    assert float(sums.max()) > 0
+    for name, rows in (("first", slice(0, 6)), ("second", slice(6, 15))):
+        torch.testing.assert_close(control.statistics[name].gradient_sum, sums[rows])
+        assert control.statistics[name].visits.tolist() == visits[rows].tolist()
+
+
+def test_statistics_start_anew_after_a_refinement_and_only_then():
+    strategy = AskedStrategy()
+    control = every_ten(Interval(0.1, 0.1, every=10), pause=10)
+    trainer, system, _ = started(control, background=background(4, density=strategy))
+    trainer.global_step = 8
+    trainer.train(2, frame_at())  # refined at 10, then reset; no refinement at 20
+    assert strategy.asked[0]["statistics"].visits.max() == 2
+    assert not control.statistics["background"].visits.any()
+    assert not control.statistics["background"].gradient_sum.any()
+    assert not control.statistics["background"].largest_screen.any()
+    trainer.global_step = 18
+    trainer.train(2, frame_at())
+    assert control.statistics["background"].visits.max() == 2
+    trainer.global_step = 29
+    trainer.train(1, frame_at())
+    assert strategy.asked[-1]["statistics"].visits.max() == 3  # those of the pause as well
+
+
+def test_after_the_last_refinement_nothing_is_counted_any_more():
+    control = every_ten()
+    trainer, _, _ = started(control, background=background(4, density=KEEPS_ALL))
+    trainer.global_step = 89
+    trainer.train(1, frame_at())
+    trainer.train(3, frame_at())
+    assert not control.statistics["background"].visits.any()
+    trainer.global_step = 88
+    trainer.train(1, frame_at())
+    assert control.statistics["background"].visits.any()
+
+
+def test_statistics_follow_the_rows_whoever_changes_them():
+    control = every_ten()
+    nodes = {"first": background(4, density=KEEPS_ALL), "second": background(3, density=KEEPS_ALL)}
+    trainer, system, _ = started(control, bare=background(2), **nodes)
+    for row in range(4):
+        control.statistics["first"].visits[row] = row
+    keep = torch.tensor([False, True, False, True])
+    resize_rows(trainer, system, "first", RowPlan.keep(keep), "somebody else")
+    resize_rows(trainer, system, "bare", RowPlan.keep(torch.tensor([True, False])), "somebody else")
+    assert control.statistics["first"].visits.tolist() == [1, 3]
+    assert len(control.statistics["second"]) == 3
+    trainer.walk(10)  # else the strategy would refuse them
+    assert len(system.scene.nodes["first"].rows) == 2
+
+
+def test_oversized_rows_go_after_their_fraction_and_not_before():
+    """cull_scale 0.2 of a radius of 10 m: rows 3 and 7 are larger than 2 m, row 5 is not."""
+    node = background(10, density=GradientDensity(grad_threshold=1e9, cull_scale=0.2, cull_scale_from=0.3))
+    set_rows(node, "opacity_logits", dict.fromkeys(range(10), 0.0))
+    set_rows(node, "log_scales", {3: 1.0, 5: 0.6, 7: 3.0})  # 2.7 m, 1.8 m, 20 m
+    trainer, _, listener = started(every_ten(), background=node)
+    trainer.walk(30)
+    assert labels(node) == list(range(10))
+    trainer.walk(40)
+    assert labels(node) == [0, 1, 2, 4, 5, 6, 8, 9]
+    assert [(step, reason) for step, _, reason in listener.reasons][-2:] == [(40, "densify"), (40, "cull")]
+
+
+def test_rows_outside_their_box_go_after_the_cull():
+    """Boxes of 4 x 2 x 1.5 m (even rows) and 1 x 1 x 2 m (odd ones), with 0.1 m of margin."""
+    node = rigid(8, density=KEEPS_ALL)
+    places = [[2.05, 0, 0], [0.55, 0, 0], [0, 1.15, 0], [0.65, 0, 0], [1, 0.9, -0.8], [0, 0, -1.2], [0, 0, 0.9], [0.5, 0, 1]]
+    with torch.no_grad():
+        node.rows.means.copy_(torch.tensor(places))
+    control = every_ten()
+    trainer, system, listener = started(control, rigid=node, background=background(5, density=KEEPS_ALL))
+    trainer.walk(10)
+    assert labels(node) == [0, 1, 4, 7]
+    assert node.rows.instances.tolist() == [0, 1, 0, 1]
+    assert len(control.statistics["rigid"]) == 4
+    assert [reason for _, name, reason in listener.reasons if name == "rigid"] == ["densify", "cull", "outside its box"]
+    assert len(system.scene.nodes["background"].rows) == 5
+    trainer.walk(20)  # nothing is outside any more: nobody is told of a change
+    assert [reason for step, name, reason in listener.reasons if (step, name) == (20, "rigid")] == ["densify", "cull"]
+
+
+def test_a_reset_lowers_opacities_and_forgets_their_moments_only():
+    node = background(6, density=KEEPS_ALL)
+    trainer, _, _ = started(every_ten(Interval(0.05, 0.05, every=5)), background=node)
+    trainer.train(4, frame_at())
+    before = node.rows.opacity_logits.detach().clone()
+    optimizer = trainer.optimizers[0]
+    assert optimizer.state[node.rows.opacity_logits]["exp_avg"].any()
+    trainer.walk(5)
+    limit = torch.logit(torch.tensor(0.01))
+    torch.testing.assert_close(node.rows.opacity_logits.detach(), before.clamp(max=limit))
+    assert bool((node.rows.opacity_logits < before).all())
+    for moment in ("exp_avg", "exp_avg_sq"):
+        assert not optimizer.state[node.rows.opacity_logits][moment].any()
+        assert optimizer.state[node.rows.means][moment].any()
+
+
+def splitting(count: int = 20) -> Node:
+    """Rows of which all that have been seen are split or cloned: a refinement asks chance."""
+    return background(count, density=GradientDensity(grad_threshold=0.0, split_scale=0.01, cull_opacity=0.0))
+
+
+def test_seeds_decide_where_children_lie():
+    means = []
+    for seed in (1, 1, 2):
+        node = splitting()
+        trainer, _, _ = started(every_ten(seed=seed), background=node)
+        trainer.global_step = 9
+        trainer.train(1, frame_at())
+        means.append(node.rows.means.detach())
+    assert len(means[0]) > 20
+    assert torch.equal(means[0], means[1])
+    assert not torch.equal(means[0], means[2])
+
+
+def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tmp_path):
+    """Statistics, the generator and the pause after a reset come back: cut after 24 of 30 steps, inside a pause."""
+    resets = Interval(0.1, 0.2, every=10)
+    control, node = every_ten(resets, pause=9), splitting()
+    trainer, system, _ = started(control, background=node)
+    trainer.global_step = 9
+    trainer.train(1, frame_at())
+    trainer.global_step = 18
+    trainer.train(6, frame_at())
+    torch.save(control.state_dict(), tmp_path / "control.pt")
+    resumed_node, step = copy.deepcopy(node), trainer.global_step
+    optimizer_state = copy.deepcopy(trainer.optimizers[0].state_dict())
+    trainer.train(6, frame_at())
+
+    resumed = every_ten(resets, pause=9, seed=5)
+    later = StubTrainer(make_system({"background": resumed_node}), [resumed])
+    resumed.load_state_dict(torch.load(tmp_path / "control.pt", weights_only=True))
+    later.optimizers[0].load_state_dict(optimizer_state)
+    later.global_step = step
+    later.start()
+    later.train(6, frame_at())
+    assert len(node.rows) > 40
+    for name, column in node.rows.columns().items():
+        assert torch.equal(resumed_node.rows.columns()[name], column), name
+
+
+def test_a_pause_outlives_a_resume():
+    resets = Interval(0.3, 0.3, every=10)
+    trainer, _, _ = started(control := every_ten(resets, pause=20), background=background(4, density=AskedStrategy()))
+    trainer.walk(34)
+    strategy = AskedStrategy()
+    resumed = every_ten(resets, pause=20)
+    later = StubTrainer(make_system({"background": background(4, density=strategy)}), [resumed])
+    resumed.load_state_dict(control.state_dict())
+    later.global_step = 34
+    later.start()
+    later.walk(70)
+    assert asked_at(strategy, "cull") == [60, 70]
+
+
+def test_a_state_has_the_number_of_rows_of_its_moment():
+    """A checkpoint comes from after a growth: setup, which saw the rows before, does not count."""
+    control = every_ten()
+    started(control, background=background(4, density=KEEPS_ALL))
+    resumed = every_ten()
+    started(resumed, background=background(9, density=KEEPS_ALL))
+    resumed.load_state_dict(control.state_dict())
+    assert len(resumed.statistics["background"]) == 4
+
+
+@pytest.mark.parametrize("densify_until", [0.05, 0.95])
+def test_densification_outside_the_refinement_is_refused(densify_until):
+    with pytest.raises(ValueError, match="densify_until must lie between"):
+        every_ten(densify_until=densify_until)

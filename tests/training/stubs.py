@@ -1,0 +1,241 @@
+"""Scenes of a few Gaussians to train, and a trainer reduced to what callbacks and the system ask of Lightning's."""
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from lightning import Callback, Trainer
+from torch import Tensor
+
+from sparsestreet.data.log import Split
+from sparsestreet.scene.density import DensityStatistics
+from sparsestreet.scene.gaussians import RowPlan, Rows
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid, RigidSettings
+from sparsestreet.scene.nodes.trajectory import Trajectories
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.sky import Sky
+from sparsestreet.training.callbacks.resizing import RowChange, RowListener
+from sparsestreet.training.losses import Loss, Photometric
+from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.system import StreetSystem
+from sparsestreet.types import Camera, Frame
+
+WIDTH, HEIGHT = 32, 16
+NUM_FRAMES = 5
+
+BASE = {
+    "min_gaussians": 0,
+    "max_gaussians": None,
+    "density": None,
+    "prunable": True,
+    "learning_rates": {
+        "rows": LearningRate(0.01),
+        "rotation_deltas": LearningRate(0.001),
+        "translation_deltas": LearningRate(0.001),
+    },
+}
+
+
+def make_rows(count: int, seed: int = 0, columns: Mapping[str, Tensor] | None = None, **buffers: Tensor) -> Rows:
+    """Rows in front of the camera of ``frame_at``, about 0.1 m large; the buffer ``label`` is the row's number."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 1.5, 2.0]) + torch.tensor([-1.5, -0.7, 2.0])
+    parameters = {
+        "means": means,
+        "log_scales": torch.full((count, 3), 0.1).log() + 0.2 * normal(count, 3),
+        "quaternions": normal(count, 4),
+        "opacity_logits": normal(count),
+        "sh_dc": normal(count, 1, 3),
+        "sh_rest": 0.1 * normal(count, 15, 3),
+    }
+    extra = dict(columns or {})
+    return Rows(parameters | extra, {"label": torch.arange(count), **buffers}, transient=extra.keys())
+
+
+def background(count: int = 20, *, seed: int = 0, mask: StaticMaskSettings | None = None, **changes: Any) -> Background:
+    settings = BackgroundSettings(
+        **{**BASE, "mask": mask, "masked": mask is not None, "num_lidar": 0, "num_near": 0, "num_far": 0, **changes}
+    )
+    trained = None if mask is None else mask.build(settings.min_gaussians)
+    columns = {} if trained is None else trained.initial_columns(count)
+    return Background(settings, make_rows(count, seed, columns), trained)
+
+
+def rigid(count: int = 10, *, seed: int = 1, mask: StaticMaskSettings | None = None, **changes: Any) -> Rigid:
+    """Two objects of 4 x 2 x 1.5 m and 1 x 1 x 2 m that stand at the origin; rows take turns between them."""
+    settings = RigidSettings(**{**BASE, "mask": mask, "masked": mask is not None, "box_margin": 0.1, **changes})
+    trained = None if mask is None else mask.build(settings.min_gaussians)
+    columns = {} if trained is None else trained.initial_columns(count)
+    rows = make_rows(count, seed, columns, instances=torch.arange(count) % 2)
+    still = Trajectories(
+        torch.tensor([[0.0, 1.0]] * 2),
+        torch.tensor([[[1.0, 0.0, 0.0, 0.0]] * 2] * 2),
+        torch.tensor([[[0.0, 0.0, 3.0]] * 2] * 2),
+        torch.ones(2, 2, dtype=torch.bool),
+        torch.tensor([[0.0, 1.0]] * 2),
+    )
+    sizes = torch.tensor([[4.0, 2.0, 1.5], [1.0, 1.0, 2.0]])
+    return Rigid(settings, rows, still, sizes, names=("truck", "person"), max_gap=1.0, mask=trained)
+
+
+def labels(node: Node) -> list[int]:
+    """Which of the first rows a node still has."""
+    return node.rows.label.tolist()
+
+
+def set_rows(node: Node, column: str, entries: Mapping[int, float]) -> None:
+    """Give rows by number other values."""
+    with torch.no_grad():
+        for row, value in entries.items():
+            node.rows.columns()[column][row] = value
+
+
+def frame_at(index: int = 0, width: int = WIDTH, height: int = HEIGHT, **known: Tensor) -> Frame:
+    """A random image seen from the origin along +z, with 90 degrees of horizontal view."""
+    focal = width / 2
+    intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    generator = torch.Generator().manual_seed(index)
+    image = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=generator)
+    return Frame(
+        Camera(torch.eye(4), intrinsics, width, height), index / (NUM_FRAMES - 1), index, 0, image=image, **known
+    )
+
+
+def make_system(
+    nodes: Mapping[str, Node],
+    losses: Mapping[str, Loss] | None = None,
+    optimizer: OptimizerSettings | None = None,
+    *,
+    sky: Sky | None = None,
+    radius: float = 10.0,
+    options: RenderOptions | None = None,
+    sh_interval: float = 0.1,
+) -> StreetSystem:
+    return StreetSystem(
+        SceneGraph(nodes, sky),
+        {"photometric": Photometric()} if losses is None else losses,
+        OptimizerSettings() if optimizer is None else optimizer,
+        radius=radius,
+        options=RenderOptions() if options is None else options,
+        sh_interval=sh_interval,
+    )
+
+
+class StubTrainer(Trainer):
+    """Takes steps and calls hooks in Lightning's order, without loops, loggers or devices (test_stubs compares)."""
+
+    # In place of Lightning's properties.
+    global_step = 0
+    max_steps = 0
+    optimizers: Sequence[torch.optim.Optimizer] = ()
+    datamodule: Any = None
+    is_global_zero = True
+    sanity_checking = False
+    callback_metrics: Mapping[str, Tensor] = {}
+
+    def __init__(
+        self,
+        system: StreetSystem,
+        callbacks: Iterable[Callback] = (),
+        *,
+        max_steps: int = 100,
+        train: tuple[Frame, ...] = (),
+        held_out: tuple[Frame, ...] = (),
+    ) -> None:
+        # Not Lightning's __init__: nothing of its machinery is there.
+        self.system, self.callbacks, self.max_steps = system, list(callbacks), max_steps
+        self.datamodule = SimpleNamespace(split=Split(train, held_out))
+        self.callback_metrics = {}
+        self.log_calls: list[tuple[str, float, dict[str, Any]]] = []
+        self.optimizers = [system.configure_optimizers()]
+        system.trainer = self
+        system.log, system.log_dict = self._log, self._log_dict
+        for callback in self.callbacks:
+            callback.setup(self, system, "fit")
+
+    def start(self) -> None:
+        for callback in self.callbacks:
+            callback.on_train_start(self, self.system)
+
+    def train(self, steps: int, frame: Frame) -> None:
+        """Optimizer steps on one frame."""
+        for _ in range(steps):
+            self.system.on_train_batch_start(frame, 0)
+            loss = self.system.training_step(frame, 0)
+            self.optimizers[0].zero_grad()
+            loss.backward()
+            for callback in self.callbacks:
+                callback.on_after_backward(self, self.system)
+            self.optimizers[0].step()
+            self._end_step(frame)
+
+    def walk(self, until: int) -> None:
+        """Let the steps up to ``until`` pass: callbacks hear that they ended, nothing is rendered."""
+        while self.global_step < until:
+            self._end_step(None)
+
+    def _end_step(self, frame: Frame | None) -> None:
+        self.global_step += 1
+        for callback in self.callbacks:
+            callback.on_train_batch_end(self, self.system, None, frame, 0)
+
+    def _log(self, name: str, value: float | Tensor, **how: Any) -> None:
+        self.log_calls.append((name, float(value), how))
+        self.callback_metrics[name] = torch.as_tensor(float(value))
+
+    def _log_dict(self, values: Mapping[str, Tensor], **how: Any) -> None:
+        for name, value in values.items():
+            self._log(name, value, **how)
+
+
+class Listener(Callback, RowListener):
+    """Writes down what it hears of rows."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[RowChange, RowPlan]] = []
+
+    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+        self.heard.append((change, plan))
+
+    @property
+    def reasons(self) -> list[tuple[int, str, str]]:
+        return [(change.step, change.node, change.reason) for change, _ in self.heard]
+
+
+class AskedStrategy:
+    """A density strategy that writes down what it is asked, and changes nothing."""
+
+    def __init__(self) -> None:
+        self.asked: list[dict[str, Any]] = []
+
+    def densify(
+        self,
+        rows: Rows,
+        statistics: DensityStatistics,
+        *,
+        radius: float,
+        progress: float,
+        max_gaussians: int | None,
+        generator: torch.Generator,
+    ) -> RowPlan:
+        given = {"radius": radius, "progress": progress, "max_gaussians": max_gaussians, "generator": generator}
+        return self._keep("densify", rows, statistics=copy.deepcopy(statistics), **given)
+
+    def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
+        return self._keep("cull", rows, statistics=copy.deepcopy(statistics), radius=radius, progress=progress)
+
+    def reset(self, rows: Rows) -> RowPlan:
+        return self._keep("reset", rows)
+
+    def _keep(self, what: str, rows: Rows, **given: Any) -> RowPlan:
+        self.asked.append({"what": what, **given})
+        return RowPlan.keep(torch.ones(len(rows), dtype=torch.bool))
