@@ -49,8 +49,9 @@ def report(arguments: list[str]) -> int:
     if not shown:
         print("sparsestreet report: no configuration was run on two scenes, so there is no mean", file=sys.stderr)
         return 1
-    for table in tables(shown):
-        Console().print(table)
+    console = Console()
+    for table in tables(shown, console.width):
+        console.print(table)
     if "markdown" in options:
         Path(options["markdown"]).write_text(markdown(shown))
     return 0

@@ -30,7 +30,7 @@ def compare_runs(runs: Sequence[Path], sheet: Path, *, legend: Legend | None = N
         for run, summary, name in zip(runs, summaries, names, strict=True)
     ]
     views = "held-out" if all(summary.main_split == HELD_OUT for summary in summaries) else "training"
-    title = f"{summaries[0].run.scene}: dB over {summaries[0].images[summaries[0].main_split]} {views} images"
+    title = f"{summaries[0].run.scene}: PSNR over {summaries[0].images[summaries[0].main_split]} {views} images"
     write_png(sheet, comparison_sheet(columns, title=title, legend=legend))
 
 

@@ -83,7 +83,7 @@ def differing_options(configs: Sequence[Configuration], commands: Iterable[str] 
         configs: of the runs that one table compares.
         commands: that made them; options given there are always named.
     """
-    given = {word.partition("=")[0].lstrip("+") for command in commands for word in command.split()}
+    given = given_keys(commands)
     words: list[tuple[str, ...]] = []
     named: set[tuple[str, ...]] = set()
     for key in sorted(set().union(*configs), key=lambda key: (key not in given, key.count("."), key)):
@@ -97,6 +97,16 @@ def differing_options(configs: Sequence[Configuration], commands: Iterable[str] 
             words.append(option)
         named.add(values)
     return [tuple(option[index] for option in words) for index in range(len(configs))]
+
+
+def given_keys(commands: Iterable[str]) -> set[str]:
+    """The keys of the options that stand in commands."""
+    return {word.partition("=")[0].lstrip("+") for command in commands for word in command.split() if "=" in word}
+
+
+def key_of(option: str) -> str:
+    """The key of an option in the words of ``differing_options``."""
+    return option.partition("=")[0].removeprefix("without ").removeprefix("with ")
 
 
 def _missing_part(key: str, configs: Sequence[Configuration]) -> str | None:

@@ -81,7 +81,9 @@ def comparison_sheet(
         both = list(zip(columns, pictures, strict=True))
         truth = Tile(f"truth: {_view(first)}", first.truth)
         lines.append([truth, *(Tile(column.label, picture.render) for column, picture in both)])
-        lines.append([None, *(Tile(f"error: {one.psnr[index]:.2f} dB here", picture.error) for one, picture in both)])
+        lines.append(
+            [None, *(Tile(f"error: {one.psnr[index]:.2f} dB in this image", picture.error) for one, picture in both)]
+        )
         lines.append([None, *(Tile(column.size, picture.centers) for column, picture in both)])
     return _sheet(lines, title, legend or {}, tile_width)
 

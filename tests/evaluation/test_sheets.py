@@ -81,7 +81,15 @@ def test_comparison_has_a_column_for_each_run_and_lines_of_renders_errors_and_ce
     assert order_of(sheet, rows[1]) == errors
     assert (sheet[rows[2]] == COLORS["centers"]).all(-1).sum() == 3 * 120
     assert (sheet == LEGEND["rigid"]).all(-1).sum() >= 100
-    for text in ("t", "truth: frame 3, camera 1", "run0", "run2", "error: 20.50 dB here", "run1 size", "rigid"):
+    for text in (
+        "t",
+        "truth: frame 3, camera 1",
+        "run0",
+        "run2",
+        "error: 20.50 dB in this image",
+        "run1 size",
+        "rigid",
+    ):
         assert text in written
 
 
@@ -116,8 +124,8 @@ def test_run_folders_make_a_sheet(tmp_path, written):
     assert sheet.shape[1] > 4 * 480
     assert order_of(sheet, row_within(sheet, colors["plain"])) == [COLORS["truth"], *colors.values()]
     for text in (
-        *("street: dB over 6 held-out images", "plain, 25.00 dB", "paper, 24.00 dB", "removal, 24.50 dB"),
-        *("error: 26.00 dB here", "error: 25.00 dB here", "error: 25.50 dB here"),
+        *("street: PSNR over 6 held-out images", "plain, 25.00 dB", "paper, 24.00 dB", "removal, 24.50 dB"),
+        *("error: 26.00 dB in this image", "error: 25.00 dB in this image", "error: 25.50 dB in this image"),
         *("1,200 Gaussians, held down by a cap", "600 Gaussians, 50 % of plain", "300 Gaussians, 25 % of plain"),
     ):
         assert text in written
@@ -137,9 +145,9 @@ def test_runs_of_one_label_are_told_apart(tmp_path, written):
 def test_runs_without_held_out_views_show_training_views(tmp_path, written):
     runs = [write_run(tmp_path / name, COLORS["render"], 30.0, TRAINING, label=name) for name in ("plain", "ours")]
     compare_runs(runs, tmp_path / "sheet.png")
-    assert "street: dB over 6 training images" in written
+    assert "street: PSNR over 6 training images" in written
     assert "plain, 30.00 dB" in written
-    assert "error: 31.00 dB here" in written
+    assert "error: 31.00 dB in this image" in written
 
 
 def test_what_cannot_be_compared_is_named(tmp_path):

@@ -18,15 +18,16 @@ from sparsestreet.evaluation.report.variants import variants
 ABSENT = "-"
 
 _MOST_COLUMNS = 5
-"""Variants and differences beside each other in a terminal; beyond it they stand below each other."""
+"""Variants and differences beside each other; more stand below each other where there is room."""
 
 
-def tables(sections: Sequence[Section]) -> list[Table]:
-    """The sections as rich tables for a terminal; print them with ``rich.console.Console``.
+def tables(sections: Sequence[Section], width: int = 80) -> list[Table]:
+    """The sections as rich tables for a terminal of ``width`` characters; print them with ``rich.console.Console``.
 
-    A few variants stand as columns, which fits 80 characters; many (a sweep) stand as rows.
+    Variants stand as columns, in as many tables below each other as it takes that no text is cut; many of them (a
+    sweep) stand as rows where the terminal is wide enough.
     """
-    return [_drawn(section) for section in sections]
+    return [table for section in sections for table in _drawn(section, width)]
 
 
 def markdown(sections: Sequence[Section]) -> str:
@@ -60,14 +61,43 @@ def figure(records: Sequence[RunRecord], path: Path) -> None:
     plot_runs(path, {name: some for name, some in points.items() if some})
 
 
-def _drawn(section: Section) -> Table:
+def _drawn(section: Section, width: int) -> list[Table]:
     lines = _lines(section)
-    if len(section.rows) <= _MOST_COLUMNS:
-        lines = [list(line) for line in zip(*lines, strict=True)]
+    if len(section.rows) > _MOST_COLUMNS and sum(map(_room, zip(*lines, strict=True))) < width:
+        blocks = [lines]
+    else:
+        labels, *columns = lines
+        blocks = [list(zip(labels, *some, strict=True)) for some in _fitting(columns, width - 1 - _room(labels))]
+    tables = [_table(block) for block in blocks]
     # Texts, not strings, whose square brackets rich would read as markup.
-    table = Table(title=Text(section.title), caption=Text("\n".join(section.notes)), caption_justify="left")
+    tables[0].title = Text(section.title)
+    tables[-1].caption = Text("\n".join(section.notes))
+    return tables
+
+
+def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence[str]]]:
+    """Consecutive columns in groups that fit a width, at least one in each."""
+    groups: list[list[Sequence[str]]] = []
+    left = 0
+    for column in columns:
+        if not groups or _room(column) > left:
+            groups.append([])
+            left = width
+        groups[-1].append(column)
+        left -= _room(column)
+    return groups
+
+
+def _room(column: Sequence[str]) -> int:
+    """Characters that a column takes: its heading may break between words, its cells may not."""
+    heading, *cells = column
+    return max(*map(len, heading.split()), *map(len, cells)) + 3
+
+
+def _table(lines: Sequence[Sequence[str]]) -> Table:
+    table = Table(caption_justify="left", title_justify="left")
     for index, heading in enumerate(lines[0]):
-        table.add_column(Text(heading), justify="right" if index else "left")
+        table.add_column(Text(heading), justify="right" if index else "left", overflow="fold")
     for line in lines[1:]:
         table.add_row(*map(Text, line))
     return table

@@ -1,7 +1,7 @@
 """Which runs are repeats of one another, and how those that are not get names of their own."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from sparsestreet.evaluation.configuration import (
@@ -9,6 +9,8 @@ from sparsestreet.evaluation.configuration import (
     Setting,
     config_hash,
     differing_options,
+    given_keys,
+    key_of,
     only,
     without,
 )
@@ -52,16 +54,18 @@ def variants(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) 
         groups.setdefault((run.run.label, config_hash(_compared(run))), []).append(run)
     found = []
     for (label, identity), group in groups.items():
-        here, anywhere = _of_label(runs, label), _of_label((*runs, *everywhere), label)
-        options = (*_options(group[0], anywhere, _method), *_options(group[0], here, _data))
-        found.append((Variant(_name(label, options, identity), label, options, tuple(group)), identity))
+        anywhere, given_anywhere = _options(group[0], (*runs, *everywhere))
+        here, given_here = _options(group[0], runs)
+        options = (*_not_of_data(anywhere), *_of_data(here))
+        named = (*_not_of_data(given_anywhere), *_of_data(given_here))
+        found.append((Variant(_name(label, named, identity), label, options, tuple(group)), identity))
     shared = Counter(variant.name for variant, _ in found)
     # Differences that words cannot tell, such as an option that is null in one and absent in the other.
-    named = [
+    unique = [
         variant if shared[variant.name] == 1 else replace(variant, name=f"{variant.name} #{identity[:6]}")
         for variant, identity in found
     ]
-    return sorted(named, key=lambda variant: variant.name)
+    return sorted(unique, key=lambda variant: variant.name)
 
 
 def log_config(run: RunSummary) -> dict[str, Setting]:
@@ -74,28 +78,31 @@ def _compared(run: RunSummary) -> dict[str, Setting]:
     return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS))
 
 
-def _method(run: RunSummary) -> dict[str, Setting]:
-    return without(_compared(run), ("data.*",))
+def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The options by which a run differs from others of its label, itself among them; and those that are named.
+
+    The latter are the ones that the commands gave, where these tell all configurations apart: the rest follows from
+    them. Else they are all.
+    """
+    alike = [other for other in others if other.run.label == run.run.label]
+    distinct = {config_hash(_compared(other)): _compared(other) for other in alike}
+    commands = [other.run.command for other in alike]
+    given = given_keys(commands)
+    words = differing_options(list(distinct.values()), commands)
+    short = [tuple(word for word in options if key_of(word) in given) for options in words]
+    position = list(distinct).index(config_hash(_compared(run)))
+    return words[position], (short if len(set(short)) == len(short) else words)[position]
 
 
-def _data(run: RunSummary) -> dict[str, Setting]:
-    return only(_compared(run), ("data.*",))
+def _of_data(options: Iterable[str]) -> list[str]:
+    return [option for option in options if key_of(option).startswith("data.")]
 
 
-def _of_label(runs: Sequence[RunSummary], label: str) -> list[RunSummary]:
-    return [run for run in runs if run.run.label == label]
+def _not_of_data(options: Iterable[str]) -> list[str]:
+    return [option for option in options if not key_of(option).startswith("data.")]
 
 
-def _options(
-    run: RunSummary, others: Sequence[RunSummary], part: Callable[[RunSummary], dict[str, Setting]]
-) -> tuple[str, ...]:
-    """The options by which a part of a run's configuration differs from that of others, itself among them."""
-    distinct = {config_hash(part(other)): part(other) for other in others}
-    words = differing_options(list(distinct.values()), [other.run.command for other in others])
-    return dict(zip(distinct, words, strict=True))[config_hash(part(run))]
-
-
-def _name(label: str, options: tuple[str, ...], identity: str) -> str:
+def _name(label: str, options: Sequence[str], identity: str) -> str:
     named = [word if len(word) <= _LONGEST else f"{word[:_LONGEST]}..." for word in options[:_MOST_NAMED]]
     if len(options) > _MOST_NAMED:
         named.append(f"and {len(options) - _MOST_NAMED} more #{identity[:6]}")

@@ -70,10 +70,25 @@ def test_square_brackets_are_no_markup():
     assert 'nodes=["blue"]' in text
 
 
-def test_many_methods_stand_below_each_other():
-    (table,) = tables(sections(records(*(make_summary(f"method{index}") for index in range(6)))))
+SWEEP = records(*(make_summary("streetgs+removal", config={"schedule.removal_db": value}) for value in range(6)))
+
+
+def test_many_variants_are_rows_where_there_is_room():
+    (table,) = tables(sections(SWEEP), 200)
     assert table.row_count == 6
     assert str(table.columns[0].header) == "method"
+    assert "…" not in printed(table, 200)
+
+
+def test_many_variants_are_tables_below_each_other_where_there_is_none():
+    drawn = tables(sections(SWEEP), 80)
+    assert len(drawn) > 1
+    text = "".join(printed(table, 80) for table in drawn)
+    assert all(f" schedule.removal_db={value} " in text for value in range(6))
+    assert text.count("n=1 (seed 0) ") == 6
+    assert "…" not in text
+    assert text.count("held out") == 1  # one title
+    assert text.count("guards: none fired") == 1
 
 
 def test_every_run_is_a_point_in_its_variants_color(tmp_path, monkeypatch):

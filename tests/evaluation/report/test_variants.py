@@ -37,6 +37,29 @@ def test_a_variant_has_one_name_in_all_tables():
     assert names(variants([here], [here, there])) == [("streetgs+removal schedule.removal_db=0.1", 1)]
 
 
+def test_a_data_sets_own_options_are_no_name_where_nodes_take_them_over():
+    """Each data set has its classes; a report over two of them names neither."""
+    one, two = ({"data.classes": [name], "node.rigid.classes": [name]} for name in ("Car", "vehicle.car"))
+    here, there = make_summary("m", config=one, scene="a"), make_summary("m", config=two, scene="b")
+    assert names(variants([here], [here, there])) == [("m", 1)]
+
+
+def test_what_follows_from_a_given_option_is_left_to_the_notes():
+    small = make_summary("m", config={"capacity": "small", "node.num_lidar": 20, "node.num_far": 4})
+    command = "sparsestreet train capacity=paper"
+    paper = make_summary("m", config={"capacity": "paper", "node.num_lidar": 600, "node.num_far": 20}, command=command)
+    found = variants([small, paper])
+    assert names(found) == [("m capacity=paper", 1), ("m capacity=small", 1)]
+    assert found[0].options == ("capacity=paper", "node.num_far=20", "node.num_lidar=600")
+    # A difference that no command gave, such as a default that has changed, is named where the given ones do not do.
+    changed = make_summary("m", config={"capacity": "paper", "node.num_lidar": 600, "node.num_far": 5}, command=command)
+    assert [name for name, _ in names(variants([small, paper, changed]))] == [
+        "m capacity=paper, node.num_far=20, node.num_lidar=600",
+        "m capacity=paper, node.num_far=5, node.num_lidar=600",
+        "m capacity=small, node.num_far=4, node.num_lidar=20",
+    ]
+
+
 def test_options_of_the_data_are_named_only_within_a_table():
     near, far = with_option(1.0, key="data.min_path_length"), with_option(3.0, key="data.min_path_length")
     assert names(variants([near], [near, far])) == [("streetgs+removal", 1)]
