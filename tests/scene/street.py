@@ -81,7 +81,7 @@ def training_data(
     """What a node sees of a log; ``movers`` says which of its tracks move (none, if nobody says)."""
     log = street_log() if log is None else log
     taken = () if movers is None else assign_tracks(log.tracks, {"movers": movers}).claimed
-    frames = [frame for frame in log.frames if frame.frame_index not in held_out]
+    frames = log.frames.where(lambda view: view.frame_index not in held_out)
     return TrainingData(log, frames, held_out, tracks=taken, moving=taken)
 
 

@@ -73,7 +73,7 @@ def random_points(
     count: int,
     center: Float[Tensor, "3"],
     radius: float,
-    frames: Frames,
+    frames: Sequence[Frame],
     generator: torch.Generator,
 ) -> Points:
     """``count`` points of the distribution ``draw`` that the frames see; fewer if they see too little of it."""
