@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
 from sparsestreet.evaluation.pictures import KINDS, Picture, write_picture, write_png
 from sparsestreet.evaluation.provenance import this_machine, this_source
@@ -32,14 +33,14 @@ from sparsestreet.ops import Guards, guards
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.types import Frame
+from sparsestreet.types import Frame, View
 
 
 @torch.no_grad()
 def evaluate_scene(
     scene: SceneGraph,
-    held_out: Sequence[Frame],
-    training: Sequence[Frame],
+    held_out: Frames | tuple[Frame, ...],
+    training: Frames | tuple[Frame, ...],
     *,
     run: RunDescription,
     options: RenderOptions,
@@ -57,7 +58,7 @@ def evaluate_scene(
     Args:
         scene: moved to ``device``, where it stays.
         held_out: views that training never saw; may be empty.
-        training: views that it saw; may be empty. Both may load images when indexed, since none is kept.
+        training: views that it saw; may be empty. Of both one image at a time is loaded, and none is kept.
         run: what identifies the run; goes into the record as it is.
         options: how the scene is rendered.
         out: the run's folder.
@@ -68,14 +69,14 @@ def evaluate_scene(
 
     Raises ValueError without any view, or for renders that are not finite.
     """
-    views = {split: frames for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
-    if not views:
+    splits = {split: Frames.of(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
+    if not splits:
         raise ValueError(f"there is no view to evaluate {run.label} on: give held-out views, training views or both")
     scene = scene.to(torch.device(device)).eval()
-    quality = {split: list(evaluate_frames(scene, frames, options)) for split, frames in views.items()}
-    main, frames = next(iter(views.items()))
-    latency = measure_latency(scene, frames, options, warmup=warmup, repeats=repeats)
-    summary = _summary(scene, quality, latency, _guard_counts(scene, frames, options), run, command)
+    quality = {split: list(evaluate_frames(scene, frames, options)) for split, frames in splits.items()}
+    main, frames = next(iter(splits.items()))
+    latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
+    summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command)
     chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
     _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
     for split in (HELD_OUT, TRAINING):
@@ -86,10 +87,10 @@ def evaluate_scene(
     return summary
 
 
-def _guard_counts(scene: SceneGraph, frames: Sequence[Frame], options: RenderOptions) -> GuardCounts:
+def _guard_counts(scene: SceneGraph, views: Sequence[View], options: RenderOptions) -> GuardCounts:
     total = Guards()
-    for frame in frames:
-        total += guards(scene.gaussians_at(frame).gaussians, frame.camera, settings=options.settings)
+    for view in views:
+        total += guards(scene.gaussians_at(view).gaussians, view.camera, settings=options.settings)
     return GuardCounts(asdict(total), total.alarms)
 
 

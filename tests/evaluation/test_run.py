@@ -8,6 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
+from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.pictures import picture_path
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
@@ -25,6 +26,7 @@ from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
 from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.types import View
 from tests.evaluation.frames import make_frame, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 
@@ -43,8 +45,8 @@ def dark(monkeypatch):
 def evaluate(out, held_out, training=(), pictures=2, device="cpu", **replaced):
     return evaluate_scene(
         small_scene(),
-        held_out,
-        training,
+        held_out if isinstance(held_out, Frames) else tuple(held_out),
+        tuple(training),
         out=out,
         device=device,
         pictures=pictures,
@@ -93,6 +95,16 @@ def test_a_run_leaves_its_records(tmp_path):
     rows = read_quality(quality_path(tmp_path))
     assert [(row.frame, row.camera) for row in rows] == [(0, 0), (10, 1), (20, 0), (30, 1), (40, 0)]
     assert [row.frame for row in read_quality(quality_path(tmp_path, TRAINING))] == [1, 11, 21]
+
+
+def test_images_are_loaded_for_their_comparison_and_pictures_alone(tmp_path):
+    """Timing and guards need none: a decoder would warm the caches and the patience of whoever waits."""
+    frames = {frame.frame_index: frame for frame in make_frames()}
+    views = [View(frame.camera, frame.time, frame.frame_index, frame.camera_index) for frame in frames.values()]
+    loaded = []
+    lazy = Frames(views, lambda view: loaded.append(view.frame_index) or frames[view.frame_index])
+    evaluate(tmp_path, lazy, pictures=2, repeats=9)
+    assert loaded[-7:] == [0, 10, 20, 30, 40, 20, 40]  # before them, what the type checks of a test look at
 
 
 @pytest.mark.usefixtures("dark")
@@ -191,7 +203,7 @@ def test_the_scene_is_moved_to_the_device_it_is_told(tmp_path, monkeypatch):
     move = type(scene).to
     monkeypatch.setattr(type(scene), "to", lambda self, device: moved.append(device) or move(self, device))
     device = torch.device("cpu", 0)
-    evaluate_scene(scene, make_frames(2), [], run=RUN, options=OPTIONS, out=tmp_path, command="c", device=device)
+    evaluate_scene(scene, tuple(make_frames(2)), (), run=RUN, options=OPTIONS, out=tmp_path, command="c", device=device)
     assert moved == [device]
     assert not scene.training
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sparsestreet.data.lazy import Frames
 from sparsestreet.geometry.cameras import project
 from sparsestreet.types import Frame
 
