@@ -5,24 +5,36 @@ foreign code by itself.
 """
 
 import importlib
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 CLASS = "class"
-"""Key of a JSON object that stands for a dataclass."""
+"""Key of a JSON object that stands for a dataclass, or for a number that JSON does not know."""
+
+_NUMBER = "float"
+
+_Settings = TypeVar("_Settings")
 
 
 def encode(value: Any) -> Any:
-    """JSON of plain values, lists, mappings and frozen dataclasses. Raises TypeError, naming it, for anything else."""
+    """Strict JSON of plain values, lists, mappings and frozen dataclasses; every float comes back to the last bit.
+
+    Raises TypeError, naming it, for anything else, ValueError for a mapping with the key ``class``.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         entries = {field.name: encode(getattr(value, field.name)) for field in fields(value)}
         return {CLASS: f"{type(value).__module__}:{type(value).__qualname__}", **entries}
     if isinstance(value, Mapping):
+        if CLASS in value:
+            raise ValueError(f"{CLASS!r} marks a dataclass and is no key of a mapping, got {dict(value)}: rename it")
         return {str(key): encode(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [encode(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return {CLASS: _NUMBER, "value": str(value)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise TypeError(f"settings hold plain values, lists, mappings and dataclasses, got a {type(value).__name__}")
@@ -37,6 +49,8 @@ def decode(value: Any) -> Any:
     entries = {key: decode(entry) for key, entry in value.items() if key != CLASS}
     if CLASS not in value:
         return entries
+    if value[CLASS] == _NUMBER:
+        return float(entries["value"])
     kind = _find(value[CLASS])
     try:
         return kind(**entries)
@@ -44,16 +58,24 @@ def decode(value: Any) -> Any:
         raise ValueError(f"{value[CLASS]} of this version cannot be made from the file ({error})") from error
 
 
+def decode_as(kind: type[_Settings], value: Any) -> _Settings:
+    """What ``encode`` was given, which must be of a class. Raises TypeError where it is not."""
+    decoded = decode(value)
+    if not isinstance(decoded, kind):
+        raise TypeError(f"a {type(decoded).__name__} stands where a {kind.__name__} belongs")
+    return decoded
+
+
 def _find(name: str) -> type:
     module_name, _, qualified = name.partition(":")
     if not module_name.startswith("sparsestreet.") and module_name not in sys.modules:
-        raise ValueError(f"the file uses {name}, which this program has not imported: import {module_name} first")
+        raise ValueError(f"the file uses {name!r}, which this program has not imported: import {module_name} first")
     try:
         found: Any = importlib.import_module(module_name)
         for part in qualified.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"the file uses {name}, which this version does not have: load it with its own") from error
+        raise ValueError(f"the file uses {name!r}, which this version does not have: load it with its own") from error
     if not (isinstance(found, type) and is_dataclass(found)):
-        raise ValueError(f"the file uses {name} as settings, but that is no dataclass: the file is damaged")
+        raise ValueError(f"the file uses {name!r} as settings, but that is no dataclass: the file is damaged")
     return found

@@ -17,12 +17,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from sparsestreet.scene.encoding import decode, encode
+from sparsestreet.scene.encoding import decode_as, encode
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
-from sparsestreet.scene.sky import Sky
+from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import View
 from sparsestreet.whole_file import whole_file
 
@@ -32,6 +32,7 @@ VERSION = 1
 FILE_NAME = "scene.safetensors"
 """Name of the scene file in a run's folder."""
 
+_KEY = "sparsestreet"
 _ROWS = "rows."
 
 
@@ -53,7 +54,10 @@ class StoredScene:
 
 
 def save_scene(path: Path | str, stored: StoredScene) -> None:
-    """Write the whole file or nothing. A scene with masks is written as they leave it, and stays as it is."""
+    """Write the whole file or nothing. A scene with masks is written as they leave it, and stays as it is.
+
+    Raises OSError where it cannot be written, TypeError for settings that are no plain values.
+    """
     scene = _without_masks(stored.scene)
     header = {
         "version": VERSION,
@@ -68,8 +72,11 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
     }
     # safetensors refuses what shares memory or is not contiguous.
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in scene.state_dict().items()}
-    with whole_file(Path(path)) as temporary:
-        save_file(tensors, temporary, metadata={"sparsestreet": json.dumps(header)})
+    try:
+        with whole_file(Path(path)) as temporary:
+            save_file(tensors, temporary, metadata={_KEY: json.dumps(header, allow_nan=False)})
+    except SafetensorError as error:
+        raise OSError(f"cannot write {path} ({error}): make room, or give another folder") from error
 
 
 def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredScene:
@@ -82,20 +89,31 @@ def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredSc
     if not path.is_file():
         raise FileNotFoundError(f"there is no scene at {path}: give a {FILE_NAME}, or the folder of a run that has one")
     try:
-        with safe_open(path, framework="pt", device=str(torch.device(device))) as file:
+        with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    except SafetensorError as error:
-        raise ValueError(f"{path} is no scene file or is damaged ({error}): write it again") from error
-    if "sparsestreet" not in metadata:
-        raise ValueError(f"{path} holds tensors but no scene: give the {FILE_NAME} that a run wrote")
-    header = json.loads(metadata["sparsestreet"])
+        if _KEY not in metadata:
+            raise ValueError(f"the file holds tensors but no scene: give the {FILE_NAME} that a run wrote")
+        stored = _scene_of(json.loads(metadata[_KEY]), tensors)
+    except (SafetensorError, json.JSONDecodeError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        # Whatever else is wrong: the header does not say what the tensors are.
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise ValueError(f"{path} is no scene file or is damaged ({reason}): write it again") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    stored.scene.to(torch.device(device))
+    return stored
+
+
+def _scene_of(header: Mapping[str, Any], tensors: dict[str, Tensor]) -> StoredScene:
     if header["version"] > VERSION:
-        raise ValueError(f"{path} has version {header['version']}, this program reads {VERSION}: update it")
+        raise ValueError(f"the file has version {header['version']}, this program reads {VERSION}: update it")
     nodes = {name: _restored(entry, _below(f"nodes.{name}.", tensors)) for name, entry in header["nodes"].items()}
-    scene = SceneGraph(nodes, None if header["sky"] is None else Sky(decode(header["sky"])))
-    scene.to(torch.device(device)).load_state_dict(tensors)
-    return StoredScene(scene.eval(), decode(header["options"]), header["name"], header["num_frames"])
+    sky = None if header["sky"] is None else Sky(decode_as(SkySettings, header["sky"]))
+    scene = SceneGraph(nodes, sky)
+    scene.load_state_dict(tensors)
+    options = decode_as(RenderOptions, header["options"])
+    return StoredScene(scene.eval(), options, header["name"], header["num_frames"])
 
 
 def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
@@ -104,7 +122,7 @@ def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
         {name: column for name, column in columns.items() if column.is_floating_point()},
         {name: column for name, column in columns.items() if not column.is_floating_point()},
     )
-    return decode(entry["settings"]).restore(rows, tensors, entry["header"])
+    return decode_as(NodeSettings, entry["settings"]).restore(rows, tensors, entry["header"])
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
