@@ -98,7 +98,7 @@ def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:
         return None
     for text in overrides:
         key = text.partition("=")[0]
-        if re.match(r"(node\.\w+\.mask\.|schedule\.(mask_|lambda_m))", key):
+        if re.match(r"(node\.\w+\.mask\.|schedule\.(mask_learning_rate|lambda_m))", key):
             return f"{key} has no effect with sparsify={cfg.sparsify.name}: choose sparsify=masks, paper or removal"
     return None
 

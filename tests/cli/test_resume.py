@@ -1,0 +1,118 @@
+"""A run that was stopped goes on exactly where it was, as if nothing had happened."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from sparsestreet.cli.train import train
+from sparsestreet.training.callbacks import RowLedger
+
+pytestmark = pytest.mark.xdist_group("tiny street")
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+def assert_equal(run: Path, other: Path) -> None:
+    expected, got = weights(run), weights(other)
+    assert expected.keys() == got.keys()
+    for name, value in expected.items():
+        assert torch.equal(value, got[name]), name
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_street, tmp_path_factory) -> Path:
+    """The uninterrupted run, with resets, so that a pause after one can be interrupted too."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert train([*tiny_street, *ALL_STAGES, f"out={out}"]) == 0
+    return out
+
+
+ALL_STAGES = (
+    "sparsify=removal",
+    "node.rigid.points_per_instance=150",
+    "node.rigid.min_gaussians=60",
+    "node.rigid.max_gaussians=3000",
+    "schedule.reset_in.start=0.3",
+    "schedule.reset_in.stop=0.35",
+    "schedule.reset_in.every=10",
+    "schedule.pause_after_reset=12",
+)
+
+
+@pytest.mark.parametrize("stop_at", [23, 50])
+def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, tiny_street, tmp_path, stop_at):
+    """Stopped inside the mask stage (23: after a reset, in its pause) and after it (50: the masks are gone)."""
+    part = tmp_path / "part"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RowLedger, "on_train_batch_start", _raises_at(stop_at), raising=False)
+        patch.setenv("HYDRA_FULL_ERROR", "1")
+        with pytest.raises(RuntimeError, match="stopped by the test"):
+            train([*tiny_street, *ALL_STAGES, f"out={part}"])
+    lines = (part / "curves" / "metrics.csv").read_text().splitlines()
+    assert train([f"resume={part}"]) == 0
+    assert_equal(whole, part)
+    # The curve of before is still there, and the ledger is that of the whole run.
+    assert set(lines[1:]) <= set((part / "curves" / "metrics.csv").read_text().splitlines())
+    assert (part / "records" / "counts.csv").read_text() == (whole / "records" / "counts.csv").read_text()
+
+
+def _raises_at(step: int):
+    """A hook that fails inside step ``step`` + 1, after its frame was drawn."""
+
+    def hook(self, trainer, *arguments):
+        if trainer.global_step == step:
+            raise RuntimeError("stopped by the test")
+
+    return hook
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_after_the_step_with_its_own_status(whole, tiny_street, tmp_path, number, status):
+    """In a process of its own, at whatever moment of a step the signal comes; then it goes on to the same end."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "sparsestreet", "train", *tiny_street, *ALL_STAGES, f"out={out}"]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+    for line in process.stdout:
+        if "step 6 of 60" in line:
+            break
+    time.sleep(0.05)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == status, errors
+    assert (out / "checkpoints" / "interrupted.ckpt").is_file()
+    assert (out / "scene.safetensors").is_file()
+    assert train([f"resume={out}"]) == 0
+    assert not (out / "checkpoints" / "interrupted.ckpt").exists()
+    assert_equal(whole, out)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"), [("schedule.lambda_m=3", "schedule.lambda_m"), ("seed=1", "seed"), ("sparsify=none", "options")]
+)
+def test_another_configuration_is_refused(whole, change, said, capfd):
+    with pytest.raises(SystemExit) as exit_:
+        train([f"resume={whole}", change])
+    assert exit_.value.code == 1
+    assert said in capfd.readouterr().err
+
+
+def test_an_interrupted_run_can_be_evaluated(tiny_street, tmp_path, monkeypatch):
+    from sparsestreet.cli.evaluate import evaluate
+    from sparsestreet.evaluation.records import read_summary, summary_path
+
+    monkeypatch.setattr(RowLedger, "on_train_batch_start", _raises_at(7), raising=False)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(RuntimeError, match="stopped by the test"):
+        train([*tiny_street, *ALL_STAGES, f"out={tmp_path}"])
+    assert evaluate([f"run={tmp_path}"]) == 0
+    run = read_summary(summary_path(tmp_path)).run
+    assert (run.steps, run.max_steps) == (7, 60)
