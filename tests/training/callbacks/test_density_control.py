@@ -31,7 +31,9 @@ NEVER = Interval(0.0, 0.0)
 KEEPS_ALL = GradientDensity(grad_threshold=1e9, cull_opacity=0.0, cull_scale=1e9)
 
 
-def every_ten(reset_in: Interval = NEVER, *, pause: int = 0, seed: int = 0, densify_until: float = 0.9) -> DensityControl:
+def every_ten(
+    reset_in: Interval = NEVER, *, pause: int = 0, seed: int = 0, densify_until: float = 0.9
+) -> DensityControl:
     """Refines at 10, 20 ... 90 of 100 steps."""
     return DensityControl(Interval(0.1, 0.9, every=10), densify_until, reset_in, pause_after_reset=pause, seed=seed)
 
@@ -108,7 +110,11 @@ def seen(system: StreetSystem, gradient: Tensor, radii: Tensor, width: int, heig
 def test_statistics_of_a_wide_image_by_hand():
     """|(g_x W/2, g_y H/2)| of each node's own rows; radii as fractions of the width."""
     control = every_ten()
-    nodes = {"bare": background(2), "first": background(1, density=KEEPS_ALL), "second": background(2, density=KEEPS_ALL)}
+    nodes = {
+        "bare": background(2),
+        "first": background(1, density=KEEPS_ALL),
+        "second": background(2, density=KEEPS_ALL),
+    }
     trainer, system, _ = started(control, **nodes)
     # Half image: 320 by 100 pixels.
     gradient = torch.tensor([[9.0, 9.0], [9.0, 9.0], [3 / 320, 4 / 100], [5 / 320, 12 / 100], [1.0, 1.0]])
@@ -141,7 +147,7 @@ def test_statistics_are_those_of_the_renderings_of_the_steps():
 def test_statistics_start_anew_after_a_refinement_and_only_then():
     strategy = AskedStrategy()
     control = every_ten(Interval(0.1, 0.1, every=10), pause=10)
-    trainer, system, _ = started(control, background=background(4, density=strategy))
+    trainer, _, _ = started(control, background=background(4, density=strategy))
     trainer.global_step = 8
     trainer.train(2, frame_at())  # refined at 10, then reset; no refinement at 20
     assert strategy.asked[0]["statistics"].visits.max() == 2
@@ -199,7 +205,16 @@ def test_oversized_rows_go_after_their_fraction_and_not_before():
 def test_rows_outside_their_box_go_after_the_cull():
     """Boxes of 4 x 2 x 1.5 m (even rows) and 1 x 1 x 2 m (odd ones), with 0.1 m of margin."""
     node = rigid(8, density=KEEPS_ALL)
-    places = [[2.05, 0, 0], [0.55, 0, 0], [0, 1.15, 0], [0.65, 0, 0], [1, 0.9, -0.8], [0, 0, -1.2], [0, 0, 0.9], [0.5, 0, 1]]
+    places = [
+        [2.05, 0, 0],
+        [0.55, 0, 0],
+        [0, 1.15, 0],
+        [0.65, 0, 0],
+        [1, 0.9, -0.8],
+        [0, 0, -1.2],
+        [0, 0, 0.9],
+        [0.5, 0, 1],
+    ]
     with torch.no_grad():
         node.rows.means.copy_(torch.tensor(places))
     control = every_ten()
@@ -252,7 +267,7 @@ def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tmp_path):
     """Statistics, the generator and the pause after a reset come back: cut after 24 of 30 steps, inside a pause."""
     resets = Interval(0.1, 0.2, every=10)
     control, node = every_ten(resets, pause=9), splitting()
-    trainer, system, _ = started(control, background=node)
+    trainer, _, _ = started(control, background=node)
     trainer.global_step = 9
     trainer.train(1, frame_at())
     trainer.global_step = 18

@@ -71,7 +71,7 @@ def test_removing_closed_rows_changes_no_image():
 
 @pytest.mark.parametrize("visible_only", [False, True])
 def test_masks_end_with_their_interval_in_scene_and_optimizer(visible_only):
-    """Column, group and moments are gone; the moments of what stays are those of the rows that stay; training goes on."""
+    """Column, group and moments are gone; what stays keeps the moments of its rows; training goes on."""
     nodes = {"background": background(8, mask=MASK), "rigid": rigid(6, mask=MASK)}
     losses = {"photometric": Photometric(), "sparsity": MaskSparsity()}
     system = make_system(nodes, losses, OptimizerSettings(visible_only=visible_only))
@@ -101,7 +101,7 @@ def test_masks_end_with_their_interval_in_scene_and_optimizer(visible_only):
 
 
 def test_the_floor_keeps_the_best_rows_and_is_counted_and_logged(caplog):
-    """Five of eight rows are closed and K_min is 5: the best two of the closed stay open, in images and in the table."""
+    """Five of eight rows are closed and K_min is 5: the best two of the closed stay."""
     node = background(8, mask=MASK, min_gaussians=5)
     set_rows(node, "mask_logits", {0: -6.0, 2: -5.0, 3: -8.0, 5: -7.0, 6: -9.0})
     trainer = StubTrainer(make_system({"background": node}), [every_twenty()])
