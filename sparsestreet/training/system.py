@@ -45,8 +45,13 @@ class StreetSystem(LightningModule):
             radius: of the scene, meters.
             options: how it is rendered.
             sh_interval: fraction of the run after which one more degree of spherical harmonics is used.
+
+        Raises:
+            ValueError: if the interval is not positive.
         """
         super().__init__()
+        if not sh_interval > 0:
+            raise ValueError(f"sh_interval must be > 0, got {sh_interval}: a tiny one uses all degrees from the start")
         self.scene = scene
         self.losses = dict(losses)
         self.optimizer_settings = optimizer
@@ -59,7 +64,8 @@ class StreetSystem(LightningModule):
     def state(self, *, training: bool = False) -> SceneState:
         """Where training stands, for whoever renders the scene now."""
         progress = self.global_step / max(self.trainer.max_steps, 1)
-        return SceneState(progress, int(progress / self.sh_interval), training)
+        # 0.6 / 0.2 is 2.9999999999999996.
+        return SceneState(progress, int(progress / self.sh_interval + 1e-6), training)
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
         state = self.state(training=True)

@@ -6,10 +6,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from lightning import Callback, Trainer
+from lightning import Callback, LightningDataModule, Trainer
 from torch import Tensor
 
+from sparsestreet.data.datamodule import OrderedFrames
+from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Split
+from sparsestreet.evaluation.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
@@ -19,7 +22,7 @@ from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid
 from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.sky import Sky
-from sparsestreet.training.callbacks.resizing import RowChange, RowListener
+from sparsestreet.training.callbacks.resizing import RowListener
 from sparsestreet.training.losses import Loss, Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
@@ -153,7 +156,7 @@ class StubTrainer(Trainer):
     ) -> None:
         # Not Lightning's __init__: nothing of its machinery is there.
         self.system, self.callbacks, self.max_steps = system, list(callbacks), max_steps
-        self.datamodule = SimpleNamespace(split=Split(train, held_out))
+        self.datamodule = SimpleNamespace(split=Split(Frames.of(train), Frames.of(held_out)))
         self.callback_metrics = {}
         self.log_calls: list[tuple[str, float, dict[str, Any]]] = []
         self.optimizers = [system.configure_optimizers()]
@@ -197,13 +200,47 @@ class StubTrainer(Trainer):
             self._log(name, value, **how)
 
 
+class _OneFrame(LightningDataModule):
+    def __init__(self, frame: Frame) -> None:
+        super().__init__()
+        self.frames = OrderedFrames(Frames.of((frame,)))
+
+    def train_dataloader(self) -> OrderedFrames:
+        return self.frames
+
+    def val_dataloader(self) -> OrderedFrames:
+        return self.frames
+
+    def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
+        return batch
+
+
+def fit(system: StreetSystem, callbacks: Sequence[Callback], max_steps: int, frame: Frame, **settings: Any) -> Trainer:
+    """Lightning's own training on one frame, and its trainer; without validation unless ``settings`` ask for it."""
+    trainer = Trainer(
+        **{
+            "accelerator": "cpu",
+            "max_steps": max_steps,
+            "logger": False,
+            "enable_checkpointing": False,
+            "enable_progress_bar": False,
+            "enable_model_summary": False,
+            "limit_val_batches": 0,
+            "callbacks": list(callbacks),
+            **settings,
+        }
+    )
+    trainer.fit(system, datamodule=_OneFrame(frame))
+    return trainer
+
+
 class Listener(Callback, RowListener):
     """Writes down what it hears of rows."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[RowChange, RowPlan]] = []
+        self.heard: list[tuple[CountChange, RowPlan]] = []
 
-    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+    def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         self.heard.append((change, plan))
 
     @property

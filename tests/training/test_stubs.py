@@ -3,17 +3,14 @@
 from typing import Any
 
 import torch
-from lightning import Callback, LightningDataModule, Trainer
+from lightning import Callback, Trainer
 
-from sparsestreet.data.datamodule import OrderedFrames
-from sparsestreet.data.log import Split
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
-from sparsestreet.types import Frame
-from tests.training.stubs import StubTrainer, background, frame_at, make_system, set_rows
+from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system, set_rows
 
 STEPS = 6
 
@@ -40,21 +37,6 @@ class Diary(Callback):
         self._note("end", trainer, pl_module)
 
 
-class OneFrame(LightningDataModule):
-    def __init__(self, frame: Frame) -> None:
-        super().__init__()
-        self.split = Split((frame,), ())
-
-    def train_dataloader(self) -> OrderedFrames:
-        return OrderedFrames(self.split.train)
-
-    def val_dataloader(self) -> OrderedFrames:
-        return OrderedFrames(self.split.train)
-
-    def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
-        return batch
-
-
 def parts() -> tuple[StreetSystem, list[Callback]]:
     """A training in which rows are split at steps 2 and 4, the masked go at 3, the mask at 5."""
     density = GradientDensity(grad_threshold=1e-4, split_scale=0.005)
@@ -72,17 +54,7 @@ def parts() -> tuple[StreetSystem, list[Callback]]:
 def test_lightning_and_the_stub_train_alike():
     frame = frame_at()
     system, callbacks = parts()
-    real = Trainer(
-        accelerator="cpu",
-        max_steps=STEPS,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=callbacks,
-        limit_val_batches=0,
-    )
-    real.fit(system, datamodule=OneFrame(frame))
+    real = fit(system, callbacks, STEPS, frame)
     stub_system, stub_callbacks = parts()
     stub = StubTrainer(stub_system, stub_callbacks, max_steps=STEPS)
     stub.start()

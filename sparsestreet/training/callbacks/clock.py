@@ -11,6 +11,7 @@ class Clock(Callback):
     def __init__(self) -> None:
         self._finished = 0.0
         self._started: float | None = None
+        self._interrupted = False
 
     @property
     def seconds(self) -> float:
@@ -24,10 +25,12 @@ class Clock(Callback):
         self._pause()
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._interrupted = self._started is not None
         self._pause()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not trainer.sanity_checking:
+        # Lightning also validates before training starts, and whoever wants to after its end.
+        if self._interrupted:
             self._started = time.perf_counter()
 
     def state_dict(self) -> dict[str, object]:

@@ -3,9 +3,10 @@
 import torch
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.evaluation.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan
-from sparsestreet.training.callbacks.resizing import RowChange, RowListener, resize_rows
+from sparsestreet.training.callbacks.resizing import RowListener, resize_rows
 from sparsestreet.training.schedule import Interval, last_step
 from sparsestreet.training.system import StreetSystem
 
@@ -51,7 +52,7 @@ class DensityControl(Callback, RowListener):
         for statistics in self.statistics.values():
             statistics.to(pl_module.device)
 
-    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+    def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         """Keep statistics beside the rows, whoever changed them."""
         if change.node in self.statistics:
             self.statistics[change.node].resize(plan)

@@ -34,8 +34,7 @@ class TrainingProgress(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        every = REFRESH_EVERY if self._bar is not None else max(trainer.max_steps // LINES, 1)
-        if step % every and step != trainer.max_steps:
+        if not self._due(step, trainer.max_steps):
             return
         text = self._status(trainer, pl_module)
         if self._bar is not None:
@@ -44,9 +43,22 @@ class TrainingProgress(Callback):
             log.info("step %d of %d: %s", step, trainer.max_steps, text)
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._stop()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        # Lightning tears no callback down then, and a live bar hides the cursor.
+        self._stop()
+
+    def _stop(self) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+    def _due(self, step: int, steps: int) -> bool:
+        if self._bar is not None:
+            return step % REFRESH_EVERY == 0 or step == steps
+        # Where another tenth is full.
+        return step * LINES // steps > (step - 1) * LINES // steps
 
     def _status(self, trainer: Trainer, system: LightningModule) -> str:
         first, then = self._since

@@ -1,31 +1,20 @@
 """The one way in which callbacks change a node's rows and columns during training."""
 
 import logging
-from dataclasses import dataclass
 
 from lightning import Trainer
 
+from sparsestreet.evaluation.ledger import CountChange
 from sparsestreet.scene.gaussians import RowPlan, drop_parameter
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class RowChange:
-    """One change of a node's number of rows."""
-
-    step: int
-    node: str
-    before: int
-    after: int
-    reason: str
-
-
 class RowListener:
     """A callback that keeps something for every row; it hears of each change."""
 
-    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+    def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         raise NotImplementedError
 
 
@@ -35,7 +24,7 @@ def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan
     before = len(rows)
     rows.resize(plan, trainer.optimizers[0])
     system.rendering = None
-    change = RowChange(trainer.global_step, node, before, len(rows), reason)
+    change = CountChange(trainer.global_step, node, before, len(rows), reason)
     for callback in trainer.callbacks:
         if isinstance(callback, RowListener):
             callback.on_rows_changed(change, plan)

@@ -5,13 +5,14 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.evaluation.ledger import CountChange
 from sparsestreet.evaluation.records import RunDescription, run_path, write_run
 from sparsestreet.export import views
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
 from sparsestreet.training.callbacks.clock import Clock
 from sparsestreet.training.callbacks.graceful_stop import TornStop
-from sparsestreet.training.callbacks.resizing import RowChange, RowListener
+from sparsestreet.training.callbacks.resizing import RowListener
 from sparsestreet.training.system import StreetSystem
 
 
@@ -35,7 +36,7 @@ class RunFiles(Callback, RowListener):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._limits = {name: node.settings.max_gaussians for name, node in pl_module.scene.nodes.items()}
 
-    def on_rows_changed(self, change: RowChange, plan: RowPlan) -> None:
+    def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         limit = self._limits[change.node]
         # A split adds two: one row below the limit there is no room for it either.
         if limit is not None and change.after > change.before and change.after >= limit - 1:
