@@ -2,9 +2,21 @@ import pytest
 import torch
 
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes import Rigid
+from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.sky import Sky, SkySettings
-from tests.scene.street import background, degree, keyframes, pose, random_rows, rigid, static_mask, track, view_at
+from sparsestreet.scene.state import SceneState
+from tests.scene.street import (
+    background,
+    background_settings,
+    degree,
+    keyframes,
+    pose,
+    random_rows,
+    rigid,
+    static_mask,
+    track,
+    view_at,
+)
 
 MASK = static_mask(sparsity_weight=0.25)
 VIEW = view_at(0.0)
@@ -55,6 +67,25 @@ def test_masks_are_those_of_masked_nodes_only():
     (gradient,) = torch.autograd.grad(loss, road.rows.mask_logits)
     sigma = torch.sigmoid(torch.tensor(1.0))
     torch.testing.assert_close(gradient, (sigma * (1 - sigma)).expand(4))
+
+
+class Heavy(Background):
+    """A node with two terms of its own."""
+
+    def regularizers(self, state: SceneState) -> dict[str, torch.Tensor]:
+        return {"weight": self.rows.means.sum(), "age": torch.tensor(state.progress)}
+
+
+def test_regularizers_are_named_by_node_and_term():
+    heavy = Heavy(background_settings(), random_rows(3, 2))
+    scene = SceneGraph({"road": background(random_rows(4, 0)), "heavy": heavy, "cars": cars(3)})
+    terms = scene.regularizers(SceneState(progress=0.25, training=True))
+    assert list(terms) == ["heavy/weight", "heavy/age"]
+    assert terms["heavy/age"].item() == 0.25
+    assert torch.equal(terms["heavy/weight"], heavy.rows.means.sum())
+    sum(terms.values()).backward()
+    assert torch.equal(heavy.rows.means.grad, torch.ones(3, 3))
+    assert SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]}).regularizers(SceneState()) == {}
 
 
 def test_bytes_of_every_part():

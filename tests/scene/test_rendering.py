@@ -1,10 +1,14 @@
+import pytest
 import torch
 
 from sparsestreet.geometry.cameras import ray_directions
+from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.sky import Sky, SkySettings
+from sparsestreet.scene.state import FINISHED, SceneState
+from sparsestreet.types import Frame, View
 from tests.scene.street import (
     background,
     camera_at,
@@ -46,6 +50,43 @@ def test_fields_and_shapes():
     assert result.splats.radii.shape == (14,)
     assert result.splats.visible.any()
     assert 0.1 < result.alpha.max() <= 1
+
+
+def test_a_novel_view_needs_no_frame_and_no_camera_of_the_log():
+    scene, blank = scene_of(), torch.zeros(11, 17, 3, dtype=torch.uint8)
+    novel = View(CAMERA, 0.5)
+    assert novel.frame_index is None
+    assert novel.camera_index is None
+    expected = rendered(scene, 0.5)
+    options = RenderOptions(backend="reference")
+    for view in (novel, View(CAMERA, 0.5, frame_index=1), Frame(CAMERA, 0.5, 7, 3, image=blank)):
+        assert torch.equal(render(scene, view, options=options).rgb, expected.rgb)
+    assert not torch.equal(render(scene, View(CAMERA, 0.9), options=options).rgb, expected.rgb)
+
+
+def test_a_finished_scene_shows_all_that_it_has():
+    """State is what training adds to a view; without it a scene is finished."""
+    assert SceneState() == FINISHED == SceneState(progress=1.0, sh_degree=3, training=False)
+    scene, options = scene_of(), RenderOptions(backend="reference")
+    finished = rendered(scene).rgb
+    assert torch.equal(render(scene, view_at(0.5, CAMERA), FINISHED, options).rgb, finished)
+    assert torch.equal(render(scene, view_at(0.5, CAMERA), SceneState(sh_degree=1), options).rgb, finished)
+    young = render(scene, view_at(0.5, CAMERA), SceneState(sh_degree=0), options)
+    assert not torch.equal(young.rgb, finished)
+    for node in scene.nodes.values():
+        with torch.no_grad():
+            node.rows.sh_rest.zero_()
+    assert torch.equal(rendered(scene).rgb, young.rgb)
+
+
+def test_options_are_those_of_the_op():
+    scene, view = scene_of(), view_at(0.5, CAMERA)
+    default = render(scene, view)
+    assert torch.equal(default.rgb, render(scene, view, options=RenderOptions(SplatSettings(), "auto")).rgb)
+    coarse = render(scene, view, options=RenderOptions(SplatSettings(alpha_min=0.2)))
+    assert coarse.alpha.sum() < default.alpha.sum()
+    with pytest.raises(ValueError, match="no-such-backend"):
+        render(scene, view, options=RenderOptions(backend="no-such-backend"))
 
 
 def test_the_sky_shines_through_what_alpha_leaves():
