@@ -48,7 +48,9 @@ def stored_street() -> StoredScene:
     sky = Sky(SkySettings(4))
     with torch.no_grad():
         sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
-    return StoredScene(SceneGraph({"background": road, "rigid": objects}, sky), RenderOptions(), "hand-made", NUM_FRAMES)
+    return StoredScene(
+        SceneGraph({"background": road, "rigid": objects}, sky), RenderOptions(), "hand-made", NUM_FRAMES
+    )
 
 
 def street_views(width: int = 48, height: int = 32, cameras: tuple[int, ...] = tuple(YAWS)) -> list[View]:

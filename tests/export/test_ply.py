@@ -39,9 +39,7 @@ def test_plyfile_reads_the_same_gaussians(tmp_path):
     assert torch.equal(columns(path, "nx", "ny", "nz"), torch.zeros(7, 3))
     # exp and sigmoid of a float32 that was rounded once: a few units of its last digit.
     torch.testing.assert_close(columns(path, *numbered("scale", 3)).exp(), written.scales, rtol=1e-6, atol=0)
-    torch.testing.assert_close(
-        columns(path, "opacity").sigmoid().squeeze(1), written.opacities, rtol=1e-6, atol=0
-    )
+    torch.testing.assert_close(columns(path, "opacity").sigmoid().squeeze(1), written.opacities, rtol=1e-6, atol=0)
     unit = written.quaternions / written.quaternions.norm(dim=1, keepdim=True)
     torch.testing.assert_close(columns(path, *numbered("rot", 4)), unit, rtol=0, atol=1e-7)
     assert torch.equal(columns(path, *numbered("f_dc", 3)), written.sh[:, 0])
