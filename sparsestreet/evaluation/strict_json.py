@@ -6,12 +6,13 @@ of the format; a record of another one is refused before its keys are looked at.
 
 import json
 import math
-import os
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
 from pathlib import Path
+
+from sparsestreet.whole_file import whole_file
 
 Json = None | bool | int | float | str | list | dict
 Record = typing.TypeVar("Record")
@@ -31,13 +32,8 @@ def version(number: int, remedy: str) -> typing.Any:
 
 def write_atomically(path: Path, text: str) -> None:
     """Write a whole file or nothing: a reader never sees half of it, a crash leaves the old one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with whole_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: object) -> None:

@@ -16,9 +16,9 @@ from sparsestreet.whole_file import whole_file, whole_folder
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
-_COLORS = ["-vf", "scale=out_color_matrix=bt709"]
-_COLORS += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
-"""Said in the file, because players guess differently where nothing is said."""
+_COLORS = "color_primaries=bt709:color_trc=bt709:colorspace=bt709"
+_FILTERS = ["-vf", f"scale=out_color_matrix=bt709,format=yuv420p,setparams={_COLORS}"]
+"""The colors are said in the file, because players guess differently where nothing is said."""
 _STREAMABLE = ["-movflags", "+faststart"]
 
 
@@ -80,9 +80,8 @@ def _write_video(path: Path, pictures: Iterable[Picture], fps: float, quality: f
         (width, height),
         fps=float(fps),
         quality=quality,
-        codec="libx264",
         macro_block_size=1,
-        output_params=[*_COLORS, *_STREAMABLE],
+        output_params=[*_FILTERS, *_STREAMABLE],
     )
     count = 0
     with closing(writer):

@@ -1,21 +1,17 @@
 """``views.json``: from where and when a log was seen. A scene beside it can be rendered without the log."""
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.evaluation.strict_json import read_json
+from sparsestreet.evaluation.strict_json import EXACT, json_line, read_json, version, write_atomically
 from sparsestreet.types import Camera, Shutter, View
-from sparsestreet.whole_file import whole_file
 
 FORMAT = 1
-"""Raised when an older program could not read the file."""
-
 FILE_NAME = "views.json"
 """Name of the file in a run's folder."""
 
@@ -45,21 +41,21 @@ class _Entry:
     split: str
     frame_index: int
     camera_index: int
-    time: float
+    time: float = field(metadata=EXACT)
     width: int
     height: int
-    camera_from_world: Matrix
-    intrinsics: Matrix
-    distortion: Numbers | None = None
-    shutter_translation: Numbers | None = None
-    shutter_rotation: Numbers | None = None
+    camera_from_world: Matrix = field(metadata=EXACT)
+    intrinsics: Matrix = field(metadata=EXACT)
+    distortion: Numbers | None = field(default=None, metadata=EXACT)
+    shutter_translation: Numbers | None = field(default=None, metadata=EXACT)
+    shutter_rotation: Numbers | None = field(default=None, metadata=EXACT)
 
 
 @dataclass(frozen=True)
 class _File:
-    format: int
     frames_per_second: float | None
     views: tuple[_Entry, ...]
+    format: int = version(FORMAT, "update the program, or write the views anew by training")
 
 
 def write_views(
@@ -73,26 +69,24 @@ def write_views(
     Poses are written as float32. Raises ValueError for a view without frame or camera index, or with a number that is
     not finite.
     """
+    path = Path(path)
     entries = [_entry("training", view) for view in training] + [_entry("held_out", view) for view in held_out]
     # A view a line: short enough to read, and a diff shows which view changed.
-    lines = ",\n".join(json.dumps(asdict(entry), allow_nan=False) for entry in entries)
-    head = f'{{\n"format": {FORMAT},\n"frames_per_second": {json.dumps(frames_per_second, allow_nan=False)},\n'
-    with whole_file(Path(path)) as temporary:
-        temporary.write_text(f'{head}"views": [\n{lines}\n]\n}}\n', encoding="utf-8")
+    lines = ",\n".join(json_line(entry, f"{path}: view {index}") for index, entry in enumerate(entries))
+    head = json_line({"format": FORMAT, "frames_per_second": frames_per_second}, str(path)).removesuffix("}")
+    write_atomically(path, f'{head}, "views": [\n{lines}\n]}}\n')
 
 
 def read_views(path: Path | str) -> RecordedViews:
     """Read what ``write_views`` wrote.
 
     Raises FileNotFoundError where there is no such file, ValueError, naming file and entry, for one that is damaged
-    or of a newer version.
+    or of another format.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no {path}: training writes a {FILE_NAME} into the folder of its run")
     file = read_json(path, _File)
-    if file.format > FORMAT:
-        raise ValueError(f"{path} has format {file.format}, this program reads {FORMAT}: update it")
     views: dict[str, list[View]] = {"training": [], "held_out": []}
     for index, entry in enumerate(file.views):
         if entry.split not in views:

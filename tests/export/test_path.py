@@ -1,0 +1,124 @@
+"""Where a camera drives."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.export.path import left_to_right, of_cameras, of_frames, recorded, resampled, resized, shifted
+from sparsestreet.geometry.cameras import project
+from tests.export.street import NUM_FRAMES, street_views
+
+STEP = 1 / (NUM_FRAMES - 1)
+
+
+def test_recorded_views_are_rigs_in_order_of_time():
+    path = recorded(street_views()[::-1])
+    assert [rig[0].frame_index for rig in path] == [0, 1, 2, 3, 4]
+    assert [view.camera_index for view in path[2]] == [0, 1, 2, 3]
+    assert {view.time for view in path[3]} == {0.75}
+
+
+def test_an_instant_without_one_of_the_cameras_is_named():
+    with pytest.raises(ValueError, match=r"frame 4 has \[0, 1, 2\] and frame 0 \[0, 1, 2, 3\]"):
+        recorded(street_views()[:-1])
+    with pytest.raises(ValueError, match="got none"):
+        recorded([])
+
+
+def test_frames_and_cameras_choose():
+    path = recorded(street_views())
+    assert [rig[0].frame_index for rig in of_frames(path, slice(1, 3))] == [1, 2]
+    assert [rig[0].frame_index for rig in of_frames(path, slice(None, 2))] == [0, 1]
+    assert [rig[0].frame_index for rig in of_frames(path, slice(3, None))] == [3, 4]
+    assert [view.camera_index for view in of_cameras(path, [3, 0])[4]] == [3, 0]
+    with pytest.raises(ValueError, match="frames 7 to 9: the path has 0 to 4"):
+        of_frames(path, slice(7, 9))
+    with pytest.raises(ValueError, match=r"cameras \[5\]: the path has \[0, 1, 2, 3\]"):
+        of_cameras(path, [0, 5])
+
+
+def test_a_rig_stands_left_to_right_as_the_driver_sees_it():
+    # 50 degrees to the left, ahead, 50 to the right; 170 to the left is leftmost.
+    assert left_to_right(recorded(street_views())[2]) == [3, 1, 0, 2]
+
+
+def test_a_shifted_rig_moves_as_one_along_the_front_cameras_right():
+    path = recorded(street_views())
+    for before, after in zip(path, shifted(path, 1.5), strict=True):
+        angle = math.radians(3.0 * before[0].frame_index)
+        right = torch.tensor([math.sin(angle), -math.cos(angle), 0.0])
+        for old, new in zip(before, after, strict=True):
+            moved = new.camera.position - old.camera.position
+            # Positions of some meters, added up in float32.
+            torch.testing.assert_close(moved, 1.5 * right, rtol=0, atol=2e-6)
+            assert torch.equal(new.camera.camera_from_world[:3, :3], old.camera.camera_from_world[:3, :3])
+            assert (new.time, new.frame_index, new.camera_index) == (old.time, None, old.camera_index)
+
+
+def test_a_path_at_its_own_rate_is_itself():
+    path = recorded(street_views())
+    assert resampled(path, STEP) == path
+
+
+def test_between_two_instants_lies_the_middle():
+    path = recorded(street_views())
+    finer = resampled(path, STEP / 2)
+    assert [rig[0].time for rig in finer] == [index / 8 for index in range(9)]
+    assert finer[::2] == path
+    for before, view, after in zip(path[1], finer[3], path[2], strict=True):
+        assert (view.frame_index, view.camera_index) == (None, before.camera_index)
+        middle = (before.camera.position + after.camera.position) / 2
+        torch.testing.assert_close(view.camera.position, middle, rtol=0, atol=2e-6)
+        # Half of 3 degrees, about the axis that the whole turn is about.
+        forward = view.camera.camera_from_world[2, :3]
+        for end in (before, after):
+            cosine = float(forward @ end.camera.camera_from_world[2, :3])
+            assert math.degrees(math.acos(min(cosine, 1.0))) == pytest.approx(1.5, abs=0.02)  # float32 near cos = 1
+        assert torch.equal(view.camera.intrinsics, before.camera.intrinsics)
+
+
+def test_frames_that_are_missing_are_bridged_and_too_many_are_skipped():
+    path = recorded([view for view in street_views() if view.frame_index != 2])
+    bridged = resampled(path, STEP)
+    assert [rig[0].frame_index for rig in bridged] == [0, 1, None, 3, 4]
+    torch.testing.assert_close(bridged[2][0].camera.position, torch.tensor([2.0, 0.2, 1.5]), rtol=0, atol=2e-6)
+    assert [rig[0].frame_index for rig in resampled(recorded(street_views()), 2 * STEP)] == [0, 2, 4]
+    with pytest.raises(ValueError, match="steps above 0"):
+        resampled(path, 0.0)
+
+
+def test_a_third_of_a_step_meets_every_recorded_instant():
+    """Thirds are no binary fractions: recorded frames must be met in spite of the rounding."""
+    finer = resampled(recorded(street_views()), STEP / 3)
+    assert [rig[0].frame_index for rig in finer[::3]] == [0, 1, 2, 3, 4]
+    assert len(finer) == 13
+
+
+def test_a_single_instant_is_a_path():
+    path = of_frames(recorded(street_views()), slice(1, 2))
+    assert resampled(path, 0.01) == path
+
+
+def test_another_width_shows_the_same():
+    path = recorded(street_views(width=48, height=33))
+    view, small = path[1][0], resized(path, 20)[1][0]
+    assert (small.camera.width, small.camera.height) == (20, 14)
+    points = torch.tensor([[9.0, 1.0, 2.0], [7.0, -3.0, 0.5]])
+    pixels, _, _ = project(view.camera, points)
+    expected = pixels * torch.tensor([20 / 48, 14 / 33])
+    torch.testing.assert_close(project(small.camera, points)[0], expected)
+    assert small.frame_index == view.frame_index
+    with pytest.raises(ValueError, match="at least 1 pixel"):
+        resized(path, 0)
+
+
+def test_lens_and_shutter_stay(tmp_path):
+    views = [
+        replace(view, camera=replace(view.camera, distortion=torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0])))
+        for view in street_views()
+    ]
+    path = recorded(views)
+    for changed in (shifted(path, 1.0), resampled(path, STEP / 2), resized(path, 20)):
+        assert torch.equal(changed[1][0].camera.distortion, views[0].camera.distortion)

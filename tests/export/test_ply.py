@@ -1,0 +1,141 @@
+"""Our .ply files, read back by plyfile with the layout that INRIA's code writes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from sparsestreet.export.ply import instance_names, scene_gaussians, write_ply
+from sparsestreet.types import Gaussians
+from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street
+
+
+def gaussians(count: int = 7, terms: int = 9) -> Gaussians:
+    generator = torch.Generator().manual_seed(5)
+    return Gaussians(
+        torch.randn(count, 3, generator=generator) * 100,
+        torch.randn(count, 4, generator=generator) * 3,
+        torch.rand(count, 3, generator=generator) + 0.001,
+        torch.rand(count, generator=generator) * 0.9 + 0.05,
+        torch.randn(count, terms, 3, generator=generator),
+    )
+
+
+def columns(path, *names: str) -> torch.Tensor:
+    vertices = PlyData.read(path)["vertex"]
+    return torch.tensor(np.stack([vertices[name] for name in names], axis=1))
+
+
+def numbered(name: str, count: int) -> list[str]:
+    return [f"{name}_{index}" for index in range(count)]
+
+
+def test_plyfile_reads_the_same_gaussians(tmp_path):
+    path, written = tmp_path / "street.ply", gaussians()
+    assert write_ply(path, written) == 7
+    assert torch.equal(columns(path, "x", "y", "z"), written.means)
+    assert torch.equal(columns(path, "nx", "ny", "nz"), torch.zeros(7, 3))
+    # exp and sigmoid of a float32 that was rounded once: a few units of its last digit.
+    torch.testing.assert_close(columns(path, *numbered("scale", 3)).exp(), written.scales, rtol=1e-6, atol=0)
+    torch.testing.assert_close(columns(path, "opacity").sigmoid().squeeze(1), written.opacities, rtol=1e-6, atol=0)
+    unit = written.quaternions / written.quaternions.norm(dim=1, keepdim=True)
+    torch.testing.assert_close(columns(path, *numbered("rot", 4)), unit, rtol=0, atol=1e-7)
+    assert torch.equal(columns(path, *numbered("f_dc", 3)), written.sh[:, 0])
+    for channel in range(3):
+        for term in range(8):
+            rest = columns(path, f"f_rest_{channel * 8 + term}").squeeze(1)
+            assert torch.equal(rest, written.sh[:, 1 + term, channel]), (channel, term)
+
+
+def test_the_layout_is_inrias(tmp_path):
+    path = tmp_path / "street.ply"
+    write_ply(path, gaussians(terms=16))
+    data = PlyData.read(path)
+    expected = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc", 3), *numbered("f_rest", 45)]
+    expected += ["opacity", *numbered("scale", 3), *numbered("rot", 4)]
+    assert [item.name for item in data["vertex"].properties] == expected
+    assert {item.val_dtype for item in data["vertex"].properties} == {"f4"}
+    assert (data.text, data.byte_order) == (False, "<")
+
+
+def test_one_color_a_gaussian_is_a_file_without_rest(tmp_path):
+    write_ply(tmp_path / "flat.ply", gaussians(terms=1))
+    names = [item.name for item in PlyData.read(tmp_path / "flat.ply")["vertex"].properties]
+    assert not [name for name in names if name.startswith("f_rest")]
+
+
+def test_rows_that_are_not_there_are_left_out(tmp_path):
+    opacities = torch.tensor([0.0, 0.5, 0.0, 1.0, 0.2, 0.0, 0.3])
+    assert write_ply(tmp_path / "some.ply", replace(gaussians(), opacities=opacities)) == 4
+    read = columns(tmp_path / "some.ply", "opacity").sigmoid().squeeze(1)
+    torch.testing.assert_close(read, opacities[opacities > 0], rtol=1e-6, atol=0)
+    assert torch.equal(columns(tmp_path / "some.ply", "x", "y", "z"), gaussians().means[opacities > 0])
+
+
+def test_a_flat_gaussian_has_finite_numbers(tmp_path):
+    scales = gaussians().scales.clone()
+    scales[2, 1] = 0
+    write_ply(tmp_path / "flat.ply", replace(gaussians(), scales=scales))
+    assert columns(tmp_path / "flat.ply", *numbered("scale", 3)).exp()[2, 1] < 1e-20
+
+
+def test_what_cannot_be_written_is_said_and_leaves_no_file(tmp_path):
+    with pytest.raises(ValueError, match="opacity above 0"):
+        write_ply(tmp_path / "a.ply", replace(gaussians(), opacities=torch.zeros(7)))
+    means = gaussians().means.clone()
+    means[3, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"finite, but 1 Gaussians.*row 3"):
+        write_ply(tmp_path / "a.ply", replace(gaussians(), means=means))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match="cannot be written"):
+        write_ply(tmp_path / "file" / "a.ply", gaussians())
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_scene_at_a_time_is_all_its_nodes():
+    stored = stored_street()
+    whole = scene_gaussians(stored, 0.0)
+    assert len(whole) == ROAD_ROWS + CAR_ROWS + TRAM_ROWS
+    assert whole.sh.shape[1] == 9  # the background's degree; the objects' lower one is padded
+    # The car starts at (8, 1, 1) without a turn.
+    car = scene_gaussians(stored, 0.0, instances=["car"])
+    box = stored.scene.nodes["rigid"].rows.means[:CAR_ROWS].detach()
+    torch.testing.assert_close(car.means, box + torch.tensor([8.0, 1.0, 1.0]))
+    assert not car.means.requires_grad
+
+
+def test_nodes_and_instances_choose(tmp_path):
+    stored = stored_street()
+    whole = scene_gaussians(stored, 0.25)
+    assert torch.equal(scene_gaussians(stored, 0.25, nodes=["background"]).means, whole.means[:ROAD_ROWS])
+    assert torch.equal(scene_gaussians(stored, 0.25, nodes=["rigid"]).means, whole.means[ROAD_ROWS:])
+    tram = scene_gaussians(stored, 0.25, instances=["tram"])
+    assert torch.equal(tram.means, whole.means[ROAD_ROWS + CAR_ROWS :])
+    both = scene_gaussians(stored, 0.25, instances=["tram", "car"])
+    assert torch.equal(both.means, whole.means[ROAD_ROWS:])
+    assert instance_names(stored) == ["car", "tram"]
+
+
+def test_an_absent_object_is_not_in_the_file(tmp_path):
+    assert write_ply(tmp_path / "late.ply", scene_gaussians(stored_street(), 1.0)) == ROAD_ROWS + CAR_ROWS
+
+
+@pytest.mark.parametrize(
+    ("choice", "said"),
+    [
+        ({"instances": ["cart"]}, r"no instance 'cart'; it has car, tram"),
+        ({"nodes": ["rigids"]}, r"no node 'rigids'; it has background, rigid"),
+        ({"instances": ["tram"]}, r"tram is not in the scene at time 0\.8: it is there from 0\.000 to 0\.500"),
+        ({"instances": ["car"], "nodes": ["rigid"]}, "leave one out"),
+    ],
+)
+def test_a_choice_that_is_not_there_names_what_is(choice, said):
+    with pytest.raises(ValueError, match=said):
+        scene_gaussians(stored_street(), 0.8, **choice)
+
+
+def test_time_lies_in_the_log():
+    with pytest.raises(ValueError, match=r"time runs from 0 .* got 1\.2"):
+        scene_gaussians(stored_street(), 1.2)

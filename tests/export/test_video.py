@@ -1,0 +1,120 @@
+"""Videos and pictures of a path, read back by ffmpeg and Pillow."""
+
+import sys
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparsestreet.export.path import of_cameras, recorded
+from sparsestreet.export.video import path_pictures, side_by_side, write_pictures
+from tests.export.street import stored_street, street_views
+
+
+def smooth_pictures(count: int, width: int = 64, height: int = 48) -> list[np.ndarray]:
+    """Gradients that move: what a video can hold."""
+    y, x = np.mgrid[0:height, 0:width]
+    return [np.stack((x + 20 * i, y + x, 200 - y), axis=-1).astype(np.uint8) for i in range(count)]
+
+
+def read_video(path) -> tuple[dict, np.ndarray]:
+    # Without these flags the reader itself rounds down: one level too dark.
+    frames = imageio_ffmpeg.read_frames(str(path), output_params=["-sws_flags", "accurate_rnd+full_chroma_int"])
+    header = next(frames)
+    width, height = header["size"]
+    return header, np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames])
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / ((a.astype(np.float64) - b) ** 2).mean()))
+
+
+def test_a_video_of_a_scene_shows_what_it_renders(tmp_path):
+    stored = stored_street()
+    path = of_cameras(recorded(street_views(width=64, height=48)), [1, 0])
+    pictures = list(path_pictures(stored, path))
+    assert write_pictures(tmp_path / "drive.mp4", iter(pictures), fps=12, quality=9) == 5
+    header, frames = read_video(tmp_path / "drive.mp4")
+    assert (header["fps"], header["size"], len(frames)) == (12.0, (128, 48), 5)
+    for picture, frame in zip(pictures, frames, strict=True):
+        # Color at half the resolution costs most at the edges of Gaussians; two neighboring frames are 15 dB apart.
+        assert psnr(picture, frame) > 30
+    assert psnr(pictures[1], frames[2]) < 25
+
+
+def test_pictures_are_the_scenes_renderings_side_by_side():
+    stored = stored_street()
+    path = of_cameras(recorded(street_views()), [2, 0])
+    pictures = list(path_pictures(stored, path))
+    rgb = stored.render(path[3][1]).rgb.clamp(0, 1).numpy()
+    # Half a level of rounding.
+    np.testing.assert_allclose(pictures[3][:, 48:] / 255, rgb, atol=0.5 / 255 + 1e-6)
+    assert pictures[3].shape == (32, 96, 3)
+
+
+def test_lower_images_stand_in_the_middle():
+    tall, low = np.full((6, 3, 3), 9, np.uint8), np.full((3, 2, 3), 7, np.uint8)
+    row = side_by_side([tall, low])
+    assert row.shape == (6, 5, 3)
+    assert (row[:, :3] == 9).all()
+    assert (row[1:4, 3:] == 7).all()
+    assert (row[0, 3:] == 0).all()
+    assert (row[4:, 3:] == 0).all()
+
+
+def test_colors_survive_and_quality_costs_bytes(tmp_path):
+    pictures = smooth_pictures(6)
+    for quality in (2, 9):
+        write_pictures(tmp_path / f"{quality}.mp4", pictures, fps=10, quality=quality)
+    _, frames = read_video(tmp_path / "9.mp4")
+    # A wrong color matrix moves gray by nothing but these colors by 5 levels and more.
+    assert np.abs((frames.astype(np.float64) - pictures).mean(axis=(1, 2))).max() < 0.6
+    assert (tmp_path / "2.mp4").stat().st_size < (tmp_path / "9.mp4").stat().st_size
+
+
+def test_odd_sizes_keep_every_pixel(tmp_path):
+    pictures = smooth_pictures(3, width=33, height=21)
+    write_pictures(tmp_path / "odd.mp4", pictures, fps=10, quality=9)
+    header, frames = read_video(tmp_path / "odd.mp4")
+    assert header["size"] == (34, 22)
+    assert psnr(frames[:, :21, :33], np.stack(pictures)) > 35
+
+
+def test_a_name_without_ending_is_a_folder_of_pngs(tmp_path):
+    pictures = smooth_pictures(3)
+    (tmp_path / "still").mkdir()
+    assert write_pictures(tmp_path / "still", pictures, fps=10) == 3
+    names = sorted(path.name for path in (tmp_path / "still").iterdir())
+    assert names == ["00000.png", "00001.png", "00002.png"]
+    for name, picture in zip(names, pictures, strict=True):
+        assert np.array_equal(np.asarray(Image.open(tmp_path / "still" / name)), picture)
+    assert [path.name for path in tmp_path.iterdir()] == ["still"]
+
+
+@pytest.mark.parametrize("name", ["drive.mp4", "still"])
+def test_an_interrupted_film_leaves_nothing(tmp_path, name):
+    def interrupted():
+        yield from smooth_pictures(2)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_pictures(tmp_path / name, interrupted(), fps=10)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_filmed_is_said(tmp_path):
+    with pytest.raises(ValueError, match="got none"):
+        write_pictures(tmp_path / "a.mp4", [], fps=10)
+    with pytest.raises(ValueError, match=r"one size, got \(8, 8, 3\) after \(48, 64, 3\)"):
+        write_pictures(tmp_path / "a.mp4", [*smooth_pictures(1), np.zeros((8, 8, 3), np.uint8)], fps=10)
+    with pytest.raises(ValueError, match=r"ends in \.mp4.*got 'a\.gif'"):
+        write_pictures(tmp_path / "a.gif", smooth_pictures(1), fps=10)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_ffmpeg_the_extra_is_named_but_pngs_go_on(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'sparsestreet\[video\]'"):
+        write_pictures(tmp_path / "a.mp4", smooth_pictures(1), fps=10)
+    assert write_pictures(tmp_path / "still", smooth_pictures(1), fps=10) == 1

@@ -1,0 +1,56 @@
+import pytest
+
+from sparsestreet.whole_file import whole_file, whole_folder
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
+    path = tmp_path / "new" / "a.txt"
+    with whole_file(path) as temporary:
+        temporary.write_text("one")
+        assert temporary.suffix == ".txt"
+        assert not path.exists()
+    assert path.read_text() == "one"
+    assert names(path.parent) == ["a.txt"]
+
+
+@pytest.mark.parametrize("stopped_by", [RuntimeError, KeyboardInterrupt])
+def test_a_failure_leaves_the_old_file(tmp_path, stopped_by):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(stopped_by), whole_file(path) as temporary:
+        temporary.write_text("half")
+        raise stopped_by
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_where_nothing_can_be_written_is_said_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "a.txt", tmp_path):
+        with pytest.raises(OSError, match="cannot be written"), whole_file(path):
+            pytest.fail("the block must not run")
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_folder_takes_its_place_when_it_is_whole(tmp_path):
+    with whole_folder(tmp_path / "out") as temporary:
+        (temporary / "a").write_text("one")
+        assert names(tmp_path) == [temporary.name]
+    assert names(tmp_path) == ["out"]
+    assert (tmp_path / "out" / "a").read_text() == "one"
+    with pytest.raises(RuntimeError), whole_folder(tmp_path / "other") as temporary:
+        (temporary / "a").write_text("half")
+        raise RuntimeError
+    assert names(tmp_path) == ["out"]
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("")
+    with pytest.raises(OSError, match="no empty folder"), whole_folder(tmp_path / "out"):
+        pytest.fail("the block must not run")
+    assert names(tmp_path / "out") == ["mine"]
