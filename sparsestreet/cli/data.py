@@ -42,7 +42,7 @@ def _check(arguments: list[str]) -> int:
     if not any(text.startswith("data=") for text in overrides):
         overrides = ["data=drivestudio", *overrides]
     cfg = _compose(overrides)
-    if folders and ("root" not in cfg.data or len(folders) > 1):
+    if folders and ("root" not in set(cfg.data) or len(folders) > 1):
         raise _UsageError(f"one recorded log is checked at a time, got {' '.join(arguments)}: name one folder")
     if folders:
         # Not as an override: Hydra's grammar would want some characters of a path in quotes.
@@ -54,7 +54,7 @@ def _check(arguments: list[str]) -> int:
 
 def _make(overrides: list[str]) -> int:
     cfg = _compose(overrides)
-    if "root" in cfg.data:
+    if "root" in set(cfg.data):
         raise _UsageError("only data=synthetic can be made; a recorded drive is read as it is")
     reader = _reader(cfg)
     log = reader.read()

@@ -46,4 +46,4 @@ def test_every_problem_is_printed_with_its_remedy(tmp_path, console):
 
 def test_a_folder_that_is_not_there_is_a_problem(tmp_path, console):
     assert report_check(DriveStudioReader(tmp_path / "nowhere"), console) == 1
-    assert "no images/" in console.file.getvalue()
+    assert "nothing is there" in console.file.getvalue()

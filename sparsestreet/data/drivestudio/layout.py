@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.data.problems import fault
+from sparsestreet.data.formats import published_format
+from sparsestreet.data.problems import LogError, fault
 
 _FRAME = re.compile(r"(\d+)")
 _CAMERA = re.compile(r"(\d+)")
@@ -104,7 +105,7 @@ def find_layout(
     Raises LogError where the folder is no such log, ValueError where cameras or frames are asked for that it lacks.
     """
     if not (root / "images").is_dir():
-        raise fault(root, "the folder has no images/", "name the folder of one scene in DriveStudio's processed layout")
+        raise _no_log(root)
     waymo = (root / "ego_pose").is_dir()
     if not waymo and not _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA):
         remedy = "add ego_pose/TTT.txt (Waymo flavour) or extrinsics/TTT_C.txt (nuScenes flavour)"
@@ -121,6 +122,21 @@ def find_layout(
     if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(on_disk):
         raise ValueError(f"cameras {list(chosen)} must be different ones of the log's {on_disk}: {root}")
     return Layout(root, waymo, range(first_frame, last + 1), chosen, on_disk[0], count)
+
+
+def _no_log(root: Path) -> LogError:
+    """What is there instead of a scene, and what to do about it."""
+    wanted = "the folder of one scene in DriveStudio's processed layout"
+    published = published_format(root)
+    if published:
+        remedy = f"convert it with DriveStudio's preprocessing, and name {wanted}"
+        return fault(root, f"this is {published}, which must be converted before it can be read", remedy)
+    if not root.is_dir():
+        return fault(root, "this is a file" if root.exists() else "nothing is there", f"name {wanted}")
+    scenes = sorted(path.parent.name for path in root.glob("*/images"))
+    if scenes:
+        return fault(root, f"the folder has no images/; it holds {len(scenes)} scenes", f"name one: {root / scenes[0]}")
+    return fault(root, "the folder has no images/", f"name {wanted}")
 
 
 def _count_frames(root: Path, waymo: bool) -> int:

@@ -1,5 +1,8 @@
 """A street read as a log: the reader's frames, tracks and points are the tracer's."""
 
+import dataclasses
+import re
+
 import numpy as np
 import torch
 
@@ -30,6 +33,24 @@ def test_a_street_opens_as_a_log(tmp_path):
         actor = world.actors[int(distances.argmin())]
         assert track.class_name == actor.model.class_name
         np.testing.assert_allclose(track.size.numpy(), actor.model.size, rtol=1e-6)
+
+
+def test_every_setting_has_a_folder_of_its_own_and_the_seed_comes_last():
+    folders = {}
+    for field in dataclasses.fields(StreetSettings):
+        value = getattr(SETTINGS, field.name)
+        changed = {field.name: (1.0,) if field.name == "novel_offsets" else 3 if value == 2 else value + 1}
+        folders[field.name] = StreetReader(dataclasses.replace(SETTINGS, **changed)).folder
+    plain = StreetReader(SETTINGS).folder
+    assert len({plain, *folders.values()}) == len(folders) + 1
+    assert re.fullmatch(r"outputs/streets/64x40x2_[0-9a-f]{8}_seed1", str(plain))
+    # What a report needs to see that two streets differ in nothing but the seed.
+    assert str(folders["seed"]) == str(plain).removesuffix("1") + "2"
+
+
+def test_a_street_lies_where_it_is_told_to(tmp_path):
+    assert StreetReader(SETTINGS, root=tmp_path / "a", parent="b").folder == tmp_path / "a"
+    assert StreetReader(SETTINGS, parent=tmp_path).folder.parent == tmp_path
 
 
 def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:

@@ -1,0 +1,116 @@
+"""`sparsestreet data`: what it looks at, what it makes, and one line on what is wrong."""
+
+from pathlib import Path
+
+import pytest
+
+from sparsestreet.cli.data import data
+from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_lines
+
+SMALL = [
+    f"data.log.settings.{setting}"
+    for setting in (
+        "num_frames=2", "width=32", "height=20", "num_cameras=1", "lidar_beams=4", "lidar_azimuth_steps=40",
+        "num_parked_cars=1", "num_moving_cars=0", "num_pedestrians=0", "num_cyclists=0",
+    )
+]  # fmt: skip
+
+
+@pytest.fixture
+def lens(tmp_path) -> Path:
+    """A log of 12 frames whose second camera has a lens with distortion, and whose frame 7 lacks its points."""
+    make_waymo(tmp_path, frames=12)
+    write_lines(tmp_path / "intrinsics/1.txt", [40.0, 40, 20, 12, 0.25, 0, 0, 0, 0])
+    (tmp_path / "lidar/007.bin").unlink()
+    return tmp_path
+
+
+@pytest.mark.parametrize("say", [lambda root: f"{root}", lambda root: f"data.root={root}"])
+def test_a_folder_is_checked_as_it_is_or_by_its_key(say, tmp_path, capsys):
+    assert data(["check", say(make_nuscenes(tmp_path))]) == 0
+    assert "ready to train" in capsys.readouterr().out
+
+
+def test_a_folder_may_be_named_as_it_likes(tmp_path, capsys):
+    odd = tmp_path / "a, b {c} $d 'e'"
+    assert data(["check", str(make_nuscenes(odd))]) == 0
+    assert "ready to train" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("choice", "count"),
+    [
+        ([], 2),
+        (["data.log.ignore_distortion=true"], 1),
+        (["data.log.cameras=[0]"], 1),
+        (["data.log.last_frame=6"], 1),
+        (["data.log.first_frame=8", "data.log.cameras=[0]"], 0),
+        (["data.log.last_frame=5", "data.log.ignore_distortion=true"], 0),
+    ],
+)
+def test_only_what_would_be_read_is_checked(choice, count, lens, capsys):
+    assert data(["check", str(lens), *choice]) == (1 if count else 0)
+    printed = capsys.readouterr().out
+    assert (f"{count} to repair" if count else "ready to train") in printed
+    if "data.log.first_frame=8" in choice:
+        assert "4 x 1" in printed
+
+
+def test_the_remedy_names_the_key_that_works(lens, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    data(["check", str(lens)])
+    assert "data.log.ignore_distortion=true" in capsys.readouterr().out
+
+
+def test_the_size_is_the_one_that_would_be_read(tmp_path, capsys):
+    assert data(["check", str(make_nuscenes(tmp_path)), "data.log.width=20"]) == 0
+    assert "20x12" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["check"], "say sparsestreet data check DIR"),
+        (["check", "a", "b"], "name one folder"),
+        (["check", "a", "data=synthetic"], "name one folder"),
+        (["check", "{log}", "data.log.width=41"], "width must be within 1 to 40"),
+        (["check", "{log}", "data.log.cameras=[7]"], "cameras [7] must be different ones of the log's [0, 1]"),
+        (["check", "{log}", "data.log.last_frme=3"], "no key 'data.log.last_frme'"),
+        (["make", "data=drivestudio", "data.root={log}"], "only data=synthetic can be made"),
+        (["make", "data.log.settings.width=-5"], "StreetSettings.width must be positive but is -5"),
+        (["make", *SMALL, "data.log.root={log}"], "holds something else"),
+    ],
+)
+def test_a_wrong_command_is_answered_in_one_line(arguments, words, tmp_path, capsys):
+    log = make_nuscenes(tmp_path)
+    assert data([argument.replace("{log}", str(log)) for argument in arguments]) == 2
+    written = capsys.readouterr()
+    assert words in written.err
+    assert written.err.startswith(f"sparsestreet data {arguments[0]}: ")
+    assert written.err.count("\n") == 1
+    assert written.out == ""
+
+
+def test_streets_of_other_settings_lie_beside_each_other(tmp_path, capsys):
+    for choice in ([], ["data.log.settings.ego_speed=5.0"], []):
+        assert data(["make", *SMALL, f"data.log.parent={tmp_path}", *choice]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(": ")[2] for line in lines] == ["2 frames of 1 cameras"] * 3
+    folders = [line.partition(":")[0] for line in lines]
+    assert folders[0] == folders[2]
+    assert {Path(folder) for folder in folders} == set(tmp_path.iterdir())
+    assert len(set(folders)) == 2
+
+
+def test_a_street_is_checked_like_a_log(tmp_path, capsys):
+    assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}"]) == 0
+    assert "2 x 1" in capsys.readouterr().out
+    assert (tmp_path / "mine/images/000_0.jpg").is_file()
+    (tmp_path / "mine/images/000_0.jpg").unlink()
+    assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}"]) == 1
+
+
+@pytest.mark.parametrize(("arguments", "status"), [([], 2), (["look"], 2), (["--help"], 0), (["check", "--help"], 0)])
+def test_usage(arguments, status, capsys):
+    assert data(arguments) == status
+    assert "sparsestreet data check DIR" in capsys.readouterr().out
