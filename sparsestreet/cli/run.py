@@ -5,6 +5,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import torch
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from omegaconf import DictConfig, OmegaConf
@@ -23,6 +24,7 @@ from sparsestreet.training.callbacks import (
     TrainingProgress,
     newest_checkpoint,
 )
+from sparsestreet.training.curves import kept_curves
 
 log = logging.getLogger(__name__)
 
@@ -45,8 +47,10 @@ def run(cfg: DictConfig, out: Path) -> float:
     system = recipe.build(data)
     # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
     resume = {} if checkpoint is None else {"ckpt_path": checkpoint, "weights_only": False}
+    at = None if checkpoint is None else torch.load(checkpoint, map_location="cpu", weights_only=False)["global_step"]
     try:
-        trainer.fit(system, datamodule=data, **resume)
+        with kept_curves(out / "curves" / "metrics.csv", at):
+            trainer.fit(system, datamodule=data, **resume)
     except SystemExit:
         sys.exit(stop.exit_status or 1)
     if trainer.fast_dev_run:
@@ -98,5 +102,6 @@ def _checkpoint(cfg: DictConfig) -> Path | None:
 def silence_known_noise() -> None:
     """Hints of Lightning that do not apply: frames come from a cache, a loader process would copy them."""
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)

@@ -44,7 +44,14 @@ class GracefulStop(Callback):
         if self.received is not None:
             raise KeyboardInterrupt
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        # Lightning tears no callback down after an exception.
+        self._release()
+
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._release()
+
+    def _release(self) -> None:
         while self._before:
             number, handler = self._before.popitem()
             signal.signal(number, handler)
