@@ -1,6 +1,6 @@
 """Which points lie in which object's box."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -50,12 +50,16 @@ def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Ge
     return points
 
 
-def lidar_in_box(track: Track, sweeps: Sequence[Sweep]) -> Points:
-    """Colored returns inside the object's box at their own instant, in the box frame."""
-    parts = []
+def lidar_in_boxes(tracks: Sequence[Track], sweeps: Iterable[Sweep]) -> list[Points]:
+    """For each object, the colored returns inside its box at their own instant, in the box frame.
+
+    One pass over the sweeps, which may be read from disk while it lasts.
+    """
+    parts: list[list[Points]] = [[] for _ in tracks]
     for sweep in sweeps:
-        in_box_frame = points_in_box_frame(track, sweep.index, sweep.points)
-        if in_box_frame is not None:
-            inside = inside_box(in_box_frame, track.size) & sweep.colored
-            parts.append(Points(in_box_frame, sweep.colors).where(inside))
-    return Points.concatenate(parts)
+        for track, found in zip(tracks, parts, strict=True):
+            in_box_frame = points_in_box_frame(track, sweep.index, sweep.points)
+            if in_box_frame is not None:
+                inside = inside_box(in_box_frame, track.size) & sweep.colored
+                found.append(Points(in_box_frame, sweep.colors).where(inside))
+    return [Points.concatenate(found) for found in parts]

@@ -1,13 +1,12 @@
 """Colored points in the world: what lidar saw, and random guesses where it saw nothing."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames
 from sparsestreet.geometry.cameras import project
 from sparsestreet.types import Frame
 
@@ -84,11 +83,11 @@ def random_points(
             break
         candidates = draw(CANDIDATES_PER_POINT * count, center, radius, generator)
         views = torch.randperm(len(frames), generator=generator)[:VIEWS_PER_ROUND].tolist()
-        found = Points.concatenate([found, seen_points(candidates, [frames[view] for view in views])])
+        found = Points.concatenate([found, seen_points(candidates, (frames[view] for view in views))])
     return found.sampled(count, generator)
 
 
-def seen_points(positions: Float[Tensor, "n 3"], frames: Sequence[Frame]) -> Points:
+def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Points:
     """Those positions that the first view looking at them does not show as sky, with the color they have there.
 
     A ray that ends in the sky meets nothing, so a Gaussian on it could only learn to vanish. Without sky masks every

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_box
+from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_boxes
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -19,7 +19,7 @@ from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
 from sparsestreet.scene.nodes.trajectory import Trajectories, keyframe_interval
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Gaussians, Sweep, Track, View
+from sparsestreet.types import Gaussians, Track, View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +39,8 @@ class RigidSettings(NodeSettings):
         tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
         if not tracks:
             return None
-        sweeps = data.sweeps
-        objects = [self._object_points(track, sweeps, generator) for track in tracks]
+        measured = lidar_in_boxes(tracks, data.sweeps)
+        objects = [self._object_points(*pair, generator) for pair in zip(tracks, measured, strict=True)]
         counts = torch.tensor([len(points) for points in objects])
         rows, mask = self.start(
             data,
@@ -71,9 +71,9 @@ class RigidSettings(NodeSettings):
         names = tuple(header["names"])
         return Rigid(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
 
-    def _object_points(self, track: Track, sweeps: Sequence[Sweep], generator: torch.Generator) -> Points:
+    def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
         """One object's colored points in its box frame, filled up where lidar left too few."""
-        lidar = lidar_in_box(track, sweeps).sampled(self.points_per_instance, generator)
+        lidar = measured.sampled(self.points_per_instance, generator)
         missing = min(self.box_points, self.points_per_instance) - len(lidar)
         if missing <= 0:
             return lidar
