@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, Look, PruningRule
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, Look, PruningRule, prunable_floors
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
-from sparsestreet.scene.sky import Sky
+from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import Camera, Frame
 from tests.scene.street import background
 
@@ -88,8 +88,9 @@ def test_a_row_seen_in_one_view_of_two_stays():
     assert rule.select(scene, [front, behind], LOOK)["background"].removed == 0
 
 
-def test_what_shows_a_vehicle_costs_more():
-    # Equal discs side by side, each in its own half of the image; the right half is marked as a vehicle.
+@pytest.mark.parametrize("region", ["vehicle", "human"])
+def test_what_shows_a_vehicle_or_a_person_costs_more(region: str):
+    # Equal discs side by side, each in its own half of the image; one half is marked.
     scene = scene_of([0.5, 0.5], [2.0, 2.0])
     with torch.no_grad():
         scene.nodes["background"].rows.means.copy_(torch.tensor([[-0.12, 0.0, 2.0], [0.12, 0.0, 2.0]]))
@@ -97,12 +98,36 @@ def test_what_shows_a_vehicle_costs_more():
     frame = frame_of(scene, 20)
     halves = torch.zeros(7, 9, dtype=torch.bool)
     halves[:, 5:] = True
-    for vehicle, kept in ((halves, [False, True]), (halves.flip(1), [True, False])):
-        marked = replace(frame, vehicle=vehicle)
+    for mask, kept in ((halves, [False, True]), (halves.flip(1), [True, False])):
+        marked = replace(frame, **{region: mask})
         budgets = [LeaveOneOutRule(db, noticeable=0.0) for db in torch.linspace(0.1, 25, 250).tolist()]
         selections = [rule.select(scene, [marked], LOOK)["background"] for rule in budgets]
         first = next(selection for selection in selections if selection.removed)
         assert first.keep.tolist() == kept
+
+
+def test_a_change_is_measured_over_the_sky():
+    """A disc of the sky's color is not missed, a black one before the same sky is."""
+    white = Sky(SkySettings(2, initial_color=1.0))
+    color = (1.0 - 0.5) / 0.28209479177387814
+    for sh_dc, sky, removed in ((color, white, 1), (-9.0, white, 0), (color, None, 0), (-9.0, None, 1)):
+        scene = scene_of([0.3], [2.0], sky=sky)
+        with torch.no_grad():
+            scene.nodes["background"].rows.sh_dc.fill_(sh_dc)
+        selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], LOOK)["background"]
+        assert selection.removed == removed
+
+
+def test_only_prunable_nodes_are_asked_each_with_its_own_floor():
+    """A node that must not be pruned still stands in the way of what it hides."""
+    rows = [scene_of([opacity], [depth]).nodes["background"].rows for opacity, depth in ((0.99, 2.0), (0.3, 3.0))]
+    wall, hidden = background(rows[0], prunable=False), background(rows[1])
+    scene = SceneGraph({"wall": wall, "hidden": hidden, "kept": background(rows[1], min_gaussians=1)})
+    assert prunable_floors(scene) == {"hidden": 0, "kept": 1}
+    for rule in (LeaveOneOutRule(0.0), ImportanceRule()):
+        selections = rule.select(scene, [frame_of(scene, 5)], LOOK)
+        assert {name: each.removed for name, each in selections.items()} == {"hidden": 1, "kept": 0}
+        assert [each.floor_hit for each in selections.values()] == [False, True]
 
 
 def test_a_scene_without_error_loses_nothing_that_is_seen():

@@ -36,6 +36,15 @@ def test_nodes_in_their_order():
     assert torch.equal(placed.gaussians.means[4:], scene.nodes["cars"].gaussians_at(VIEW, degree(1)).means)
 
 
+def test_spans_tile_the_rows_of_three_nodes_of_different_sizes():
+    nodes = {"road": background(random_rows(4, 0)), "cars": cars(3), "trees": background(random_rows(5, 2))}
+    placed = SceneGraph(nodes).gaussians_at(VIEW, degree(1))
+    assert placed.spans == {"road": slice(0, 4), "cars": slice(4, 7), "trees": slice(7, 12)}
+    assert len(placed.gaussians) == 12
+    for name, node in nodes.items():
+        assert torch.equal(placed.gaussians.means[placed.spans[name]], node.gaussians_at(VIEW, degree(1)).means)
+
+
 def test_nodes_of_different_degree_are_padded():
     road = background(random_rows(2, 0, sh_degree=2))
     tree = background(random_rows(2, 1, sh_degree=0))
@@ -98,6 +107,12 @@ def test_bytes_of_every_part():
         "sky": 6 * 8 * 8 * 3 * 4,
     }
     assert SceneGraph({"road": road}).bytes_by_part() == {"road": 4 * 59 * 4, "poses": 0, "sky": 0}
+
+
+def test_poses_of_all_nodes_are_stored():
+    longer = keyframes([track("tram", [0, 1, 2], [pose(0, (5.0, 0, 0))] * 3)], 3)
+    trams = rigid(random_rows(2, 1, instances=torch.zeros(2, dtype=torch.int64)), longer)
+    assert SceneGraph({"cars": cars(3), "trams": trams}).bytes_by_part()["poses"] == (2 + 3) * 8 * 4
 
 
 def test_names_of_the_parameters():

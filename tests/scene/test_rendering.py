@@ -137,6 +137,18 @@ def test_the_image_moves_with_the_car():
     assert middle[0] - middle[1] > 1  # y is to the left; 2 m at 6 m distance are 2.8 pixels
 
 
+def test_the_last_frame_is_shown_at_its_own_time():
+    scene = scene_of(road_rows=0)
+    last = scene.nodes["cars"].keyframe_translations[0, -1]
+    with torch.no_grad():
+        scene.nodes["cars"].rows.means.zero_()
+    placed = scene.gaussians_at(view_at(1.0, CAMERA)).gaussians
+    assert torch.equal(placed.means, last.expand(5, 3))
+    means = rendered(scene, 1.0).rgb
+    scene.nodes["cars"].keyframe_translations[0, 0] = 50.0
+    assert torch.equal(rendered(scene, 1.0).rgb, means)
+
+
 def test_gradients_reach_every_parameter():
     """Finite differences in float64 of a random projection of the image, one random direction per parameter."""
     scene = scene_of(dtype=torch.float64, mask=None)

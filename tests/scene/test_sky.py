@@ -96,6 +96,14 @@ def test_gradient_of_the_texels():
     assert torch.autograd.gradcheck(colors, [sky.texels])
 
 
+def test_gradients_go_to_the_texels_only():
+    directions = torch.randn(5, 3, generator=torch.Generator().manual_seed(3), requires_grad=True)
+    sky = random_sky(3)
+    sky.colors(directions).sum().backward()
+    assert directions.grad is None
+    assert (sky.texels.grad != 0).any()
+
+
 def test_the_diagonals_and_an_empty_image():
     assert torch.isfinite(random_sky(4).colors(torch.tensor([[[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0]]]))).all()
     assert Sky(SkySettings(2)).colors(torch.zeros(0, 4, 3)).shape == (0, 4, 3)

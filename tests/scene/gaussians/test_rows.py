@@ -68,6 +68,24 @@ def test_training_goes_on_as_if_removed_rows_had_never_been():
         assert torch.equal(column, alone.columns()[name][kept]), name
 
 
+def test_a_frozen_column_stays_frozen_and_out_of_the_optimizer():
+    rows = random_rows(6, 0, mask=MASK)
+    rows.means.requires_grad_(False)
+    trainable = [parameter for parameter in rows.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.Adam(trainable)
+    means = rows.means.clone()
+    rows.resize(RowPlan(6, torch.tensor([5, 0, 3]), torch.tensor([False, True, False])), optimizer)
+    assert not rows.means.requires_grad
+    assert torch.equal(rows.means, means[[5, 0, 3]])
+    assert all(parameter.requires_grad for name, parameter in rows.named_parameters() if name != "means")
+    assert all(rows.means is not held for group in optimizer.param_groups for held in group["params"])
+    # Also through a checkpoint, of another length or of the same.
+    for count in (3, 8):
+        rows.load_state_dict(random_rows(count, 1, mask=MASK).state_dict())
+        assert len(rows) == count
+        assert [name for name, parameter in rows.named_parameters() if not parameter.requires_grad] == ["means"]
+
+
 def test_resizing_before_the_first_step_and_without_optimizer():
     rows = random_rows(3, 0)
     optimizer = torch.optim.Adam(rows.parameters())

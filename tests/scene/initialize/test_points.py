@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import torch
 
 from sparsestreet.geometry.cameras import project
@@ -59,6 +61,24 @@ def test_random_points_are_drawn_until_there_are_enough():
     points = random_points(near_positions, 40, CENTER, 20.0, frames, torch.Generator().manual_seed(0))
     assert len(points) == 40
     assert project(frames[0].camera, points.positions)[2].all()
+
+
+def test_random_points_come_from_all_views_in_the_colors_of_each():
+    """Two cameras back to back: neither sees what the other does."""
+    ahead = frame_at(0)
+    turned = ahead.camera.camera_from_world.clone()
+    turned[[0, 2]] *= -1  # x to the left, z backward
+    backward = replace(ahead, camera=replace(ahead.camera, camera_from_world=turned), image=255 - ahead.image)
+    frames = [ahead, backward]
+    center = ahead.camera.position
+    points = random_points(near_positions, 200, center, 20.0, frames, torch.Generator().manual_seed(0))
+    seen = [project(frame.camera, points.positions) for frame in frames]
+    assert not (seen[0][2] & seen[1][2]).any()
+    for frame, (pixels, _, inside) in zip(frames, seen, strict=True):
+        assert 50 < int(inside.sum()) < 150
+        column, row = pixels[inside].long().unbind(1)
+        assert torch.equal(points.colors[inside], frame.image[row, column] / 255)
+    assert len(points) == 200
 
 
 def test_views_of_nothing_give_up():
