@@ -1,7 +1,8 @@
 """``sparsestreet evaluate run=RUN``: measure a trained run again."""
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from hydra.utils import get_class
@@ -9,6 +10,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, this_command
 from sparsestreet.cli.compose import load_run_config
+from sparsestreet.cli.options import run_command
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import RunDescription, read_run, run_path, summary_path
 from sparsestreet.evaluation.run import evaluate_scene
@@ -23,23 +25,21 @@ said about the training stays.
 """
 
 
+@dataclass(frozen=True)
+class Options:
+    """The words of the command."""
+
+    run: Path
+    device: Literal["cpu", "cuda"] | None = None
+
+
 def evaluate(arguments: list[str]) -> int:
-    """Open the run's scene and its log, write records and pictures; 2 on wrong usage, 1 where it cannot be read."""
-    given = dict(text.split("=", 1) for text in arguments if "=" in text)
-    if "--help" in arguments:
-        print(USAGE)
-        return 0
-    if "run" not in given or set(given) - {"run", "device"}:
-        print(USAGE, file=sys.stderr)
-        return 2
-    try:
-        return _evaluate(Path(given["run"]), given.get("device"))
-    except (FileNotFoundError, ValueError) as error:
-        print(f"sparsestreet evaluate: {error}", file=sys.stderr)
-        return 1
+    """Open the run's scene and its log, write records and pictures; statuses as in ``run_command``."""
+    return run_command("evaluate", USAGE, arguments, Options, _evaluate)
 
 
-def _evaluate(run: Path, device: str | None) -> int:
+def _evaluate(options: Options) -> None:
+    run = options.run
     cfg, description = load_run_config(run), read_run(run_path(run))
     _import_nodes(cfg)
     stored = load_scene(run)
@@ -52,13 +52,12 @@ def _evaluate(run: Path, device: str | None) -> int:
         options=stored.options,
         out=run,
         command=this_command(["evaluate", f"run={run}"]),
-        device=_device(description, device),
+        device=_device(description, options.device),
     )
     draw_history(run)
     for split, quality in summary.quality.items():
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
     print(f"{summary.gaussians_total:,} Gaussians, {summary.latency.p50:.1f} ms/frame; records in {summary_path(run)}")
-    return 0
 
 
 def _import_nodes(cfg: DictConfig) -> None:
