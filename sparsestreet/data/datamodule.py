@@ -110,9 +110,9 @@ class StreetData(LightningDataModule):
         trainer = self.trainer
         return ShuffledFrames(self.split.train, self.seed, None if trainer is None else lambda: trainer.global_step)
 
-    def val_dataloader(self) -> OrderedFrames:
-        """The held-out frames in the order of the log, or ``val_frames`` of them."""
-        return OrderedFrames(self.split.held_out, self.val_frames)
+    def val_dataloader(self) -> OrderedFrames | list:
+        """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out."""
+        return OrderedFrames(self.split.held_out, self.val_frames) if len(self.split.held_out) else []
 
     def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
         """The frame on the device (Lightning itself cannot move a frozen dataclass)."""

@@ -118,14 +118,14 @@ def _decoded(kind: object, value: Json, where: str) -> typing.Any:
     return _of(kind, value, where)
 
 
-def _decoded_union(kinds: tuple[type, ...], value: Json, where: str) -> typing.Any:
+def _decoded_union(kinds: tuple[typing.Any, ...], value: Json, where: str) -> typing.Any:
     """None beside one kind of any sort, or one of several plain kinds."""
     if type(value) in kinds:
         return value
     others = [kind for kind in kinds if kind is not types.NoneType]
     if len(others) == 1:
         return _decoded(others[0], value, where)
-    names = ", ".join(kind.__name__ for kind in kinds)
+    names = ", ".join(getattr(kind, "__name__", str(kind)) for kind in kinds)
     raise RecordError(f"{where}: expected one of {names}, got {type(value).__name__} {value!r}")
 
 

@@ -176,7 +176,7 @@ def test_masks_end_with_their_stage(finished):
 
 def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     out = run_train(tmp_path, "node.background.max_gaussians=2300", "node.background.density.grad_threshold=1e-6")
-    assert read_run(run_path(out)).caps == {"background": 2300}
+    assert read_run(run_path(out)).caps["background"] == 2300
 
 
 @pytest.mark.parametrize(
