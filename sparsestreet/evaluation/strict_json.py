@@ -118,7 +118,7 @@ def _decoded(kind: object, value: Json, where: str) -> typing.Any:
     return _of(kind, value, where)
 
 
-def _decoded_union(kinds: tuple[type, ...], value: Json, where: str) -> typing.Any:
+def _decoded_union(kinds: tuple[typing.Any, ...], value: Json, where: str) -> typing.Any:
     """None beside one kind of any sort, or one of several plain kinds."""
     if type(value) in kinds:
         return value
