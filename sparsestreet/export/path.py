@@ -50,12 +50,12 @@ def of_cameras(path: CameraPath, cameras: Sequence[int]) -> CameraPath:
 
 
 def left_to_right(rig: Rig) -> list[int]:
-    """Camera indices by the yaw of their optical axes, seen from the camera of the lowest index: leftmost first."""
-    world_to_front = rig[0].camera.camera_from_world[:3, :3].double()
+    """Camera indices by the yaw of their optical axes, seen from the first camera of the rig: leftmost first."""
+    front_from_world = rig[0].camera.camera_from_world[:3, :3].double()
 
     def yaw(view: View) -> float:
-        """To the right of the front camera, radians; the third row of camera_from_world is the axis in the world."""
-        x, _, z = (world_to_front @ view.camera.camera_from_world[2, :3].double()).tolist()
+        """To the right of the first camera, radians; the third row of camera_from_world is the axis in the world."""
+        x, _, z = (front_from_world @ view.camera.camera_from_world[2, :3].double()).tolist()
         return round(math.atan2(x, z), 6)
 
     return [view.camera_index for view in sorted(rig, key=lambda view: (yaw(view), view.camera_index))]
