@@ -21,9 +21,14 @@ def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
 def test_a_failure_leaves_the_old_file(tmp_path, stopped_by):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(stopped_by), whole_file(path) as temporary:
-        temporary.write_text("half")
-        raise stopped_by
+
+    def fail() -> None:
+        with whole_file(path) as temporary:
+            temporary.write_text("half")
+            raise stopped_by
+
+    with pytest.raises(stopped_by):
+        fail()
     assert path.read_text() == "old"
     assert names(tmp_path) == ["a.txt"]
 
@@ -42,10 +47,17 @@ def test_a_folder_takes_its_place_when_it_is_whole(tmp_path):
         assert names(tmp_path) == [temporary.name]
     assert names(tmp_path) == ["out"]
     assert (tmp_path / "out" / "a").read_text() == "one"
-    with pytest.raises(RuntimeError), whole_folder(tmp_path / "other") as temporary:
-        (temporary / "a").write_text("half")
-        raise RuntimeError
-    assert names(tmp_path) == ["out"]
+
+
+def test_a_failure_leaves_no_folder(tmp_path):
+    def fail() -> None:
+        with whole_folder(tmp_path / "out") as temporary:
+            (temporary / "a").write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert names(tmp_path) == []
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):

@@ -10,7 +10,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -79,6 +79,8 @@ def override_problem(overrides: list[str], config_name: str = "train") -> str | 
         single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
         try:
             cfg = compose(config_name, single)
+        except OverrideParseException as error:
+            return f"{error.override!r} cannot be read: put a value with special characters in quotes, key='a=b'"
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             cause = error.__cause__ or error
             key = getattr(cause, "full_key", None)

@@ -5,16 +5,14 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from hydra.utils import get_class
-from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, this_command
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.options import run_command
+from sparsestreet.cli.scene import open_scene
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import RunDescription, read_run, run_path, summary_path
 from sparsestreet.evaluation.run import evaluate_scene
-from sparsestreet.scene.storage import load_scene
 
 USAGE = """\
 sparsestreet evaluate run=RUN [device=cpu|cuda]
@@ -41,8 +39,7 @@ def evaluate(arguments: list[str]) -> int:
 def _evaluate(options: Options) -> None:
     run = options.run
     cfg, description = load_run_config(run), read_run(run_path(run))
-    _import_nodes(cfg)
-    stored = load_scene(run)
+    stored = open_scene(run, "cpu")
     data = data_of(cfg)
     summary = evaluate_scene(
         stored.scene,
@@ -58,12 +55,6 @@ def _evaluate(options: Options) -> None:
     for split, quality in summary.quality.items():
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
     print(f"{summary.gaussians_total:,} Gaussians, {summary.latency.p50:.1f} ms/frame; records in {summary_path(run)}")
-
-
-def _import_nodes(cfg: DictConfig) -> None:
-    """The scene file names the classes of its nodes; those from outside this package must be known first."""
-    for node in cfg.node.values():
-        get_class(node._target_)
 
 
 def _device(description: RunDescription, device: str | None) -> torch.device:

@@ -45,10 +45,10 @@ def export(arguments: list[str]) -> int:
 
 def _export(request: ExportRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
+    from sparsestreet.cli.scene import open_scene
     from sparsestreet.export.ply import scene_gaussians, write_ply
-    from sparsestreet.scene.storage import load_scene
 
-    stored = load_scene(request.scene)
+    stored = open_scene(request.scene, "cpu")
     instances = None if request.instance is None else [request.instance]
     gaussians = scene_gaussians(stored, request.time, nodes=request.nodes, instances=instances)
     count = write_ply(request.out, gaussians)

@@ -67,7 +67,8 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | N
     loose = []
     for word in words:
         key, equals, text = word.partition("=")
-        if not equals or not key.isidentifier():
+        # A folder may have an equals sign in its name: those of sweeps do.
+        if not equals or not key.isidentifier() or (positional is not None and Path(word).exists()):
             loose.append(word)
         elif key not in names:
             raise OptionError(unknown_key(key, names))

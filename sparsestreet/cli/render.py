@@ -74,14 +74,13 @@ def render(arguments: list[str]) -> int:
 def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.progress import shown
-    from sparsestreet.cli.scene import chosen_device
+    from sparsestreet.cli.scene import open_scene
     from sparsestreet.export.video import check_destination, path_pictures, write_pictures
     from sparsestreet.export.views import FILE_NAME, read_views
-    from sparsestreet.scene.storage import load_scene
 
     started = time.perf_counter()
     check_destination(request.out)
-    stored = load_scene(request.scene, chosen_device(request.device))
+    stored = open_scene(request.scene, request.device)
     beside = request.scene if request.scene.is_dir() else request.scene.parent
     views = read_views(request.views or beside / FILE_NAME)
     log_fps = request.log_fps or views.frames_per_second
@@ -92,8 +91,8 @@ def _render(request: RenderRequest) -> None:
     path = _path(request, views.all, step=log_fps / fps / max(stored.num_frames - 1, 1))
     pictures = shown(path_pictures(stored, path), len(path), "frames")
     count = write_pictures(request.out, pictures, fps=fps, quality=request.quality)
-    seconds = time.perf_counter() - started
-    print(f"{request.out}: {count} frames of {len(path[0])} cameras at {fps:g} a second, made in {seconds:.0f} s")
+    cameras, seconds = ", ".join(str(view.camera_index) for view in path[0]), time.perf_counter() - started
+    print(f"{request.out}: {count} frames of camera {cameras} at {fps:g} a second, made in {seconds:.0f} s")
 
 
 def _path(request: RenderRequest, views: "Sequence[View]", step: float) -> "CameraPath":

@@ -1,16 +1,36 @@
 """What the commands that open a trained scene have in common."""
 
+from pathlib import Path
+
 import torch
+from hydra.utils import get_class
+
+from sparsestreet.cli.compose import load_run_config
+from sparsestreet.scene.storage import StoredScene, load_scene
 
 
-def chosen_device(name: str | None) -> torch.device:
-    """The device of that name; None: a GPU if there is one. Raises ValueError for one that is not there."""
+def open_scene(path: Path, device: str | None = None) -> StoredScene:
+    """The scene file, or that of a run's folder, on a device; None: a GPU if there is one.
+
+    Raises FileNotFoundError where there is none, ValueError for a device that is not there or a file that is no scene.
+    """
+    if (path / ".hydra").is_dir():
+        import_nodes(path)
+    return load_scene(path, _device(device))
+
+
+def import_nodes(run: Path) -> None:
+    """Make the run's node classes known: a scene file names them, but imports nothing from outside this package."""
+    for node in load_run_config(run).node.values():
+        if not node._target_.startswith("sparsestreet."):
+            get_class(node._target_)
+
+
+def _device(name: str | None) -> torch.device:
     if name is None:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"device must be cpu or cuda, got {name!r}") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
+    if name.partition(":")[0] not in ("cpu", "cuda"):
+        raise ValueError(f"device must be cpu or cuda, got {name!r}")
+    if name != "cpu" and not torch.cuda.is_available():
         raise ValueError(f"device={name} asks for a GPU, but torch sees none: say device=cpu, or check the driver")
-    return device
+    return torch.device(name)

@@ -17,28 +17,20 @@ Rig = tuple[View, ...]
 """The cameras of one instant, lowest index first unless they were chosen in another order."""
 
 CameraPath = tuple[Rig, ...]
-"""Rigs of the same cameras in order of time."""
+"""Rigs in order of time."""
 
 _SAME = 1e-3
 """Of a step: an instant so near a recorded one is the recorded one."""
 
 
 def recorded(views: Sequence[View]) -> CameraPath:
-    """The views as they were recorded. Raises ValueError without any, or where an instant lacks a camera."""
+    """The views as they were recorded. Raises ValueError without any."""
     if not views:
         raise ValueError("a path needs views, got none: check that the log's views were written")
     instants = defaultdict(list)
     for view in views:
         instants[view.time].append(view)
-    path = tuple(tuple(sorted(instants[time], key=lambda view: view.camera_index)) for time in sorted(instants))
-    everywhere = _indices(path[0])
-    for rig in path:
-        if _indices(rig) != everywhere:
-            raise ValueError(
-                f"every instant of a path has the same cameras, but frame {rig[0].frame_index} has {_indices(rig)} and "
-                f"frame {path[0][0].frame_index} {everywhere}: leave out the views of the incomplete one"
-            )
-    return path
+    return tuple(tuple(sorted(instants[time], key=lambda view: view.camera_index)) for time in sorted(instants))
 
 
 def of_frames(path: CameraPath, frames: slice) -> CameraPath:
@@ -53,20 +45,17 @@ def of_frames(path: CameraPath, frames: slice) -> CameraPath:
 
 
 def of_cameras(path: CameraPath, cameras: Sequence[int]) -> CameraPath:
-    """Only these cameras, in the order they are named. Raises ValueError for an unknown one."""
-    unknown = [index for index in cameras if index not in _indices(path[0])]
-    if unknown or not cameras:
-        raise ValueError(f"no cameras {unknown}: the path has {_indices(path[0])}")
-    return tuple(tuple(next(view for view in rig if view.camera_index == index) for index in cameras) for rig in path)
+    """Only these cameras, in the order they are named. Raises ValueError for one that is unknown or missing once."""
+    return tuple(tuple(_view_of(rig, index) for index in cameras) for rig in path)
 
 
 def left_to_right(rig: Rig) -> list[int]:
-    """Camera indices by the yaw of their optical axes, seen from the camera of the lowest index: leftmost first."""
-    world_to_front = _front(rig).camera.camera_from_world[:3, :3].double()
+    """Camera indices by the yaw of their optical axes, seen from the first camera of the rig: leftmost first."""
+    front_from_world = rig[0].camera.camera_from_world[:3, :3].double()
 
     def yaw(view: View) -> float:
-        """To the right of the front camera, radians; the third row of camera_from_world is the axis in the world."""
-        x, _, z = (world_to_front @ view.camera.camera_from_world[2, :3].double()).tolist()
+        """To the right of the first camera, radians; the third row of camera_from_world is the axis in the world."""
+        x, _, z = (front_from_world @ view.camera.camera_from_world[2, :3].double()).tolist()
         return round(math.atan2(x, z), 6)
 
     return [view.camera_index for view in sorted(rig, key=lambda view: (yaw(view), view.camera_index))]
@@ -78,8 +67,10 @@ def shifted(path: CameraPath, offset: float) -> CameraPath:
     The views keep time and camera, but lose their frame index: nobody recorded them. Shift before choosing cameras.
     """
 
+    front = min(view.camera_index for view in path[0])
+
     def beside(rig: Rig) -> Rig:
-        vector = offset * _front(rig).camera.camera_from_world[0, :3].double()
+        vector = offset * _view_of(rig, front).camera.camera_from_world[0, :3].double()
         return tuple(replace(_bare(view), camera=_moved(view.camera, vector), frame_index=None) for view in rig)
 
     return tuple(beside(rig) for rig in path)
@@ -105,12 +96,14 @@ def resized(path: CameraPath, width: int) -> CameraPath:
     return _each_camera(path, lambda camera: _scaled(camera, width))
 
 
-def _indices(rig: Rig) -> list[int | None]:
-    return [view.camera_index for view in rig]
-
-
-def _front(rig: Rig) -> View:
-    return min(rig, key=lambda view: view.camera_index)
+def _view_of(rig: Rig, camera: int) -> View:
+    found = [view for view in rig if view.camera_index == camera]
+    if not found:
+        there = [view.camera_index for view in rig]
+        raise ValueError(
+            f"there is no camera {camera} in frame {rig[0].frame_index}, only {there}: choose other cameras or frames"
+        )
+    return found[0]
 
 
 def _bare(view: View) -> View:

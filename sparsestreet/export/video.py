@@ -14,7 +14,7 @@ from sparsestreet.export.path import CameraPath
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.whole_file import whole_file, whole_folder
 
-Picture = UInt8[np.ndarray, "h w 3"]
+Picture = UInt8[np.ndarray, "_h _w 3"]
 
 _COLORS = "color_primaries=bt709:color_trc=bt709:colorspace=bt709"
 _FILTERS = ["-vf", f"scale=out_color_matrix=bt709,format=yuv420p,setparams={_COLORS}"]
@@ -48,7 +48,7 @@ def check_destination(out: Path) -> None:
         raise ValueError(f"a video ends in .mp4, a folder of PNGs has no ending, got {out.name!r}")
 
 
-def write_pictures(out: Path | str, pictures: Iterable[Picture], *, fps: float, quality: float = 7) -> int:
+def write_pictures(out: Path | str, pictures: Iterable[Picture], *, fps: float, quality: float = 7.0) -> int:
     """A .mp4 where ``out`` ends so, else a folder of PNGs, whole or not at all; returns how many pictures there were.
 
     Args:

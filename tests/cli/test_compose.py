@@ -23,6 +23,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["experimant=capped"], "did you mean 'experiment'"),
         (["+surprise=1"], "no key 'surprise'"),
         (["seed=x"], "seed"),
+        (["out=runs/seed=1"], "'out=runs/seed=1' cannot be read"),
         (["node.background.mask.sparsity_weight=1e-3"], "has no effect with sparsify=none: choose sparsify=masks"),
         (["schedule.lambda_m=3"], "has no effect with sparsify=none"),
         (["sky=null"], "choose one of cube, none"),

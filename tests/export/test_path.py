@@ -21,10 +21,18 @@ def test_recorded_views_are_rigs_in_order_of_time():
 
 
 def test_an_instant_without_one_of_the_cameras_is_named():
-    with pytest.raises(ValueError, match=r"frame 4 has \[0, 1, 2\] and frame 0 \[0, 1, 2, 3\]"):
-        recorded(street_views()[:-1])
+    path = recorded(street_views()[:-1])
+    with pytest.raises(ValueError, match=r"no camera 3 in frame 4, only \[0, 1, 2\]: choose other cameras or frames"):
+        of_cameras(path, [0, 3])
+    assert len(of_cameras(path, [0, 2])) == NUM_FRAMES
     with pytest.raises(ValueError, match="got none"):
         recorded([])
+
+
+def test_a_shift_needs_the_front_camera_all_the_time():
+    views = [view for view in street_views() if (view.frame_index, view.camera_index) != (4, 0)]
+    with pytest.raises(ValueError, match=r"no camera 0 in frame 4, only \[1, 2, 3\]"):
+        shifted(recorded(views), 1.0)
 
 
 def test_frames_and_cameras_choose():
@@ -35,7 +43,7 @@ def test_frames_and_cameras_choose():
     assert [view.camera_index for view in of_cameras(path, [3, 0])[4]] == [3, 0]
     with pytest.raises(ValueError, match="frames 7 to 9: the path has 0 to 4"):
         of_frames(path, slice(7, 9))
-    with pytest.raises(ValueError, match=r"cameras \[5\]: the path has \[0, 1, 2, 3\]"):
+    with pytest.raises(ValueError, match=r"no camera 5 in frame 0, only \[0, 1, 2, 3\]"):
         of_cameras(path, [0, 5])
 
 

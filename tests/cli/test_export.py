@@ -1,0 +1,67 @@
+"""``sparsestreet export`` on a hand-made scene."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from sparsestreet.cli.export import USAGE, ExportRequest, export
+from sparsestreet.export.ply import scene_gaussians
+from sparsestreet.scene.storage import save_scene
+from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    save_scene(tmp_path / "run" / "scene.safetensors", stored_street())
+    return tmp_path / "run"
+
+
+def means(path: Path) -> np.ndarray:
+    vertices = PlyData.read(path)["vertex"]
+    return np.stack([vertices[axis] for axis in "xyz"], axis=1)
+
+
+def test_the_whole_street_at_a_time(run, tmp_path, capsys):
+    out = tmp_path / "street.ply"
+    assert export([f"scene={run}", "time=0.5", f"out={out}"]) == 0
+    assert np.array_equal(means(out), scene_gaussians(stored_street(), 0.5).means.numpy())
+    assert f"{ROAD_ROWS + CAR_ROWS + TRAM_ROWS} Gaussians at time 0.5" in capsys.readouterr().out
+
+
+def test_nodes_and_an_instance(run, tmp_path):
+    assert export([f"scene={run}", f"out={tmp_path / 'road.ply'}", "nodes=[background]"]) == 0
+    assert len(means(tmp_path / "road.ply")) == ROAD_ROWS
+    assert export([f"scene={run / 'scene.safetensors'}", f"out={tmp_path / 'car.ply'}", "instance=car"]) == 0
+    expected = scene_gaussians(stored_street(), 0.0, instances=["car"]).means.numpy()
+    assert np.array_equal(means(tmp_path / "car.ply"), expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "said"),
+    [
+        ({"tme": 0.5}, 2, "no key 'tme'; did you mean 'time'?"),
+        ({"out": "street.obj"}, 2, "must end in .ply, got 'street.obj'"),
+        ({"nodes": "rigid", "instance": "car"}, 2, "exclude each other"),
+        ({"instance": "bus"}, 1, "no instance 'bus'; it has car, tram"),
+        ({"nodes": "roads"}, 1, "no node 'roads'; it has background, rigid"),
+        ({"instance": "tram", "time": 1}, 1, "it is there from 0.000 to 0.500"),
+        ({"time": 2}, 1, "time runs from 0"),
+        ({"scene": "nowhere"}, 1, "there is no scene at nowhere"),
+    ],
+)
+def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, said, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = {"scene": run, "out": "street.ply"} | change
+    assert export([f"{key}={value}" for key, value in words.items()]) == status
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_the_help_names_every_option():
+    for field in fields(ExportRequest):
+        assert f"\n  {field.name} " in USAGE

@@ -1,0 +1,128 @@
+"""``sparsestreet render`` on a hand-made scene; the run of a real training is rendered in test_train."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparsestreet.cli.render import USAGE, RenderRequest, render
+from sparsestreet.export import video
+from sparsestreet.export.path import shifted
+from sparsestreet.export.views import read_views, write_views
+from sparsestreet.scene.storage import save_scene
+from tests.export.street import stored_street, street_views
+
+
+@pytest.fixture
+def run(tmp_path) -> Path:
+    """A folder with what a training leaves: a scene and views of 5 frames and 4 cameras; frame 2 is held out."""
+    folder = tmp_path / "run"
+    save_scene(folder / "scene.safetensors", stored_street())
+    views = street_views()
+    write_views(
+        folder / "views.json", [v for v in views if v.frame_index != 2], [v for v in views if v.frame_index == 2]
+    )
+    return folder
+
+
+def pictures(folder: Path) -> list[np.ndarray]:
+    return [np.asarray(Image.open(path)) for path in sorted(folder.iterdir())]
+
+
+def rendered(stored, view) -> np.ndarray:
+    return (stored.render(view).rgb.clamp(0, 1) * 255).round().byte().numpy()
+
+
+def test_the_recorded_path_shows_every_camera_leftmost_first(run, tmp_path, capsys):
+    assert render([f"scene={run}", f"out={tmp_path / 'drive'}"]) == 0
+    shown, stored = pictures(tmp_path / "drive"), stored_street()
+    assert len(shown) == 5
+    by_place = {(view.frame_index, view.camera_index): view for view in street_views()}
+    for frame, picture in enumerate(shown):
+        expected = np.concatenate([rendered(stored, by_place[frame, camera]) for camera in (3, 1, 0, 2)], axis=1)
+        assert np.array_equal(picture, expected)
+    said = capsys.readouterr().out
+    assert "frame rate is not known: taken as 10 a second" in said
+    assert "5 of 5 frames" in said
+    assert "5 frames of camera 3, 1, 0, 2 at 10 a second" in said
+
+
+def test_a_shifted_path_is_seen_from_beside(run, tmp_path):
+    words = [f"scene={run}", f"out={tmp_path / 'right'}", "path=shifted", "offset=1.5", "cameras=[0,2]", "frames=1:3"]
+    assert render(words) == 0
+    shown, stored = pictures(tmp_path / "right"), stored_street()
+    assert len(shown) == 2
+    rig = [view for view in street_views() if view.frame_index == 2]
+    moved = {view.camera_index: view for view in shifted((tuple(rig),), 1.5)[0]}
+    expected = np.concatenate([rendered(stored, moved[camera]) for camera in (0, 2)], axis=1)
+    assert np.array_equal(shown[1], expected)
+    assert not np.array_equal(shown[1][:, :48], rendered(stored, rig[0]))
+
+
+def test_a_smooth_small_video(run, tmp_path):
+    words = [f"scene={run / 'scene.safetensors'}", f"out={tmp_path / 'a.mp4'}", "cameras=0", "width=24", "fps=30"]
+    assert render([*words, "log_fps=10", "quality=9", "device=cpu"]) == 0
+    from tests.export.test_video import read_video
+
+    fps, frames = read_video(tmp_path / "a.mp4")
+    assert (fps, frames.shape) == (30.0, (13, 16, 24, 3))
+
+
+def test_the_logs_own_rate_is_taken_where_it_is_known(run, tmp_path, capsys):
+    views = read_views(run / "views.json")
+    write_views(tmp_path / "others.json", views.training, views.held_out, frames_per_second=4.0)
+    words = [f"scene={run}", f"out={tmp_path / 'a'}", "cameras=0", f"views={tmp_path / 'others.json'}"]
+    assert render(words) == 0
+    said = capsys.readouterr().out
+    assert "not known" not in said
+    assert "5 frames of camera 0 at 4 a second" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "said"),
+    [
+        ({"widht": 5}, 2, "did you mean 'width'?"),
+        ({"offset": 1}, 2, "needs both: path=shifted offset=METERS"),
+        ({"path": "shifted"}, 2, "needs both: path=shifted offset=METERS"),
+        ({"fps": 0}, 2, "fps must be above 0, got 0"),
+        ({"quality": 11}, 2, "quality lies in 1 to 10, got 11"),
+        ({"out": "drive.avi"}, 1, "ends in .mp4"),
+        ({"scene": "nowhere"}, 1, "there is no scene at nowhere"),
+        ({"views": "nowhere.json"}, 1, "there is no nowhere.json: training writes"),
+        ({"cameras": 7}, 1, "no camera 7 in frame 0, only [0, 1, 2, 3]"),
+        ({"frames": "9:"}, 1, "the path has 0 to 4"),
+        ({"device": "tpu"}, 1, "device must be cpu or cuda, got 'tpu'"),
+    ],
+)
+def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, said, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = {"scene": run, "out": "drive.mp4"} | change
+    assert render([f"{key}={value}" for key, value in words.items()]) == status
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+def test_a_place_that_cannot_be_written_is_found_before_the_first_frame(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(video, "side_by_side", lambda images: pytest.fail("a frame was rendered"))
+    (tmp_path / "file").write_text("")
+    assert render([f"scene={run}", f"out={tmp_path / 'file' / 'drive.mp4'}"]) == 1
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
+    def interrupt(images):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(video, "side_by_side", interrupt)
+    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 130
+    assert "stopped, nothing was written" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+def test_the_help_names_every_option():
+    for field in fields(RenderRequest):
+        assert f"\n  {field.name} " in USAGE
