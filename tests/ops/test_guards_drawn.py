@@ -46,6 +46,7 @@ def test_what_is_counted_as_drawn_is_drawn(backend, scene, effects, case):
     check_against(backend, gaussians, view, CASES[case])
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 @pytest.mark.parametrize("effects", [False, True], ids=["pinhole", "effects"])
 def test_a_clean_scene_fires_no_alarm(backend, dtype, effects):
@@ -63,6 +64,8 @@ def test_a_clean_scene_fires_no_alarm(backend, dtype, effects):
         assert (counted.outside > 10) == (settings.alpha_min > 0)
 
 
+@pytest.mark.lengthy
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_the_hard_scenes(backend, dtype):
     total = Guards()

@@ -22,8 +22,14 @@ from tests.ops.scenes import (
 )
 
 # Meters from the origin: a drive, the edge of what DrivingLog takes, and a map's easting and northing.
-FAR = {"2 km": (1.7e3, -1e3, 40.0), "20 km": (17e3, -1e4, 100.0), "map": (4.5e5, 5.4e6, 100.0)}
-far_away = pytest.mark.parametrize("offset", FAR.values(), ids=FAR)
+far_away = pytest.mark.parametrize(
+    "offset",
+    [
+        pytest.param((1.7e3, -1e3, 40.0), id="2 km", marks=pytest.mark.slow_if_interpreted),
+        pytest.param((17e3, -1e4, 100.0), id="20 km", marks=pytest.mark.slow_if_interpreted),
+        pytest.param((4.5e5, 5.4e6, 100.0), id="map"),
+    ],
+)
 
 
 def _camera_at(position: torch.Tensor, width: int, height: int) -> Camera:

@@ -49,7 +49,7 @@ NEEDLES = {
 
 @every_backend
 @pytest.mark.parametrize("orientation", NEEDLES)
-@pytest.mark.parametrize("ratio", [1e2, 1e4, 1e6])
+@pytest.mark.parametrize("ratio", [1e2, pytest.param(1e4, marks=pytest.mark.slow_if_interpreted), 1e6])
 def test_03_04_needles_in_float32(backend, ratio, orientation):
     # From the thin side's blur (0.55 px) to 1e6 times the thickness; q >= 0 keeps alpha <= opacity.
     view = front_camera(48, 40, 40.0)
@@ -68,6 +68,7 @@ def test_03_04_needles_in_float32(backend, ratio, orientation):
         assert relative_error(result.gradients[name], truth.gradients[name]) < bar, name
 
 
+@pytest.mark.slow_if_interpreted
 @every_backend
 def test_04_exponent_far_along_a_needle(backend):
     # 350 px from the center the conic form subtracts terms of 1e5 to find a squared distance below 10.
@@ -187,7 +188,7 @@ def test_07_the_limit_acts_and_is_continuous(backend, dtype):
 
 
 @every_precision
-@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow_if_interpreted)])
 def test_21_brightness_of_a_sub_pixel_splat(backend, dtype, axis):
     # Sigma 0.05 px moves over a pixel. Its light is that of its own ellipse, o 2 pi sigma^2, wherever it is: pixel sums
     # of the blurred splat (sigma 0.55) are constant to 2 exp(-2 pi^2 0.3025) = 0.5 % along one axis; along the other it

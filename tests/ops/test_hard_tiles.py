@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution
@@ -93,6 +94,8 @@ def _check_tiles(backend: str, dtype: torch.dtype, tiles: tuple[int, int], longe
     assert clear_cases > 0.6 * len(longest) or listed is None
 
 
+@pytest.mark.lengthy
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend, dtype):
     # The first ones reach further than the 8 tiles that a mask can hold.

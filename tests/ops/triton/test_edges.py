@@ -57,7 +57,7 @@ def test_masked_rows_leave_no_trace():
         assert not dropped.gradients[name][~keep].any()
 
 
-@pytest.mark.parametrize("effects", [False, True])
+@pytest.mark.parametrize("effects", [False, pytest.param(True, marks=pytest.mark.slow_if_interpreted)])
 def test_nothing_is_read_before_it_is_written(effects, monkeypatch):
     # The third tile is empty; the stack closes the first one, so that its pairs behind the 32nd are never looked at.
     view = front_camera(33, 5, 20.0)
