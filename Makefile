@@ -8,7 +8,11 @@ export XDG_CACHE_HOME := $(CURDIR)/.cache
 $(shell mkdir -p .cache/tmp)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
-.PHONY: test demo lint bench clean FORCE
+.DEFAULT_GOAL := help
+.PHONY: help quick test test-all lint demo bench clean FORCE
+
+help: ## this list
+	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 # An editable install knows the modules it was made with: a new or renamed one calls for another.
 .cache/modules: FORCE
@@ -23,24 +27,30 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 	  echo 'torchvision must not be installed beside the CPU build of torch: it breaks torchmetrics and lightning'; exit 1; fi
 	touch $@
 
-test: $(VENV)/.ok
-	$(BIN)/python -m ruff check
-	$(BIN)/lint-imports
-	# One thread a process: tests are small, and threads that wait for each other cost more than they bring.
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+# One thread a process: tests are small, and threads that wait for each other cost more than they bring.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
 
-demo: $(VENV)/.ok
-	$(BIN)/sparsestreet demo
+quick: lint ## the loop of daily work, under a minute: lint and unit tests without trainings and Triton's interpreter
+	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'
 
-lint: $(VENV)/.ok
+test: lint ## what a change must pass: lint and all tests but those marked slow
+	$(PYTEST) -m 'not slow'
+
+test-all: lint ## lint and all tests: every kernel for every architecture, every size of tiles
+	$(PYTEST)
+
+lint: $(VENV)/.ok ## style, format, imports that go downwards
 	$(BIN)/python -m ruff check
 	$(BIN)/python -m ruff format --check
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.ok
+demo: $(VENV)/.ok ## a synthetic street, trained plain and pruned: one table, pictures in outputs/demo
+	$(BIN)/sparsestreet demo
+
+bench: $(VENV)/.ok ## what accuracy costs in time: records and figures
 	$(BIN)/sparsestreet bench blend
 	$(BIN)/sparsestreet bench knobs
 	$(BIN)/sparsestreet bench scaling
 
-clean:
+clean: ## removes what the targets made
 	rm -rf $(VENV) build outputs/demo outputs/streets

@@ -9,36 +9,50 @@ import torch
 from torch import Tensor
 
 from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops.backend import has_triton
 from sparsestreet.types import Camera, Gaussians
 
 Answer = TypeVar("Answer")
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
 CPU = torch.device("cpu")
-_ON_A_GPU = ("triton",) if torch.cuda.is_available() else ()
-BACKENDS = ("reference", "cpu", *_ON_A_GPU)
-"""Every implementation of the op that is fast enough for all tests: what is tested for all of them takes the list from
-here. Triton's interpreter bears only small scenes (triton/test_shared_cases.py)."""
+BACKENDS = ("reference", "cpu", *["triton"] * has_triton())
+"""Every implementation of the op. What is tested for all of them takes its list from here, so that a new case runs on
+each. Triton's kernels run by its interpreter where there is no GPU; what is too much for that in ``make test`` has the
+marker ``slow_if_interpreted`` and waits for ``make test-all``."""
 SINGLE_PRECISION = ("triton",)
 """Those that compute in float32 only; tests whose oracle needs float64 leave them out."""
+
+
+def device_of(backend: str) -> torch.device:
+    """Where a backend is tested: "triton" on a GPU if there is one, else on the CPU by Triton's interpreter."""
+    return torch.device("cuda") if backend == "triton" and torch.cuda.is_available() else CPU
 
 
 def _dtypes(backend: str) -> tuple[torch.dtype, ...]:
     return (torch.float32,) if backend in SINGLE_PRECISION else (torch.float32, torch.float64)
 
 
-def _in_every_precision(backends: tuple[str, ...]) -> pytest.MarkDecorator:
-    pairs = [(backend, dtype) for backend in backends for dtype in _dtypes(backend)]
-    names = [f"{backend}-{str(dtype).removeprefix('torch.')}" for backend, dtype in pairs]
-    return pytest.mark.parametrize(("backend", "dtype"), pairs, ids=names)
+def _each(backends: tuple[str, ...], *, in_every_precision: bool) -> pytest.MarkDecorator:
+    cases = []
+    for backend in backends:
+        marks = [pytest.mark.interpreted] * (backend == "triton" and device_of(backend) == CPU)
+        if in_every_precision:
+            for dtype in _dtypes(backend):
+                name = f"{backend}-{str(dtype).removeprefix('torch.')}"
+                cases.append(pytest.param(backend, dtype, marks=marks, id=name))
+        else:
+            cases.append(pytest.param(backend, marks=marks))
+    return pytest.mark.parametrize(("backend", "dtype") if in_every_precision else "backend", cases)
 
 
-every_backend = pytest.mark.parametrize("backend", BACKENDS)
-every_precision = _in_every_precision(BACKENDS)
-every_double = pytest.mark.parametrize("backend", [name for name in BACKENDS if torch.float64 in _dtypes(name)])
 _FAST_BACKENDS = tuple(name for name in BACKENDS if name != "reference")
-every_fast_backend = pytest.mark.parametrize("backend", _FAST_BACKENDS)
-every_fast_precision = _in_every_precision(_FAST_BACKENDS)
+_DOUBLE_BACKENDS = tuple(name for name in BACKENDS if torch.float64 in _dtypes(name))
+every_backend = _each(BACKENDS, in_every_precision=False)
+every_precision = _each(BACKENDS, in_every_precision=True)
+every_double = _each(_DOUBLE_BACKENDS, in_every_precision=False)
+every_fast_backend = _each(_FAST_BACKENDS, in_every_precision=False)
+every_fast_precision = _each(_FAST_BACKENDS, in_every_precision=True)
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:
@@ -105,11 +119,6 @@ def cast(
         *(field.requires_grad_(requires_grad) for field in fields),
         None if moved is None else moved.detach().to(device, dtype),
     )
-
-
-def device_of(backend: str) -> torch.device:
-    """Where a backend is tested: "triton" on a GPU if there is one, else on the CPU by Triton's interpreter."""
-    return torch.device("cuda") if backend == "triton" and torch.cuda.is_available() else CPU
 
 
 def cotangents(view: Camera, seed: int = 5) -> tuple[Tensor, Tensor, Tensor]:

@@ -42,7 +42,7 @@ INSTANCE = """
                                            const Outputs<float>&, const Range&);
     }"""
 
-pytestmark = pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")
+pytestmark = [pytest.mark.lengthy, pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")]
 
 
 def folder(place: Path, effects: str, replaced: dict[str, str]) -> Path:

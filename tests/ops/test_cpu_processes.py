@@ -8,6 +8,7 @@ import pytest
 
 from sparsestreet.ops.cpu.library import find_library
 
+pytestmark = pytest.mark.lengthy
 ROOT = Path(__file__).parents[2]
 SCENE = """
 import torch

@@ -165,6 +165,7 @@ def test_most_of_a_moving_scene_is_right(backend):
     assert np.linalg.norm(image - expected) < 0.2 * effect
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_no_motion_is_no_shutter_bit_for_bit(backend, dtype):
     view = camera(21, 13)

@@ -276,6 +276,7 @@ def test_more_pairs_than_may_be_held(monkeypatch):
             splat(gaussians, view, backend="cpu")
 
 
+@pytest.mark.lengthy
 def test_pairs_beyond_32_bits_are_counted_not_allocated():
     # 20,000 opaque giants over 512 x 512 tiles of a 8192 x 8192 image: 5.2e9 pairs, 42 GB of lists.
     rows = 20_000

@@ -94,6 +94,7 @@ def test_24_expected_depth_of_a_faint_splat(backend, dtype):
     assert corner.images["depth"][0, 0] == 0
 
 
+@pytest.mark.slow_if_interpreted
 @pytest.mark.parametrize("opacities", [(0.02, 0.3), (0.9, 1.0)], ids=["translucent", "opaque"])
 @every_fast_backend
 def test_26_deep_stacks(backend, opacities):

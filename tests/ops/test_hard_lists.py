@@ -58,6 +58,7 @@ def _poison(patch: pytest.MonkeyPatch) -> None:
         patch.setattr(torch, name, poisoned(getattr(torch, name)))
 
 
+@pytest.mark.slow_if_interpreted
 @every_fast_precision
 @pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
 def test_16_nothing_is_read_before_it_is_written(backend, dtype, stop):
@@ -123,6 +124,7 @@ def test_17_neighboring_depths_are_told_apart(backend, dtype):
     assert center[1] == pytest.approx(1.28, rel=1e-5)
 
 
+@pytest.mark.slow_if_interpreted
 @every_backend
 def test_17_the_order_of_rows_does_not_matter_without_ties(backend):
     view = camera(37, 29)
@@ -135,6 +137,7 @@ def test_17_the_order_of_rows_does_not_matter_without_ties(backend):
         torch.testing.assert_close(plain.gradients[name][order], other.gradients[name], rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow_if_interpreted
 @every_backend
 def test_18_two_runs_are_bitwise_equal(backend):
     view = camera(37, 29)

@@ -1,6 +1,7 @@
 """Values that training drifts into (docs/stability.md; the number in a name is the row there)."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -51,6 +52,7 @@ EXTREME_SETTINGS = (
 )
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_01_no_nan_in_extreme_scenes(backend, dtype):
     # 10,000 rows in small scenes: in large ones the opaque rows in front hide the others.
@@ -226,34 +228,41 @@ def test_20_half_precision(backend, half):
             call(cast(gaussians, half, device=device), view, backend=backend)
 
 
-@every_precision
-@pytest.mark.parametrize("field", FIELDS)
-def test_22_every_parameter_alone(backend, dtype, field):
-    # Each number of each row by central differences, the other fields without gradient: a factor that is missing from
-    # one chain shows here, in one number as well: each is held to the bar in units of what the field's numbers usually
-    # have. Differences of step 1e-5 are good to 1e-9 of the largest gradient.
+def _loss_of(field: str, gaussians: Gaussians, value: torch.Tensor, backend: str) -> torch.Tensor:
+    """Images and depth under random cotangents, with one field replaced by ``value``."""
     view = camera(6, 5)
-    gaussians = random_gaussians(4, view, terms=4, seed=8)
+    fields = {other: getattr(gaussians, other).to(value) for other in FIELDS} | {field: value}
     settings = SplatSettings(alpha_min=1e-9, antialias=True)
-    cotangent = cotangents(view)
+    seen = splat(Gaussians(**fields), view, settings=settings, backend=backend)
+    images = (seen.rgb, seen.alpha, seen.depth)
+    return sum((image * weight.to(image)).sum() for image, weight in zip(images, cotangents(view), strict=True))
 
-    def loss(value, name):
-        fields = {other: getattr(gaussians, other).to(value) for other in FIELDS} | {field: value}
-        seen = splat(Gaussians(**fields), view, settings=settings, backend=name)
-        images = (seen.rgb, seen.alpha, seen.depth)
-        return sum((image * weight.to(image)).sum() for image, weight in zip(images, cotangent, strict=True))
 
+@functools.cache
+def _differences(field: str) -> tuple[Gaussians, torch.Tensor]:
+    """Rows, and central differences of their loss in each number of ``field``: good to 1e-9 of the largest."""
+    gaussians = random_gaussians(4, camera(6, 5), terms=4, seed=8)
     start = getattr(gaussians, field)
-    expected = torch.zeros_like(start)
+    found = torch.zeros_like(start)
     for index in np.ndindex(*start.shape):
         sides = []
         for step in (1e-5, -1e-5):
             moved = start.clone()
             moved[index] += step
-            sides.append(loss(moved, "reference"))
-        expected[index] = (sides[0] - sides[1]) / 2e-5
-    value = start.to(device_of(backend), dtype).clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(loss(value, backend), value)
+            sides.append(_loss_of(field, gaussians, moved, "reference"))
+        found[index] = (sides[0] - sides[1]) / 2e-5
+    return gaussians, found
+
+
+@pytest.mark.lengthy
+@every_precision
+@pytest.mark.parametrize("field", FIELDS)
+def test_22_every_parameter_alone(backend, dtype, field):
+    # Each number of each row, the other fields without gradient: a factor that is missing from one chain shows here, in
+    # one number as well: each is held to the bar in units of what the field's numbers usually have.
+    gaussians, expected = _differences(field)
+    value = getattr(gaussians, field).to(device_of(backend), dtype).clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(_loss_of(field, gaussians, value, backend), value)
     usual = expected.square().mean().sqrt()
     assert usual > 0
     assert (gradient.double().cpu() - expected).abs().max() < (1e-7 if dtype == torch.float64 else 1e-4) * usual

@@ -99,11 +99,13 @@ def test_rows_not_visible_keep_every_bit_whatever_they_hold(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("shape", [(0, 3), (4, 0), (0,)])
-def test_nothing_to_do(shape, backend):
-    empty = [torch.zeros(shape, device=device_of(backend)) for _ in range(4)]
-    mask = torch.ones(shape[0], dtype=torch.bool, device=empty[0].device)
-    adam_step_(*empty, mask, AdamStep(1, LR), backend=backend)
+@pytest.mark.parametrize(("shape", "visible"), [((0, 3), True), ((4, 0), True), ((0,), True), ((5, 3), False)])
+def test_without_a_visible_number_nothing_changes(shape, visible, backend):
+    fields = [torch.full(shape, value, device=device_of(backend)) for value in (1.0, 2.0, 3.0, 4.0)]
+    before = [field.clone() for field in fields]
+    mask = torch.full(shape[:1], visible, device=fields[0].device)
+    adam_step_(*fields, mask, AdamStep(1, LR), backend=backend)
+    assert all(torch.equal(field, old) for field, old in zip(fields, before, strict=True))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -91,7 +91,4 @@ def _per_sample(instructions: list[tuple[int, str]]) -> float | None:
 
 if __name__ == "__main__":
     given = json.load(sys.stdin)
-    json.dump(
-        [{str(arch): compile_launch(launch, arch) for arch in given["archs"]} for launch in given["launches"]],
-        sys.stdout,
-    )
+    json.dump([compile_launch(launch, given["arch"]) for launch in given["launches"]], sys.stdout)

@@ -59,15 +59,12 @@ def record_launches(
     return launches
 
 
-def compile_launches(launches: list[Launch], architectures: Sequence[str]) -> list[tuple[Launch, dict]]:
-    """What compile_offline.py finds of each launch, by architecture."""
+def compile_launches(launches: list[Launch], arch: int) -> list[tuple[Launch, dict]]:
+    """What compile_offline.py finds of each launch, compiled for sm_``arch``."""
     # The interpreter replaces the compiler in this process.
     environment = {"TRITON_CACHE_DIR": str(Path.cwd() / ".cache" / "triton")} | dict(os.environ)
     environment.pop("TRITON_INTERPRET", None)
-    given = {
-        "archs": [int(arch) for arch in architectures],
-        "launches": [dataclasses.asdict(item) for item in launches],
-    }
+    given = {"arch": arch, "launches": [dataclasses.asdict(item) for item in launches]}
     command = [sys.executable, "-m", "tests.ops.triton.compile_offline"]
     ended = subprocess.run(
         command, input=json.dumps(given), env=environment, capture_output=True, text=True, check=False

@@ -93,7 +93,7 @@ def test_past_the_limit_of_the_jacobian():
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("antialias", [False, pytest.param(True, marks=pytest.mark.slow_if_interpreted)])
 def test_effects(name, antialias):
     view = camera(17, 13)
     displacements = 0.3 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -77,7 +77,7 @@ def test_against_the_reference(name, short_parts):
         assert relative_error(result.gradients[field], gradient) <= 1e-5, field
 
 
-@pytest.mark.parametrize("length", [1, 4])
+@pytest.mark.parametrize("length", [1, pytest.param(4, marks=pytest.mark.slow_if_interpreted)])
 def test_any_length_draws_the_same(length, monkeypatch):
     view = camera(19, 17)
     scene = random_gaussians(12, view)

@@ -22,10 +22,15 @@ PROPERTIES = (
 
 
 @pytest.mark.parametrize(("property_", "numbers"), PROPERTIES)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow_if_interpreted)])
 def test_property(property_, numbers, seed):
     scene = test_properties.make_scene(seed, width=18, height=11, focal=16.0, rows=10, terms=(1, 4)[seed])
     given = {"backend": "triton", "scene": scene} | numbers
     if "dtype" in inspect.signature(property_).parameters:
         given["dtype"] = torch.float32
     property_.hypothesis.inner_test(**given)
+
+
+def test_no_property_is_missing():
+    named = {name for name in vars(test_properties) if name.startswith("test_")}
+    assert {property_.__name__ for property_, _ in PROPERTIES} == named

@@ -37,7 +37,9 @@ def assert_matches_float64(image: Tensor, truth: Tensor) -> None:
     assert relative_error(gradient, wanted) <= 1e-5
 
 
-@pytest.mark.parametrize(("height", "width"), [(11, 11), (13, 17), (12, 60), (43, 11)])
+@pytest.mark.parametrize(
+    ("height", "width"), [(11, 11), pytest.param(13, 17, marks=pytest.mark.slow_if_interpreted), (12, 60), (43, 11)]
+)
 def test_odd_sizes_strips_and_blocks(height, width):
     """One window; several; columns in two programs (150 and 180 numbers); lines in two."""
     assert_matches_float64(*noise(height, width))
