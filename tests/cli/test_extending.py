@@ -1,0 +1,151 @@
+"""What docs/extending.md shows, run: a loss, a rule, a mask, a method, a reader and a number from outside."""
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose
+from PIL import Image
+
+from sparsestreet.cli.assemble import data_of, recipe_of
+from sparsestreet.cli.compose import configuration, override_problem
+from sparsestreet.cli.data import data
+from sparsestreet.cli.train import train
+from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.evaluation.records import read_run, run_path
+from sparsestreet.export.views import read_views
+from sparsestreet.pruning import Look
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.rendering import render
+from tests.cli.conftest import TINY_RIGID
+from tests.cli.toy.loss import MeanColor
+from tests.cli.toy.mask import ProbitMask, ProbitMaskSettings
+from tests.cli.toy.metric import largest_errors
+from tests.cli.toy.rule import SizeRule
+from tests.training.stubs import background, frame_at, make_rows, set_rows
+
+pytestmark = pytest.mark.xdist_group("tiny street")
+
+ROOT = Path(__file__).parents[2]
+OUTSIDE = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
+PROBIT = "node.background.mask._target_=tests.cli.toy.mask.ProbitMaskSettings"
+
+
+def composed(*overrides: str):
+    assert override_problem([OUTSIDE, *overrides]) is None
+    with configuration():
+        return compose("train", ["folder=.", OUTSIDE, *overrides])
+
+
+@pytest.fixture(scope="module")
+def run(tiny_street, tmp_path_factory) -> Path:
+    """Two steps with everything that is our own; the rule comes in at the first."""
+    out = tmp_path_factory.mktemp("extending") / "run"
+    words = ["method=no_lidar", "loss=[photometric,sky,mean_color]", "sparsify=size", PROBIT]
+    rule = "callback.background_pruning.rule.meters=0.1"
+    assert train([*tiny_street, *TINY_RIGID, OUTSIDE, *words, rule, f"out={out}", "trainer.fast_dev_run=2"]) == 0
+    return out
+
+
+def test_the_page_shows_what_is_run():
+    page = (ROOT / "docs" / "extending.md").read_text()
+    shown = re.findall(r"^`(tests/\S+)`[^\n]*\n\n```\w+\n(.*?)^```", page, flags=re.M | re.S)
+    names = {name for name, _ in shown}
+    assert {f"tests/cli/toy/{name}.py" for name in ("bobbing", "loss", "rule", "mask", "reader", "metric")} <= names
+    for name, code in shown:
+        # Comments in brackets stand for what was left out.
+        for part in re.split(r"^ *# \(.*\)\n", code, flags=re.M):
+            assert part in (ROOT / name).read_text(), f"{name} does not hold\n{part}"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["loss=[photometric,sky,depth,mean_color]"],
+        ["++loss.mean_color._target_=tests.cli.toy.loss.MeanColor", "++loss.mean_color.weight=0.1"],
+    ],
+    ids=["a file", "no file"],
+)
+def test_a_loss(words):
+    loss = recipe_of(composed(*words)).losses["mean_color"]
+    assert loss == MeanColor(weight=0.1)
+    frame = frame_at()
+    frame = replace(frame, image=torch.tensor([51, 102, 153], dtype=torch.uint8).expand(frame.image.shape))
+    scene = SceneGraph({"background": background()})
+    rendering = replace(render(scene, frame), rgb=torch.tensor([0.5, 0.6, 0.7]).expand(frame.image.shape))
+    assert loss.applies(frame)
+    # The colors lie 0.3, 0.2 and 0.1 apart.
+    torch.testing.assert_close(loss(rendering, frame, scene), torch.tensor(0.1 * 0.2))
+
+
+def test_a_rule():
+    cfg = composed("sparsify=size")
+    pruning = recipe_of(cfg).callbacks["background_pruning"]
+    assert (pruning.at, pruning.rule, cfg.name) == ((0.6,), SizeRule(meters=1.0), "streetgs+size")
+    node = background(20, min_gaussians=19)
+    set_rows(node, "log_scales", {3: 1.0, 5: 2.0})
+    selection = pruning.rule.select(SceneGraph({"background": node}), [frame_at()], Look())["background"]
+    assert (~selection.keep).nonzero().tolist() == [[5]]
+    assert selection.floor_hit
+
+
+def test_a_mask():
+    settings = recipe_of(composed("sparsify=masks", PROBIT)).nodes["background"]
+    mask = settings.mask_settings.build(settings.min_gaussians)
+    assert isinstance(mask, ProbitMask)
+    assert mask.settings == ProbitMaskSettings(sparsity_weight=2.5e-3)
+    rows = make_rows(3, columns={"mask_logits": torch.tensor([-2.5, -2.0, 1.0])})
+    # The normal distribution passes 0.01 at -2.33, the sigmoid at -4.6.
+    probit, sigmoid = ProbitMask(mask.settings), StaticMask(mask.settings)
+    assert probit.multipliers(rows, 0.0).tolist() == [0, 1, 1] == probit.keep(rows).keep.tolist()
+    assert sigmoid.multipliers(rows, 0.0).tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("sparsify", ["none", "paper", "size"])
+def test_a_method_goes_with_every_sparsification(sparsify):
+    cfg = composed("method=no_lidar", f"sparsify={sparsify}")
+    recipe = recipe_of(cfg)
+    assert cfg.name == "no_lidar" + ("" if sparsify == "none" else f"+{sparsify}")
+    assert {"photometric", "sky"} <= set(recipe.losses)
+    assert "depth" not in recipe.losses
+
+
+def test_they_train_together(run):
+    with (run / "records" / "counts.csv").open() as file:
+        pruned = [row for row in csv.DictReader(file) if row["reason"] == "background pruning"]
+    assert [row["node"] for row in pruned] == ["background"]
+    assert int(pruned[0]["after"]) < int(pruned[0]["before"])
+    description = read_run(run_path(run))
+    assert (description.label, description.steps) == ("no_lidar+size", 2)
+    assert description.config["loss.mean_color.weight"] == 0.1
+
+
+def test_a_number_of_a_finished_run(run, tiny_street):
+    root = next(word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
+    errors = largest_errors(run, DriveStudioReader(root).read())
+    held_out = read_views(run / "views.json").held_out
+    assert set(errors) == {(view.frame_index, view.camera_index) for view in held_out}
+    # Two steps from gray: somewhere a channel is far off, and none can be off by more than 1.
+    assert all(0.2 < error <= 1 for error in errors.values())
+
+
+def test_a_reader(tmp_path, capsys):
+    words = [OUTSIDE, "data=pictures", "data.log.focal=20", f"data.root={tmp_path}"]
+    assert data(["check", *words]) == 1
+    assert "there is no picture" in capsys.readouterr().out
+    for index in range(3):
+        Image.fromarray(np.full((20, 32, 3), 40 * index, np.uint8)).save(tmp_path / f"{index:03d}.png")
+    assert data(["check", *words]) == 0
+    assert "3 x 1" in capsys.readouterr().out
+    split = data_of(composed(*words[1:], "split.stride=2", "split.offset=1")).split
+    assert [int(frame.image[0, 0, 0]) for frame in split.train] == [0, 80]
+    (view,) = split.held_out.views
+    assert (view.time, view.frame_index, view.camera.position.tolist()) == (0.5, 1, [0.0, 0.0, 1.0])
+    (tmp_path / "001.png").write_bytes(b"torn")
+    assert data(["check", *words]) == 1
+    assert "cannot be decoded" in capsys.readouterr().out
