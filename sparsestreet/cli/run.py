@@ -8,11 +8,10 @@ from pathlib import Path
 import torch
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.resume import check_resumed, run_of
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import read_run, run_path
 from sparsestreet.evaluation.run import evaluate_scene
@@ -91,12 +90,11 @@ def build_trainer(cfg: DictConfig, callbacks: list, out: Path, data) -> tuple[Tr
 
 
 def _checkpoint(cfg: DictConfig) -> Path | None:
-    """The checkpoint to go on from. Raises ValueError where the configuration is not that of its run."""
+    """The checkpoint to go on from, if any."""
     if not cfg.resume:
         return None
-    path, folder = Path(cfg.resume), run_of(Path(cfg.resume))
-    check_resumed(OmegaConf.to_container(cfg, resolve=True), folder)
-    return newest_checkpoint(folder) if path.is_dir() else path
+    path = Path(cfg.resume)
+    return newest_checkpoint(path) if path.is_dir() else path
 
 
 def silence_known_noise() -> None:

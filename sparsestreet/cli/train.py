@@ -9,10 +9,10 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.compose import CONF, configuration, override_problem
-from sparsestreet.cli.resume import resumed_overrides
+from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 
 
 def train(arguments: list[str]) -> int:
@@ -40,7 +40,12 @@ def _problem_of_values(arguments: list[str]) -> str | None:
     with configuration():
         # The folder is known only to a running app.
         given = [text for text in arguments if not text.startswith("hydra.run")]
-        return config_problem(compose("train", [*given, "folder=."]))
+        cfg = compose("train", [*given, "folder=."])
+        problem = config_problem(cfg)
+    if problem is None and cfg.resume:
+        # Before Hydra writes the configuration of this start over that of the run.
+        check_resumed(OmegaConf.to_container(cfg, resolve=True), run_of(Path(cfg.resume)))
+    return problem
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
