@@ -1,0 +1,1 @@
+"""A node type that the package has never heard of; docs/extending.md explains it."""
