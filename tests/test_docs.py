@@ -1,0 +1,39 @@
+"""What the pages say of the code: files that they name, the floors, the options of conf."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+HISTORY = ("CHANGELOG.md", "results.md")
+"""Pages that also name what has been."""
+PAGES = [page for page in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]) if page.name not in HISTORY]
+ROOMS = (ROOT, ROOT / "sparsestreet", ROOT / "tests")
+TOPS = {path.name for room in ROOMS for path in room.iterdir() if path.name[0] not in "._"} - {"outputs", "build"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_is_named_is_there(page):
+    named = re.findall(r"(?<![\w/.$-])(?:[\w.-]+/)+(?:[\w*.-]*\w)?", page.read_text())
+    named = {name for name in named if name.partition("/")[0] in TOPS}
+    assert [name for name in named if not any(list(room.glob(name.rstrip("/"))) for room in ROOMS)] == []
+
+
+def test_the_floors_are_those_of_the_import_contract():
+    (contract,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    floors = [layer.replace("sparsestreet.", "") for layer in contract["layers"]]
+    assert "```\n" + "\n".join(floors) + "\n```" in (ROOT / "docs" / "architecture.md").read_text()
+
+
+def test_every_group_of_conf_is_explained():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    cells = re.findall(r"^\| (`[a-z_`, ]+`) \| (.*) \|$", page, flags=re.M)
+    said = {group: text for groups, text in cells for group in re.findall(r"\w+", groups)}
+    folders = [path for path in (ROOT / "conf").iterdir() if path.is_dir()]
+    assert said.keys() == {folder.name for folder in folders}
+    for folder in folders:
+        options = {path.stem for path in folder.glob("*.yaml")}
+        if folder.name in ("method", "sparsify", "schedule", "experiment"):
+            assert options == set(re.findall(r"`(\w+)`", said[folder.name]))
