@@ -208,6 +208,13 @@ def test_the_baseline_may_be_the_name_of_a_column():
         sections(records(*BOTH), "none")
 
 
+def test_a_label_is_a_baseline_in_tables_where_it_has_one_configuration():
+    """Whatever it is called for the sake of other tables."""
+    runs = [make_summary("m", config={"x": value}, scene=scene) for value, scene in ((1, "a"), (2, "b"))]
+    found = sections(records(*runs, make_summary("other", scene="a")), "m")
+    assert [row.label for row in found[0].rows] == ["m x=1", "other", "other against m x=1"]
+
+
 def test_a_section_without_the_baseline_says_so():
     found = sections(records(make_summary(), make_summary("ours", scene="kitti")), "plain")
     assert "no run of the baseline plain here, so no differences" in found[0].notes
