@@ -1,7 +1,6 @@
 """From a config to the objects of a run."""
 
 import shlex
-import sys
 from collections.abc import Sequence
 
 import torch
@@ -41,7 +40,7 @@ def data_of(cfg: DictConfig) -> StreetData:
     return StreetData(log, **cfg.split, seed=cfg.seed)
 
 
-def description_of(cfg: DictConfig, log: DrivingLog, device: torch.device) -> RunDescription:
+def description_of(cfg: DictConfig, log: DrivingLog, device: torch.device, command: str) -> RunDescription:
     """What identifies a run that is about to start on a device."""
     config = flat_config(OmegaConf.to_container(cfg, resolve=True))
     return RunDescription(
@@ -53,7 +52,7 @@ def description_of(cfg: DictConfig, log: DrivingLog, device: torch.device) -> Ru
         split=split_in_words(cfg),
         config=config,
         config_hash=config_hash(config),
-        command=this_command(),
+        command=command,
         device=device_name(device),
         threads=torch.get_num_threads(),
         steps=0,
@@ -70,6 +69,6 @@ def split_in_words(cfg: DictConfig) -> str:
     return f"every {cfg.split.stride}th frame from {cfg.split.offset}" if cfg.split.stride else "none"
 
 
-def this_command(words: Sequence[str] | None = None) -> str:
-    """What was typed: the words after ``sparsestreet``; None: those of the program's arguments."""
-    return shlex.join(["sparsestreet", *(sys.argv[0].split()[1:] + sys.argv[1:] if words is None else words)])
+def this_command(words: Sequence[str]) -> str:
+    """A command as it is typed: the words after ``sparsestreet``."""
+    return shlex.join(["sparsestreet", *words])

@@ -148,4 +148,7 @@ def load_run_config(run: Path) -> DictConfig:
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
-    return OmegaConf.load(path)
+    cfg = OmegaConf.load(path)
+    # Written as an interpolation that only a running app can resolve; and runs may have been moved.
+    cfg.folder = str(run)
+    return cfg

@@ -6,12 +6,14 @@ import warnings
 from pathlib import Path
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning import Trainer, seed_everything
+from lightning import Callback, Trainer, seed_everything
 from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command
 from sparsestreet.cli.checks import config_problem
+from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import read_run, run_path
 from sparsestreet.evaluation.run import evaluate_scene
@@ -24,6 +26,7 @@ from sparsestreet.training.callbacks import (
     newest_checkpoint,
 )
 from sparsestreet.training.curves import kept_curves
+from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
@@ -38,20 +41,13 @@ def run(cfg: DictConfig, out: Path) -> float:
     if problem:
         raise ValueError(problem)
     recipe = recipe_of(cfg)
-    checkpoint = _checkpoint(cfg)
     seed_everything(cfg.seed, verbose=False)
     silence_known_noise()
     data = data_of(cfg)
-    trainer, stop = build_trainer(cfg, list(recipe.callbacks.values()), out, data)
     system = recipe.build(data)
-    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
-    resume = {} if checkpoint is None else {"ckpt_path": checkpoint, "weights_only": False}
-    at = None if checkpoint is None else torch.load(checkpoint, map_location="cpu", weights_only=False)["global_step"]
-    try:
-        with kept_curves(out / "curves" / "metrics.csv", at):
-            trainer.fit(system, datamodule=data, **resume)
-    except SystemExit:
-        sys.exit(stop.exit_status or 1)
+    # The job's own overrides: in a sweep they are not what was typed.
+    command = this_command(["train", *HydraConfig.get().overrides.task])
+    trainer = _train(cfg, list(recipe.callbacks.values()), system, data, out, command)
     if trainer.fast_dev_run:
         log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
         return 0.0
@@ -62,18 +58,19 @@ def run(cfg: DictConfig, out: Path) -> float:
         run=read_run(run_path(out)),
         options=system.options,
         out=out,
-        command=this_command(),
+        command=command,
         device=trainer.strategy.root_device,
     )
     draw_history(out)
     log.info("records and pictures in %s", out)
-    split = "held_out" if "held_out" in summary.quality else "training"
-    return summary.quality[split]["psnr_full"].mean
+    return summary.quality[summary.main_split]["psnr_full"].mean
 
 
-def build_trainer(cfg: DictConfig, callbacks: list, out: Path, data) -> tuple[Trainer, GracefulStop]:
-    """The trainer with the configured callbacks and those that every run has."""
-    clock, stop = Clock(), GracefulStop()
+def _train(
+    cfg: DictConfig, callbacks: list[Callback], system: StreetSystem, data: StreetData, out: Path, command: str
+) -> Trainer:
+    """Fit to the end, or end the program as the signal wants that came."""
+    clock, stop, checkpoint = Clock(), GracefulStop(), _checkpoint(cfg)
     trainer: Trainer = instantiate(
         cfg.trainer,
         callbacks=[clock, *callbacks, TrainingProgress()],
@@ -84,9 +81,17 @@ def build_trainer(cfg: DictConfig, callbacks: list, out: Path, data) -> tuple[Tr
         enable_checkpointing=False,
         max_epochs=-1,
     )
-    description = description_of(cfg, data.driving_log, trainer.strategy.root_device)
+    description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
     trainer.callbacks += [RunFiles(out, description, clock), Checkpoints(out / "checkpoints"), stop]
-    return trainer, stop
+    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
+    resume = {} if checkpoint is None else {"ckpt_path": checkpoint, "weights_only": False}
+    at = None if checkpoint is None else torch.load(checkpoint, map_location="cpu", weights_only=False)["global_step"]
+    try:
+        with kept_curves(out / "curves" / "metrics.csv", at):
+            trainer.fit(system, datamodule=data, **resume)
+    except SystemExit:
+        sys.exit(stop.exit_status or 1)
+    return trainer
 
 
 def _checkpoint(cfg: DictConfig) -> Path | None:
