@@ -97,11 +97,13 @@ def test_frames_that_are_missing_are_bridged_and_too_many_are_skipped():
         resampled(path, 0.0)
 
 
-def test_a_third_of_a_step_meets_every_recorded_instant():
-    """Thirds are no binary fractions: recorded frames must be met in spite of the rounding."""
-    finer = resampled(recorded(street_views()), STEP / 3)
-    assert [rig[0].frame_index for rig in finer[::3]] == [0, 1, 2, 3, 4]
-    assert len(finer) == 13
+@pytest.mark.parametrize("pieces", [1, 3, 7])
+def test_pieces_of_a_step_meet_every_recorded_instant(pieces):
+    """Frames of a log of 50: times and steps are no binary fractions, and are met in spite of the rounding."""
+    views = [replace(view, time=(40 + view.frame_index) / 49) for view in street_views()]
+    finer = resampled(recorded(views), 1 / 49 / pieces)
+    assert [rig[0].frame_index for rig in finer[::pieces]] == [0, 1, 2, 3, 4]
+    assert len(finer) == 4 * pieces + 1
 
 
 def test_a_single_instant_is_a_path():
