@@ -7,7 +7,7 @@
 # Needs a python with torch, triton, numpy, jaxtyping, lightning and pytest; with beartype the tests also check shapes
 # and types. Packages that are missing beside them (those and hydra-core, omegaconf, antlr4-python3-runtime, kornia;
 # gsplat to compare with) come as wheels in a folder. Test files that need another package (hypothesis, scipy,
-# matplotlib) are left out, and the table names them; the training needs matplotlib.
+# matplotlib) are left out, and the table names them; training needs scipy, matplotlib, safetensors, rich, beartype.
 #   SPARSESTREET_WHEELS   folder of wheels, installed into a temporary folder without an index and without dependencies
 #   OUT                   where logs and records go (default: outputs/gpu_check)
 #   PYTHON                the interpreter (default: python3)
@@ -44,7 +44,7 @@ export SUMMARIZE='
 import json, sys
 
 record = json.load(open(sys.argv[1]))
-seconds, psnr = record["run"]["training_seconds"], record["quality"]["psnr_full"]["mean"]
+seconds, psnr = record["run"]["training_seconds"], record["quality"]["held_out"]["psnr_full"]["mean"]
 print(f"{seconds:.1f} s of training, held-out PSNR {psnr:.2f} dB")'
 
 has() { "$PYTHON" -c "import $1" >/dev/null 2>&1; }
@@ -166,7 +166,7 @@ run_training() {
   run_part train 75 "$OUT/train.log" bash -c '"$@" && cp "$0/train/records/summary.json" "$0/train.json" &&
     "$1" -c "$SUMMARIZE" "$0/train.json"' "$WORK" "$PYTHON" -m sparsestreet train "trainer=$trainer" \
     "schedule.max_steps=$steps" data.log.settings.width=160 data.log.settings.height=96 \
-    data.log.settings.num_frames=10 "data.log.root=$WORK/street" "hydra.run.dir=$WORK/train"
+    data.log.settings.num_frames=10 "data.log.root=$WORK/street" "out=$WORK/train"
   [ ! -f "$WORK/train.json" ] || cp "$WORK/train.json" "$OUT/train.json"
 }
 
