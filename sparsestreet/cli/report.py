@@ -50,8 +50,8 @@ def report(arguments: list[str]) -> int:
         print("sparsestreet report: no configuration was run on two scenes, so there is no mean", file=sys.stderr)
         return 1
     console = Console()
-    for table in tables(shown, console.width):
-        console.print(table)
+    for part in tables(shown, console.width):
+        console.print(part)
     if "markdown" in options:
         Path(options["markdown"]).write_text(markdown(shown))
     return 0

@@ -21,13 +21,13 @@ _MOST_COLUMNS = 5
 """Variants and differences beside each other; more stand below each other where there is room."""
 
 
-def tables(sections: Sequence[Section], width: int = 80) -> list[Table]:
-    """The sections as rich tables for a terminal of ``width`` characters; print them with ``rich.console.Console``.
+def tables(sections: Sequence[Section], width: int = 80) -> list[Table | Text]:
+    """The sections for a terminal of ``width`` characters, title, tables and notes; for ``rich.console.Console``.
 
     Variants stand as columns, in as many tables below each other as it takes that no text is cut; many of them (a
     sweep) stand as rows where the terminal is wide enough.
     """
-    return [table for section in sections for table in _drawn(section, width)]
+    return [part for section in sections for part in _drawn(section, width)]
 
 
 def markdown(sections: Sequence[Section]) -> str:
@@ -61,18 +61,16 @@ def figure(records: Sequence[RunRecord], path: Path) -> None:
     plot_runs(path, {name: some for name, some in points.items() if some})
 
 
-def _drawn(section: Section, width: int) -> list[Table]:
+def _drawn(section: Section, width: int) -> list[Table | Text]:
     lines = _lines(section)
     if len(section.rows) > _MOST_COLUMNS and sum(map(_room, zip(*lines, strict=True))) < width:
         blocks = [lines]
     else:
         labels, *columns = lines
         blocks = [list(zip(labels, *some, strict=True)) for some in _fitting(columns, width - 1 - _room(labels))]
-    tables = [_table(block) for block in blocks]
     # Texts, not strings, whose square brackets rich would read as markup.
-    tables[0].title = Text(section.title)
-    tables[-1].caption = Text("\n".join(section.notes))
-    return tables
+    title, notes = Text(section.title, style="bold"), Text("\n".join(section.notes) + "\n")
+    return [title, *map(_table, blocks), notes]
 
 
 def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence[str]]]:
@@ -95,7 +93,7 @@ def _room(column: Sequence[str]) -> int:
 
 
 def _table(lines: Sequence[Sequence[str]]) -> Table:
-    table = Table(caption_justify="left", title_justify="left")
+    table = Table()
     for index, heading in enumerate(lines[0]):
         table.add_column(Text(heading), justify="right" if index else "left", overflow="fold")
     for line in lines[1:]:

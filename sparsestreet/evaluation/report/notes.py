@@ -61,7 +61,10 @@ def _training(runs: Sequence[RunSummary]) -> list[str]:
 def _places(clocks: Iterable[tuple[str, int, Machine]]) -> list[str]:
     """What a time depends on beside the code, each once."""
     return sorted(
-        {f"{device}, {threads} threads, {host.cores} cores, torch {host.torch}" for device, threads, host in clocks}
+        {
+            f"{device}, {threads} thread{'s' if threads != 1 else ''}, {host.cores} cores, torch {host.torch}"
+            for device, threads, host in clocks
+        }
     )
 
 

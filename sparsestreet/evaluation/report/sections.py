@@ -134,11 +134,11 @@ def _section(group: _Group, title: str, found: Sequence[Variant], baseline: str 
     ordered = sorted(found, key=lambda variant: (variant is not reference, variant.name))
     rows = [_variant_row(variant, columns, group.over_scenes) for variant in ordered]
     said = notes(ordered, group.over_scenes)
-    if reference is not None:
+    if reference is not None and len(ordered) > 1:
         rows += [_difference_row(variant, reference, columns, group.over_scenes) for variant in ordered[1:]]
         paired = "scene and seed" if group.over_scenes else "seed"
         said.append(f"differences are to {reference.name}, paired by {paired}; per cent is what remains of it")
-    elif baseline is not None:
+    elif reference is None and baseline is not None:
         said.append(f"no run of the baseline {baseline} here, so no differences")
     return Section(title, group.over_scenes, columns, tuple(rows), tuple(said))
 

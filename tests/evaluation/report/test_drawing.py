@@ -47,25 +47,25 @@ def test_counts_that_a_cap_held_down_are_marked():
     assert "†" not in paper
 
 
-def printed(table, width):
+def printed(found, width, baseline=None):
     console = Console(width=width)
     with console.capture() as capture:
-        console.print(table)
+        for part in tables(sections(found, baseline), width):
+            console.print(part)
     return capture.get()
 
 
 def test_a_few_methods_fit_a_terminal_of_80_characters():
-    (table,) = tables(sections(PLAIN_AND_OURS, "plain"))
-    text = printed(table, 80)
+    text = printed(PLAIN_AND_OURS, 80, "plain")
     for cell in ("26.00 ± 1.41", "25.75 ± 1.20", "-0.25 ± 0.21", "29.2 ± 5.9 %", "1,400 ± 283", "every 10th frame"):
         assert cell in text
     assert "…" not in text
+    assert "mean ± sample sd over runs; n=1 has no spread and proves nothing below the noise" in text  # its whole width
+    assert text.count("┏") == 1
 
 
 def test_square_brackets_are_no_markup():
-    runs = [make_summary("m", config={"nodes": [name]}) for name in ("red", "blue")]
-    (table,) = tables(sections(records(*runs)))
-    text = printed(table, 200)
+    text = printed(records(*(make_summary("m", config={"nodes": [name]}) for name in ("red", "blue"))), 200)
     assert 'nodes=["red"]' in text
     assert 'nodes=["blue"]' in text
 
@@ -74,20 +74,21 @@ SWEEP = records(*(make_summary("streetgs+removal", config={"schedule.removal_db"
 
 
 def test_many_variants_are_rows_where_there_is_room():
-    (table,) = tables(sections(SWEEP), 200)
+    title, table, notes = tables(sections(SWEEP), 200)
     assert table.row_count == 6
     assert str(table.columns[0].header) == "method"
-    assert "…" not in printed(table, 200)
+    assert "…" not in printed(SWEEP, 200)
+    assert "held out" in str(title)
+    assert "guards: none fired" in str(notes)
 
 
 def test_many_variants_are_tables_below_each_other_where_there_is_none():
-    drawn = tables(sections(SWEEP), 80)
-    assert len(drawn) > 1
-    text = "".join(printed(table, 80) for table in drawn)
+    text = printed(SWEEP, 80)
+    assert text.count("┏") > 1
     assert all(f" schedule.removal_db={value} " in text for value in range(6))
     assert text.count("n=1 (seed 0) ") == 6
     assert "…" not in text
-    assert text.count("held out") == 1  # one title
+    assert text.count("held out:") == 1  # one title
     assert text.count("guards: none fired") == 1
 
 

@@ -208,6 +208,11 @@ def test_the_baseline_may_be_the_name_of_a_column():
         sections(records(*BOTH), "none")
 
 
+def test_nothing_is_said_of_differences_where_there_are_none():
+    (section,) = sections(records(make_summary()), "plain")
+    assert not [note for note in section.notes if "differences" in note]
+
+
 def test_a_label_is_a_baseline_in_tables_where_it_has_one_configuration():
     """Whatever it is called for the sake of other tables."""
     runs = [make_summary("m", config={"x": value}, scene=scene) for value, scene in ((1, "a"), (2, "b"))]
