@@ -1,9 +1,13 @@
-"""What the check of a GPU leaves out where packages of the tests are missing."""
+"""What the check of a GPU leaves out where packages of the tests are missing, and what it says of its training."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+from sparsestreet.evaluation.records import write_summary
+from tests.evaluation.frames import make_summary
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
@@ -36,3 +40,10 @@ def test_files_without_their_packages_are_left_out_and_named(tmp_path):
         ], run.stdout + run.stderr
         assert "1 passed, 1 skipped" in lines[-1]
         assert (f"{broken} errors" in lines[-1], run.returncode) == (broken > 0, int(broken > 0))
+
+
+def test_the_line_about_the_training_is_of_todays_records(tmp_path):
+    write_summary(tmp_path / "train.json", make_summary())
+    (program,) = re.findall(r"SUMMARIZE='\n(.*?)'\n", (SCRIPTS / "gpu_check.sh").read_text(), flags=re.S)
+    said = subprocess.run([sys.executable, "-c", program, tmp_path / "train.json"], capture_output=True, text=True)
+    assert said.stdout == "100.0 s of training, held-out PSNR 25.00 dB\n", said.stderr
