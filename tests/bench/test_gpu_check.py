@@ -6,12 +6,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from sparsestreet.evaluation.records import write_summary
 from tests.evaluation.frames import make_summary
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
+@pytest.mark.lengthy
 def test_files_without_their_packages_are_left_out_and_named(tmp_path):
     files = {
         "good": "",

@@ -12,6 +12,8 @@ from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.ops import SplatSettings
 from tests.bench.test_records import PROVENANCE
 
+pytestmark = pytest.mark.lengthy
+
 ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 SCENES = bench_scenes(Size(48, 32, 120))
 EXACT = SplatSettings.preset("exact")

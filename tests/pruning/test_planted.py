@@ -14,6 +14,8 @@ from sparsestreet.types import Camera
 from tests.pruning.planted import NOTICEABLE, Views, activated, contributions_of, joint_change, judge, plant
 from tests.scene.street import static_mask
 
+pytestmark = pytest.mark.lengthy
+
 BACKEND = "reference"
 RECALL, VISIBLE_LOST = 0.95, 0.02
 

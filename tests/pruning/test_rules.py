@@ -88,6 +88,7 @@ def test_a_row_seen_in_one_view_of_two_stays():
     assert rule.select(scene, [front, behind], LOOK)["background"].removed == 0
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("region", ["vehicle", "human"])
 def test_what_shows_a_vehicle_or_a_person_costs_more(region: str):
     # Equal discs side by side, each in its own half of the image; one half is marked.

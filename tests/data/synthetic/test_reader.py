@@ -4,6 +4,7 @@ import dataclasses
 import re
 
 import numpy as np
+import pytest
 import torch
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
@@ -16,6 +17,7 @@ SETTINGS = StreetSettings(
 )  # fmt: skip
 
 
+@pytest.mark.lengthy
 def test_a_street_opens_as_a_log(tmp_path):
     log = StreetReader(SETTINGS, tmp_path / "street").read()
     assert (log.num_frames, log.num_cameras, len(log.sweeps)) == (2, 2, 2)
@@ -60,6 +62,7 @@ def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:
     return torch.stack((-y, -z, x))
 
 
+@pytest.mark.lengthy
 def test_sweeps_fall_on_the_pixels_that_color_them(tmp_path):
     log = StreetReader(SETTINGS, tmp_path / "street").read()
     sweep = log.sweeps[0]

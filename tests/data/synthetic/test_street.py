@@ -13,6 +13,8 @@ from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import make_street
 from sparsestreet.data.synthetic.world import build_world
 
+pytestmark = pytest.mark.lengthy
+
 TINY = StreetSettings(
     seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, num_parked_cars=8, num_moving_cars=3,
     num_pedestrians=3, num_cyclists=1, lidar_beams=16, lidar_azimuth_steps=200, annotation_range=25.0,
