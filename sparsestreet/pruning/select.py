@@ -28,6 +28,8 @@ def keep_by_cost(
     ``costs`` and ``min_gaussians``: by name of the node. At a node's floor its dearest rows stay and, among equals, the
     lower row. Raises ValueError for costs that are NaN or negative, or a negative floor.
     """
+    if not costs:
+        return {}
     everything = torch.cat([cost.double() for cost in costs.values()])
     if not (everything >= 0).all():
         raise ValueError(f"costs of removal must be numbers >= 0, got {float(everything[~(everything >= 0)][0])}")

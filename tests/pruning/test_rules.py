@@ -131,6 +131,12 @@ def test_only_prunable_nodes_are_asked_each_with_its_own_floor():
         assert [each.floor_hit for each in selections.values()] == [False, True]
 
 
+def test_a_scene_in_which_nothing_may_be_pruned():
+    scene = SceneGraph({"wall": background(scene_of([0.99], [2.0]).nodes["background"].rows, prunable=False)})
+    for rule in (LeaveOneOutRule(1.0), ImportanceRule()):
+        assert rule.select(scene, [frame_of(scene, 5)], LOOK) == {}
+
+
 def test_a_scene_without_error_loses_nothing_that_is_seen():
     """A budget relative to no error is no budget: an overexposed disc before a white truth stays."""
     scene = scene_of([0.99], [2.0])

@@ -63,6 +63,16 @@ def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, seco
     assert chosen["b"].keep.tolist() == by_hand(second, unwanted[len(first) :], 0)
 
 
+def test_without_nodes_nothing_is_chosen():
+    assert keep_by_cost({}, 1.0, {}) == {}
+
+
+def test_a_budget_may_be_met_exactly():
+    costs = {"a": torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64)}
+    assert keep_by_cost(costs, 0.5, {"a": 0})["a"].keep.tolist() == [False, True, False]
+    assert keep_by_cost(costs, 0.49, {"a": 0})["a"].keep.tolist() == [True, True, False]
+
+
 def test_costs_must_be_numbers():
     for bad in (float("nan"), -1.0):
         with pytest.raises(ValueError, match="costs of removal"):

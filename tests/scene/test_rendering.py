@@ -50,6 +50,8 @@ def test_fields_and_shapes():
     assert result.splats.radii.shape == (14,)
     assert result.splats.visible.any()
     assert 0.1 < result.alpha.max() <= 1
+    masks = {name: MASK.scores(node.rows).shape for name, node in scene_of().nodes.items()}
+    assert masks == {"road": (9,), "cars": (5,)}
 
 
 def test_a_novel_view_needs_no_frame_and_no_camera_of_the_log():

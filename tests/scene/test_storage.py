@@ -132,6 +132,14 @@ def test_options_come_back_to_the_last_bit(tmp_path: Path, settings: SplatSettin
     assert header_of(tmp_path / FILE_NAME)["num_frames"] == 5
 
 
+def test_the_scene_goes_to_the_device_that_is_asked_for(tmp_path: Path):
+    save_scene(tmp_path / FILE_NAME, stored())
+    scene = load_scene(tmp_path, "meta").scene  # a device that every machine has
+    tensors = [*scene.parameters(), *scene.buffers()]
+    assert {tensor.device.type for tensor in tensors} == {"meta"}
+    assert scene.device == torch.device("meta")
+
+
 def test_a_run_folder_stands_for_its_scene(tmp_path: Path):
     scene = stored()
     save_scene(tmp_path / "runs" / "first" / FILE_NAME, scene)
