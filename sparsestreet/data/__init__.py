@@ -1,0 +1,15 @@
+"""Driving logs: what they are, where they come from, and in which order training sees them.
+
+log          DrivingLog, what the rest of the package sees of any data set; its split
+lazy         frames and sweeps that are read when they are indexed, and the cache of what was read
+reader       LogReader, what every data set offers: check and read
+problems     what is wrong with a log on disk, all at once, with remedies
+check        what `sparsestreet data check` prints
+images       pixels and masks from files
+lidar        colors that points take from images, depth that pixels take from points
+formats      data sets as they are published, to be named where they must be converted first
+drivestudio  reader of DriveStudio's processed layout
+synthetic    the embedded street: traced, written in that layout, read from there
+datamodule   the loaders of training and validation
+device       frozen values from one device to another
+"""

@@ -1,10 +1,15 @@
 """`sparsestreet data`: what it looks at, what it makes, and one line on what is wrong."""
 
+from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 
+from sparsestreet.cli.compose import CONF
 from sparsestreet.cli.data import data
+from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.synthetic import StreetReader, StreetSettings
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_lines
 
 SMALL = [
@@ -108,6 +113,20 @@ def test_a_street_is_checked_like_a_log(tmp_path, capsys):
     assert (tmp_path / "mine/images/000_0.jpg").is_file()
     (tmp_path / "mine/images/000_0.jpg").unlink()
     assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("choice", "reader"),
+    [("synthetic", StreetReader), ("synthetic", StreetSettings), ("drivestudio", DriveStudioReader)],
+)
+def test_every_choice_of_a_reader_is_a_key_with_the_readers_own_default(choice, reader):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        log = compose("train", [f"data={choice}", "seed=0"]).data.log
+    keys = log.settings if reader is StreetSettings else log
+    assert set(keys) == {"_target_"} | {field.name for field in fields(reader)}
+    for field in fields(reader):
+        if field.default is not MISSING:
+            assert keys[field.name] == (list(field.default) if isinstance(field.default, tuple) else field.default)
 
 
 @pytest.mark.parametrize(("arguments", "status"), [([], 2), (["look"], 2), (["--help"], 0), (["check", "--help"], 0)])

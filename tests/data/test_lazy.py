@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
@@ -98,6 +98,7 @@ def test_what_is_larger_than_the_room_is_not_kept_and_drives_nothing_out():
     assert asked == [10, 11, 11]
 
 
+@settings(deadline=None)  # the first example pays for what is built once
 @given(st.lists(st.integers(0, 12), max_size=60), st.integers(0, 30))
 def test_a_cache_never_holds_more_than_it_may_and_forgets_only_where_it_must(keys, room):
     """Against a list in order of use, the straightforward way."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.data.log import split
@@ -17,6 +17,7 @@ def sweep(points: torch.Tensor, colored: torch.Tensor) -> Sweep:
     return Sweep(0, points, torch.full_like(points, 0.5), colored)
 
 
+@settings(deadline=None)  # the first example pays for what is built once
 @given(st.integers(2, 30), st.integers(1, 3), st.integers(2, 12), st.data())
 def test_a_split_takes_every_frame_once_and_all_cameras_of_an_instant_together(num_frames, num_cameras, stride, data):
     offset = data.draw(st.integers(0, min(stride, num_frames - 1)))
@@ -86,3 +87,21 @@ def test_very_many_points_are_thinned_evenly():
     log = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(points, torch.ones(2_500_000, dtype=torch.bool)),))
     # The 2 % quantile of 8e5 samples of a 100 m interval scatters by 100 * sqrt(0.02 * 0.98 / 8e5) = 0.016 m.
     assert log.radius == pytest.approx(1.1 * 96 / 2, abs=0.1)
+
+
+def test_points_are_thinned_alike_in_however_many_sweeps_they_lie():
+    """Every second of 1.1 million is taken; a part behind an odd number of points must not start anew."""
+    points = torch.from_numpy(np.random.default_rng(1).normal(0, 50, (1_100_000, 3)).astype(np.float32))
+    colored = torch.ones(1_100_000, dtype=torch.bool)
+    whole = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(points, colored),))
+    parts = torch.split(points, [1, 600_000, 0, 300_001, 199_998])
+    sweeps = tuple(Sweep(index, part, part, colored[: len(part)]) for index, part in enumerate(parts))
+    log = make_log(num_frames=1, num_cameras=1, sweeps=sweeps)
+    assert log.radius == whole.radius
+    assert torch.equal(log.center, whole.center)
+
+
+def test_where_no_camera_sees_a_point_all_of_them_count():
+    points = torch.tensor([[0.0, 0, 0], [100.0, 0, 0]]).repeat(50, 1)
+    log = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(points, torch.zeros(100, dtype=torch.bool)),))
+    assert log.radius == pytest.approx(1.1 * 50)

@@ -1,4 +1,4 @@
-"""Logs in DriveStudio's processed layout: Waymo and nuScenes flavour."""
+"""Logs in DriveStudio's processed layout: Waymo and nuScenes flavor."""
 
 from sparsestreet.data.drivestudio.reader import DriveStudioReader
 

@@ -1,4 +1,4 @@
-"""Where DriveStudio's processed layout keeps what, in its Waymo and its nuScenes flavour."""
+"""Where DriveStudio's processed layout keeps what, in its Waymo and its nuScenes flavor."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -100,7 +100,7 @@ MASK_KINDS = ("sky", "human", "vehicle")
 def find_layout(
     root: Path, *, cameras: Sequence[int] | None = None, first_frame: int = 0, last_frame: int = -1
 ) -> Layout:
-    """Recognize the flavour by its files and choose cameras and frames (last_frame is included; -1: to the end).
+    """Recognize the flavor by its files and choose cameras and frames (last_frame is included; -1: to the end).
 
     Raises LogError where the folder is no such log, ValueError where cameras or frames are asked for that it lacks.
     """
@@ -108,8 +108,8 @@ def find_layout(
         raise _no_log(root)
     waymo = (root / "ego_pose").is_dir()
     if not waymo and not _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA):
-        remedy = "add ego_pose/TTT.txt (Waymo flavour) or extrinsics/TTT_C.txt (nuScenes flavour)"
-        raise fault(root / "extrinsics", "the folder holds no poses of either flavour", remedy)
+        remedy = "add ego_pose/TTT.txt (Waymo flavor) or extrinsics/TTT_C.txt (nuScenes flavor)"
+        raise fault(root / "extrinsics", "the folder holds no poses of either flavor", remedy)
     images = _numbers(root / "images", ".jpg", _FRAME_CAMERA)
     on_disk = sorted({camera for _, camera in images} | {n for (n,) in _numbers(root / "intrinsics", ".txt", _CAMERA)})
     if not images or not on_disk:

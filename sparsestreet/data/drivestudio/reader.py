@@ -32,7 +32,7 @@ _ABSENT = {
 class DriveStudioReader(LogReader):
     """Frames first_frame .. last_frame (included) of some cameras, of the folder of one scene.
 
-    Both flavours are recognized by their files. The world keeps the data set's axes and is shifted, in float64, so
+    Both flavors are recognized by their files. The world keeps the data set's axes and is shifted, in float64, so
     that the vehicle (Waymo) or the front camera (nuScenes) starts at the origin. Frames are counted from the window's
     start, cameras by their place in ``cameras``. Time is frame / (frames - 1), 0 in a log of one frame.
     """

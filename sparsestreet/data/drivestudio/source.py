@@ -48,7 +48,7 @@ def read_mount(layout: Layout, index: int, number: int, width: int | None) -> Mo
 
 
 class Source:
-    """The folder of a log in the re-centerd world: poses are read at once, images and points when asked for."""
+    """The folder of a log in the re-centered world: poses are read at once, images and points when asked for."""
 
     def __init__(
         self,

@@ -22,7 +22,7 @@ def check_sweep_size(layout: Layout, frame: int) -> None:
     if path.stat().st_size % row:
         message = f"{path.stat().st_size} bytes are no whole number of rows of {layout.sweep_columns} float32"
         remedy = (
-            f"write float32 rows of {layout.sweep_columns} columns ({'Waymo' if layout.waymo else 'nuScenes'} flavour)"
+            f"write float32 rows of {layout.sweep_columns} columns ({'Waymo' if layout.waymo else 'nuScenes'} flavor)"
         )
         raise fault(path, message, remedy)
 
@@ -42,4 +42,4 @@ def _check_points(points: Float64[Tensor, "n 3"], path: Path) -> None:
     broken = int((~(points.abs() <= _FARTHEST)).any(-1).sum())
     if broken:
         message = f"{broken} of {points.shape[0]} points are NaN, infinite or more than {_FARTHEST:g} m away"
-        raise fault(path, message, "drop these returns, and make sure that the rows have the flavour's columns")
+        raise fault(path, message, "drop these returns, and make sure that the rows have the flavor's columns")

@@ -1,4 +1,4 @@
-"""Frames of a street on disk: DriveStudio's processed layout in its nuScenes flavour, and the exact truth beside it."""
+"""Frames of a street on disk: DriveStudio's processed layout in its nuScenes flavor, and the exact truth beside it."""
 
 import json
 from dataclasses import dataclass, field

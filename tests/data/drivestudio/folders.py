@@ -1,4 +1,4 @@
-"""Minimal valid logs in both flavours, written with NumPy and Pillow alone.
+"""Minimal valid logs in both flavors, written with NumPy and Pillow alone.
 
 The vehicle drives along world x at 1 m a frame. Camera c looks along x from 1.5 m above the ground and c * 0.5 m to
 the left; the lidar sits at 1.8 m and is turned by 90 degrees to the left. One car stands at (10, 2, 0.75).

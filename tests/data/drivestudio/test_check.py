@@ -205,12 +205,12 @@ def test_every_object_at_fault_is_reported(tmp_path):
     assert [message.split(" cannot")[0] for message in messages] == ["object 0", "object 1", "object 2"]
 
 
-def test_the_waymo_flavour_is_checked_by_its_own_files(tmp_path):
+def test_the_waymo_flavor_is_checked_by_its_own_files(tmp_path):
     make_waymo(tmp_path)
     edit_matrix("ego_pose/001.txt", mirror)(tmp_path)
     edit_matrix("extrinsics/1.txt", put(0, 0, 1.2))(tmp_path)
     remove("ego_pose/002.txt")(tmp_path)
-    write_rows(tmp_path / "lidar/000.bin", np.ones((3, 4)))  # rows of the other flavour
+    write_rows(tmp_path / "lidar/000.bin", np.ones((3, 4)))  # rows of the other flavor
     found = {problem.path.relative_to(tmp_path).as_posix() for problem in DriveStudioReader(tmp_path).check()}
     assert found == {"ego_pose/001.txt", "extrinsics/1.txt", "ego_pose/002.txt", "lidar/000.bin"}
 

@@ -26,10 +26,10 @@ from tests.data.drivestudio.folders import (
 )
 
 MAP = np.array([450123.377, 5400321.713, 230.19])  # meters, as UTM coordinates of central Europe
-FLAVOURS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
+FLAVORS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 
 
-@FLAVOURS
+@FLAVORS
 def test_frames_are_ordered_and_timed(make, tmp_path):
     log = DriveStudioReader(make(tmp_path / "street_7")).read()
     assert (log.name, log.num_frames, log.num_cameras, log.notes) == ("street_7", 3, 2, ())
@@ -42,7 +42,7 @@ def test_frames_are_ordered_and_timed(make, tmp_path):
     assert (log.frames[0].camera.width, log.frames[0].camera.height) == (WIDTH, HEIGHT)
 
 
-@FLAVOURS
+@FLAVORS
 def test_a_point_straight_ahead_lands_in_the_image_center(make, tmp_path):
     """Camera 0 stands at height 1.5 m and looks along the drive: (x, 0, 1.5) is on its axis, at depth x - frame."""
     log = DriveStudioReader(make(tmp_path)).read()
@@ -53,7 +53,7 @@ def test_a_point_straight_ahead_lands_in_the_image_center(make, tmp_path):
         assert torch.allclose(depths, torch.tensor([10.0, 20.0]) - frame.frame_index, atol=1e-5)
 
 
-@FLAVOURS
+@FLAVORS
 def test_left_and_up_are_left_and_up_in_the_image(make, tmp_path):
     """The point at (8, 0.3, 1.5) is left of camera 0 by 0.3 m at 8 m; the car's center is left and below."""
     log = DriveStudioReader(make(tmp_path)).read()
@@ -68,7 +68,7 @@ def test_left_and_up_are_left_and_up_in_the_image(make, tmp_path):
     assert torch.allclose(pixels, expected.float(), atol=1e-4)
 
 
-@FLAVOURS
+@FLAVORS
 def test_map_coordinates_keep_their_relative_geometry(make, tmp_path):
     """float32 at 5.4e6 has a spacing of 0.5 m; after re-centering in float64 nothing of that may be left."""
     here = DriveStudioReader(make(tmp_path / "here")).read()
@@ -80,7 +80,7 @@ def test_map_coordinates_keep_their_relative_geometry(make, tmp_path):
     assert torch.allclose(here.tracks[0].world_from_object, far.tracks[0].world_from_object, atol=1e-4)
 
 
-@FLAVOURS
+@FLAVORS
 def test_dataset_from_world_adds_the_map_back(make, tmp_path):
     log = DriveStudioReader(make(tmp_path, offset=MAP)).read()
     in_dataset = log.dataset_from_world @ log.tracks[0].world_from_object[1]
@@ -90,7 +90,7 @@ def test_dataset_from_world_adds_the_map_back(make, tmp_path):
 
 
 def test_the_world_starts_at_the_front_camera_whichever_cameras_are_read(tmp_path):
-    """nuScenes flavour: camera 0 at the first frame is the origin, so camera 1 alone stands 0.5 m to its left."""
+    """nuScenes flavor: camera 0 at the first frame is the origin, so camera 1 alone stands 0.5 m to its left."""
     log = DriveStudioReader(make_nuscenes(tmp_path), cameras=[1], first_frame=1).read()
     assert torch.allclose(log.frames[0].camera.position, torch.tensor([0, 0.5, 0]), atol=1e-6)
 
@@ -158,14 +158,20 @@ def test_masks_are_where_they_were_drawn(tmp_path):
 
 
 def test_shrunken_object_masks_keep_every_pixel_they_touch_and_sky_does_not_grow(tmp_path):
+    """A quarter of the size: the nearest pixel of (i, j) is (4 i + 2, 4 j + 2), and a line beside it goes unseen."""
     make_nuscenes(tmp_path)
-    dot = np.zeros((HEIGHT, WIDTH), np.uint8)
-    dot[6, 10] = 255
-    for folder in ("sky_masks", "dynamic_masks/vehicle"):
-        write_image(tmp_path / folder / "000_0.png", dot)
+    lines = np.zeros((HEIGHT, WIDTH), np.uint8)
+    lines[:, 9] = 255
+    lines[18, :] = 255
+    for folder in ("sky_masks", "dynamic_masks/vehicle", "dynamic_masks/human"):
+        write_image(tmp_path / folder / "000_0.png", lines)
     frame = DriveStudioReader(tmp_path, width=10).read().frames[0]
-    assert frame.vehicle[1, 2]
-    assert int(frame.sky.sum()) <= 1
+    for mask in (frame.vehicle, frame.human):
+        assert mask[:, 2].all()
+        assert mask[4].all()
+    expected = torch.zeros(6, 10, dtype=torch.bool)
+    expected[4] = True
+    assert torch.equal(frame.sky, expected)
 
 
 def test_fine_masks_replace_the_coarse_ones(tmp_path):
@@ -182,7 +188,7 @@ def test_fine_masks_replace_the_coarse_ones(tmp_path):
     ("folder", "word"),
     [("sky_masks", "sky"), ("lidar", "lidar"), ("instances", "boxes"), ("dynamic_masks/human", "human")],
 )
-@FLAVOURS
+@FLAVORS
 def test_what_is_optional_may_be_absent_and_is_noted(make, folder, word, tmp_path):
     shutil.rmtree(make(tmp_path) / folder)
     log = DriveStudioReader(tmp_path).read()
@@ -216,7 +222,7 @@ def test_distortion_is_ignored_only_when_asked(tmp_path):
     assert "0.25" in log.notes[0]
 
 
-@FLAVOURS
+@FLAVORS
 def test_sweeps_are_colored_by_the_images_of_their_instant(make, tmp_path):
     """At frame 0 all points but the one behind the vehicle lie in camera 0's (red) image; JPEG costs a few levels."""
     sweep = DriveStudioReader(make(tmp_path)).read().sweeps[0]
@@ -227,7 +233,7 @@ def test_sweeps_are_colored_by_the_images_of_their_instant(make, tmp_path):
     assert sweep.points.shape == POINTS_IN_WORLD.shape
 
 
-@FLAVOURS
+@FLAVORS
 def test_depth_takes_the_nearest_of_the_points_in_a_pixel(make, tmp_path):
     """Points 0 and 1 share the center pixel, at 10 and 20 m."""
     depth = DriveStudioReader(make(tmp_path)).read().frames[0].depth
