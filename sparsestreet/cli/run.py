@@ -103,8 +103,10 @@ def _checkpoint(cfg: DictConfig) -> Path | None:
 
 
 def silence_known_noise() -> None:
-    """Hints of Lightning that do not apply: frames come from a cache, a loader process would copy them; a run that holds
-    nothing out has nothing to validate on."""
+    """Hints of Lightning that do not apply.
+
+    Frames lie in a cache that worker processes would copy; a run that holds nothing out has nothing to validate on.
+    """
     warnings.filterwarnings("ignore", message="Total length of .list. across ranks is zero.*")
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")
