@@ -1,0 +1,103 @@
+"""When a checkpoint is written, under which name, and what a failed one leaves."""
+
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
+from sparsestreet.training.callbacks.graceful_stop import TornStop
+from tests.training.stubs import StubTrainer, background, make_system
+
+
+class HalfWritten(StubTrainer):
+    """Its checkpoints fail half way from a step on."""
+
+    fails_from = 100
+
+    def save_checkpoint(self, filepath: Path, weights_only: bool | None = None, storage_options: Any = None) -> None:
+        if self.global_step >= self.fails_from:
+            filepath.write_text("ha")
+            raise OSError("no space left on device")
+        super().save_checkpoint(filepath)
+
+
+def trainer_in(folder: Path, every: int = 2, max_steps: int = 5) -> HalfWritten:
+    """Its only callback writes checkpoints, whose content is their step."""
+    return HalfWritten(make_system({"background": background(1)}), [Checkpoints(folder, every)], max_steps=max_steps)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir()} if folder.exists() else {}
+
+
+def test_a_checkpoint_every_few_steps_and_one_at_the_end(tmp_path):
+    trainer = trainer_in(tmp_path / "run" / "checkpoints")
+    folder, seen = tmp_path / "run" / "checkpoints", []
+    for step in range(1, 6):
+        trainer.walk(step)
+        seen.append(contents(folder).get("last.ckpt"))
+    assert seen == [None, "2", "2", "4", "4"]
+    trainer.callbacks[0].on_train_end(trainer, trainer.system)
+    assert contents(folder) == {"last.ckpt": "5"}
+
+
+def test_the_last_step_is_left_to_the_end(tmp_path):
+    trainer = trainer_in(tmp_path, every=5)
+    trainer.walk(5)
+    assert contents(tmp_path) == {}
+
+
+def test_an_exception_leaves_the_step_that_was_done_and_a_finished_run_takes_it_away(tmp_path, caplog):
+    trainer = trainer_in(tmp_path / "run" / "checkpoints")
+    folder, callback = tmp_path / "run" / "checkpoints", trainer.callbacks[0]
+    trainer.walk(3)
+    callback.on_exception(trainer, trainer.system, KeyboardInterrupt())
+    assert contents(folder) == {"last.ckpt": "2", "interrupted.ckpt": "3"}
+    assert caplog.messages == [f"stopped after step 3; go on with resume={tmp_path / 'run'}"]
+    trainer.interrupted = True
+    callback.on_train_end(trainer, trainer.system)
+    assert contents(folder) == {"last.ckpt": "2", "interrupted.ckpt": "3"}
+    trainer.interrupted = False
+    trainer.walk(5)
+    callback.on_train_end(trainer, trainer.system)
+    assert contents(folder) == {"last.ckpt": "5"}
+
+
+@pytest.mark.parametrize(("step", "exception"), [(3, TornStop()), (0, RuntimeError("no data"))])
+def test_half_a_step_and_no_step_leave_no_checkpoint(tmp_path, step, exception):
+    trainer = trainer_in(tmp_path)
+    trainer.walk(step)
+    trainer.callbacks[0].on_exception(trainer, trainer.system, exception)
+    assert "interrupted.ckpt" not in contents(tmp_path)
+
+
+def test_a_full_disk_stops_no_training_but_is_an_error_at_the_end(tmp_path, caplog):
+    """The checkpoint before stays whole, and nothing half written stays beside it."""
+    trainer = trainer_in(tmp_path)
+    trainer.walk(2)
+    trainer.fails_from = 3
+    with caplog.at_level(logging.ERROR):
+        trainer.walk(5)
+        trainer.callbacks[0].on_exception(trainer, trainer.system, KeyboardInterrupt())
+    assert contents(tmp_path) == {"last.ckpt": "2"}
+    assert [message[:7] for message in caplog.messages] == ["step 4:", "step 5:"]
+    with pytest.raises(OSError, match="no space left"):
+        trainer.callbacks[0].on_train_end(trainer, trainer.system)
+    assert contents(tmp_path) == {"last.ckpt": "2"}
+
+
+def test_the_newest_checkpoint_is_the_one_that_was_written_last(tmp_path):
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    with pytest.raises(FileNotFoundError, match="has no checkpoint to go on from"):
+        newest_checkpoint(tmp_path)
+    for newest, older in (("last.ckpt", "interrupted.ckpt"), ("interrupted.ckpt", "last.ckpt")):
+        for name, seconds in ((older, 1000), (newest, 2000)):
+            (folder / name).touch()
+            os.utime(folder / name, (seconds, seconds))
+        assert newest_checkpoint(tmp_path) == folder / newest
+    (folder / "interrupted.ckpt").unlink()
+    assert newest_checkpoint(tmp_path) == folder / "last.ckpt"

@@ -1,0 +1,110 @@
+"""What a training leaves for everybody else, when, and what run.json says of it."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.evaluation.records import read_run, run_path
+from sparsestreet.export.views import read_views
+from sparsestreet.ops import SplatSettings
+from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.storage import load_scene
+from sparsestreet.training.callbacks import Clock, RunFiles
+from sparsestreet.training.callbacks.graceful_stop import TornStop
+from sparsestreet.training.callbacks.resizing import resize_rows
+from tests.evaluation.frames import make_run
+from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
+
+OPTIONS = RenderOptions(SplatSettings(near_plane=0.25), "reference")
+
+
+def grown(rows: int, by: int) -> RowPlan:
+    source = torch.cat((torch.arange(rows), torch.zeros(by, dtype=torch.int64)))
+    return RowPlan(rows, source, torch.arange(rows + by) >= rows)
+
+
+@pytest.fixture
+def trainer(tmp_path) -> StubTrainer:
+    """At step 3 of 10; seven instants, of which 1 and 4 are held out; the files are written by its only callback."""
+    nodes = {"background": background(4, max_gaussians=10), "rigid": rigid(3)}
+    clock = Clock()
+    clock.load_state_dict({"seconds": 12.5})
+    trainer = StubTrainer(make_system(nodes, options=OPTIONS), [RunFiles(tmp_path, make_run(), clock)], max_steps=10)
+    log = DrivingLog("seven", tuple(frame_at(index) for index in range(7)), (), (), 7, 1, torch.eye(4).double())
+    trainer.datamodule = StreetData(log, stride=3, offset=1)
+    trainer.walk(3)
+    return trainer
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def check_whole(trainer: StubTrainer, folder: Path) -> None:
+    assert files(folder) == {"scene.safetensors", "views.json", "run.json"}
+    stored = load_scene(folder)
+    assert stored.scene.counts() == trainer.system.scene.counts()
+    assert (stored.name, stored.num_frames, stored.options) == ("seven", 7, OPTIONS)
+    views = read_views(folder / "views.json")
+    assert [view.frame_index for view in views.training] == [0, 2, 3, 5, 6]
+    assert [view.frame_index for view in views.held_out] == [1, 4]
+    run = read_run(run_path(folder))
+    assert (run.steps, run.training_seconds) == (trainer.global_step, 12.5)
+    assert run.label == make_run().label
+
+
+def test_the_end_of_training_leaves_all_three(trainer, tmp_path):
+    trainer.callbacks[0].on_train_end(trainer, trainer.system)
+    check_whole(trainer, tmp_path)
+    assert read_run(run_path(tmp_path)).caps == {}
+
+
+def test_so_does_an_interruption_between_two_steps(trainer, tmp_path):
+    trainer.callbacks[0].on_exception(trainer, trainer.system, KeyboardInterrupt())
+    check_whole(trainer, tmp_path)
+
+
+@pytest.mark.parametrize("exception", [TornStop(), OSError("no space left on device")])
+def test_half_a_step_and_a_full_disk_leave_nothing(trainer, tmp_path, exception):
+    trainer.callbacks[0].on_exception(trainer, trainer.system, exception)
+    assert files(tmp_path) == set()
+
+
+def test_no_step_and_an_interrupted_end_leave_nothing(trainer, tmp_path):
+    trainer.interrupted = True
+    trainer.callbacks[0].on_train_end(trainer, trainer.system)
+    trainer.global_step = 0
+    trainer.callbacks[0].on_exception(trainer, trainer.system, RuntimeError("no data"))
+    assert files(tmp_path) == set()
+
+
+def test_run_json_names_the_nodes_that_their_limit_held_down(trainer, tmp_path):
+    """A split adds two rows: at nine of ten there is no room for another one."""
+    callback, system = trainer.callbacks[0], trainer.system
+    resize_rows(trainer, system, "background", grown(4, 4), "densify")
+    resize_rows(trainer, system, "rigid", grown(3, 50), "densify")  # has no limit
+    assert callback.caps == {}
+    resize_rows(trainer, system, "background", grown(8, 1), "densify")
+    assert callback.caps == {"background": 10}
+    resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(9) < 2), "cull")
+    callback.on_train_end(trainer, system)
+    assert read_run(run_path(tmp_path)).caps == {"background": 10}
+
+
+def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
+    system = make_system({"background": background(8, max_gaussians=6)})
+    trainer = StubTrainer(system, [RunFiles(tmp_path, make_run(), Clock())])
+    resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(8) < 6), "cull")
+    assert trainer.callbacks[0].caps == {}
+
+
+def test_a_resumed_run_remembers_the_limits(trainer, tmp_path):
+    resize_rows(trainer, trainer.system, "background", grown(4, 6), "densify")
+    torch.save(trainer.callbacks[0].state_dict(), tmp_path / "state.pt")
+    resumed = RunFiles(tmp_path, make_run(), Clock())
+    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert resumed.caps == {"background": 10}
