@@ -17,7 +17,7 @@ Trains the embedded street three times, in outputs/demo: plain, sparsify=paper (
 sparsify=removal (the paper's masks, then our rule). The overrides go to all three: seed=1, schedule.max_steps=2000 ...
 """
 SPARSIFY = ("none", "paper", "removal")
-STEPS = 1500
+STEPS = 1200
 """Three runs, their pictures and the setting-up in ten minutes on two cores; a run of one's own takes 2,000 steps."""
 
 
