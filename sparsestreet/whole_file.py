@@ -20,10 +20,13 @@ def whole_file(path: Path) -> Iterator[Path]:
             raise IsADirectoryError(0, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
+        mode = temporary.stat().st_mode
     except OSError as error:
         raise _unwritable(path, error) from error
     try:
         yield temporary
+        # Some writers (safetensors) leave a file that only its owner may read.
+        temporary.chmod(mode)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

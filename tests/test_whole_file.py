@@ -17,6 +17,14 @@ def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
     assert names(path.parent) == ["a.txt"]
 
 
+def test_a_file_may_be_read_by_whom_the_user_lets_read(tmp_path):
+    (tmp_path / "plain").write_text("")
+    with whole_file(tmp_path / "a.txt") as temporary:
+        temporary.unlink()
+        temporary.touch(mode=0o600)
+    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 @pytest.mark.parametrize("stopped_by", [RuntimeError, KeyboardInterrupt])
 def test_a_failure_leaves_the_old_file(tmp_path, stopped_by):
     path = tmp_path / "a.txt"
