@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from sparsestreet.bench import gpu, scaling
-from sparsestreet.cli.assemble import assemble
 from sparsestreet.cli.bench import bench, trained_street
-from sparsestreet.cli.compose import load_run_config
+from sparsestreet.export.views import read_views
 from sparsestreet.ops import splat
+from sparsestreet.scene.storage import load_scene
 
 
 def test_help_teaches_by_example(capsys):
@@ -46,22 +46,19 @@ def test_gpu_without_a_device_is_an_error_and_quick_is_not(tmp_path, capsys, mon
 
 
 def test_a_folder_that_is_no_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match="is no run"):
+    with pytest.raises(FileNotFoundError, match="there is no scene at"):
         trained_street(tmp_path)
 
 
 def test_the_street_of_a_run_is_what_the_run_renders(run_train, tmp_path):
     run = run_train(tmp_path / "run", "schedule.max_steps=20")
     street = trained_street(run)
-    assert street.source.startswith("trained: streetgs on ")
-    assert ", 20 steps, frame " in street.source
+    assert street.source.startswith("trained: run on ")
     assert not street.gaussians.means.requires_grad
-    parts = assemble(load_run_config(run))
-    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=True)
-    parts.system.load_state_dict(checkpoint["state_dict"])
-    frame = parts.datamodule.split.held_out[len(parts.datamodule.split.held_out) // 2]
+    views = read_views(run / "views.json").all
+    view = views[len(views) // 2]
+    assert street.source.endswith(f"frame {view.frame_index}")
     with torch.no_grad():
-        rendering = parts.system.eval().render(frame)
         again = splat(street.gaussians, street.camera)
-    assert torch.equal(again.rgb, rendering.splats.rgb)  # without the sky
+    assert torch.equal(again.rgb, load_scene(run).render(view).splats.rgb)  # without the sky
     assert float(again.alpha.mean()) > 0.2

@@ -16,6 +16,8 @@ from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, M
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
 PAIRS = list(itertools.product(METHODS, SPARSIFY))
+DAILY = [("streetgs", "paper"), ("3dgs", "removal")]
+"""The pairs that a daily run trains: both methods, every stage."""
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 
@@ -120,7 +122,10 @@ def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: 
         recipe_of(composed(*overrides))
 
 
-@pytest.mark.parametrize(("method", "sparsify"), PAIRS)
+@pytest.mark.parametrize(
+    ("method", "sparsify"),
+    [pair if pair in DAILY else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
+)
 def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: str, run_train, tmp_path):
     """20 steps in which densification, masking and pruning each come once; quick masks, so that some rows do go."""
     masks = ["schedule.mask_learning_rate=1.0", "schedule.lambda_m=10.0"]

@@ -4,24 +4,30 @@ Pruning by removal finds them and spares what is visible. The paper's stages do 
 what is visible and leave half of the planted, the importance gate takes rows that would be missed (docs/results.md).
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from jaxtyping import Bool
 from lightning import Trainer
 from torch import Tensor
 
-from sparsestreet.cli.assemble import Assembly, assemble
+from sparsestreet.cli.assemble import data_of
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.train import train
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, View
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, Look
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMask
-from sparsestreet.scene.nodes.background import Background
-from sparsestreet.scene.rendering import sky_image
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.nodes import Background
+from sparsestreet.scene.rendering import RenderOptions, sky_image
+from sparsestreet.scene.storage import StoredScene, load_scene
 from sparsestreet.training.callbacks import BackgroundPruning, MaskTraining
-from sparsestreet.training.losses import MaskSparsity
-from sparsestreet.training.optimizer import LearningRate, OptimizerSettings
+from sparsestreet.training.losses import InverseDepth, MaskSparsity, Photometric, SkyMask
+from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.schedule import Interval
+from sparsestreet.training.system import StreetSystem
 from tests.pruning.planted import Views, activated, judge, plant
 
 # One process trains for all tests.
@@ -35,23 +41,23 @@ FEW_VISIBLE = 300
 def planted_street(tiny_street, tmp_path_factory):
     """A trained background, what was planted into it, and which of its own rows a view would miss."""
     out = tmp_path_factory.mktemp("planted")
-    few = ("schedule.max_steps=300", "node=[background]", "scale.background.max_gaussians=2500")
-    assert train([*tiny_street, f"hydra.run.dir={out}", *few]) == 0
-    parts = _trained(out)
-    cameras = [frame.camera for frame in parts.datamodule.split.train]
+    few = ("schedule.max_steps=300", "node=[background]", "node.background.max_gaussians=2500")
+    assert train([*tiny_street, f"out={out}", *few]) == 0
+    data, stored = data_of(load_run_config(out)), load_scene(out)
+    cameras = [view.camera for view in data.split.train.views]
     generator = torch.Generator().manual_seed(0)
-    background = parts.system.scene.nodes["background"]
-    sky = [sky_image(parts.system.scene, camera).detach() for camera in cameras]
-    rows, planted = plant(background.rows, cameras, generator, hidden=60, copies=12, backend="cpu", sky_images=sky)
+    sky = [sky_image(stored.scene, camera).detach() for camera in cameras]
+    table = stored.scene.nodes["background"].rows
+    rows, planted = plant(table, cameras, generator, hidden=60, copies=12, backend="cpu", sky_images=sky)
     sample = torch.randperm(int((~planted).sum()), generator=generator)[:FEW_VISIBLE]
     visible = Views(activated(rows), cameras, "cpu", sky).visible(sample)
-    return out, rows, planted, visible
+    return out, data, rows, planted, visible
 
 
 def test_removal_finds_what_was_planted_and_spares_what_is_visible(planted_street):
     """One pass without a budget: rows that nobody sees. The judge renders every view without the row."""
-    out, rows, planted, visible = planted_street
-    keep = _prune_by_removal(_trained(out), rows, allowed_db=0.0)
+    out, data, rows, planted, visible = planted_street
+    keep = _prune_by_removal(load_scene(out), data, rows, allowed_db=0.0)
     verdict = judge(keep, planted, visible)
     assert verdict.recall >= 0.95
     assert verdict.visible_lost <= 0.02
@@ -62,63 +68,63 @@ def test_removal_finds_what_was_planted_and_spares_what_is_visible(planted_stree
 
 def test_a_budget_takes_what_is_missed_least(planted_street):
     """0.01 dB: more rows than nobody sees, but none whose removal moves a pixel by more than 16/255."""
-    out, rows, planted, _ = planted_street
-    parts = _trained(out)
-    cameras = [frame.camera for frame in parts.datamodule.split.train]
-    sky = [sky_image(parts.system.scene, camera).detach() for camera in cameras]
-    keep = _prune_by_removal(parts, rows, allowed_db=0.01)
-    assert int(keep.sum()) < int(_prune_by_removal(_trained(out), rows, allowed_db=0.0).sum())
+    out, data, rows, planted, _ = planted_street
+    stored = load_scene(out)
+    cameras = [view.camera for view in data.split.train.views]
+    sky = [sky_image(stored.scene, camera).detach() for camera in cameras]
+    keep = _prune_by_removal(stored, data, rows, allowed_db=0.01)
+    assert int(keep.sum()) < int(_prune_by_removal(load_scene(out), data, rows, allowed_db=0.0).sum())
     lost = torch.nonzero(~keep & ~planted).squeeze(-1)[::4]
     assert not Views(activated(rows), cameras, "cpu", sky).visible(lost, more_than=16 / 255).any()
 
 
 def test_both_stages_find_what_was_planted(planted_street):
     """Measured recall 0.96 with one thread; the order of sums differs with threads, and 0.05 are 4 of 72 rows."""
-    out, rows, planted, visible = planted_street
-    keep = _prune(_trained(out), rows, mask_weight=20.0, gated=True)
+    out, data, rows, planted, visible = planted_street
+    keep = _prune(load_scene(out), data, rows, lambda_m=20.0, gated=True)
     assert judge(keep, planted, visible).recall >= 0.9
 
 
 def test_gentle_masks_leave_what_is_visible(planted_street):
     """Visible: moves a pixel of some view by more than 1/255 when it alone is removed. Measured 0.013."""
-    out, rows, planted, visible = planted_street
-    verdict = judge(_prune(_trained(out), rows, mask_weight=2.0, gated=False), planted, visible)
+    out, data, rows, planted, visible = planted_street
+    verdict = judge(_prune(load_scene(out), data, rows, lambda_m=2.0, gated=False), planted, visible)
     assert verdict.visible_lost <= 0.02
     assert verdict.recall >= 0.3
 
 
-def _trained(out) -> Assembly:
-    parts = assemble(load_run_config(out))
-    parts.system.load_state_dict(torch.load(out / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"])
-    return parts
+def _prune_by_removal(stored: StoredScene, data: StreetData, rows: Rows, *, allowed_db: float) -> Bool[Tensor, " n"]:
+    scene = stored.scene
+    settings = replace(scene.nodes["background"].settings, min_gaussians=0)
+    scene.nodes["background"] = Background(settings, rows)
+    look = Look(options=RenderOptions(stored.options.settings, "cpu"))
+    return LeaveOneOutRule(allowed_db).select(scene, data.split.train, look)["background"].keep
 
 
-def _prune_by_removal(parts: Assembly, rows: Rows, *, allowed_db: float) -> Bool[Tensor, " n"]:
-    parts.system.scene.nodes["background"] = Background(rows, None)
-    view = View(parts.system.options.settings, "cpu")
-    frames = parts.datamodule.split.train
-    return LeaveOneOutRule(allowed_db).select(parts.system.scene, frames, {"background": 0}, view)["background"].keep
-
-
-def _prune(parts: Assembly, rows: Rows, *, mask_weight: float, gated: bool) -> Bool[Tensor, " n"]:
+def _prune(stored: StoredScene, data: StreetData, rows: Rows, *, lambda_m: float, gated: bool) -> Bool[Tensor, " n"]:
     """Train on with masks, and with background pruning if ``gated``; which of the rows are left.
 
     A buffer of row numbers follows every plan.
     """
-    mask = StaticMask(weight=2.5e-3, min_gaussians=200)
-    columns = dict(rows.named_parameters()) | {"mask_logits": mask.initial_logits(len(rows))}
-    node = Background(Rows(columns, {"numbers": torch.arange(len(rows))}), mask)
-    system = parts.system
-    system.scene.nodes["background"] = node
-    system.losses["mask_sparsity"] = MaskSparsity(mask_weight)
-    system.optimization = OptimizerSettings({**system.optimization.rates, "mask_logits": LearningRate(0.05)})
+    scene = stored.scene.train()
+    settings = scene.nodes["background"].settings
+    rates = {**settings.learning_rates, "mask_logits": LearningRate(0.05)}
+    settings = replace(settings, min_gaussians=200, learning_rates=rates)
+    mask = StaticMaskSettings(sparsity_weight=2.5e-3).build(200)
+    logits = mask.initial_columns(len(rows))
+    columns = dict(rows.named_parameters()) | logits
+    node = Background(settings, Rows(columns, {"numbers": torch.arange(len(rows))}, transient=logits), mask)
+    scene.nodes["background"] = node
+    terms = (Photometric(), SkyMask(), InverseDepth(), MaskSparsity(lambda_m))
+    losses = {type(term).__name__: term for term in terms}
+    system = StreetSystem(scene, losses, OptimizerSettings(), radius=data.driving_log.radius, options=stored.options)
     trainer = Trainer(
         accelerator="cpu",
         max_steps=STEPS,
         max_epochs=-1,
         callbacks=[
             MaskTraining(Interval(0.0, 0.8, 50)),
-            *([BackgroundPruning([0.8], ImportanceRule(), {"background": 200})] if gated else []),
+            *([BackgroundPruning([0.8], ImportanceRule())] if gated else []),
         ],
         logger=False,
         enable_progress_bar=False,
@@ -127,7 +133,7 @@ def _prune(parts: Assembly, rows: Rows, *, mask_weight: float, gated: bool) -> B
         limit_val_batches=0,
         num_sanity_val_steps=0,
     )
-    trainer.fit(system, datamodule=parts.datamodule)
+    trainer.fit(system, datamodule=data)
     keep = torch.zeros(len(rows), dtype=torch.bool)
     keep[node.rows.numbers] = True
     return keep

@@ -48,7 +48,7 @@ ALL_STAGES = (
 )
 
 
-@pytest.mark.parametrize("stop_at", [23, 50])
+@pytest.mark.parametrize("stop_at", [23, pytest.param(50, marks=pytest.mark.slow)])
 def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, tiny_street, tmp_path, stop_at):
     """Stopped inside the mask stage (23: after a reset, in its pause) and after it (50: the masks are gone)."""
     part = tmp_path / "part"
@@ -82,7 +82,9 @@ def _raises_at(step: int):
     return hook
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)]
+)
 def test_a_signal_ends_after_the_step_with_its_own_status(whole, tiny_street, tmp_path, number, status):
     """In a process of its own, at whatever moment of a step the signal comes; then it goes on to the same end."""
     out = tmp_path / "run"

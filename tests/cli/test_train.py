@@ -144,6 +144,7 @@ def test_adam_of_visible_gaussians_runs(run_train, tmp_path):
     run_train(tmp_path, "optimizer=visible_adam", "trainer.fast_dev_run=2")
 
 
+@pytest.mark.slow
 def test_bf16_mixed_changes_nothing_where_it_would_hurt(run_train, tmp_path):
     """Masks, losses and the op stay float32: in bfloat16 a logit would stop at -4.0, above the threshold."""
     few = ("sparsify=masks", "schedule.max_steps=12", "schedule.mask_in.stop=1.0", "schedule.mask_in.every=100")
@@ -174,6 +175,7 @@ def test_masks_end_with_their_stage(finished):
     assert not [name for name in weights(finished) if "mask" in name]
 
 
+@pytest.mark.slow
 def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     out = run_train(tmp_path, "node.background.max_gaussians=2300", "node.background.density.grad_threshold=1e-6")
     assert read_run(run_path(out)).caps["background"] == 2300
