@@ -21,7 +21,7 @@ class CountChange:
     before: int
     after: int
     reason: str
-    """In a word or two: "seeds", "densify", "cull", ``MASK``, ``PRUNING`` ..."""
+    """In a word or two: "start", "densify", "cull", ``MASK``, ``PRUNING`` ..."""
 
 
 _COLUMNS = [field.name for field in fields(CountChange)]
