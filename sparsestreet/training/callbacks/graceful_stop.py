@@ -3,9 +3,9 @@
 import logging
 import signal
 from types import FrameType
-from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 log = logging.getLogger(__name__)
 
@@ -26,17 +26,16 @@ class GracefulStop(Callback):
     def __init__(self) -> None:
         self.received: int | None = None
         """Number of the signal that ended training; None: none did."""
-        self._before: dict[int, Any] = {}
 
     @property
     def exit_status(self) -> int:
         """What a shell expects of a program that the signal ended; 0 where none did."""
         return 0 if self.received is None else 128 + self.received
 
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        # After Lightning's own handlers, which end a process on SIGTERM with status 0.
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # Not earlier: after on_fit_start Lightning notes which handlers it finds, and puts these back however it ends.
         for number in SIGNALS:
-            self._before[number] = signal.signal(number, self._receive)
+            signal.signal(number, self._receive)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
@@ -45,16 +44,10 @@ class GracefulStop(Callback):
             raise KeyboardInterrupt
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        # Lightning tears no callback down after an exception.
-        self._release()
-
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        self._release()
-
-    def _release(self) -> None:
-        while self._before:
-            number, handler = self._before.popitem()
-            signal.signal(number, handler)
+        if self.received is None:
+            # A signal before training started came as one of these.
+            kinds = ((KeyboardInterrupt, signal.SIGINT), (SIGTERMException, signal.SIGTERM))
+            self.received = next((number for kind, number in kinds if isinstance(exception, kind)), None)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None:
