@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import project
+from sparsestreet.metrics.definitions import LIDAR_REACH
 from sparsestreet.types import Camera
 
 
@@ -42,6 +43,15 @@ def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "
     nearest = torch.full((camera.height * camera.width,), torch.inf)
     nearest.scatter_reduce_(0, pixels, depths.float(), "amin")
     return torch.where(nearest.isinf(), 0.0, nearest).view(camera.height, camera.width)
+
+
+def near_returns(depth: Float[Tensor, "h w"], reach: float = LIDAR_REACH) -> Bool[Tensor, "h w"]:
+    """Pixels of a depth image that have a return at most round(reach * longer side) columns and rows away."""
+    window = 2 * round(reach * max(depth.shape)) + 1
+    hit = (depth > 0).float()[None, None]
+    # A square window is a row of columns: two passes of a line cost less than one of a square.
+    wide = torch.nn.functional.max_pool2d(hit, (1, window), stride=1, padding=(0, window // 2))
+    return torch.nn.functional.max_pool2d(wide, (window, 1), stride=1, padding=(window // 2, 0))[0, 0] > 0
 
 
 def visible_pixels(

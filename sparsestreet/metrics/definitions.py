@@ -9,6 +9,10 @@ per-image PSNRs, the PSNR of the mean MSE and the pixel-pooled PSNR lie more tha
 REGIONS = ("full", "human", "vehicle")
 QUANTITIES = ("mse", "psnr", "ssim_uniform7")
 
+LIDAR_REACH = 0.04
+"""A pixel is near the lidar where a return of the same instant falls into the square window of this fraction of the
+longer image side to all four sides; the others are beyond it."""
+
 PSNR_CAP = 100.0
 """dB; a perfectly reproduced image would otherwise make every mean infinite. Summaries count the capped images."""
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from sparsestreet.data.lidar import color_points, depth_image
+from sparsestreet.data.lidar import color_points, depth_image, near_returns
 from sparsestreet.types import Camera
 
 # At the origin, looking along z; a point (x, y, z) falls on pixel (2 x/z + 1.5, 2 y/z + 1).
@@ -46,3 +46,14 @@ def test_no_points_give_no_color_and_no_depth():
 def test_without_cameras_nothing_is_colored():
     _, colored = color_points(torch.ones(3, 3), [])
     assert not colored.any()
+
+
+def test_near_returns_is_a_square_about_each_return():
+    depth = torch.zeros(9, 20)
+    depth[2, 3], depth[8, 19] = 5.0, 7.0
+    rows, columns = torch.meshgrid(torch.arange(9), torch.arange(20), indexing="ij")
+    # A tenth of the longer side, 20, is 2 pixels.
+    expected = ((rows - 2).abs() <= 2) & ((columns - 3).abs() <= 2)
+    expected |= ((rows - 8).abs() <= 2) & ((columns - 19).abs() <= 2)
+    assert torch.equal(near_returns(depth, reach=0.1), expected)
+    assert not near_returns(torch.zeros(4, 5)).any()
