@@ -27,6 +27,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         options=instantiate(cfg.render, _convert_="all"),
         sh_interval=cfg.schedule.sh_interval,
         seed=cfg.seed,
+        image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,
     )
     problems = recipe.problems()
     if problems:

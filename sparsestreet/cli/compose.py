@@ -37,6 +37,7 @@ class TrainSchema:
     sparsify: Any = MISSING
     node: Any = MISSING
     sky: Any = None
+    image_points: Any = None
     loss: Any = MISSING
     callback: Any = MISSING
     optimizer: Any = MISSING

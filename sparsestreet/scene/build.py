@@ -14,6 +14,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.sky import Sky, SkySettings
+from sparsestreet.triangulation import ImagePointSettings, cached_street_points
 from sparsestreet.types import Track
 
 _log = logging.getLogger(__name__)
@@ -26,6 +27,7 @@ def build_scene(
     nodes: Mapping[str, NodeSettings],
     sky: SkySettings | None,
     seed: int,
+    image_points: ImagePointSettings | None = None,
 ) -> SceneGraph:
     """Start every node class from what training may see.
 
@@ -37,15 +39,17 @@ def build_scene(
             program's log says so.
         sky: settings of the cube map; None for a scene without sky.
         seed: each node draws from its own stream, so a change of one leaves the others as they are.
+        image_points: how points are triangulated from the views; None: no node gets any.
 
     Raises ValueError where two nodes claim one track, or a node has nothing to start from.
     """
     assignment = assign_tracks(log.tracks, nodes)
     _report(assignment)
+    points = None if image_points is None else cached_street_points(train_frames, assignment.claimed, image_points)
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
         generator = torch.Generator().manual_seed(seed + zlib.crc32(name.encode()))
-        data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed)
+        data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed, points)
         node = settings.build(data, generator)
         if node is None:
             _log.warning("node %r has no instance in %s: the scene goes without it", name, log.name)

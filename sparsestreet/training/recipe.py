@@ -14,6 +14,7 @@ from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, M
 from sparsestreet.training.losses import Loss, MaskSparsity
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
+from sparsestreet.triangulation import ImagePointSettings
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class Recipe:
     sh_interval: float
     """Fraction of the run after which one more degree of spherical harmonics is used."""
     seed: int
+    image_points: ImagePointSettings | None = None
+    """How points are triangulated from the training images; None: not at all."""
 
     def problems(self) -> list[str]:
         """Parts that lack their counterpart, one sentence each; an empty list where all fits together."""
@@ -52,7 +55,9 @@ class Recipe:
     def build(self, data: StreetData) -> StreetSystem:
         """Start the scene from the training part of the data, and wrap it for training."""
         log, split = data.driving_log, data.split
-        scene = build_scene(log, split.train, split.held_out_indices, self.nodes, self.sky, self.seed)
+        scene = build_scene(
+            log, split.train, split.held_out_indices, self.nodes, self.sky, self.seed, self.image_points
+        )
         return StreetSystem(
             scene, self.losses, self.optimizer, radius=log.radius, options=self.options, sh_interval=self.sh_interval
         )

@@ -39,8 +39,8 @@ def init_gaussians(
     colors: Float[Tensor, "n 3"],
     scales: Float[Tensor, " n"],
     *,
+    opacities: Float[Tensor, " n"],
     sh_degree: int,
-    initial_opacity: float,
     generator: torch.Generator,
     mask_columns: Mapping[str, Tensor] | None = None,
     buffers: Mapping[str, Tensor] | None = None,
@@ -49,10 +49,12 @@ def init_gaussians(
 
     ``mask_columns`` are parameters that a mask learns, ``buffers`` what else is known of each row.
 
-    Raises ValueError if the opacity is outside (0, 1) or the degree outside 0 to 3.
+    Raises ValueError if an opacity is outside (0, 1) or the degree outside 0 to 3.
     """
-    if not 0 < initial_opacity < 1:
-        raise ValueError(f"the initial opacity must lie between 0 and 1, got {initial_opacity}")
+    if not bool(((opacities > 0) & (opacities < 1)).all()):
+        raise ValueError(
+            f"initial opacities must lie between 0 and 1, got {float(opacities.min())} to {float(opacities.max())}"
+        )
     if sh_degree not in (0, 1, 2, 3):
         raise ValueError(f"spherical harmonics are known up to degree 3, got sh_degree={sh_degree}")
     num_rows = points.shape[0]
@@ -60,7 +62,7 @@ def init_gaussians(
         "means": points.float(),
         "log_scales": scales.float().log()[:, None].expand(-1, 3),
         "quaternions": normalized(torch.randn(num_rows, 4, generator=generator)),
-        "opacity_logits": torch.full((num_rows,), math.log(initial_opacity / (1 - initial_opacity))),
+        "opacity_logits": torch.logit(opacities.float()),
         "sh_dc": ((colors.float() - 0.5) / SH_CONSTANT)[:, None, :],
         "sh_rest": torch.zeros(num_rows, (sh_degree + 1) ** 2 - 1, 3),
     }

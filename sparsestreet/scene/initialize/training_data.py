@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Track, View
 
 
@@ -21,6 +22,8 @@ class TrainingData:
     """The objects that were assigned to the node that asks."""
     moving: tuple[Track, ...] = ()
     """The objects of all nodes: what lies in their boxes belongs to no static node."""
+    image_points: StreetPoints | None = None
+    """Points triangulated from ``frames``; None where a run makes none."""
 
     @property
     def views(self) -> Sequence[View]:

@@ -42,7 +42,6 @@ class NodeSettings(ABC):
     max_gaussians: int | None
     """Density control stops here; None: no limit."""
     sh_degree: int = 3
-    initial_opacity: float = 0.1
     mask: MaskSettings | None
     """None: this node knows no mask."""
     masked: bool
@@ -85,18 +84,19 @@ class NodeSettings(ABC):
         data: TrainingData,
         points: Points,
         scales: Float[Tensor, " n"],
+        opacities: Float[Tensor, " n"],
         generator: torch.Generator,
         buffers: Mapping[str, Tensor] | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """The table of a node that begins, one Gaussian a point, and its mask; ``scales`` in meters."""
+        """The table of a node that begins, one Gaussian a point, and its mask; ``scales`` in meters, ``opacities`` in (0, 1)."""
         mask = None if self.mask_settings is None else self.mask_settings.build(self.min_gaussians, data.times)
         columns = {} if mask is None else mask.initial_columns(len(points))
         rows = init_gaussians(
             points.positions,
             points.colors,
             scales,
+            opacities=opacities,
             sh_degree=self.sh_degree,
-            initial_opacity=self.initial_opacity,
             generator=generator,
             mask_columns=columns,
             buffers=buffers,

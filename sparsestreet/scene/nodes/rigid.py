@@ -24,11 +24,13 @@ from sparsestreet.types import Gaussians, Track, View
 
 @dataclass(frozen=True, kw_only=True)
 class RigidSettings(NodeSettings):
-    """Starts from the lidar points of all training instants, pooled in the frame of each object's box."""
+    """Starts from the lidar returns of all training instants, pooled in the frame of each object's box, and from the
+    points that images gave there."""
 
     points_per_instance: int = 5000
     box_points: int = 1000
-    """An instance with fewer lidar points than this is filled up with random points on the faces of its box."""
+    """An instance with fewer points than this is filled up with random points on the faces of its box."""
+    initial_opacity: float = 0.1
     max_gap: int = 2
     """Frames; an object is present within its span up to this far from a training annotation."""
     box_margin: float = 0.1
@@ -40,13 +42,17 @@ class RigidSettings(NodeSettings):
         if not tracks:
             return None
         measured = lidar_in_boxes(tracks, data.sweeps)
-        objects = [self._object_points(*pair, generator) for pair in zip(tracks, measured, strict=True)]
+        objects = [
+            self._object_points(track, Points.concatenate([_from_images(track, data), returns]), generator)
+            for track, returns in zip(tracks, measured, strict=True)
+        ]
         counts = torch.tensor([len(points) for points in objects])
         rows, mask = self.start(
             data,
             Points.concatenate(objects),
             # Per instance: in their own frames all objects lie on top of each other.
             torch.cat([neighbor_scales(points.positions) for points in objects]),
+            torch.full((int(counts.sum()),), self.initial_opacity),
             generator,
             buffers={"instances": torch.repeat_interleave(torch.arange(len(tracks)), counts)},
         )
@@ -72,14 +78,22 @@ class RigidSettings(NodeSettings):
         return Rigid(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
 
     def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
-        """One object's colored points in its box frame, filled up where lidar left too few."""
-        lidar = measured.sampled(self.points_per_instance, generator)
-        missing = min(self.box_points, self.points_per_instance) - len(lidar)
+        """One object's colored points in its box frame, filled up where there are too few."""
+        points = measured.sampled(self.points_per_instance, generator)
+        missing = min(self.box_points, self.points_per_instance) - len(points)
         if missing <= 0:
-            return lidar
-        color = lidar.colors.mean(0) if len(lidar) else torch.full((3,), 0.5)
+            return points
+        color = points.colors.mean(0) if len(points) else torch.full((3,), 0.5)
         surface = box_surface_points(missing, track.size.float(), generator)
-        return Points.concatenate([lidar, Points(surface, color.expand(missing, 3))])
+        return Points.concatenate([points, Points(surface, color.expand(missing, 3))])
+
+
+def _from_images(track: Track, data: TrainingData) -> Points:
+    """What images gave inside the track's box, in its frame."""
+    if data.image_points is None:
+        return Points.concatenate([])
+    found = data.image_points.in_boxes[track.name]
+    return Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors))
 
 
 class Rigid(Node):

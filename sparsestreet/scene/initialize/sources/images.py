@@ -1,0 +1,49 @@
+"""Points triangulated from the training images."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from sparsestreet.scene.initialize.coverage import Coverage, beyond_lidar
+from sparsestreet.scene.initialize.points import Points, thinned
+from sparsestreet.scene.initialize.sources.source import PointSource, Seeds
+from sparsestreet.scene.initialize.training_data import TrainingData
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagePoints(PointSource):
+    """Points of what stands still, those first that no return of the lidar covers."""
+
+    order: Literal["beyond_first", "beyond_only", "random"] = "beyond_first"
+    """Which points are taken: those beyond the lidar before the others, those alone, or any."""
+    voxel: float | None = None
+    """Meters: of the points in a cube of this side one is taken; None: all."""
+    smallest_pixels: float = 0.5
+    """Limits of a Gaussian's scale, in pixels of the view that sees the point from nearest."""
+    largest_pixels: float = 8.0
+
+    def share(self, coverage: Coverage) -> float:
+        return coverage.images
+
+    def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
+        if data.image_points is None:
+            return self.seeds(Points.concatenate([]))
+        found = data.image_points.static
+        chosen = self._chosen(count, data, generator)
+        points = Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors)).at(chosen)
+        pixel = torch.from_numpy(found.pixel_sizes)[chosen]
+        return self.seeds(points, self.smallest_pixels * pixel, self.largest_pixels * pixel)
+
+    def _chosen(self, count: int, data: TrainingData, generator: torch.Generator) -> Int[Tensor, " k"]:
+        found = data.image_points.static
+        order = torch.randperm(len(found), generator=generator)
+        if self.voxel is not None:
+            order = order[torch.isin(order, thinned(torch.from_numpy(found.positions), self.voxel, generator))]
+        if self.order != "random":
+            beyond = beyond_lidar(data, found)[order]
+            rest = order[:0] if self.order == "beyond_only" else order[~beyond]
+            order = torch.cat((order[beyond], rest))
+        return order[:count]

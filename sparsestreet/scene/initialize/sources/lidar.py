@@ -1,0 +1,34 @@
+"""Returns of the lidar that do not belong to a moving object."""
+
+from dataclasses import dataclass
+
+import torch
+
+from sparsestreet.scene.initialize.boxes import outside_boxes
+from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.points import Points, thinned
+from sparsestreet.scene.initialize.sources.source import PointSource, Seeds
+from sparsestreet.scene.initialize.training_data import TrainingData
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarPoints(PointSource):
+    """Colored returns of the training sweeps outside all moving boxes of their instant."""
+
+    box_enlargement: float = 1.1
+    """Of a moving object's box, for points that lie just outside an imprecise one."""
+    voxel: float | None = None
+    """Meters: of the returns in a cube of this side one is taken; None: all."""
+
+    def share(self, coverage: Coverage) -> float:
+        return coverage.lidar
+
+    def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
+        parts = []
+        for sweep in data.sweeps:
+            outside = outside_boxes(data.moving, sweep.index, sweep.points, self.box_enlargement)
+            parts.append(Points(sweep.points, sweep.colors).where(sweep.colored & outside))
+        points = Points.concatenate(parts)
+        if self.voxel is not None:
+            points = points.at(thinned(points.positions, self.voxel, generator))
+        return self.seeds(points.sampled(count, generator))

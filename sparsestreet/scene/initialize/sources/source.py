@@ -1,0 +1,68 @@
+"""What every source of points has in common."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.gaussians import MINIMUM_SCALE
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.training_data import TrainingData
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Points, and what their source knows of the Gaussians that start there."""
+
+    points: Points
+    smallest: Float[Tensor, " n"]
+    """Limits of a Gaussian's scale, meters; between them the distance to its neighbors decides."""
+    largest: Float[Tensor, " n"]
+    opacities: Float[Tensor, " n"]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @staticmethod
+    def concatenate(parts: Sequence["Seeds"]) -> "Seeds":
+        empty = torch.zeros(0)
+        return Seeds(
+            Points.concatenate([part.points for part in parts]),
+            torch.cat([empty, *(part.smallest for part in parts)]),
+            torch.cat([empty, *(part.largest for part in parts)]),
+            torch.cat([empty, *(part.opacities for part in parts)]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointSource(ABC):
+    """One source of initial points."""
+
+    initial_opacity: float = 0.1
+
+    @abstractmethod
+    def share(self, coverage: Coverage) -> float:
+        """Of the node's points, at most so many; the shares of all sources should add up to 1."""
+
+    @abstractmethod
+    def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
+        """``count`` points, or all there are."""
+
+    def seeds(
+        self,
+        points: Points,
+        smallest: Float[Tensor, " n"] | None = None,
+        largest: Float[Tensor, " n"] | None = None,
+    ) -> Seeds:
+        """Points with the source's opacity; None: no limit of the scale on that side."""
+        count = len(points)
+        return Seeds(
+            points,
+            torch.full((count,), MINIMUM_SCALE) if smallest is None else smallest,
+            torch.full((count,), torch.inf) if largest is None else largest,
+            torch.full((count,), self.initial_opacity),
+        )

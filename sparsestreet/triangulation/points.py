@@ -1,0 +1,235 @@
+"""From views with known poses to points: every feature gathers its matches, and the rays of all of them must meet."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int
+
+from sparsestreet.triangulation.features import Features
+from sparsestreet.triangulation.matches import NEAREST, guided_matches
+from sparsestreet.triangulation.pairs import image_pairs
+from sparsestreet.triangulation.rays import Observations, meet, relative_depth_error, reprojection_errors, summed
+from sparsestreet.triangulation.settings import ImagePointSettings
+from sparsestreet.types import View
+
+FEATURE_NOISE = 0.5
+"""Pixels; standard deviation of a feature's position, for the uncertainty of a point."""
+
+ROUNDS = 4
+"""Times that the worst observation of a point is dropped before the point is given up."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one view shows of something that does not change its shape."""
+
+    view: View
+    camera_from_frame: Float64[np.ndarray, "4 4"]
+    """From the frame in which the thing stands still."""
+    features: Features
+    rays: Float64[np.ndarray, "n 2"]
+    """The features' normalized image points x/z, y/z, without lens distortion."""
+    colors: Float32[np.ndarray, "n 3"]
+    """RGB in [0, 1] at the features."""
+
+    @property
+    def focal(self) -> float:
+        """Pixels per unit of normalized image points."""
+        return float(self.view.camera.intrinsics[0, 0])
+
+
+@dataclass(frozen=True)
+class TriangulatedPoints:
+    """Points, and the pixels that show them."""
+
+    positions: Float32[np.ndarray, "n 3"]
+    """Meters."""
+    colors: Float32[np.ndarray, "n 3"]
+    """RGB in [0, 1], the mean over the views."""
+    pixel_sizes: Float32[np.ndarray, " n"]
+    """Meters that a pixel spans at the point, in the nearest view."""
+    observed: Int[np.ndarray, " o"]
+    """One row for each view of each point: the point,"""
+    views: Int[np.ndarray, " o"]
+    """the view's place among those that were given,"""
+    pixels: Float32[np.ndarray, "o 2"]
+    """and where it shows the point."""
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def triangulate(
+    sightings: Sequence[Sighting],
+    settings: ImagePointSettings,
+    progress: Callable[[int, int], None] | None = None,
+) -> TriangulatedPoints:
+    """The points on which the views agree; none where the cameras stand still.
+
+    ``progress`` is called with the number of pairs of images compared and of all pairs.
+    """
+    pairs = image_pairs([sighting.view for sighting in sightings], _poses(sightings))
+    counts = np.array([len(sighting.features) for sighting in sightings], np.int64)
+    view_of = np.repeat(np.arange(len(sightings)), counts)
+    matches = _all_matches(sightings, pairs, np.cumsum(counts) - counts, settings, progress)
+    centers, features, points = _stars(matches, len(view_of), settings.min_views)
+    observations = _observations(sightings, view_of, features, points)
+    agreed = _agreed(observations, len(centers), settings.max_error)
+    features, observations = features[agreed], observations.where(agreed)
+    positions = meet(observations, len(centers))
+    seen = np.bincount(observations.point, minlength=len(centers))
+    with_center = np.zeros(len(centers), bool)
+    with_center[observations.point[features == centers[observations.point]]] = True
+    good = with_center & (seen >= settings.min_views)
+    good &= relative_depth_error(observations, positions, FEATURE_NOISE) < settings.max_depth_error
+    good &= seen - 1 >= settings.min_support * _lookers(positions, view_of[centers], pairs, sightings)
+    good &= ~_twins(centers, features, observations.point, seen, good)
+    return _gathered(sightings, view_of, features, observations, positions, good)
+
+
+def _poses(sightings: Sequence[Sighting]) -> Float64[np.ndarray, "v 4 4"]:
+    return np.stack([sighting.camera_from_frame for sighting in sightings]) if sightings else np.zeros((0, 4, 4))
+
+
+def _all_matches(
+    sightings: Sequence[Sighting],
+    pairs: Sequence[tuple[int, int]],
+    starts: Int[np.ndarray, " v"],
+    settings: ImagePointSettings,
+    progress: Callable[[int, int], None] | None,
+) -> Int[np.ndarray, "k 2"]:
+    """Matches of all pairs, features numbered over all views; by threads, as NumPy lets go of the interpreter."""
+
+    def compare(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
+        first, second = (sightings[index] for index in pair)
+        found = guided_matches(
+            first.features,
+            second.features,
+            first.rays,
+            second.rays,
+            second.camera_from_frame @ np.linalg.inv(first.camera_from_frame),
+            tolerance=settings.epipolar_tolerance / second.focal,
+            ratio=settings.ratio,
+        )
+        return found + starts[list(pair)]
+
+    parts: list[Int[np.ndarray, "k 2"]] = [np.zeros((0, 2), np.int64)]
+    with ThreadPoolExecutor(settings.threads) as executor:
+        for done, part in enumerate(executor.map(compare, pairs), start=1):
+            parts.append(part)
+            if progress is not None:
+                progress(done, len(pairs))
+    return np.concatenate(parts)
+
+
+def _stars(
+    matches: Int[np.ndarray, "k 2"], count: int, min_views: int
+) -> tuple[Int[np.ndarray, " s"], Int[np.ndarray, " o"], Int[np.ndarray, " o"]]:
+    """(center, feature, point): each feature with its own matches, itself first, is one candidate of a point.
+
+    Nothing is joined over more than one match: one wrong link would tie two points together.
+    """
+    both = np.concatenate((matches, matches[:, ::-1]))
+    degree = np.bincount(both[:, 0], minlength=count)
+    centers = np.flatnonzero(degree >= max(min_views - 1, 1))
+    number = np.full(count, -1)
+    number[centers] = np.arange(len(centers))
+    both = both[number[both[:, 0]] >= 0]
+    features = np.concatenate((centers, both[:, 1]))
+    return centers, features, np.concatenate((np.arange(len(centers)), number[both[:, 0]]))
+
+
+def _observations(
+    sightings: Sequence[Sighting],
+    view_of: Int[np.ndarray, " n"],
+    features: Int[np.ndarray, " o"],
+    points: Int[np.ndarray, " o"],
+) -> Observations:
+    views = view_of[features]
+    focal = np.array([sighting.focal for sighting in sightings])
+    rays = np.concatenate([np.zeros((0, 2)), *(sighting.rays for sighting in sightings)])
+    return Observations(points, _poses(sightings)[views], rays[features], focal[views])
+
+
+def _agreed(observations: Observations, count: int, max_error: float) -> np.ndarray:
+    """Which observations are left when each point has dropped its worst one again and again while one is too far off.
+
+    Points that still have one after all rounds keep nothing.
+    """
+    left = np.ones(len(observations), bool)
+    for last in [False] * ROUNDS + [True]:
+        now = observations.where(left)
+        error, depth = reprojection_errors(now, meet(now, count))
+        error = np.where(depth > NEAREST, error, np.inf)
+        worst = np.zeros(count)
+        np.maximum.at(worst, now.point, error)
+        off = worst[now.point] > max_error
+        drop = off if last else off & (error == worst[now.point])
+        left[np.flatnonzero(left)[drop]] = False
+    return left
+
+
+def _lookers(
+    positions: Float64[np.ndarray, "s 3"],
+    center_views: Int[np.ndarray, " s"],
+    pairs: Iterable[tuple[int, int]],
+    sightings: Sequence[Sighting],
+) -> Int[np.ndarray, " s"]:
+    """For each point, in how many of the views that its center was compared with it lies inside the image."""
+    count = np.zeros(len(positions), np.int64)
+    by_view = [np.flatnonzero(center_views == view) for view in range(len(sightings))]
+    for first, second in pairs:
+        for own, other in ((first, second), (second, first)):
+            camera, pose = sightings[other].view.camera, sightings[other].camera_from_frame
+            local = positions[by_view[own]] @ pose[:3, :3].T + pose[:3, 3]
+            ahead = local[:, 2] > NEAREST
+            pixels = local @ camera.intrinsics.double().numpy().T
+            x, y = (pixels[:, :2] / np.where(ahead, local[:, 2], 1)[:, None]).T
+            count[by_view[own]] += ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return count
+
+
+def _twins(
+    centers: Int[np.ndarray, " s"],
+    features: Int[np.ndarray, " o"],
+    points: Int[np.ndarray, " o"],
+    seen: Int[np.ndarray, " s"],
+    good: np.ndarray,
+) -> np.ndarray:
+    """Points whose center belongs to a good point of more views (or as many, and an earlier one) as well."""
+    rank = np.empty(len(centers), np.int64)
+    rank[np.lexsort((np.arange(len(centers)), -np.where(good, seen, 0)))] = np.arange(len(centers))
+    of_good = good[points]
+    best = np.full(max(features.max(initial=-1), centers.max(initial=-1)) + 1, len(centers))
+    np.minimum.at(best, features[of_good], rank[points[of_good]])
+    return best[centers] < rank
+
+
+def _gathered(
+    sightings: Sequence[Sighting],
+    view_of: Int[np.ndarray, " n"],
+    features: Int[np.ndarray, " o"],
+    observations: Observations,
+    positions: Float64[np.ndarray, "s 3"],
+    good: np.ndarray,
+) -> TriangulatedPoints:
+    number = np.cumsum(good) - 1
+    kept = good[observations.point]
+    features, observations = features[kept], observations.where(kept)
+    point, count = number[observations.point], int(good.sum())
+    _, depth = reprojection_errors(observations, positions)
+    pixel_sizes = np.full(count, np.inf)
+    np.minimum.at(pixel_sizes, point, depth / observations.focal)
+    colors = np.concatenate([np.zeros((0, 3), np.float32), *(sighting.colors for sighting in sightings)])[features]
+    mean = summed(colors, point, count) / np.maximum(np.bincount(point, minlength=count), 1)[:, None]
+    pixels = np.concatenate([np.zeros((0, 2)), *(sighting.features.pixels for sighting in sightings)])[features]
+    return TriangulatedPoints(
+        positions[good].astype(np.float32),
+        mean.astype(np.float32),
+        pixel_sizes.astype(np.float32),
+        point,
+        view_of[features],
+        pixels.astype(np.float32),
+    )

@@ -1,0 +1,148 @@
+"""The points of a drive: of what stands still, and of each box in its own frame."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+
+from sparsestreet.data.lazy import Frames
+from sparsestreet.geometry.distortion import undistort
+from sparsestreet.triangulation.features import Features, find_features
+from sparsestreet.triangulation.points import Sighting, TriangulatedPoints, triangulate
+from sparsestreet.triangulation.settings import ImagePointSettings
+from sparsestreet.types import Camera, Frame, Track
+
+log = logging.getLogger(__name__)
+
+ENLARGEMENT = 1.1
+"""Of a box, for what lies just outside an imprecise one."""
+
+
+@dataclass(frozen=True)
+class StreetPoints:
+    """Points triangulated from the training images; ``views`` count the training views."""
+
+    static: TriangulatedPoints
+    """In the world."""
+    in_boxes: Mapping[str, TriangulatedPoints]
+    """Name of a track -> points in the frame of its box, within it."""
+
+
+def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
+    """Find points in images; each is decoded once.
+
+    Args:
+        frames: training views.
+        moving: objects that move on their own: what is seen through their boxes counts for them alone.
+        settings: limits of the search.
+    """
+    sightings = _sightings(frames, settings)
+    still = [np.ones(len(sighting.features), bool) for sighting in sightings]
+    in_boxes = {}
+    for track in moving:
+        own = {}
+        for place, sighting in enumerate(sightings):
+            moved = _from_box(sighting, track)
+            if moved is not None:
+                through = _through_box(moved, track)
+                still[place] &= ~through
+                own[place] = _where(moved, through)
+        in_boxes[track.name] = _inside(triangulate(list(own.values()), settings), list(own), track)
+    static = [_where(sighting, mask) for sighting, mask in zip(sightings, still, strict=True)]
+    points = StreetPoints(triangulate(static, settings, _report), in_boxes)
+    log.info("points from %d images: %d that stand still, %d in boxes", len(frames), len(points.static), _total(in_boxes))
+    return points
+
+
+def _report(done: int, total: int) -> None:
+    """A line when a quarter more is compared."""
+    if done * 4 // total > (done - 1) * 4 // total:
+        log.info("points from images: %d of %d pairs compared", done, total)
+
+
+def _total(parts: Mapping[str, TriangulatedPoints]) -> int:
+    return sum(map(len, parts.values()))
+
+
+def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
+    """In the order of the frames; OpenCV lets go of the interpreter, so threads find features beside each other."""
+    with ThreadPoolExecutor(settings.threads) as executor:
+        return list(executor.map(lambda index: _sighting(frames[index], settings.features), range(len(frames))))
+
+
+def _sighting(frame: Frame, limit: int) -> Sighting:
+    """The features of a frame that are not in the sky."""
+    image = frame.image.numpy()
+    features = find_features(image, limit)
+    if frame.sky is not None:
+        features = features.where(~frame.sky.numpy()[_pixel(features, frame.camera)])
+    return Sighting(
+        frame,
+        frame.camera.camera_from_world.double().numpy(),
+        features,
+        _rays(features.pixels, frame.camera),
+        image[_pixel(features, frame.camera)].astype(np.float32) / 255,
+    )
+
+
+def _pixel(features: Features, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the pixel that each feature lies in."""
+    column, row = features.pixels.astype(np.int64).T
+    return row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
+
+
+def _rays(pixels: Float64[np.ndarray, "n 2"], camera: Camera) -> Float64[np.ndarray, "n 2"]:
+    """Normalized image points, the lens taken away."""
+    intrinsics = camera.intrinsics.double().numpy()
+    imaged = np.linalg.solve(intrinsics[:2, :2], (pixels - intrinsics[:2, 2]).T).T
+    if camera.distortion is None:
+        return imaged
+    return undistort(torch.from_numpy(imaged), camera.distortion.double()).numpy()
+
+
+def _where(sighting: Sighting, mask: Bool[np.ndarray, " n"]) -> Sighting:
+    return replace(
+        sighting,
+        features=sighting.features.where(mask),
+        rays=sighting.rays[mask],
+        colors=sighting.colors[mask],
+    )
+
+
+def _from_box(sighting: Sighting, track: Track) -> Sighting | None:
+    """The same with its pose in the box's frame; None where the box is not annotated."""
+    at = torch.nonzero(track.frames == sighting.view.frame_index).flatten()
+    if not len(at):
+        return None
+    world_from_box = track.world_from_object[int(at[0])].numpy()
+    return replace(sighting, camera_from_frame=sighting.camera_from_frame @ world_from_box)
+
+
+def _through_box(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:
+    """Which features' rays meet the box, whose frame the sighting is in, ahead of the camera (slab test)."""
+    rotation, translation = sighting.camera_from_frame[:3, :3], sighting.camera_from_frame[:3, 3]
+    center = -rotation.T @ translation
+    rays = np.concatenate((sighting.rays, np.ones((len(sighting.rays), 1))), 1) @ rotation
+    half = ENLARGEMENT / 2 * track.size.double().numpy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_planes = np.stack(((-half - center) / rays, (half - center) / rays))
+    enter, leave = to_planes.min(0).max(1), to_planes.max(0).min(1)
+    return (enter <= leave) & (leave > 0)
+
+
+def _inside(points: TriangulatedPoints, views: list[int], track: Track) -> TriangulatedPoints:
+    """Those of a box's points that lie in the box; ``views`` are the places of the views that were given."""
+    kept = (np.abs(points.positions) <= ENLARGEMENT / 2 * track.size.numpy()).all(1)
+    number, of_kept = np.cumsum(kept) - 1, kept[points.observed]
+    return TriangulatedPoints(
+        points.positions[kept],
+        points.colors[kept],
+        points.pixel_sizes[kept],
+        number[points.observed[of_kept]],
+        np.array(views, np.int64)[points.views[of_kept]],
+        points.pixels[of_kept],
+    )
