@@ -11,7 +11,7 @@ from PIL import Image
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.pictures import picture_path
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
+from sparsestreet.evaluation.quality import RegionQuality
 from sparsestreet.evaluation.quality_csv import quality_path, read_quality
 from sparsestreet.evaluation.records import (
     HELD_OUT,
@@ -27,7 +27,7 @@ from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View
-from tests.evaluation.frames import make_frame, make_run
+from tests.evaluation.frames import make_frame, make_image, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 
 RUN = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
@@ -216,10 +216,7 @@ def test_a_run_without_pictures(tmp_path):
 
 def quality_with_vehicles(*pixels):
     return [
-        FrameQuality(
-            index // 2, index % 2, 8, 8, RegionQuality(64, 0.1, 10.0, 0.5), None, RegionQuality(n, 0.1, 10.0, 0.5)
-        )
-        for index, n in enumerate(pixels)
+        make_image(index // 2, index % 2, vehicle=RegionQuality(n, 0.1, 10.0, 0.5)) for index, n in enumerate(pixels)
     ]
 
 
@@ -239,5 +236,5 @@ def test_pictures_are_chosen_by_vehicles_and_spacing(pixels, count, expected):
 
 
 def test_choice_does_without_masks():
-    quality = [FrameQuality(index, 0, 8, 8, RegionQuality(64, 0.1, 10.0, 0.5)) for index in range(11)]
+    quality = [make_image(index) for index in range(11)]
     assert len(set(choose_pictures(quality, 4))) == 4

@@ -7,11 +7,10 @@ from PIL import Image
 from sparsestreet.evaluation import sheets
 from sparsestreet.evaluation.compare import compare_runs
 from sparsestreet.evaluation.pictures import Picture, write_picture
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING, summary_path, write_summary
 from sparsestreet.evaluation.sheets import SheetColumn, comparison_sheet, picture_sheet
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import make_image, make_summary
 from tests.evaluation.tiles import COLORS, flat, make_picture
 
 LEGEND = {"rigid": (250, 150, 40)}
@@ -104,7 +103,7 @@ def test_only_runs_of_the_same_images_are_compared():
 def write_run(folder, color, psnr, split=HELD_OUT, **summary):
     views = {"psnr": psnr} if split == HELD_OUT else {"psnr": None, "training_psnr": psnr}
     write_summary(summary_path(folder), make_summary(**views, **summary))
-    quality = [FrameQuality(3, 1, 13, 9, RegionQuality(117, 0.01, psnr + 1, 0.9))]
+    quality = [make_image(3, 1, psnr=psnr + 1)]
     write_quality(quality_path(folder, split), quality)
     write_picture(folder / "pictures", make_picture(render=color))
     return folder
