@@ -10,8 +10,15 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
-from sparsestreet.evaluation.pictures import KINDS, Picture, write_picture, write_png
+from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.pictures import (
+    KINDS,
+    Picture,
+    draw_lidar_end,
+    error_picture,
+    write_picture,
+    write_png,
+)
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, camera_means, summarize
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
@@ -164,13 +171,12 @@ def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Lege
 
 
 def _picture(scene: SceneGraph, frame: Frame, options: RenderOptions) -> Picture:
-    return Picture(
-        frame.frame_index,
-        frame.camera_index,
-        frame.image.cpu().numpy(),
-        _uint8(screen_image(scene, frame, options)),
-        _uint8(project_centers(scene, frame)),
-    )
+    truth, render = frame.image.cpu().numpy(), _uint8(screen_image(scene, frame, options))
+    error = error_picture(render, truth)
+    if frame.depth is not None:
+        near, beyond = (mask.cpu().numpy() for mask in lidar_masks(frame).values())
+        error = draw_lidar_end(error, near, beyond)
+    return Picture(frame.frame_index, frame.camera_index, truth, render, error, _uint8(project_centers(scene, frame)))
 
 
 def _uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
-from sparsestreet.evaluation.pictures import picture_path
+from sparsestreet.evaluation.pictures import LIDAR_END, picture_path, read_pictures
 from sparsestreet.evaluation.quality import RegionQuality
 from sparsestreet.evaluation.quality_csv import quality_path, read_quality
 from sparsestreet.evaluation.records import (
@@ -172,6 +172,19 @@ def test_a_run_leaves_pictures_in_full_resolution(tmp_path):
     with Image.open(tmp_path / "pictures" / "040_0_render.png") as image:
         rounded = (frames[4].image.double() * 0.9).numpy()
         assert np.abs(np.asarray(image) - rounded).max() <= 0.5 + 1e-4  # rounded, not truncated
+
+
+@pytest.mark.usefixtures("dark")
+def test_errors_show_where_the_lidar_ends(tmp_path):
+    """0.04 of 12 columns is less than a pixel: near are the pixels with a return, here the lower four rows."""
+    depth = torch.zeros(9, 12)
+    depth[5:] = 3.0
+    summary = evaluate(tmp_path, [make_frame(0, depth=depth), make_frame(10, 1)])
+    lidar, none = read_pictures(tmp_path / "pictures")
+    assert np.argwhere((lidar.error == LIDAR_END).all(-1)).tolist() == [[5, column] for column in range(12)]
+    assert not none.shows_lidar_end
+    assert summary.by_camera[HELD_OUT]["0"]["psnr_near_lidar"] == summary.mean("psnr_near_lidar")
+    assert summary.by_camera[HELD_OUT]["1"]["psnr_near_lidar"] is None
 
 
 def test_no_view_is_an_error(tmp_path):
