@@ -11,6 +11,7 @@ from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
 from sparsestreet.evaluation.history import draw_history
+from sparsestreet.evaluation.provenance import this_machine
 from sparsestreet.evaluation.records import RunDescription, read_run, run_path, summary_path
 from sparsestreet.evaluation.run import evaluate_scene
 
@@ -18,8 +19,8 @@ USAGE = """\
 sparsestreet evaluate run=RUN [device=cpu|cuda]
 
 RUN is a folder that train wrote, also of a run that was interrupted. Its scene is measured against the views of its
-log, on the kind of device that it was trained on unless another is named; records and pictures are made anew, what is
-said about the training stays.
+log, on the kind of device that it was trained on unless another is named, with as many threads as trained it; records
+and pictures are made anew, what is said about the training stays.
 """
 
 
@@ -39,6 +40,8 @@ def evaluate(arguments: list[str]) -> int:
 def _evaluate(options: Options) -> None:
     run = options.run
     cfg, description = load_run_config(run), read_run(run_path(run))
+    # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
+    torch.set_num_threads(min(description.threads, this_machine().cores))
     stored = open_scene(run, "cpu")
     data = data_of(cfg)
     summary = evaluate_scene(

@@ -48,10 +48,12 @@ def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "
 def near_returns(depth: Float[Tensor, "h w"], reach: float = LIDAR_REACH) -> Bool[Tensor, "h w"]:
     """Pixels of a depth image that have a return at most round(reach * longer side) columns and rows away."""
     window = 2 * round(reach * max(depth.shape)) + 1
-    hit = (depth > 0).float()[None, None]
-    # A square window is a row of columns: two passes of a line cost less than one of a square.
-    wide = torch.nn.functional.max_pool2d(hit, (1, window), stride=1, padding=(0, window // 2))
-    return torch.nn.functional.max_pool2d(wide, (window, 1), stride=1, padding=(window // 2, 0))[0, 0] > 0
+    near = depth > 0
+    for _ in range(2):
+        # Returns within a line of the window, as the difference of two running sums: its cost is free of the reach.
+        returns = torch.nn.functional.pad(near.int(), (window // 2 + 1, window // 2)).cumsum(1)
+        near = (returns[:, window:] > returns[:, :-window]).T
+    return near
 
 
 def visible_pixels(

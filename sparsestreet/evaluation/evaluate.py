@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
+from sparsestreet.data.lidar import near_returns
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.metrics import image as metrics
 from sparsestreet.scene.graph import SceneGraph
@@ -45,21 +46,25 @@ def evaluate_frames(scene: SceneGraph, frames: Iterable[Frame], options: RenderO
 
 
 def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame) -> FrameQuality:
-    """Compare one clamped render [0, 1] with the frame's image, in full and within its masks; both on one device."""
+    """Compare one clamped render [0, 1] with the frame's image, in full and by region; both on one device."""
     truth = frame.image.float() / 255
     similarity = metrics.ssim_map(rgb, truth)
     error = metrics.mse(rgb, truth)
     height, width = frame.image.shape[:2]
     full = RegionQuality(height * width, error, metrics.psnr_of_mse(error), metrics.ssim_of_map(similarity))
-    return FrameQuality(
-        frame.frame_index,
-        frame.camera_index,
-        width,
-        height,
-        full,
-        human=None if frame.human is None else _region_quality(rgb, truth, similarity, frame.human),
-        vehicle=None if frame.vehicle is None else _region_quality(rgb, truth, similarity, frame.vehicle),
-    )
+    masks = {"human": frame.human, "vehicle": frame.vehicle} | lidar_masks(frame)
+    parts = {name: _region_quality(rgb, truth, similarity, mask) for name, mask in masks.items() if mask is not None}
+    return FrameQuality(frame.frame_index, frame.camera_index, width, height, {"full": full} | parts)
+
+
+def lidar_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
+    """Name -> pixels of the regions "near_lidar" and "beyond_lidar", in this order, without the sky where the frame
+    knows it; nothing where the log has no lidar."""
+    if frame.depth is None:
+        return {}
+    near = near_returns(frame.depth)
+    ground = torch.ones_like(near) if frame.sky is None else ~frame.sky
+    return {"near_lidar": near & ground, "beyond_lidar": ~near & ground}
 
 
 def _region_quality(

@@ -7,13 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image, ImageFilter
 
 ERROR_SCALE = 0.2
 """Mean absolute difference over RGB, in [0, 1], at which the error picture reaches its brightest color."""
 
+TILE_WIDTH = 480
+"""Pixels of a column of a sheet."""
+
 KINDS = ("truth", "render", "error", "centers")
+
+LIDAR_END = (0, 230, 230)
+"""RGB of the line in error pictures that runs where the lidar ends; no error has this color."""
 
 # Perceptually uniform dark-to-bright map: 17 equally spaced samples of "inferno" (van der Walt and Smith, CC0).
 _INFERNO = np.array(
@@ -34,13 +40,15 @@ class Picture:
     camera: int
     truth: UInt8[np.ndarray, "h w 3"]
     render: UInt8[np.ndarray, "h w 3"]
+    error: UInt8[np.ndarray, "h w 3"]
+    """``error_picture`` of render and truth; where the log has lidar, with the line at its end."""
     centers: UInt8[np.ndarray, "h w 3"]
     """The Gaussians' centers, projected."""
 
     @property
-    def error(self) -> UInt8[np.ndarray, "h w 3"]:
-        """The colored absolute difference of render and truth, on the common scale."""
-        return error_picture(self.render, self.truth)
+    def shows_lidar_end(self) -> bool:
+        """Whether there is a line in its error."""
+        return bool((self.error == LIDAR_END).all(axis=-1).any())
 
 
 def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
@@ -59,6 +67,18 @@ def error_picture(
     return color_map(difference / scale)
 
 
+def draw_lidar_end(
+    picture: UInt8[np.ndarray, "h w 3"], near: Bool[np.ndarray, "h w"], beyond: Bool[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with a line on those near pixels that touch a pixel beyond.
+
+    One pixel wide; wider above 720 pixels of image width, so that it is still seen in the tile of a sheet.
+    """
+    reach = max(round(picture.shape[1] / TILE_WIDTH), 1)
+    touched = Image.fromarray(beyond).convert("L").filter(ImageFilter.MaxFilter(2 * reach + 1))
+    return np.where((near & (np.asarray(touched) > 0))[..., None], np.uint8(LIDAR_END), picture)
+
+
 def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     """Write an RGB image, creating the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,15 +92,14 @@ def picture_path(folder: Path, frame: int, camera: int, kind: str) -> Path:
 
 def write_picture(folder: Path, picture: Picture) -> None:
     """Write truth, render, error and centers as single PNGs in their own resolution."""
-    images = (picture.truth, picture.render, picture.error, picture.centers)
-    for kind, image in zip(KINDS, images, strict=True):
-        write_png(picture_path(folder, picture.frame, picture.camera, kind), image)
+    for kind in KINDS:
+        write_png(picture_path(folder, picture.frame, picture.camera, kind), getattr(picture, kind))
 
 
 def read_pictures(folder: Path) -> list[Picture]:
     """The pictures that a run left in its folder, in order of frame and camera.
 
-    Raises FileNotFoundError if there are none, or one lacks its render or centers.
+    Raises FileNotFoundError if there are none, or one lacks another of its images.
     """
     suffix = "_truth.png"
     keys = sorted(
@@ -89,9 +108,7 @@ def read_pictures(folder: Path) -> list[Picture]:
     if not keys:
         raise FileNotFoundError(f"{folder} has no pictures (*{suffix}): evaluate the run first")
     return [
-        Picture(
-            frame, camera, *(_read_png(picture_path(folder, frame, camera, kind)) for kind in KINDS if kind != "error")
-        )
+        Picture(frame, camera, *(_read_png(picture_path(folder, frame, camera, kind)) for kind in KINDS))
         for frame, camera in keys
     ]
 

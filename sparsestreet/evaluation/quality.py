@@ -4,7 +4,7 @@ The summary takes means over images, never over pixels; see ``metrics.definition
 """
 
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, QUANTITIES, REGIONS, metric_id
@@ -29,18 +29,18 @@ class FrameQuality:
     camera: int
     width: int
     height: int
-    full: RegionQuality
-    human: RegionQuality | None = None
-    """None where the data has no such mask; a RegionQuality of 0 pixels where the mask is empty."""
-    vehicle: RegionQuality | None = None
+    regions: Mapping[str, RegionQuality]
+    """Name, of ``REGIONS`` -> its quality: "full" always; others where the data has such a mask, or lidar, with 0
+    pixels where the region is empty."""
 
     def value(self, quantity: str, region: str) -> float | None:
         """One metric, such as ("psnr", "vehicle"); None where the region is absent or empty."""
-        regions = {"full": self.full, "human": self.human, "vehicle": self.vehicle}
-        found = regions[region]
-        if found is None:
-            return None
-        return {"mse": found.mse, "psnr": found.psnr, "ssim_uniform7": found.ssim_uniform7}[quantity]
+        found = self.regions.get(region)
+        return None if found is None else getattr(found, quantity)
+
+    def pixels(self, region: str) -> int:
+        """Number of pixels of a region; 0 where it is absent."""
+        return self.regions[region].pixels if region in self.regions else 0
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,17 @@ def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
             capped = sum(value >= PSNR_CAP for value in values) if quantity == "psnr" else 0
             summaries[metric_id(quantity, region)] = _summary(values, capped)
     return {name: summaries[name] for name in DEFINITIONS}
+
+
+def camera_means(quality: Iterable[FrameQuality]) -> dict[str, dict[str, float | None]]:
+    """Number of each camera, in order -> id of each metric -> its mean over the camera's images with the region."""
+    images = list(quality)
+    return {
+        str(camera): {
+            name: one.mean for name, one in summarize(image for image in images if image.camera == camera).items()
+        }
+        for camera in sorted({image.camera for image in images})
+    }
 
 
 def _summary(values: list[float], capped: int) -> MetricSummary:

@@ -17,6 +17,7 @@ _COLUMNS = (
     *("frame", "camera", "width", "height"),
     *(metric_id(quantity, region) for region in REGIONS for quantity in ("pixels", *QUANTITIES)),
 )
+_REGION_CELLS = 1 + len(QUANTITIES)
 
 
 def quality_path(run: Path, split: str = HELD_OUT) -> Path:
@@ -25,15 +26,15 @@ def quality_path(run: Path, split: str = HELD_OUT) -> Path:
 
 
 def write_quality(path: Path, quality: Iterable[FrameQuality]) -> None:
-    """Write one row per image atomically; a region's cells are blank where the data has no mask, and its metrics are
-    blank where the mask is empty (0 pixels)."""
+    """Write one row per image atomically; a region's cells are blank where the data has no such mask or no lidar, and
+    its metrics are blank where the region is empty (0 pixels)."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(_COLUMNS)
     for image in quality:
         row: list[object] = [image.frame, image.camera, image.width, image.height]
-        for region in (image.full, image.human, image.vehicle):
-            row += [""] * 4 if region is None else _region_cells(region, f"{path}: frame {image.frame}")
+        for region in REGIONS:
+            row += _region_cells(image.regions.get(region), f"{path}: frame {image.frame}")
         writer.writerow(row)
     write_atomically(path, buffer.getvalue())
 
@@ -48,7 +49,9 @@ def read_quality(path: Path) -> list[FrameQuality]:
     return [_parsed(cells, f"{path}, line {number}") for number, cells in enumerate(lines[1:], start=2)]
 
 
-def _region_cells(region: RegionQuality, where: str) -> list[object]:
+def _region_cells(region: RegionQuality | None, where: str) -> list[object]:
+    if region is None:
+        return [""] * _REGION_CELLS
     metrics = (region.mse, region.psnr, region.ssim_uniform7)
     return [region.pixels, *("" if value is None else significant(value, where) for value in metrics)]
 
@@ -57,18 +60,18 @@ def _parsed(cells: list[str], where: str) -> FrameQuality:
     if len(cells) != len(_COLUMNS):
         raise RecordError(f"{where}: {len(cells)} cells, expected {len(_COLUMNS)}")
     try:
-        full, human, vehicle = (_parsed_region(cells[start : start + 4]) for start in (4, 8, 12))
-        frame, camera, width, height = (int(cell) for cell in cells[:4])
+        numbers = (int(cell) for cell in cells[:4])
+        parts = (cells[start : start + _REGION_CELLS] for start in range(4, len(cells), _REGION_CELLS))
+        regions = {name: _parsed_region(part) for name, part in zip(REGIONS, parts, strict=True) if any(part)}
+        image = FrameQuality(*numbers, regions)
     except ValueError as error:
         raise RecordError(f"{where}: {error}") from error
-    if full is None:
+    if "full" not in regions:
         raise RecordError(f"{where}: the metrics of the full image are missing")
-    return FrameQuality(frame, camera, width, height, full, human, vehicle)
+    return image
 
 
-def _parsed_region(cells: list[str]) -> RegionQuality | None:
-    if not any(cells):
-        return None
+def _parsed_region(cells: list[str]) -> RegionQuality:
     values = tuple(float(cell) if cell else None for cell in cells[1:])
     if any(value is not None and not math.isfinite(value) for value in values):
         raise ValueError(f"a metric is not a finite number: {cells[1:]}")

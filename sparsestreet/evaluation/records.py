@@ -14,7 +14,7 @@ from sparsestreet.evaluation.strict_json import EXACT, read_json, version, write
 RUN_FORMAT = 1
 """Version of ``run.json``; raised when a key changes its meaning."""
 
-FORMAT = 2
+FORMAT = 3
 """Version of ``summary.json``; raised when a key changes its meaning."""
 
 HELD_OUT, TRAINING = "held_out", "training"
@@ -144,6 +144,8 @@ class RunSummary:
     """"WIDTHxHEIGHT" of the evaluated images, each once."""
     quality: dict[str, dict[str, MetricSummary]]
     """Split -> id of a metric -> its summary over the split's images."""
+    by_camera: dict[str, dict[str, dict[str, float | None]]]
+    """Split -> number of a camera -> id of a metric -> its mean over the split's images of that camera."""
     definitions: dict[str, str]
     """Id of a metric -> what it is, in words."""
     gaussians: dict[str, int]
@@ -158,10 +160,11 @@ class RunSummary:
     """Over the views of ``main_split``."""
 
     def __post_init__(self) -> None:
-        if not self.quality or set(self.quality) != set(self.images) or set(self.quality) - {HELD_OUT, TRAINING}:
+        splits = [sorted(part) for part in (self.quality, self.by_camera, self.images)]
+        if splits[0] not in ([HELD_OUT], [TRAINING], [HELD_OUT, TRAINING]) or splits != 3 * splits[:1]:
             raise ValueError(
-                f"quality speaks of the splits {sorted(self.quality)} and images of {sorted(self.images)}, expected "
-                f"{HELD_OUT}, {TRAINING} or both in both: evaluate again"
+                f"quality speaks of the splits {splits[0]}, by_camera of {splits[1]} and images of {splits[2]}, "
+                f"expected {HELD_OUT}, {TRAINING} or both in all: evaluate again"
             )
         for name, parts, total in (
             ("gaussians", self.gaussians, self.gaussians_total),
@@ -179,6 +182,10 @@ class RunSummary:
         """Mean of a metric over the images of a split (of ``main_split``); None where it was not measured."""
         found = self.quality.get(split or self.main_split, {}).get(metric)
         return None if found is None else found.mean
+
+    def camera_mean(self, metric: str, camera: str) -> float | None:
+        """Mean of a metric over the images of one camera of ``main_split``; None where it was not measured."""
+        return self.by_camera[self.main_split].get(camera, {}).get(metric)
 
 
 def run_path(run: Path) -> Path:

@@ -10,10 +10,17 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
-from sparsestreet.evaluation.pictures import KINDS, Picture, write_picture, write_png
+from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.pictures import (
+    KINDS,
+    Picture,
+    draw_lidar_end,
+    error_picture,
+    write_picture,
+    write_png,
+)
 from sparsestreet.evaluation.provenance import this_machine, this_source
-from sparsestreet.evaluation.quality import FrameQuality, summarize
+from sparsestreet.evaluation.quality import FrameQuality, camera_means, summarize
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
 from sparsestreet.evaluation.records import (
     HELD_OUT,
@@ -110,6 +117,7 @@ def _summary(
         images={split: len(images) for split, images in quality.items()},
         resolutions=tuple(sorted(sizes)),
         quality={split: summarize(images) for split, images in quality.items()},
+        by_camera={split: camera_means(images) for split, images in quality.items()},
         definitions=DEFINITIONS,
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
@@ -131,8 +139,8 @@ def choose_pictures(quality: Sequence[FrameQuality], count: int) -> list[int]:
         return list(range(len(quality)))
     chosen: list[int] = []
     instants: set[int] = set()
-    for index in sorted(range(len(quality)), key=lambda index: -_vehicle_pixels(quality[index])):
-        if len(chosen) == (count + 1) // 2 or _vehicle_pixels(quality[index]) == 0:
+    for index in sorted(range(len(quality)), key=lambda index: -quality[index].pixels("vehicle")):
+        if len(chosen) == (count + 1) // 2 or quality[index].pixels("vehicle") == 0:
             break
         if quality[index].frame not in instants:
             chosen.append(index)
@@ -142,10 +150,6 @@ def choose_pictures(quality: Sequence[FrameQuality], count: int) -> list[int]:
     # The middle of each of ``wanted`` equal stretches; there are at least as many images left, so none repeats.
     spaced = [remaining[(2 * stretch + 1) * len(remaining) // (2 * wanted)] for stretch in range(wanted)]
     return sorted(chosen + spaced)
-
-
-def _vehicle_pixels(image: FrameQuality) -> int:
-    return 0 if image.vehicle is None else image.vehicle.pixels
 
 
 def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Legend, folder: Path) -> None:
@@ -167,13 +171,12 @@ def _write_pictures(chosen: Sequence[Picture], summary: RunSummary, legend: Lege
 
 
 def _picture(scene: SceneGraph, frame: Frame, options: RenderOptions) -> Picture:
-    return Picture(
-        frame.frame_index,
-        frame.camera_index,
-        frame.image.cpu().numpy(),
-        _uint8(screen_image(scene, frame, options)),
-        _uint8(project_centers(scene, frame)),
-    )
+    truth, render = frame.image.cpu().numpy(), _uint8(screen_image(scene, frame, options))
+    error = error_picture(render, truth)
+    if frame.depth is not None:
+        near, beyond = (mask.cpu().numpy() for mask in lidar_masks(frame).values())
+        error = draw_lidar_end(error, near, beyond)
+    return Picture(frame.frame_index, frame.camera_index, truth, render, error, _uint8(project_centers(scene, frame)))
 
 
 def _uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

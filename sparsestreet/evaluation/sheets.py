@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from sparsestreet.evaluation.pictures import ERROR_SCALE, Picture, color_map
+from sparsestreet.evaluation.pictures import ERROR_SCALE, LIDAR_END, TILE_WIDTH, Picture, color_map
 
 Legend = Mapping[str, tuple[int, int, int]]
 """Node -> RGB in [0, 255] of its centers."""
@@ -41,7 +41,7 @@ class Tile:
 
 
 def picture_sheet(
-    pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = 480
+    pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
     """A sheet with one line per picture and the columns truth, render, error, centers.
 
@@ -59,11 +59,11 @@ def picture_sheet(
         ]
         for picture in pictures
     ]
-    return _sheet(lines, title, legend or {}, tile_width)
+    return _sheet(lines, title, legend or {}, tile_width, any(picture.shows_lidar_end for picture in pictures))
 
 
 def comparison_sheet(
-    columns: Sequence[SheetColumn], *, title: str, legend: Legend | None = None, tile_width: int = 480
+    columns: Sequence[SheetColumn], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
     """Runs on the same images, one column each: for every picture a line of renders beside the truth, one of errors,
     one of centers, so that what is to be compared stands side by side.
@@ -85,7 +85,8 @@ def comparison_sheet(
             [None, *(Tile(f"error: {one.psnr[index]:.2f} dB in this image", picture.error) for one, picture in both)]
         )
         lines.append([None, *(Tile(column.size, picture.centers) for column, picture in both)])
-    return _sheet(lines, title, legend or {}, tile_width)
+    lidar_end = any(picture.shows_lidar_end for picture in columns[0].pictures)
+    return _sheet(lines, title, legend or {}, tile_width, lidar_end)
 
 
 def _view(picture: Picture) -> str:
@@ -97,7 +98,7 @@ def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sheet(
-    lines: list[list[Tile | None]], title: str, legend: Legend, tile_width: int
+    lines: list[list[Tile | None]], title: str, legend: Legend, tile_width: int, lidar_end: bool
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
     """Lay tiles out on dark paper under their headings; the title on top, scale and legend at the foot."""
     if not lines:
@@ -115,18 +116,21 @@ def _sheet(
                 _write(draw, (x, top + 6), tile.heading, _INK, 14, tile_width)
                 paper.paste(_fitted(tile.image, tile_width), (x, top + _HEADING))
         top += _HEADING + height
-    _draw_scale(paper, draw, _MARGIN, top + 14)
+    _draw_scale(paper, draw, _MARGIN, top + 14, lidar_end)
     _draw_legend(draw, legend, _MARGIN, top + 14 + _HEADING)
     return np.asarray(paper)
 
 
-def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int) -> None:
-    """The error colors with their values."""
+def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, lidar_end: bool) -> None:
+    """The error colors with their values, and what the line in them is."""
     x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
     bar = color_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
     paper.paste(Image.fromarray(bar), (x, y))
     draw.rectangle((x - 1, y - 1, x + 160, y + 16), outline=_QUIET)
-    _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13)
+    x = _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13) + 20
+    if lidar_end:
+        draw.line((x, y + 8, x + 20, y + 8), fill=LIDAR_END)
+        _write(draw, (x + 28, y), "where the lidar ends", _QUIET, 13)
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:

@@ -6,7 +6,7 @@ image and then averaged over images with equal weight. The choice matters: on on
 per-image PSNRs, the PSNR of the mean MSE and the pixel-pooled PSNR lie more than 5 dB apart.
 """
 
-REGIONS = ("full", "human", "vehicle")
+REGIONS = ("full", "human", "vehicle", "near_lidar", "beyond_lidar")
 QUANTITIES = ("mse", "psnr", "ssim_uniform7")
 
 LIDAR_REACH = 0.04
@@ -16,8 +16,19 @@ longer image side to all four sides; the others are beyond it."""
 PSNR_CAP = 100.0
 """dB; a perfectly reproduced image would otherwise make every mean infinite. Summaries count the capped images."""
 
-_FULL = "all pixels of the image, the ego vehicle included"
-_MASKED = "the pixels of the {region} mask; images without the mask, or where it is empty, are skipped in the mean"
+_MASKED = "the pixels of the {} mask; images without the mask, or where it is empty, are skipped in the mean"
+_LIDAR = (
+    f"the pixels {{}} a lidar return of the same instant within {LIDAR_REACH:g} of the longer image side (a square "
+    "window), moving objects included, sky left out; without a sky mask the sky counts too, mostly as beyond; images "
+    "without lidar, or without such pixels, are skipped in the mean"
+)
+_DOMAIN = {
+    "full": "all pixels of the image, the ego vehicle included",
+    "human": _MASKED.format("human"),
+    "vehicle": _MASKED.format("vehicle"),
+    "near_lidar": _LIDAR.format("with"),
+    "beyond_lidar": _LIDAR.format("without"),
+}
 
 _QUANTITY = {
     "mse": "mean squared error over pixels and RGB channels, values in [0, 1]",
@@ -34,11 +45,10 @@ _SSIM_DOMAIN = {
 
 
 def _definition(quantity: str, region: str) -> str:
-    kind = "full" if region == "full" else "masked"
-    domain = (_FULL if kind == "full" else _MASKED).format(region=region)
+    words = [_QUANTITY[quantity], _DOMAIN[region]]
     if quantity == "ssim_uniform7":
-        domain = f"{_SSIM_DOMAIN[kind].format(region=region)}; {domain}"
-    return f"{_QUANTITY[quantity]}; {domain}"
+        words.insert(1, _SSIM_DOMAIN["full" if region == "full" else "masked"].format(region=region))
+    return "; ".join(words)
 
 
 def metric_id(quantity: str, region: str) -> str:

@@ -122,9 +122,12 @@ def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished,
     shutil.copytree(finished, out)
     first = read_summary(summary_path(out))
     shutil.rmtree(out / "records")
+    torch.set_num_threads(first.run.threads + 1)  # evaluate goes back to the number that trained
     assert evaluate([f"run={out}"]) == 0
     second = read_summary(summary_path(out))
-    assert second.quality == first.quality
+    assert second.evaluated.threads == min(first.run.threads, second.evaluated.machine.cores)
+    assert (second.quality, second.by_camera) == (first.quality, first.by_camera)
+    assert list(second.by_camera["held_out"]) == ["0", "1"]
     assert second.gaussians == first.gaussians
     assert second.run == first.run
     assert second.evaluated.command == f"sparsestreet evaluate run={out}"

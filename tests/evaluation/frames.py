@@ -3,7 +3,7 @@
 import torch
 
 from sparsestreet.evaluation.configuration import Setting, config_hash
-from sparsestreet.evaluation.quality import MetricSummary
+from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
 from sparsestreet.evaluation.records import (
     HELD_OUT,
     TRAINING,
@@ -22,15 +22,14 @@ def make_frame(
     index: int = 0,
     camera_index: int = 0,
     size: tuple[int, int] = (9, 12),
-    human: torch.Tensor | None = None,
-    vehicle: torch.Tensor | None = None,
+    **known: torch.Tensor,
 ) -> Frame:
-    """A frame with a random image (seeded by frame and camera) and the given masks."""
+    """A frame with a random image (seeded by frame and camera) and the given masks and depth."""
     generator = torch.Generator().manual_seed(100 * index + camera_index)
     image = torch.randint(0, 256, (*size, 3), generator=generator, dtype=torch.uint8)
     intrinsics = torch.tensor([[10.0, 0.0, size[1] / 2], [0.0, 10.0, size[0] / 2], [0.0, 0.0, 1.0]])
     camera = Camera(torch.eye(4), intrinsics, size[1], size[0])
-    return Frame(camera, index / 10, index, camera_index, image=image, human=human, vehicle=vehicle)
+    return Frame(camera, index / 10, index, camera_index, image=image, **known)
 
 
 MACHINE = Machine("test", 2, "Linux x86_64", "3.11", "2.13.0")
@@ -79,6 +78,11 @@ def make_run(
     )
 
 
+def make_image(frame: int, camera: int = 0, *, psnr: float = 20.0, **parts: RegionQuality) -> FrameQuality:
+    """The quality of an image of 8x8 pixels, with the regions that are given beside the full one."""
+    return FrameQuality(frame, camera, 8, 8, {"full": RegionQuality(64, 0.01, psnr, 0.5)} | parts)
+
+
 def make_quality(psnr: float, vehicle_psnr: float | None = 22.0) -> dict[str, MetricSummary]:
     return {
         "psnr_full": MetricSummary(psnr, 1.0, 6, 0),
@@ -98,6 +102,7 @@ def make_summary(
     alarms: dict[str, int] | None = None,
     training_psnr: float | None = None,
     evaluated: Evaluation | None = None,
+    cameras: dict[str, dict[str, float | None]] | None = None,
     **run: object,
 ) -> RunSummary:
     """A record as a run writes it, with the numbers that a test wants to see in the table; ``run`` as in make_run."""
@@ -112,6 +117,10 @@ def make_summary(
         images=dict.fromkeys(quality, 6),
         resolutions=("64x48",),
         quality=quality,
+        by_camera={
+            split: cameras or {"0": {name: one.mean for name, one in metrics.items()}}
+            for split, metrics in quality.items()
+        },
         definitions={"psnr_full": "-10 log10(mse)"},
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),

@@ -11,11 +11,11 @@ from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality, summarize
+from sparsestreet.evaluation.quality import RegionQuality, camera_means, summarize
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.rendering import RenderOptions, render
-from tests.evaluation.frames import make_frame
+from tests.evaluation.frames import make_frame, make_image
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 
 SCENE = small_scene()
@@ -46,22 +46,65 @@ def test_a_frame_is_compared_with_its_clamped_render():
     chosen = vehicle.numpy()
     # uint8 / 255 is rounded to float32 before the comparison: 6e-8 relative to values of order 1.
     assert (quality.frame, quality.camera, quality.width, quality.height) == (7, 2, 12, 9)
-    assert quality.full.pixels == 108
-    assert quality.full.mse == pytest.approx(error.mean(), abs=1e-7)
-    assert quality.full.psnr == pytest.approx(-10 * np.log10(error.mean()), abs=1e-5)
-    assert quality.full.ssim_uniform7 == pytest.approx(similarity[3:-3, 3:-3].mean(), abs=1e-5)
-    assert quality.vehicle.pixels == 24
-    assert quality.vehicle.psnr == pytest.approx(-10 * np.log10(error[chosen].mean()), abs=1e-5)
-    assert quality.vehicle.ssim_uniform7 == pytest.approx(similarity[chosen].mean(), abs=1e-5)
-    assert quality.human is None
+    full, part = quality.regions["full"], quality.regions["vehicle"]
+    assert full.pixels == 108
+    assert full.mse == pytest.approx(error.mean(), abs=1e-7)
+    assert full.psnr == pytest.approx(-10 * np.log10(error.mean()), abs=1e-5)
+    assert full.ssim_uniform7 == pytest.approx(similarity[3:-3, 3:-3].mean(), abs=1e-5)
+    assert part.pixels == 24
+    assert part.psnr == pytest.approx(-10 * np.log10(error[chosen].mean()), abs=1e-5)
+    assert part.ssim_uniform7 == pytest.approx(similarity[chosen].mean(), abs=1e-5)
+    assert set(quality.regions) == {"full", "vehicle"}
 
 
 @pytest.mark.usefixtures("noise")
 def test_an_empty_mask_is_told_from_no_mask():
     empty = torch.zeros(9, 12, dtype=torch.bool)
     (quality,) = evaluate_frames(SCENE, [make_frame(human=empty)], OPTIONS)
-    assert quality.human == RegionQuality(0, None, None, None)
-    assert quality.vehicle is None
+    assert quality.regions["human"] == RegionQuality(0, None, None, None)
+    assert (quality.pixels("human"), quality.value("psnr", "human")) == (0, None)
+    assert "vehicle" not in quality.regions
+    assert (quality.pixels("vehicle"), quality.value("psnr", "vehicle")) == (0, None)
+
+
+def lidar_regions(monkeypatch, depth, sky=None):
+    """Regions of a frame of 48 columns, whose render is off by 0.1 in the first 16, by 0.2 in the next and by 0.3."""
+    error = torch.tensor([0.1, 0.2, 0.3]).repeat_interleave(16)[None, :, None]
+    replace_render(monkeypatch, lambda view: view.image.float() / 255 + error)
+    frame = make_frame(size=(9, 48), depth=depth, sky=sky)
+    frame = dataclasses.replace(frame, image=frame.image // 2)  # so that no render is clamped
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS)
+    return quality.regions
+
+
+def test_near_and_beyond_the_lidar_without_the_sky(monkeypatch):
+    """0.04 of 48 columns: near are two on either side of a return."""
+    depth, sky = torch.zeros(9, 48), torch.zeros(9, 48, dtype=torch.bool)
+    depth[:, 1] = 7.0
+    regions = lidar_regions(monkeypatch, depth)
+    near, beyond = regions["near_lidar"], regions["beyond_lidar"]
+    assert (near.pixels, beyond.pixels) == (4 * 9, 44 * 9)
+    # Float32 in [0, 1] is rounded by 6e-8, its error of 0.3 squared by 4e-8.
+    assert near.mse == pytest.approx(0.01, abs=1e-6)
+    assert beyond.mse == pytest.approx((12 * 0.01 + 16 * 0.04 + 16 * 0.09) / 44, abs=1e-6)
+    assert near.psnr == pytest.approx(20, abs=1e-3)
+    sky[:, 2:32] = True
+    regions = lidar_regions(monkeypatch, depth, sky)
+    near, beyond = regions["near_lidar"], regions["beyond_lidar"]
+    assert (near.pixels, beyond.pixels) == (2 * 9, 16 * 9)
+    assert beyond.mse == pytest.approx(0.09, abs=1e-6)
+    assert near.ssim_uniform7 > beyond.ssim_uniform7
+
+
+def test_lidar_regions_at_their_ends(monkeypatch):
+    """No lidar, no return in the image, returns everywhere."""
+    assert set(lidar_regions(monkeypatch, None)) == {"full"}
+    sky = torch.zeros(9, 48, dtype=torch.bool)
+    sky[0] = True
+    none = lidar_regions(monkeypatch, torch.zeros(9, 48), sky)
+    assert (none["near_lidar"], none["beyond_lidar"].pixels) == (RegionQuality(0, None, None, None), 8 * 48)
+    every = lidar_regions(monkeypatch, torch.ones(9, 48))
+    assert (every["near_lidar"].pixels, every["beyond_lidar"]) == (9 * 48, RegionQuality(0, None, None, None))
 
 
 def test_the_scene_is_what_is_compared():
@@ -71,9 +114,9 @@ def test_the_scene_is_what_is_compared():
         rgb = render(SCENE, frame, options=black).rgb.detach()
         seen = dataclasses.replace(frame, image=(rgb.clamp(0, 1) * 255).round().byte())
         (quality,) = evaluate_frames(SCENE, [seen], black)
-        assert quality.full.psnr > 50  # 8 bits: at worst 54.2 dB away, half a level everywhere
+        assert quality.value("psnr", "full") > 50  # 8 bits: at worst 54.2 dB away, half a level everywhere
     (quality,) = evaluate_frames(SCENE, [seen], OPTIONS)
-    assert quality.full.psnr < 50
+    assert quality.value("psnr", "full") < 50
 
 
 @pytest.mark.usefixtures("noise")
@@ -121,13 +164,10 @@ def test_a_render_that_is_not_finite_is_refused(monkeypatch, value):
 
 
 def test_summary_takes_means_over_the_images_that_have_the_region():
-    def image(index, psnr, vehicle):
-        return FrameQuality(index, 0, 8, 8, RegionQuality(64, 0.01, psnr, 0.5), None, vehicle)
-
     quality = [
-        image(0, 20.0, RegionQuality(10, 0.1, 10.0, 0.4)),
-        image(1, 100.0, RegionQuality(0, None, None, None)),
-        image(2, 27.0, RegionQuality(1000, 0.001, 30.0, 0.6)),
+        make_image(0, psnr=20.0, vehicle=RegionQuality(10, 0.1, 10.0, 0.4)),
+        make_image(1, psnr=100.0, vehicle=RegionQuality(0, None, None, None)),
+        make_image(2, psnr=27.0, vehicle=RegionQuality(1000, 0.001, 30.0, 0.6)),
     ]
     summary = summarize(quality)
     assert list(summary) == list(DEFINITIONS)
@@ -140,6 +180,22 @@ def test_summary_takes_means_over_the_images_that_have_the_region():
 
 
 def test_summary_of_one_image_has_no_spread_and_of_none_no_mean():
-    one = summarize([FrameQuality(0, 0, 8, 8, RegionQuality(64, 0.01, 20.0, 0.5))])
+    one = summarize([make_image(0)])
     assert (one["psnr_full"].mean, one["psnr_full"].sd) == (20.0, None)
     assert summarize([])["psnr_full"].images == 0
+
+
+def test_means_by_camera_are_over_the_cameras_own_images():
+    quality = [
+        make_image(0, 10, psnr=20.0, near_lidar=RegionQuality(10, 0.1, 10.0, 0.4)),
+        make_image(0, 2, psnr=40.0),
+        make_image(1, 10, psnr=23.0, near_lidar=RegionQuality(0, None, None, None)),
+        make_image(2, 10, psnr=24.5, near_lidar=RegionQuality(1, 0.1, 13.0, 0.8)),
+    ]
+    means = camera_means(quality)
+    assert list(means) == ["2", "10"]
+    assert set(means["10"]) == set(DEFINITIONS)
+    assert (means["10"]["psnr_full"], means["2"]["psnr_full"]) == (22.5, 40.0)
+    assert (means["10"]["psnr_near_lidar"], means["2"]["psnr_near_lidar"]) == (11.5, None)
+    assert means["10"]["ssim_uniform7_near_lidar"] == pytest.approx(0.6)
+    assert camera_means([]) == {}

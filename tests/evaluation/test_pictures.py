@@ -6,7 +6,9 @@ import pytest
 
 from sparsestreet.evaluation.pictures import (
     ERROR_SCALE,
+    LIDAR_END,
     color_map,
+    draw_lidar_end,
     error_picture,
     picture_path,
     read_pictures,
@@ -36,8 +38,34 @@ def test_error_is_the_mean_absolute_difference_on_the_common_scale():
     assert (error_picture(truth, render) == picture).all()
 
 
+def line_of(picture: np.ndarray) -> np.ndarray:
+    return (picture == LIDAR_END).all(-1)
+
+
+def test_the_line_is_where_near_pixels_touch_one_beyond():
+    """Near below row 4, and in one pixel above it; the sky, of neither region, begins in column 9."""
+    near, beyond, expected = (np.zeros((9, 13), dtype=bool) for _ in range(3))
+    near[4:], beyond[:4], near[1, 4], beyond[1, 4] = True, True, True, False
+    near[:, 9:] = beyond[:, 9:] = False
+    expected[4, :9] = expected[1, 4] = True
+    picture = flat((10, 20, 30), 9, 13)
+    drawn = draw_lidar_end(picture, near, beyond)
+    assert (line_of(drawn) == expected).all()
+    assert (drawn[~expected] == picture[~expected]).all()
+    assert not line_of(picture).any()
+    assert not line_of(draw_lidar_end(picture, ~beyond & ~near, beyond & False)).any()
+
+
+def test_the_line_of_a_large_image_is_seen_on_a_sheet():
+    near = np.repeat(np.arange(10)[:, None] >= 6, 1440, axis=1)
+    drawn = line_of(draw_lidar_end(flat((10, 20, 30), 10, 1440), near, ~near))
+    assert drawn.all(1).tolist() == 6 * [False] + 3 * [True] + [False]  # three pixels become one of 480
+    assert drawn.sum() == 3 * 1440
+
+
 def test_pictures_on_disk_round_trip(tmp_path):
     pictures = [make_picture(12, 0), make_picture(3, 1), make_picture(3, 0)]
+    pictures[0].error[4] = LIDAR_END
     for picture in pictures:
         write_picture(tmp_path, picture)
     assert (tmp_path / "003_1_error.png").exists()
@@ -45,7 +73,9 @@ def test_pictures_on_disk_round_trip(tmp_path):
     found = read_pictures(tmp_path)
     assert [(picture.frame, picture.camera) for picture in found] == [(3, 0), (3, 1), (12, 0)]
     assert (found[2].render == pictures[0].render).all()
+    assert (found[2].error == pictures[0].error).all()
     assert (found[2].centers == pictures[0].centers).all()
+    assert [picture.shows_lidar_end for picture in found] == [False, False, True]
 
 
 def test_missing_pictures_are_named(tmp_path):

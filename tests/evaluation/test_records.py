@@ -20,28 +20,35 @@ from sparsestreet.evaluation.records import (
     write_summary,
 )
 from sparsestreet.evaluation.strict_json import RecordError, significant, write_atomically
-from tests.evaluation.frames import make_run, make_summary
+from tests.evaluation.frames import make_image, make_run, make_summary
 
 QUALITY = [
-    FrameQuality(0, 1, 12, 9, RegionQuality(108, 0.00123456, 29.0849, 0.912345)),
+    FrameQuality(0, 1, 12, 9, {"full": RegionQuality(108, 0.00123456, 29.0849, 0.912345)}),
     FrameQuality(
         10,
         0,
         12,
         9,
-        RegionQuality(108, 0.0, 100.0, 1.0),
-        RegionQuality(0, None, None, None),
-        RegionQuality(7, 0.5, 3.0103, -0.25),
+        {
+            "full": RegionQuality(108, 0.0, 100.0, 1.0),
+            "human": RegionQuality(0, None, None, None),
+            "vehicle": RegionQuality(7, 0.5, 3.0103, -0.25),
+            "near_lidar": RegionQuality(100, 0.125, 9.0309, 0.5),
+            "beyond_lidar": RegionQuality(0, None, None, None),
+        },
     ),
 ]
 
 
 def test_summary_round_trip(tmp_path):
-    summary = make_summary(training_seconds=None, vehicle_psnr=None)
+    cameras = {"0": {"psnr_full": 25.0, "psnr_near_lidar": None}, "10": {"psnr_full": 24.0, "psnr_near_lidar": 23.5}}
+    summary = make_summary(training_seconds=None, vehicle_psnr=None, cameras=cameras)
     path = tmp_path / "records" / "summary.json"
     write_summary(path, summary)
     assert read_summary(path) == summary
     assert json.loads(path.read_text())["latency"]["p90"] == 60.0
+    assert json.loads(path.read_text())["by_camera"] == {HELD_OUT: cameras}
+    assert (summary.camera_mean("psnr_near_lidar", "10"), summary.camera_mean("psnr_full", "3")) == (23.5, None)
 
 
 def test_run_description_round_trip(tmp_path):
@@ -75,19 +82,21 @@ def test_the_main_split_is_the_held_out_one_where_there_is_one():
 
 
 def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
-    with pytest.raises(ValueError, match=r"splits \[\] and images of \[\], expected held_out, training or both"):
+    with pytest.raises(ValueError, match=r"splits \[\], .* images of \[\], expected held_out, training or both"):
         make_summary(psnr=None)
     with pytest.raises(ValueError, match=r"splits \['test'\]"):
         dataclasses.replace(make_summary(), quality={"test": {}}, images={"test": 0})
     with pytest.raises(ValueError, match=r"images of \['training'\]"):
         dataclasses.replace(make_summary(), images={TRAINING: 3})
+    with pytest.raises(ValueError, match=r"by_camera of \['training'\]"):
+        dataclasses.replace(make_summary(), by_camera={TRAINING: {}})
 
 
 @pytest.mark.parametrize(
     ("write", "read", "value", "remedy"),
     [
         (write_run, read_run, make_run(), "format 0, this version reads 1: train the run again"),
-        (write_summary, read_summary, make_summary(), "format 0, this version reads 2: evaluate again"),
+        (write_summary, read_summary, make_summary(), "format 0, this version reads 3: evaluate again"),
     ],
 )
 def test_another_format_is_named_before_its_keys(tmp_path, write, read, value, remedy):
@@ -118,6 +127,8 @@ def test_quality_round_trip_and_plain_csv(tmp_path):
     assert (first["frame"], first["camera"], first["psnr_full"]) == ("0", "1", "29.0849")
     assert first["pixels_vehicle"] == first["psnr_vehicle"] == ""
     assert (second["pixels_human"], second["psnr_human"], second["ssim_uniform7_vehicle"]) == ("0", "", "-0.25")
+    assert (second["psnr_near_lidar"], second["pixels_beyond_lidar"], second["mse_beyond_lidar"]) == ("9.0309", "0", "")
+    assert first["pixels_near_lidar"] == ""
     write_quality(path, [])
     assert read_quality(path) == []
     names = [quality_path(tmp_path, split).relative_to(tmp_path).as_posix() for split in (HELD_OUT, TRAINING)]
@@ -131,7 +142,7 @@ def test_no_record_holds_a_number_that_is_none(tmp_path, value):
     with pytest.raises(RecordError, match=r"summary\.json: quality: held_out: psnr_full: mean is (nan|inf)"):
         write_summary(tmp_path / "summary.json", broken)
     with pytest.raises(RecordError, match=r"quality\.csv: frame 3 is (nan|inf)"):
-        write_quality(tmp_path / "quality.csv", [FrameQuality(3, 0, 8, 8, RegionQuality(64, value, 20.0, 0.5))])
+        write_quality(tmp_path / "quality.csv", [make_image(3, vehicle=RegionQuality(64, value, 20.0, 0.5))])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -164,8 +175,13 @@ def drop(entries, key):
             lambda entries: entries["quality"]["held_out"]["psnr_full"].update(images=1.5),
             r"psnr_full: images: expected int",
         ),
+        (
+            lambda entries: entries["by_camera"]["held_out"]["0"].update(psnr_full="25"),
+            r"by_camera: held_out: 0: psnr_full: expected float, got str '25'",
+        ),
+        (lambda entries: drop(entries, "by_camera"), r"lacks the keys \['by_camera'\]"),
         (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
-        (lambda entries: entries.update(format=99), r"format 99, this version reads 2"),
+        (lambda entries: entries.update(format=99), r"format 99, this version reads 3"),
         (lambda entries: entries["run"].update(format=99), r"run: the record has format 99, .* train the run again"),
         (lambda entries: entries["run"]["config"].update(a={}), r"run: config: a: expected one of bool, .* got dict"),
         (lambda entries: entries["run"].update(training_seconds="1"), r"training_seconds: expected float, got str '1'"),
@@ -197,10 +213,10 @@ def test_a_broken_summary_names_the_file(tmp_path, text):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("1,0,8,8,64,0.1", "line 3: 6 cells, expected 16"),
-        ("1,0,8,8,64,0.1,ten,0.5,,,,,,,,", "line 3: .*ten"),
-        ("1,0,8,8,64,0.1,nan,0.5,,,,,,,,", "line 3: a metric is not a finite number"),
-        ("1,0,8,8,,,,,,,,,,,,", "line 3: the metrics of the full image are missing"),
+        ("1,0,8,8,64,0.1", "line 3: 6 cells, expected 24"),
+        ("1,0,8,8,64,0.1,ten,0.5" + 16 * ",", "line 3: .*ten"),
+        ("1,0,8,8,64,0.1,nan,0.5" + 16 * ",", "line 3: a metric is not a finite number"),
+        ("1,0,8,8" + 20 * ",", "line 3: the metrics of the full image are missing"),
     ],
 )
 def test_a_malformed_quality_names_file_and_line(tmp_path, line, message):

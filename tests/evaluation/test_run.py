@@ -10,8 +10,8 @@ from PIL import Image
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
-from sparsestreet.evaluation.pictures import picture_path
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
+from sparsestreet.evaluation.pictures import LIDAR_END, picture_path, read_pictures
+from sparsestreet.evaluation.quality import RegionQuality
 from sparsestreet.evaluation.quality_csv import quality_path, read_quality
 from sparsestreet.evaluation.records import (
     HELD_OUT,
@@ -27,7 +27,7 @@ from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View
-from tests.evaluation.frames import make_frame, make_run
+from tests.evaluation.frames import make_frame, make_image, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 
 RUN = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
@@ -174,6 +174,19 @@ def test_a_run_leaves_pictures_in_full_resolution(tmp_path):
         assert np.abs(np.asarray(image) - rounded).max() <= 0.5 + 1e-4  # rounded, not truncated
 
 
+@pytest.mark.usefixtures("dark")
+def test_errors_show_where_the_lidar_ends(tmp_path):
+    """0.04 of 12 columns is less than a pixel: near are the pixels with a return, here the lower four rows."""
+    depth = torch.zeros(9, 12)
+    depth[5:] = 3.0
+    summary = evaluate(tmp_path, [make_frame(0, depth=depth), make_frame(10, 1)])
+    lidar, none = read_pictures(tmp_path / "pictures")
+    assert np.argwhere((lidar.error == LIDAR_END).all(-1)).tolist() == [[5, column] for column in range(12)]
+    assert not none.shows_lidar_end
+    assert summary.by_camera[HELD_OUT]["0"]["psnr_near_lidar"] == summary.mean("psnr_near_lidar")
+    assert summary.by_camera[HELD_OUT]["1"]["psnr_near_lidar"] is None
+
+
 def test_no_view_is_an_error(tmp_path):
     with pytest.raises(ValueError, match=r"no view to evaluate streetgs\+paper on"):
         evaluate(tmp_path, [])
@@ -216,10 +229,7 @@ def test_a_run_without_pictures(tmp_path):
 
 def quality_with_vehicles(*pixels):
     return [
-        FrameQuality(
-            index // 2, index % 2, 8, 8, RegionQuality(64, 0.1, 10.0, 0.5), None, RegionQuality(n, 0.1, 10.0, 0.5)
-        )
-        for index, n in enumerate(pixels)
+        make_image(index // 2, index % 2, vehicle=RegionQuality(n, 0.1, 10.0, 0.5)) for index, n in enumerate(pixels)
     ]
 
 
@@ -239,5 +249,5 @@ def test_pictures_are_chosen_by_vehicles_and_spacing(pixels, count, expected):
 
 
 def test_choice_does_without_masks():
-    quality = [FrameQuality(index, 0, 8, 8, RegionQuality(64, 0.1, 10.0, 0.5)) for index in range(11)]
+    quality = [make_image(index) for index in range(11)]
     assert len(set(choose_pictures(quality, 4))) == 4

@@ -6,12 +6,11 @@ from PIL import Image
 
 from sparsestreet.evaluation import sheets
 from sparsestreet.evaluation.compare import compare_runs
-from sparsestreet.evaluation.pictures import Picture, write_picture
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
+from sparsestreet.evaluation.pictures import LIDAR_END, Picture, write_picture
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING, summary_path, write_summary
 from sparsestreet.evaluation.sheets import SheetColumn, comparison_sheet, picture_sheet
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import make_image, make_summary
 from tests.evaluation.tiles import COLORS, flat, make_picture
 
 LEGEND = {"rigid": (250, 150, 40)}
@@ -56,13 +55,24 @@ def test_sheet_columns_are_truth_render_error_centers():
 
 
 def test_images_of_several_sizes_share_a_sheet():
-    tall = Picture(4, 0, flat(COLORS["truth"], 40), flat(COLORS["render"], 40), flat(COLORS["centers"], 40))
+    tall = Picture(4, 0, *(flat(COLORS[kind], 40) for kind in ("truth", "render", "render", "centers")))
     one = picture_sheet([make_picture()], title="t", tile_width=120)
     both = picture_sheet([make_picture(), tall], title="t", tile_width=120)
     assert both.shape[1] == one.shape[1]
     assert both.shape[0] > one.shape[0] + 40 * 120 // 13
     with pytest.raises(ValueError, match="at least one picture"):
         picture_sheet([], title="t")
+
+
+def test_the_line_at_the_lidars_end_is_named_where_it_is_drawn(written):
+    other, lined = make_picture(), make_picture(4)
+    picture_sheet([other], title="t", tile_width=120)
+    assert "where the lidar ends" not in written
+    lined.error[4] = LIDAR_END
+    picture_sheet([other, lined], title="t", tile_width=120)
+    assert written.count("where the lidar ends") == 1
+    comparison_sheet([SheetColumn(name, "s", [lined], [20.5]) for name in "ab"], title="t", tile_width=120)
+    assert written.count("where the lidar ends") == 2
 
 
 def column(label: str, color: tuple[int, int, int], frame: int = 3) -> SheetColumn:
@@ -104,7 +114,7 @@ def test_only_runs_of_the_same_images_are_compared():
 def write_run(folder, color, psnr, split=HELD_OUT, **summary):
     views = {"psnr": psnr} if split == HELD_OUT else {"psnr": None, "training_psnr": psnr}
     write_summary(summary_path(folder), make_summary(**views, **summary))
-    quality = [FrameQuality(3, 1, 13, 9, RegionQuality(117, 0.01, psnr + 1, 0.9))]
+    quality = [make_image(3, 1, psnr=psnr + 1)]
     write_quality(quality_path(folder, split), quality)
     write_picture(folder / "pictures", make_picture(render=color))
     return folder

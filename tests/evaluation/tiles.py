@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsestreet.evaluation.pictures import Picture
+from sparsestreet.evaluation.pictures import Picture, error_picture
 
 COLORS = {"truth": (200, 10, 10), "render": (10, 200, 10), "centers": (10, 10, 200)}
 
@@ -12,4 +12,5 @@ def flat(color: tuple[int, int, int], height: int = 9, width: int = 13) -> np.nd
 
 
 def make_picture(frame: int = 3, camera: int = 1, render: tuple[int, int, int] = COLORS["render"]) -> Picture:
-    return Picture(frame, camera, flat(COLORS["truth"]), flat(render), flat(COLORS["centers"]))
+    truth = flat(COLORS["truth"])
+    return Picture(frame, camera, truth, flat(render), error_picture(flat(render), truth), flat(COLORS["centers"]))

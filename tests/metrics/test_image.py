@@ -114,5 +114,7 @@ def test_every_id_has_a_definition_that_names_its_region():
     assert metric_id("psnr", "vehicle") == "psnr_vehicle"
     assert "ssim_uniform7_full" in DEFINITIONS
     assert "vehicle" in DEFINITIONS["psnr_vehicle"]
+    assert "with a lidar return of the same instant within 0.04" in DEFINITIONS["psnr_near_lidar"]
+    assert "without a lidar return of the same instant within 0.04" in DEFINITIONS["ssim_uniform7_beyond_lidar"]
     assert "{" not in "".join(DEFINITIONS.values())
-    assert len(set(DEFINITIONS.values())) == len(DEFINITIONS) == 9
+    assert len(set(DEFINITIONS.values())) == len(DEFINITIONS) == 15

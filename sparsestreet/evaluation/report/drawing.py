@@ -31,11 +31,13 @@ def tables(sections: Sequence[Section], width: int = 80) -> list[Table | Text]:
 
 
 def markdown(sections: Sequence[Section]) -> str:
-    """The sections as Markdown tables with their notes."""
+    """The sections as Markdown tables with their notes; those by camera with a row for each camera and region."""
     blocks = []
     for section in sections:
-        header, *lines = _lines(section)
-        rule = ["---", "---", *("---:" for _ in section.quantities)]
+        lines = _lines(section)
+        header, *lines = zip(*lines, strict=True) if section.by_camera else lines
+        texts = 1 if section.by_camera else 2
+        rule = ["---"] * texts + ["---:"] * (len(header) - texts)
         table = "\n".join(
             "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (header, rule, *lines)
         )

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from sparsestreet.evaluation.records import TRAINING, Machine, RunSummary, Source
 from sparsestreet.evaluation.report.variants import Variant
+from sparsestreet.metrics.definitions import LIDAR_REACH
 
 CAPPED = "†"
 """Marks counts that a node's ``max_gaussians`` held down."""
@@ -26,6 +27,12 @@ def notes(variants: Sequence[Variant], over_scenes: bool) -> list[str]:
     ]
 
 
+def camera_notes(variants: Sequence[Variant]) -> list[str]:
+    """The notes of a table by camera; the others stand below the table that it goes with."""
+    runs = [run for variant in variants for run in variant.runs]
+    return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
+
+
 def _general(runs: Sequence[RunSummary], over_scenes: bool) -> list[str]:
     alone = "n=1 has no spread and proves nothing below the noise of runs"
     mean = (
@@ -33,12 +40,27 @@ def _general(runs: Sequence[RunSummary], over_scenes: bool) -> list[str]:
         if over_scenes
         else f"mean ± sample sd over runs; {alone}"
     )
-    views = "training views (none is held out)" if all(run.main_split == TRAINING for run in runs) else "held-out views"
     return [
         mean,
-        f"of {views}: PSNR psnr_full, in dB; SSIM ssim_uniform7_full; masked: psnr_vehicle, ssim_uniform7_vehicle, "
-        "psnr_human (images without the mask skipped); definitions in each summary.json",
+        f"of {_views(runs)}: PSNR psnr_full, in dB; SSIM ssim_uniform7_full; masked: psnr_vehicle, "
+        "ssim_uniform7_vehicle, psnr_human (images without the mask skipped); definitions in each summary.json",
+        *_lidar(runs),
         f"MB: 10^6 bytes of parameters; ms/frame: median, {runs[0].latency.protocol}",
+    ]
+
+
+def _views(runs: Sequence[RunSummary]) -> str:
+    return "training views (none is held out)" if all(run.main_split == TRAINING for run in runs) else "held-out views"
+
+
+def _lidar(runs: Sequence[RunSummary]) -> list[str]:
+    """What near and beyond are, where a run has either."""
+    names = ("psnr_near_lidar", "psnr_beyond_lidar")
+    if all(run.mean(name) is None for run in runs for name in names):
+        return []
+    return [
+        f"near: psnr_near_lidar, of pixels with a lidar return within {100 * LIDAR_REACH:g} % of the longer image "
+        "side; beyond: psnr_beyond_lidar, of the others; sky left out"
     ]
 
 

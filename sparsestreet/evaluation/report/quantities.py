@@ -1,6 +1,6 @@
 """What a table says of a run: heading, where the record holds it, how it is written."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING, RunSummary
@@ -25,7 +25,11 @@ _METRICS = (
     ("vehicle PSNR", "psnr_vehicle", "{:.2f}"),
     ("vehicle SSIM", "ssim_uniform7_vehicle", "{:.4f}"),
     ("human PSNR", "psnr_human", "{:.2f}"),
+    ("near PSNR", "psnr_near_lidar", "{:.2f}"),
+    ("beyond PSNR", "psnr_beyond_lidar", "{:.2f}"),
 )
+
+_CAMERA_METRICS = (("", "psnr_full"), (" near", "psnr_near_lidar"), (" beyond", "psnr_beyond_lidar"))
 
 
 def quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
@@ -40,6 +44,21 @@ def quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
         Quantity("ms/frame", lambda run: run.latency.p50, "{:.1f}".format, True),
         Quantity("train s", lambda run: run.run.training_seconds, "{:.0f}".format, True),
     )
+    return _measured(known, runs)
+
+
+def camera_quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
+    """PSNR of each camera, in full and by lidar, where at least one of the runs has it; none for a single camera."""
+    cameras = dict.fromkeys(camera for run in runs for camera in run.by_camera[run.main_split])
+    known = [
+        Quantity(f"camera {camera}{region}", _camera_metric(name, camera), "{:.2f}".format, False)
+        for camera in cameras
+        for region, name in _CAMERA_METRICS
+    ]
+    return _measured(known, runs) if len(cameras) > 1 else ()
+
+
+def _measured(known: Iterable[Quantity], runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
     return tuple(quantity for quantity in known if any(quantity.value(run) is not None for run in runs))
 
 
@@ -53,6 +72,10 @@ def _training_metrics(runs: Sequence[RunSummary]) -> list[Quantity]:
 
 def _metric(name: str, split: str) -> Callable[[RunSummary], float | None]:
     return lambda run: run.mean(name, split)
+
+
+def _camera_metric(name: str, camera: str) -> Callable[[RunSummary], float | None]:
+    return lambda run: run.camera_mean(name, camera)
 
 
 def _node_count(name: str) -> Callable[[RunSummary], float | None]:

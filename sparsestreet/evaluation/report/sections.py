@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from sparsestreet.evaluation.configuration import Setting, config_hash, differing_options, only, without
 from sparsestreet.evaluation.records import RunSummary
 from sparsestreet.evaluation.report.collect import RunRecord, check_definitions
-from sparsestreet.evaluation.report.notes import notes
-from sparsestreet.evaluation.report.quantities import Quantity, quantities
+from sparsestreet.evaluation.report.notes import camera_notes, notes
+from sparsestreet.evaluation.report.quantities import Quantity, camera_quantities, quantities
 from sparsestreet.evaluation.report.spread import Spread, spread
 from sparsestreet.evaluation.report.variants import CLIP_KEYS, Variant, log_config, variants
 
@@ -33,6 +33,8 @@ class Section:
 
     title: str
     over_scenes: bool
+    by_camera: bool
+    """Whether its quantities are those of single cameras."""
     quantities: tuple[Quantity, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
@@ -53,6 +55,7 @@ def sections(records: Sequence[RunRecord], baseline: str | None = None) -> list[
 
     Within a scene, a row for each variant (runs of one label and configuration), mean and spread over its runs. Where
     a variant occurs in at least two scenes of one split, a section of means follows, in which each scene counts once.
+    Behind a section whose logs have several cameras follows one of PSNR by camera.
 
     Args:
         records: the runs.
@@ -70,8 +73,9 @@ def sections(records: Sequence[RunRecord], baseline: str | None = None) -> list[
         names = sorted({variant.name for found in parted for variant in found})
         raise ValueError(f"no run has the baseline {baseline!r}: choose one of {names}")
     return [
-        _section(group, title, found, baseline)
+        section
         for group, title, found in zip(groups, _titles(groups), parted, strict=True)
+        for section in _sections(group, title, found, baseline)
     ]
 
 
@@ -128,19 +132,28 @@ def _reference(found: Sequence[Variant], baseline: str | None) -> Variant | None
     return next(iter(named or of_label), None)
 
 
-def _section(group: _Group, title: str, found: Sequence[Variant], baseline: str | None) -> Section:
-    columns = quantities(group.runs)
+def _sections(group: _Group, title: str, found: Sequence[Variant], baseline: str | None) -> list[Section]:
+    """The table of a group, and the one by camera where there are several."""
     reference = _reference(found, baseline)
     ordered = sorted(found, key=lambda variant: (variant is not reference, variant.name))
-    rows = [_variant_row(variant, columns, group.over_scenes) for variant in ordered]
+    compared = ordered[1:] if reference is not None else []
     said = notes(ordered, group.over_scenes)
-    if reference is not None and len(ordered) > 1:
-        rows += [_difference_row(variant, reference, columns, group.over_scenes) for variant in ordered[1:]]
+    if compared:
         paired = "scene and seed" if group.over_scenes else "seed"
         said.append(f"differences are to {reference.name}, paired by {paired}; per cent is what remains of it")
     elif reference is None and baseline is not None:
         said.append(f"no run of the baseline {baseline} here, so no differences")
-    return Section(title, group.over_scenes, columns, tuple(rows), tuple(said))
+
+    def section(name: str, by_camera: bool, columns: tuple[Quantity, ...], said: list[str]) -> Section:
+        rows = [_variant_row(variant, columns, group.over_scenes) for variant in ordered]
+        rows += [_difference_row(variant, reference, columns, group.over_scenes) for variant in compared]
+        return Section(name, group.over_scenes, by_camera, columns, tuple(rows), tuple(said))
+
+    whole = section(title, False, quantities(group.runs), said)
+    cameras = camera_quantities(group.runs)
+    if not cameras:
+        return [whole]
+    return [whole, section(f"PSNR by camera, {title}", True, cameras, camera_notes(ordered))]
 
 
 def _variant_row(variant: Variant, columns: Sequence[Quantity], over_scenes: bool) -> Row:

@@ -6,7 +6,7 @@ from rich.console import Console
 
 from sparsestreet.evaluation.report import figure, markdown, sections, tables
 from tests.evaluation.frames import make_summary
-from tests.evaluation.report.test_sections import PLAIN_AND_OURS, STREETS, records, street
+from tests.evaluation.report.test_sections import PLAIN_AND_OURS, STREETS, records, rig, street
 
 
 def text_of(found, baseline=None):
@@ -24,6 +24,22 @@ def test_markdown_reads_as_written_by_hand():
     assert difference[2] == "-0.25 ± 0.21"
     assert difference[header.index("Gaussians")] == "29.2 ± 5.9 %"
     assert "**" not in text_of(PLAIN_AND_OURS, "plain")
+
+
+def test_a_table_by_camera_has_rows_of_cameras():
+    runs = [rig((25.0, 28.0, 22.0), 24.0, label=label) for label in ("ours", "plain")]
+    text = text_of(records(*runs), "plain")
+    table = text[text.index("### PSNR by camera") :].splitlines()[2:9]
+    assert table[:4] == [
+        "| method | plain | ours | ours against plain |",
+        "| --- | ---: | ---: | ---: |",
+        "| runs | n=1 (seed 0) | n=1 (seed 0) | n=1 (seed 0) |",
+        "| camera 1 | 25.00 | 25.00 | +0.00 |",
+    ]
+    assert table[6] == "| camera 10 | 24.00 | 24.00 | +0.00 |"
+    printed_text = printed(records(*runs), 80, "plain")
+    assert "camera 1 beyond" in printed_text
+    assert printed_text.count("runs ") == 2
 
 
 def test_a_single_run_says_so_and_has_no_spread():

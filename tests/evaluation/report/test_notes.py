@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from sparsestreet.evaluation.records import Evaluation, Source
+from sparsestreet.evaluation.quality import MetricSummary
+from sparsestreet.evaluation.records import HELD_OUT, Evaluation, Source
 from sparsestreet.evaluation.report import sections
 from tests.evaluation.frames import CLEAN, MACHINE, make_summary
 from tests.evaluation.report.test_sections import STREETS, records, street
@@ -45,6 +46,7 @@ def test_trainings_at_different_places_are_called_incomparable():
         said = note("train s are not comparable, trained on: ", make_summary(), make_summary("ours", **other))
         assert "cpu: test, 2 threads, 2 cores" in said
         assert said.count(";") == 1
+    assert "cpu: test, 1 thread, 2 cores" in note("trained on", make_summary(threads=1))
     two = dataclasses.replace(make_summary(), run=dataclasses.replace(make_summary().run, device="cuda: big"))
     assert "cuda: big" in note("train s are not comparable", make_summary(), two)
 
@@ -104,6 +106,14 @@ def test_a_mean_over_scenes_says_which():
     assert "ours has no run of 320x192_seed2: compare differences, not means" in said
     assert said[0] == "each scene counts once, with the mean of its runs; ± is the sample sd over scenes"
     assert said[-1] == "differences are to plain, paired by scene and seed; per cent is what remains of it"
+
+
+def test_near_and_beyond_are_explained_where_there_is_lidar():
+    blind = make_summary()
+    assert not [said for said in notes(blind) if said.startswith("near")]
+    seen = {HELD_OUT: blind.quality[HELD_OUT] | {"psnr_beyond_lidar": MetricSummary(20.0, None, 1, 0)}}
+    said = note("near:", blind, dataclasses.replace(make_summary("ours"), quality=seen))
+    assert said.startswith("near: psnr_near_lidar, of pixels with a lidar return within 4 % of the longer image side")
 
 
 def test_which_views_the_metrics_are_of():

@@ -195,6 +195,48 @@ def test_runs_without_held_out_views_show_their_training_views():
     assert "train-view SSIM" not in found
 
 
+def rig(front, back, **summary):
+    """A run with a front camera 1, of full, near and beyond PSNR, and one behind, 10, that has no lidar."""
+    metrics = dict(zip(("psnr_full", "psnr_near_lidar", "psnr_beyond_lidar"), front, strict=True))
+    return make_summary(cameras={"1": metrics, "10": {"psnr_full": back, "psnr_near_lidar": None}}, **summary)
+
+
+def test_several_cameras_get_a_table_of_their_own():
+    found = sections(
+        records(
+            rig((25.0, 28.0, 22.0), 24.0, label="plain", seed=0),
+            rig((27.0, 29.0, 24.0), 26.0, label="plain", seed=1),
+            rig((24.0, 27.5, 20.0), 24.5, label="ours", seed=0),
+        ),
+        "plain",
+    )
+    whole, cameras = found
+    assert [section.by_camera for section in found] == [False, True]
+    assert cameras.title == f"PSNR by camera, {whole.title}"
+    assert [row.label for row in cameras.rows] == [row.label for row in whole.rows]
+    plain, ours, difference = (cells(row, cameras) for row in cameras.rows)
+    assert list(plain) == ["camera 1", "camera 1 near", "camera 1 beyond", "camera 10"]
+    assert (plain["camera 1"].mean, plain["camera 1 near"].mean, plain["camera 10"].mean) == (26.0, 28.5, 25.0)
+    assert plain["camera 1 beyond"].sd == pytest.approx(2**0.5)
+    assert ours["camera 1 beyond"] == Spread(20.0, None, 1)
+    assert (difference["camera 1 beyond"].mean, difference["camera 10"].mean) == (-2.0, 0.5)
+    assert cameras.notes == (
+        "PSNR in dB of held-out views, the mean over the images of each camera; the rest as above",
+    )
+
+
+def test_one_camera_gets_no_table_of_its_own():
+    """Over scenes several logs of one camera each are one camera still."""
+    found = sections(records(make_summary(scene="a"), make_summary(scene="b")))
+    assert [(section.over_scenes, section.by_camera) for section in found] == 2 * [(False, False)] + [(True, False)]
+
+
+def test_cameras_have_means_over_scenes():
+    found = sections(records(*(rig((psnr, 28.0, 22.0), 24.0, scene=name) for name, psnr in (("a", 24.0), ("b", 26.0)))))
+    assert [(section.over_scenes, section.by_camera) for section in found[-2:]] == [(True, False), (True, True)]
+    assert cells(found[-1].rows[0], found[-1])["camera 1"] == Spread(25.0, 2**0.5, 2)
+
+
 BOTH = [make_summary("m", config={"x": value}, psnr=20.0 + value) for value in (1, 2)]
 
 
