@@ -119,7 +119,10 @@ def _explain(reason: str, overrides: list[str], config_name: str) -> str:
         return reason
     part = next(group for group in unknown.groups() if group)
     given = [text.partition("=")[0].lstrip("+~") for text in overrides]
-    return _unknown_key(next((name for name in given if part in name.split(".") or name == part), part), config_name)
+    key = next((name for name in given if part in name.split(".") or name == part), part)
+    if key in _known(config_name):
+        return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
+    return _unknown_key(key, config_name)
 
 
 def _options(group: str) -> list[str]:
@@ -127,10 +130,14 @@ def _options(group: str) -> list[str]:
 
 
 def _unknown_key(key: str, config_name: str) -> str:
-    known = _keys(OmegaConf.to_container(compose(config_name), resolve=False))
-    groups = [path.name for path in CONF.iterdir() if path.is_dir()]
-    close = difflib.get_close_matches(key, known + groups, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(key, _known(config_name), n=1, cutoff=0.5)
     return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else "")
+
+
+def _known(config_name: str) -> list[str]:
+    """Every key of the configuration as it stands without overrides, and every group."""
+    groups = [str(path.relative_to(CONF)) for path in CONF.rglob("*") if path.is_dir()]
+    return _keys(OmegaConf.to_container(compose(config_name), resolve=False)) + groups
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

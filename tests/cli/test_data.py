@@ -13,11 +13,15 @@ from sparsestreet.data.synthetic import StreetReader, StreetSettings
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_lines
 
 SMALL = [
-    f"data.log.settings.{setting}"
-    for setting in (
-        "num_frames=2", "width=32", "height=20", "num_cameras=1", "lidar_beams=4", "lidar_azimuth_steps=40",
-        "num_parked_cars=1", "num_moving_cars=0", "num_pedestrians=0", "num_cyclists=0",
-    )
+    "data.lidar.beams=4",
+    "data.lidar.azimuth_steps=40",
+    *(
+        f"data.log.settings.{setting}"
+        for setting in (
+            "num_frames=2", "width=32", "height=20", "num_cameras=1", "num_parked_cars=1", "num_moving_cars=0",
+            "num_pedestrians=0", "num_cyclists=0",
+        )
+    ),
 ]  # fmt: skip
 
 
@@ -125,7 +129,7 @@ def test_every_choice_of_a_reader_is_a_key_with_the_readers_own_default(choice, 
     keys = log.settings if reader is StreetSettings else log
     assert set(keys) == {"_target_"} | {field.name for field in fields(reader)}
     for field in fields(reader):
-        if field.default is not MISSING:
+        if field.default is not MISSING and field.name != "lidar":  # a sensor: the test of its group compares it
             assert keys[field.name] == (list(field.default) if isinstance(field.default, tuple) else field.default)
 
 
