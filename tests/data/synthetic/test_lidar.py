@@ -13,7 +13,6 @@ from sparsestreet.data.synthetic import LidarSensor, StreetReader, StreetSetting
 from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
 from sparsestreet.data.synthetic.parts import Part, at
 from sparsestreet.data.synthetic.scene import Scene
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.synthetic.shapes import box
 from sparsestreet.data.synthetic.textures.plain import Plain
 
@@ -133,10 +132,6 @@ def test_equal_sensors_are_equal_however_they_were_written():
 def reader(*overrides: str) -> StreetReader:
     with configuration():
         return instantiate(compose("train", list(overrides)).data.log, _convert_="all")
-
-
-def test_the_default_of_the_command_line_is_that_of_the_class():
-    assert reader().settings.lidar == WAYMO_TOP == StreetSettings().lidar
 
 
 @pytest.mark.parametrize("name", ["hdl32", "hdl64", "ideal", "waymo_top"])

@@ -64,6 +64,13 @@ def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:
 
 
 @pytest.mark.lengthy
+def test_a_street_can_be_read_without_its_lidar(tmp_path):
+    log = StreetReader(SETTINGS, tmp_path / "street", lidar=False).read()
+    assert (len(log.sweeps), log.frames[0].depth) == (0, None)
+    assert len(StreetReader(SETTINGS, tmp_path / "street").read().sweeps) == 2
+
+
+@pytest.mark.lengthy
 def test_sweeps_fall_on_the_pixels_that_color_them(tmp_path):
     log = StreetReader(SETTINGS, tmp_path / "street").read()
     sweep = log.sweeps[0]
