@@ -151,11 +151,25 @@ def _keys(tree: object, prefix: str = "") -> list[str]:
 
 
 def load_run_config(run: Path) -> DictConfig:
-    """The configuration that a run wrote. Raises FileNotFoundError naming what a run folder holds."""
+    """The configuration that a run wrote, with the log where the run had it.
+
+    Raises FileNotFoundError naming what a run folder holds.
+    """
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
     cfg = OmegaConf.load(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
+    _find_log(cfg, run / ".hydra" / "hydra.yaml")
     return cfg
+
+
+def _find_log(cfg: DictConfig, launch: Path) -> None:
+    """Relative folders of the log are meant from where the run was started, as long as that is there."""
+    started = Path(OmegaConf.load(launch).hydra.runtime.cwd) if launch.is_file() else Path()
+    if started.is_dir():
+        for key in ("data.root", "data.log.root", "data.log.parent"):
+            folder = OmegaConf.select(cfg, key)
+            if folder is not None:
+                OmegaConf.update(cfg, key, str(started / folder))

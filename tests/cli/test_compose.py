@@ -1,10 +1,14 @@
 """What the command line makes of overrides before Hydra sees them."""
 
+from pathlib import Path
+
 import pytest
 from hydra import compose
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import configuration, override_problem
+from sparsestreet.cli.compose import configuration, load_run_config, override_problem
 
 
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "hydra"], ["--info", "defaults"], ["-m"]])
@@ -78,3 +82,22 @@ def test_a_gpu_that_is_not_there(monkeypatch):
     with configuration():
         cfg = compose("train", ["folder=.", "trainer=gpu"])
     assert "trainer=gpu needs a CUDA device" in config_problem(cfg)
+
+
+def folder_of_the_log(run: Path, started: Path, *overrides: str) -> Path:
+    """Where a run that was started in a folder is taken to have its log."""
+    (run / ".hydra").mkdir(parents=True)
+    with configuration():
+        OmegaConf.save(compose("train", list(overrides)), run / ".hydra" / "config.yaml")
+    OmegaConf.save({"hydra": {"runtime": {"cwd": str(started)}}}, run / ".hydra" / "hydra.yaml")
+    return instantiate(load_run_config(run).data.log, _convert_="all").folder
+
+
+def test_the_log_of_a_run_is_looked_for_where_the_run_had_it(tmp_path):
+    recorded = ("data=drivestudio", "data.root=logs/7")
+    assert folder_of_the_log(tmp_path / "a", tmp_path, *recorded) == tmp_path / "logs/7"
+    assert folder_of_the_log(tmp_path / "b", tmp_path).parent == tmp_path / "outputs/streets"
+    assert folder_of_the_log(tmp_path / "c", tmp_path, "data.log.root=mine") == tmp_path / "mine"
+    assert folder_of_the_log(tmp_path / "d", tmp_path, "data.log.root=/mine") == Path("/mine")
+    # Where the run came from elsewhere, the words are all there is.
+    assert folder_of_the_log(tmp_path / "e", tmp_path / "gone", *recorded) == Path("logs/7")
