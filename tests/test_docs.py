@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 HISTORY = ("CHANGELOG.md", "results.md")
 """Pages that also name what has been."""
 PAGES = [page for page in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]) if page.name not in HISTORY]
-ROOMS = (ROOT, ROOT / "sparsestreet", ROOT / "tests")
+ROOMS = (ROOT, ROOT / "sparsestreet", ROOT / "tests", ROOT / "conf")
 TOPS = {path.name for room in ROOMS for path in room.iterdir() if path.name[0] not in "._"} - {"outputs", "build"}
 
 

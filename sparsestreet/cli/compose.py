@@ -120,7 +120,10 @@ def _explain(reason: str, overrides: list[str], config_name: str) -> str:
         return reason
     part = next(group for group in unknown.groups() if group)
     given = [text.partition("=")[0].lstrip("+~") for text in overrides]
-    return _unknown_key(next((name for name in given if part in name.split(".") or name == part), part), config_name)
+    key = next((name for name in given if part in name.split(".") or name == part), part)
+    if key in _known(config_name):
+        return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
+    return _unknown_key(key, config_name)
 
 
 def _options(group: str) -> list[str]:
@@ -128,10 +131,14 @@ def _options(group: str) -> list[str]:
 
 
 def _unknown_key(key: str, config_name: str) -> str:
-    known = _keys(OmegaConf.to_container(compose(config_name), resolve=False))
-    groups = [path.name for path in CONF.iterdir() if path.is_dir()]
-    close = difflib.get_close_matches(key, known + groups, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(key, _known(config_name), n=1, cutoff=0.5)
     return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else "")
+
+
+def _known(config_name: str) -> list[str]:
+    """Every key of the configuration as it stands without overrides, and every group."""
+    groups = [str(path.relative_to(CONF)) for path in CONF.rglob("*") if path.is_dir()]
+    return _keys(OmegaConf.to_container(compose(config_name), resolve=False)) + groups
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:
@@ -145,11 +152,25 @@ def _keys(tree: object, prefix: str = "") -> list[str]:
 
 
 def load_run_config(run: Path) -> DictConfig:
-    """The configuration that a run wrote. Raises FileNotFoundError naming what a run folder holds."""
+    """The configuration that a run wrote, with the log where the run had it.
+
+    Raises FileNotFoundError naming what a run folder holds.
+    """
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
     cfg = OmegaConf.load(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
+    _find_log(cfg, run / ".hydra" / "hydra.yaml")
     return cfg
+
+
+def _find_log(cfg: DictConfig, launch: Path) -> None:
+    """Relative folders of the log are meant from where the run was started, as long as that is there."""
+    started = Path(OmegaConf.load(launch).hydra.runtime.cwd) if launch.is_file() else Path()
+    if started.is_dir():
+        for key in ("data.root", "data.log.root", "data.log.parent"):
+            folder = OmegaConf.select(cfg, key)
+            if folder is not None:
+                OmegaConf.update(cfg, key, str(started / folder))

@@ -1,10 +1,14 @@
 """What the command line makes of overrides before Hydra sees them."""
 
+from pathlib import Path
+
 import pytest
 from hydra import compose
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import configuration, override_problem
+from sparsestreet.cli.compose import configuration, load_run_config, override_problem
 
 
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "hydra"], ["--info", "defaults"], ["-m"]])
@@ -21,6 +25,11 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["nod.background.num_lidar=5"], "did you mean 'node.background.num_lidar'"),
         (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of importance, masks, none"),
         (["experimant=capped"], "did you mean 'experiment'"),
+        (["data/lidar=hdl65"], "no option 'hdl65' in conf/data/lidar: choose one of hdl32, hdl64, ideal, waymo_top"),
+        (["data/lidr=hdl64"], "did you mean 'data/lidar'"),
+        (["data.lidar.dropot=0.1"], "did you mean 'data.lidar.dropout'"),
+        (["data=drivestudio", "data/lidar=hdl64"], "no key 'data/lidar' with these choices: leave it out"),
+        (["data=drivestudio", "data.lidar.noise=0.1"], "no key 'data.lidar.noise' with these choices: leave it out"),
         (["+surprise=1"], "no key 'surprise'"),
         (["seed=x"], "seed"),
         (["out=runs/seed=1"], "'out=runs/seed=1' cannot be read"),
@@ -45,6 +54,8 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
         ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
         ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),
         ("node.rigid.classes=Car", "node.rigid.classes must be"),
+        ("data.lidar.dropout=often", "data.lidar.dropout must be float, got 'often'"),
+        ("data.lidar=hdl64", "data.log.settings.lidar must be LidarSensor, got 'hdl64'"),
         ("capacity=huge", "no capacity 'huge': choose one of small, paper"),
         ("data=drivestudio", "data.root has no value: give data.root=..."),
         ("trainer.devices=2", "training runs on one device, got trainer.devices=2"),
@@ -71,3 +82,22 @@ def test_a_gpu_that_is_not_there(monkeypatch):
     with configuration():
         cfg = compose("train", ["folder=.", "trainer=gpu"])
     assert "trainer=gpu needs a CUDA device" in config_problem(cfg)
+
+
+def folder_of_the_log(run: Path, started: Path, *overrides: str) -> Path:
+    """Where a run that was started in a folder is taken to have its log."""
+    (run / ".hydra").mkdir(parents=True)
+    with configuration():
+        OmegaConf.save(compose("train", list(overrides)), run / ".hydra" / "config.yaml")
+    OmegaConf.save({"hydra": {"runtime": {"cwd": str(started)}}}, run / ".hydra" / "hydra.yaml")
+    return instantiate(load_run_config(run).data.log, _convert_="all").folder
+
+
+def test_the_log_of_a_run_is_looked_for_where_the_run_had_it(tmp_path):
+    recorded = ("data=drivestudio", "data.root=logs/7")
+    assert folder_of_the_log(tmp_path / "a", tmp_path, *recorded) == tmp_path / "logs/7"
+    assert folder_of_the_log(tmp_path / "b", tmp_path).parent == tmp_path / "outputs/streets"
+    assert folder_of_the_log(tmp_path / "c", tmp_path, "data.log.root=mine") == tmp_path / "mine"
+    assert folder_of_the_log(tmp_path / "d", tmp_path, "data.log.root=/mine") == Path("/mine")
+    # Where the run came from elsewhere, the words are all there is.
+    assert folder_of_the_log(tmp_path / "e", tmp_path / "gone", *recorded) == Path("logs/7")

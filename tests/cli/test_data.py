@@ -5,19 +5,24 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 from sparsestreet.cli.compose import CONF
 from sparsestreet.cli.data import data
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.synthetic import StreetReader, StreetSettings
+from sparsestreet.data.synthetic import LidarSensor, StreetReader, StreetSettings
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_lines
 
 SMALL = [
-    f"data.log.settings.{setting}"
-    for setting in (
-        "num_frames=2", "width=32", "height=20", "num_cameras=1", "lidar_beams=4", "lidar_azimuth_steps=40",
-        "num_parked_cars=1", "num_moving_cars=0", "num_pedestrians=0", "num_cyclists=0",
-    )
+    "data.lidar.beams=4",
+    "data.lidar.azimuth_steps=40",
+    *(
+        f"data.log.settings.{setting}"
+        for setting in (
+            "num_frames=2", "width=32", "height=20", "num_cameras=1", "num_parked_cars=1", "num_moving_cars=0",
+            "num_pedestrians=0", "num_cyclists=0",
+        )
+    ),
 ]  # fmt: skip
 
 
@@ -125,7 +130,9 @@ def test_every_choice_of_a_reader_is_a_key_with_the_readers_own_default(choice, 
     keys = log.settings if reader is StreetSettings else log
     assert set(keys) == {"_target_"} | {field.name for field in fields(reader)}
     for field in fields(reader):
-        if field.default is not MISSING:
+        if isinstance(field.default, LidarSensor):
+            assert instantiate(keys[field.name]) == field.default
+        elif field.default is not MISSING:
             assert keys[field.name] == (list(field.default) if isinstance(field.default, tuple) else field.default)
 
 

@@ -133,7 +133,7 @@ def _check_mask(path: Path, size: tuple[int, int], contents: bool) -> None:
 
 def _check_sweeps(layout: Layout, contents: bool) -> list[Problem]:
     problems: list[Problem] = []
-    for frame in layout.frames:
+    for frame in layout.frames if layout.has_lidar else ():
         if not layout.sweep(frame).is_file():
             continue
         # A broken pose is reported with the poses, once.

@@ -26,6 +26,8 @@ class Layout:
     front: int
     """Lowest camera number in the folder: the re-centered world starts there, whichever cameras are read."""
     num_frames_on_disk: int
+    has_lidar: bool
+    """Whether there are sweeps, and they are read."""
 
     @property
     def images(self) -> Iterator[tuple[int, int]]:
@@ -58,10 +60,6 @@ class Layout:
     def sweep_xyz(self) -> slice:
         """Columns of a lidar row that hold the point (a Waymo row starts with the ray's origin)."""
         return slice(3, 6) if self.waymo else slice(0, 3)
-
-    @property
-    def has_lidar(self) -> bool:
-        return (self.root / "lidar").is_dir()
 
     @property
     def instances(self) -> Path:
@@ -98,9 +96,16 @@ MASK_KINDS = ("sky", "human", "vehicle")
 
 
 def find_layout(
-    root: Path, *, cameras: Sequence[int] | None = None, first_frame: int = 0, last_frame: int = -1
+    root: Path,
+    *,
+    cameras: Sequence[int] | None = None,
+    first_frame: int = 0,
+    last_frame: int = -1,
+    lidar: bool = True,
 ) -> Layout:
     """Recognize the flavor by its files and choose cameras and frames (last_frame is included; -1: to the end).
+
+    Without ``lidar`` the folder is looked at as if it had none.
 
     Raises LogError where the folder is no such log, ValueError where cameras or frames are asked for that it lacks.
     """
@@ -114,14 +119,15 @@ def find_layout(
     on_disk = sorted({camera for _, camera in images} | {n for (n,) in _numbers(root / "intrinsics", ".txt", _CAMERA)})
     if not images or not on_disk:
         raise fault(root / "images", "the folder holds no TTT_C.jpg", "write the images as frame_camera, as 000_0.jpg")
-    count = _count_frames(root, waymo)
+    count = _count_frames(root, waymo, lidar)
     last = count - 1 if last_frame == -1 else last_frame
     if not 0 <= first_frame <= last < count:
         raise ValueError(f"frames {first_frame} to {last_frame} are not within the log's 0 to {count - 1}: {root}")
     chosen = tuple(on_disk) if cameras is None else tuple(cameras)
     if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(on_disk):
         raise ValueError(f"cameras {list(chosen)} must be different ones of the log's {on_disk}: {root}")
-    return Layout(root, waymo, range(first_frame, last + 1), chosen, on_disk[0], count)
+    frames, has_lidar = range(first_frame, last + 1), lidar and (root / "lidar").is_dir()
+    return Layout(root, waymo, frames, chosen, on_disk[0], count, has_lidar)
 
 
 def _no_log(root: Path) -> LogError:
@@ -139,11 +145,13 @@ def _no_log(root: Path) -> LogError:
     return fault(root, "the folder has no images/", f"name {wanted}")
 
 
-def _count_frames(root: Path, waymo: bool) -> int:
+def _count_frames(root: Path, waymo: bool, lidar: bool) -> int:
     """One more than the highest frame number of any kind of file: where one kind stops early, its files are missing."""
     found = [(frame,) for frame, _ in _numbers(root / "images", ".jpg", _FRAME_CAMERA)]
-    found += _numbers(root / "lidar", ".bin", _FRAME)
-    found += _numbers(root / ("ego_pose" if waymo else "lidar_pose"), ".txt", _FRAME)
+    if lidar:
+        found += _numbers(root / "lidar", ".bin", _FRAME)
+    if lidar or waymo:
+        found += _numbers(root / ("ego_pose" if waymo else "lidar_pose"), ".txt", _FRAME)
     if not waymo:
         found += [(frame,) for frame, _ in _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA)]
     return 1 + max(frame for (frame,) in found)

@@ -45,6 +45,8 @@ class DriveStudioReader(LogReader):
     """-1: to the end."""
     width: int | None = None
     """Pixels; every image is scaled to it at its own aspect, and the intrinsics with it. None: as recorded."""
+    lidar: bool = True
+    """False: as if the log had none."""
     ignore_distortion: bool = False
     """Take images of a lens with distortion for pinhole images."""
     cache_mb: int = 512
@@ -83,7 +85,13 @@ class DriveStudioReader(LogReader):
         )
 
     def _layout(self) -> Layout:
-        return find_layout(self.folder, cameras=self.cameras, first_frame=self.first_frame, last_frame=self.last_frame)
+        return find_layout(
+            self.folder,
+            cameras=self.cameras,
+            first_frame=self.first_frame,
+            last_frame=self.last_frame,
+            lidar=self.lidar,
+        )
 
     def _check(self, layout: Layout, *, contents: bool) -> list[Problem]:
         return check_layout(layout, ignore_distortion=self.ignore_distortion, contents=contents)

@@ -1,7 +1,7 @@
 """Synthetic streets: a ray-traced drive with exact truth, written as a log on disk. In reading order:
 
-1. what is asked for: ``settings``; ``open`` makes a street when it is first needed, ``street`` writes it whole or not
-   at all;
+1. what is asked for: ``settings``, with the lidar's ``sensor``; ``reader`` makes a street when it is first needed,
+   ``street`` writes it whole or not at all;
 2. the world: what stands where and who moves how (``world``, ``layout``, ``motion``), things built from parts
    (``models``, ``parts``), convex solids (``shapes``);
 3. how it looks: ``textures`` with ``coverage`` and ``noise``, light (``sky``, ``shading``);
@@ -10,7 +10,8 @@
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader
+from sparsestreet.data.synthetic.sensor import LidarSensor
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import make_street
 
-__all__ = ["StreetReader", "StreetSettings", "make_street"]
+__all__ = ["LidarSensor", "StreetReader", "StreetSettings", "make_street"]

@@ -8,12 +8,12 @@ from jaxtyping import Float32, Int16
 from sparsestreet.data.synthetic.noise import stream
 from sparsestreet.data.synthetic.parts import BACKGROUND, Pose, at
 from sparsestreet.data.synthetic.scene import Scene
+from sparsestreet.data.synthetic.sensor import LidarSensor
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.tracer import Rays, first_hits
 
-_MOUNT = (0.9, 0.0, 1.9)
-_ELEVATIONS_DEGREES = (-24.0, 14.0)
-MAXIMUM_RANGE = 75.0
+_AHEAD = 0.9
+"""Of the rear axle, meters: the middle of the roof."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,16 @@ class StreetSweep:
 
 
 def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: int) -> StreetSweep:
-    """One turn of the sensor in frame ``frame`` (which only seeds the noise)."""
-    world_from_lidar = world_from_ego @ at(*_MOUNT)
-    local = _directions(settings)
+    """One turn of the sensor in frame ``frame`` (which only seeds dropout and noise)."""
+    sensor = settings.lidar
+    world_from_lidar = world_from_ego @ at(_AHEAD, 0.0, sensor.height)
+    local = _directions(sensor)
     world = np.einsum("ij,jhw->ihw", world_from_lidar[:3, :3].astype(np.float32), local)
     hits = first_hits(scene, Rays(world_from_lidar[:3, 3].astype(np.float32), np.ascontiguousarray(world)))
-    returned = hits.distances < MAXIMUM_RANGE
     rng = stream(settings.seed, f"lidar {frame}")
-    ranges = hits.distances[returned] + settings.lidar_noise * rng.standard_normal(int(returned.sum()))
+    kept = rng.random(hits.distances.shape) >= sensor.dropout
+    returned = kept & (hits.distances < sensor.max_range)
+    ranges = hits.distances[returned] + sensor.noise * rng.standard_normal(int(returned.sum()))
     objects = scene.object_indices[hits.parts[returned]]
     # Reflectance falls with range; paint of cars returns more than asphalt and brick.
     intensity = np.clip(np.where(objects == BACKGROUND, 0.3, 0.6) * np.exp(-ranges / 60), 0, 1)
@@ -40,8 +42,8 @@ def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: i
     return StreetSweep(np.ascontiguousarray(points, np.float32), objects, world_from_lidar)
 
 
-def _directions(settings: StreetSettings) -> Float32[np.ndarray, "3 b a"]:
-    elevation = np.radians(np.linspace(*_ELEVATIONS_DEGREES, settings.lidar_beams))[:, None]
-    azimuth = (np.pi - 2 * np.pi * (np.arange(settings.lidar_azimuth_steps) + 0.5) / settings.lidar_azimuth_steps)[None]
+def _directions(sensor: LidarSensor) -> Float32[np.ndarray, "3 b a"]:
+    elevation = np.radians(np.linspace(*sensor.elevations, sensor.beams))[:, None]
+    azimuth = (np.pi - 2 * np.pi * (np.arange(sensor.azimuth_steps) + 0.5) / sensor.azimuth_steps)[None]
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
     return np.stack((x, y, np.broadcast_to(np.sin(elevation), x.shape))).astype(np.float32)

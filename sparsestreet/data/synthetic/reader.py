@@ -25,6 +25,8 @@ class StreetReader(LogReader):
     root: Path | str | None = None
     """The street's folder; None: one under ``parent`` that is named after the settings, all of them."""
     parent: Path | str = "outputs/streets"
+    lidar: bool = True
+    """False: as if the street had none, though it is traced with its own."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
@@ -39,7 +41,8 @@ class StreetReader(LogReader):
         return self._made().read()
 
     def _made(self) -> DriveStudioReader:
-        return DriveStudioReader(make_street(self.settings, self.folder, self._report), cache_mb=self.cache_mb)
+        root = make_street(self.settings, self.folder, self._report)
+        return DriveStudioReader(root, lidar=self.lidar, cache_mb=self.cache_mb)
 
     def _report(self, done: int, total: int) -> None:
         """A line when a quarter more is traced."""

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
+
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
 """Front, front left, front right; with 60 degrees of view each, neighbors overlap by 10."""
 
@@ -33,11 +35,7 @@ class StreetSettings:
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
     num_pedestrians: int = 6
     num_cyclists: int = 2
-    lidar_beams: int = 40
-    lidar_azimuth_steps: int = 600
-    """Rays of one beam in one full turn; about 40 percent of them look where the three cameras look."""
-    lidar_noise: float = 0.02
-    """Standard deviation of the measured range, meters."""
+    lidar: LidarSensor = WAYMO_TOP
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, meters."""
     novel_offsets: Sequence[float] = ()
@@ -50,14 +48,12 @@ class StreetSettings:
     def __post_init__(self) -> None:
         positive = (
             "num_frames", "width", "height", "supersampling", "frame_rate", "ego_speed",
-            "lidar_beams", "lidar_azimuth_steps", "annotation_range", "novel_stride",
+            "annotation_range", "novel_stride",
         )  # fmt: skip
         for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
-        not_negative = (
-            "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "lidar_noise",
-        )  # fmt: skip
+        not_negative = ("seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists")
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")

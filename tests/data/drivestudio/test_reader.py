@@ -207,6 +207,27 @@ def test_without_lidar_no_lidar_poses_are_needed(tmp_path):
     assert len(DriveStudioReader(tmp_path).read().sweeps) == 0
 
 
+@FLAVORS
+def test_lidar_that_is_not_wanted_is_as_good_as_absent_and_need_not_be_sound(make, tmp_path):
+    make(tmp_path / "log")
+    (tmp_path / "log/lidar/000.bin").write_bytes(b"half")
+    (tmp_path / "log/lidar/001.bin").unlink()
+    (tmp_path / "log/lidar/007.bin").write_bytes(b"")  # longer than the images
+    shutil.rmtree(tmp_path / "log/lidar_pose", ignore_errors=True)
+    if make is make_nuscenes:
+        write_lines(tmp_path / "log/lidar_pose/008.txt", [0.0])
+    reader = DriveStudioReader(tmp_path / "log", lidar=False)
+    assert reader.check() == []
+    log = reader.read()
+    assert len(log.sweeps) == 0
+    assert all(frame.depth is None for frame in log.frames)
+    for folder in ("lidar", "lidar_pose"):
+        shutil.rmtree(tmp_path / "log" / folder, ignore_errors=True)
+    bare = DriveStudioReader(tmp_path / "log").read()
+    assert (log.num_frames, log.notes) == (bare.num_frames, bare.notes) == (3, log.notes)
+    assert "no lidar" in log.notes[0]
+
+
 def test_an_empty_sweep_is_a_sweep(tmp_path):
     (make_nuscenes(tmp_path) / "lidar/001.bin").write_bytes(b"")
     log = DriveStudioReader(tmp_path).read()

@@ -1,19 +1,20 @@
 """A street read as a log: the reader's frames, tracks and points are the tracer's."""
 
-import dataclasses
 import re
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
+from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.synthetic.world import Actor, build_world
 from sparsestreet.geometry.cameras import project
 
 SETTINGS = StreetSettings(
-    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1, lidar_beams=12, lidar_azimuth_steps=120,
-    novel_offsets=[],
+    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1, novel_offsets=[],
+    lidar=replace(WAYMO_TOP, beams=12, azimuth_steps=120),
 )  # fmt: skip
 
 
@@ -39,10 +40,10 @@ def test_a_street_opens_as_a_log(tmp_path):
 
 def test_every_setting_has_a_folder_of_its_own_and_the_seed_comes_last():
     folders = {}
-    for field in dataclasses.fields(StreetSettings):
-        value = getattr(SETTINGS, field.name)
-        changed = {field.name: (1.0,) if field.name == "novel_offsets" else 3 if value == 2 else value + 1}
-        folders[field.name] = StreetReader(dataclasses.replace(SETTINGS, **changed)).folder
+    others = {"novel_offsets": (1.0,), "lidar": replace(SETTINGS.lidar, dropout=0.5), "num_cameras": 3}
+    for field in fields(StreetSettings):
+        changed = others[field.name] if field.name in others else getattr(SETTINGS, field.name) + 1
+        folders[field.name] = StreetReader(replace(SETTINGS, **{field.name: changed})).folder
     plain = StreetReader(SETTINGS).folder
     assert len({plain, *folders.values()}) == len(folders) + 1
     assert re.fullmatch(r"outputs/streets/64x40x2_[0-9a-f]{8}_seed1", str(plain))
@@ -60,6 +61,13 @@ def _in_camera(ego_from_world: torch.Tensor, actor: Actor) -> torch.Tensor:
     ahead = (ego_from_world @ torch.from_numpy(actor.pose(0.0)))[:3, 3]
     x, y, z = ahead - torch.tensor([1.6, 0.0, 1.65], dtype=torch.float64)
     return torch.stack((-y, -z, x))
+
+
+@pytest.mark.lengthy
+def test_a_street_can_be_read_without_its_lidar(tmp_path):
+    log = StreetReader(SETTINGS, tmp_path / "street", lidar=False).read()
+    assert (len(log.sweeps), log.frames[0].depth) == (0, None)
+    assert len(StreetReader(SETTINGS, tmp_path / "street").read().sweeps) == 2
 
 
 @pytest.mark.lengthy

@@ -1,14 +1,15 @@
 """A tiny street on disk: complete, exact, repeatable; made whole or not at all."""
 
-import dataclasses
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import make_street
 from sparsestreet.data.synthetic.world import build_world
@@ -17,8 +18,8 @@ pytestmark = pytest.mark.lengthy
 
 TINY = StreetSettings(
     seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, num_parked_cars=8, num_moving_cars=3,
-    num_pedestrians=3, num_cyclists=1, lidar_beams=16, lidar_azimuth_steps=200, annotation_range=25.0,
-    novel_offsets=(1.0, 2.5), novel_stride=2,
+    num_pedestrians=3, num_cyclists=1, annotation_range=25.0, novel_offsets=(1.0, 2.5), novel_stride=2,
+    lidar=replace(WAYMO_TOP, beams=16, azimuth_steps=200),
 )  # fmt: skip
 VIEWS = [(frame, camera) for frame in range(3) for camera in range(2)]
 
@@ -228,7 +229,7 @@ def digest(root: Path) -> dict[str, str]:
 def test_equal_settings_give_equal_bytes_and_other_seeds_other_streets(street, tmp_path):
     again = make_street(TINY, tmp_path / "again")
     assert digest(again) == digest(street)
-    other = make_street(dataclasses.replace(TINY, seed=4, num_frames=1, novel_offsets=()), tmp_path / "other")
+    other = make_street(replace(TINY, seed=4, num_frames=1, novel_offsets=()), tmp_path / "other")
     first, second = (np.array(Image.open(root / "images/000_0.jpg"), int) for root in (street, other))
     assert np.abs(first - second).mean() > 15
 
@@ -243,7 +244,7 @@ def test_a_finished_street_is_reused(street):
 
 def test_another_folder_is_not_touched(street, tmp_path):
     with pytest.raises(FileExistsError, match="choose another folder"):
-        make_street(dataclasses.replace(TINY, seed=4), street)
+        make_street(replace(TINY, seed=4), street)
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="exactly these settings"):
         make_street(TINY, tmp_path)
@@ -251,14 +252,13 @@ def test_another_folder_is_not_touched(street, tmp_path):
 
 
 def test_an_interruption_leaves_nothing(tmp_path):
-    small = dataclasses.replace(
+    small = replace(
         TINY,
         num_cameras=1,
         supersampling=1,
         width=16,
         height=9,
-        lidar_beams=2,
-        lidar_azimuth_steps=16,
+        lidar=replace(WAYMO_TOP, beams=2, azimuth_steps=16),
         novel_offsets=(),
     )
 
@@ -278,8 +278,8 @@ def test_an_interruption_leaves_nothing(tmp_path):
 
 def test_a_street_without_objects(tmp_path):
     empty = StreetSettings(
-        num_frames=1, width=16, height=9, num_cameras=1, supersampling=1, lidar_beams=4, lidar_azimuth_steps=8,
-        num_parked_cars=0, num_moving_cars=0, num_pedestrians=0, num_cyclists=0,
+        num_frames=1, width=16, height=9, num_cameras=1, supersampling=1, num_parked_cars=0,
+        num_moving_cars=0, num_pedestrians=0, num_cyclists=0, lidar=replace(WAYMO_TOP, beams=4, azimuth_steps=8),
     )  # fmt: skip
     root = make_street(empty, tmp_path / "empty")
     assert json.loads((root / "instances/frame_instances.json").read_text()) == {"0": []}
