@@ -127,7 +127,10 @@ def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: 
     [pair if pair in DAILY else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
 )
 def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: str, run_train, tmp_path):
-    """20 steps in which densification, masking and pruning each come once; quick masks, so that some rows do go."""
+    """20 steps in which densification, masking and pruning each come once.
+
+    Quick masks, so that some rows do go, and a small budget of removal, so that it leaves some to the masks.
+    """
     masks = ["schedule.mask_learning_rate=1.0", "schedule.lambda_m=10.0"]
     out = run_train(
         tmp_path,
@@ -136,6 +139,7 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
         "trainer.fast_dev_run=20",
         "schedule.refine_in.every=5",
         "schedule.mask_in.every=5",
+        "schedule.removal_db=0.01",
         "node.background.density.grad_threshold=1e-6",
         *(masks if sparsify in ("masks", "paper", "removal") else []),
     )
