@@ -6,9 +6,9 @@ import torch
 from lightning import LightningDataModule
 
 from sparsestreet.data.device import to_device
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog, split
-from sparsestreet.types import Frame, View
+from sparsestreet.types import Frame
 
 
 class ShuffledFrames:
@@ -59,25 +59,13 @@ class OrderedFrames:
 
     def __init__(self, frames: Frames, limit: int | None = None) -> None:
         """``limit``: so many of the frames, spread evenly over all of them, the first and the last included."""
-        self.frames = frames if limit is None else Frames(_spread(frames.views, limit), frames.load)
+        self.frames = frames if limit is None else frames.at(spread(len(frames), limit))
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)
-
-
-def _spread(views: Sequence[View], limit: int) -> list[View]:
-    """Every view if there are no more than ``limit``.
-
-    From the first to the last: of c cameras in turn, an even step then never meets the same camera only, because the
-    number of views less one shares no factor with c.
-    """
-    if limit >= len(views):
-        return list(views)
-    last, gaps = len(views) - 1, limit - 1
-    return [views[(2 * place * last + gaps) // (2 * gaps)] for place in range(limit)] if gaps else [views[last // 2]]
 
 
 class StreetData(LightningDataModule):

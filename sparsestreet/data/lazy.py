@@ -10,6 +10,18 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 
+def spread(count: int, limit: int) -> list[int]:
+    """At most ``limit`` of the places 0 .. count - 1, evenly; all of them if there are no more.
+
+    From the first to the last: of c cameras in turn, an even step then never meets the same camera only, because the
+    number of views less one shares no factor with c.
+    """
+    if limit >= count:
+        return list(range(count))
+    last, gaps = count - 1, limit - 1
+    return [(2 * place * last + gaps) // (2 * gaps) for place in range(limit)] if gaps else [last // 2]
+
+
 class LazySequence(Sequence):
     """For each key, what ``load`` makes of it: at each access anew. Slices load nothing.
 
@@ -29,6 +41,10 @@ class LazySequence(Sequence):
     def where(self, keep: Callable[[Any], bool]) -> Any:
         """The items whose keys are wanted, in their order; none is loaded."""
         return self._of(filter(keep, self.keys))
+
+    def at(self, places: Iterable[int]) -> Any:
+        """The items at these places, in this order; none is loaded."""
+        return self._of(self.keys[place] for place in places)
 
     def _of(self, keys: Iterable[Any]) -> Any:
         return type(self)(keys, self.load)

@@ -24,6 +24,8 @@ IDENTITY_KEYS = (
     "data.log.root",
     "data.log.parent",
     "data.log.cache_mb",
+    "image_points.cache",  # where points lie and who makes them, not which they are
+    "image_points.threads",
     "split.val_frames",
     "callback.*.path",  # where something is written
     "logger",

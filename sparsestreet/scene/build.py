@@ -1,11 +1,8 @@
 """From a driving log to a scene graph ready for training."""
 
 import logging
-import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-
-import torch
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
@@ -14,6 +11,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.sky import Sky, SkySettings
+from sparsestreet.scene.streams import stream
 from sparsestreet.triangulation import ImagePointSettings, cached_street_points
 from sparsestreet.types import Track
 
@@ -48,9 +46,8 @@ def build_scene(
     points = None if image_points is None else cached_street_points(train_frames, assignment.claimed, image_points)
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
-        generator = torch.Generator().manual_seed(seed + zlib.crc32(name.encode()))
         data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed, points)
-        node = settings.build(data, generator)
+        node = settings.build(data, stream(seed, name))
         if node is None:
             _log.warning("node %r has no instance in %s: the scene goes without it", name, log.name)
         else:

@@ -21,6 +21,7 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "data.lidar.azimuth_steps=300",
         "sky.resolution=8",
         *TINY_BACKGROUND,
+        f"image_points.cache={root.parent / 'points'}",
         "schedule.max_steps=60",
         "schedule.refine_in.every=10",
         "schedule.mask_in.every=10",
@@ -29,9 +30,7 @@ def tiny_street(tmp_path_factory) -> list[str]:
 
 
 TINY_BACKGROUND = [
-    "node.background.num_lidar=1500",
-    "node.background.num_near=200",
-    "node.background.num_far=300",
+    "node.background.num_points=2000",
     "node.background.min_gaussians=200",
     "node.background.max_gaussians=6000",
 ]

@@ -22,7 +22,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["foo"], "'foo' is no override: write key=value"),
         (["trainer.fast_dev_runx=true"], "did you mean 'trainer.fast_dev_run'"),
         (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
-        (["nod.background.num_lidar=5"], "did you mean 'node.background.num_lidar'"),
+        (["nod.background.num_points=5"], "did you mean 'node.background.num_points'"),
         (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of importance, masks, none"),
         (["experimant=capped"], "did you mean 'experiment'"),
         (["data/lidar=hdl65"], "no option 'hdl65' in conf/data/lidar: choose one of hdl32, hdl64, ideal, waymo_top"),
@@ -49,7 +49,7 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
     ("override", "said"),
     [
         ("schedule.max_steps=abc", "must be int, got 'abc'"),
-        ("node.background.num_lidar=many", "node.background.num_lidar must be int, got 'many'"),
+        ("node.background.num_points=many", "node.background.num_points must be int, got 'many'"),
         ("node.background.learning_rates.means.initial=[1]", "learning_rates.means.initial must be float"),
         ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
         ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),

@@ -70,7 +70,7 @@ def test_k_min_has_one_home():
     cfg = composed("sparsify=paper", "node.background.min_gaussians=2000")
     text = OmegaConf.to_yaml(cfg, resolve=True)
     assert "min_gaussians: 2000" in text
-    assert "4000" not in text.replace("num_far: 4000", "")
+    assert "4000" not in text.replace("num_points: 40000", "")
     settings = recipe_of(cfg).nodes["background"]
     assert settings.min_gaussians == 2000
     assert settings.mask_settings.build(settings.min_gaussians, ()).min_gaussians == 2000
@@ -93,7 +93,13 @@ def test_every_preset_of_the_op_is_an_option():
         "node.rigid.density.grad_threshold=1e-4",
         "node.background.learning_rates.means.initial=1e-4",
         "node.rigid.learning_rates.mask_logits.initial=0.1",
-        "node.background.initial_opacity=0.2",
+        "node.background.sources.lidar.initial_opacity=0.2",
+        "node.background.sources.images.order=random",
+        "node.rigid.initial_opacity=0.2",
+        "image_points.min_views=4",
+        "image_points=none",
+        "~node.background.sources.near",
+        "source@node.background.sources=[lidar,far]",
         "render.settings.alpha_min=0.01",
         "sky.learning_rate.initial=0.02",
         "loss.depth.nearest=1.0",

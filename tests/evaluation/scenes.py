@@ -15,9 +15,8 @@ from sparsestreet.scene.sky import Sky, SkySettings
 OPTIONS = RenderOptions(backend="reference")
 
 SETTINGS = BackgroundSettings(
-    num_lidar=0,
-    num_near=0,
-    num_far=0,
+    num_points=0,
+    sources={},
     min_gaussians=0,
     max_gaussians=None,
     sh_degree=0,

@@ -29,7 +29,7 @@ _COMMON |= {"prunable": False, "learning_rates": {"means": LearningRate(0.1)}}
 
 def stored_street() -> StoredScene:
     """A road, a car that drives all the time, a tram that is there up to time 0.5, a sky of many colors."""
-    road = Background(BackgroundSettings(**_COMMON, num_lidar=0, num_near=0, num_far=0), _rows(ROAD_ROWS, 0, degree=2))
+    road = Background(BackgroundSettings(**_COMMON, num_points=0, sources={}), _rows(ROAD_ROWS, 0, degree=2))
     instances = torch.tensor([0] * CAR_ROWS + [1] * TRAM_ROWS)
     objects = Rigid(
         RigidSettings(**_COMMON),

@@ -15,6 +15,7 @@ from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
 from tests.scene.street import (
+    SOURCES,
     background_settings,
     camera_at,
     keyframes,
@@ -39,7 +40,8 @@ def view(time: float = 0.37) -> View:
 def background(count: int, seed: int, *, sh_degree: int, masked: bool = False, min_gaussians: int = 0) -> Background:
     settings = background_settings(
         sh_degree=sh_degree,
-        num_lidar=7,
+        num_points=7,
+        sources=SOURCES,
         mask=StaticMaskSettings(2.5e-3),
         masked=masked,
         min_gaussians=min_gaussians,

@@ -1,6 +1,7 @@
 """Small hand-made scenes, rows, cameras and logs; nothing touches the disk."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -10,12 +11,15 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.assignment import assign_tracks
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import Mask, StaticMask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, NodeSettings, Rigid, RigidSettings
 from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.state import SceneState
+from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Camera, Frame, Sweep, Track, View
 
 RATES = {
@@ -27,9 +31,30 @@ RATES = {
 POSE_RATES = {"rotation_deltas": LearningRate(0.001), "translation_deltas": LearningRate(0.001)}
 
 
-def background_settings(**changes) -> BackgroundSettings:
-    """No limits, no mask, no density control, no points, unless said."""
-    said = {"num_lidar": 0, "num_near": 0, "num_far": 0, "learning_rates": RATES, "prunable": True}
+@dataclass(frozen=True, kw_only=True)
+class Asked(PointSource):
+    """A source that is asked for a fixed part of the points, whatever the images show."""
+
+    source: PointSource
+    part: float
+
+    def share(self, coverage: Coverage) -> float:
+        return self.part
+
+    def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
+        return self.source.draw(count, data, generator)
+
+
+SOURCES = {"lidar": LidarPoints(), "images": ImagePoints(), "near": NearPoints(part=0.5), "far": FarPoints(part=0.5)}
+"""All there are, half of the guesses near and half far."""
+
+
+def background_settings(lidar: int = 0, images: int = 0, near: int = 0, far: int = 0, **changes) -> BackgroundSettings:
+    """So many points of each source; no limits, no mask, no density control, unless said."""
+    asked = {"lidar": lidar, "images": images, "near": near, "far": far}
+    total = sum(asked.values())
+    sources = {name: Asked(source=SOURCES[name], part=count / total) for name, count in asked.items() if count}
+    said = {"num_points": total, "sources": sources, "learning_rates": RATES, "prunable": True}
     return BackgroundSettings(**(_UNLIMITED | said | changes))
 
 
@@ -76,13 +101,16 @@ def degree(sh_degree: int) -> SceneState:
 
 
 def training_data(
-    log: DrivingLog | None = None, held_out: frozenset[int] = frozenset(), movers: NodeSettings | None = None
+    log: DrivingLog | None = None,
+    held_out: frozenset[int] = frozenset(),
+    movers: NodeSettings | None = None,
+    points: StreetPoints | None = None,
 ) -> TrainingData:
     """What a node sees of a log; ``movers`` says which of its tracks move (none, if nobody says)."""
     log = street_log() if log is None else log
     taken = () if movers is None else assign_tracks(log.tracks, {"movers": movers}).claimed
     frames = log.frames.where(lambda view: view.frame_index not in held_out)
-    return TrainingData(log, frames, held_out, tracks=taken, moving=taken)
+    return TrainingData(log, frames, held_out, tracks=taken, moving=taken, image_points=points)
 
 
 def random_rows(

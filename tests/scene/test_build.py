@@ -8,7 +8,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.sky import SkySettings
 from tests.scene.street import background_settings, rigid_settings, street_log, view_at
 
-BACKGROUND = background_settings(num_lidar=30, num_near=10, num_far=10)
+BACKGROUND = background_settings(lidar=30, near=10, far=10)
 CARS = rigid_settings()
 
 
@@ -43,7 +43,7 @@ def test_a_node_does_not_depend_on_its_neighbors():
 
 
 def test_what_no_node_takes_stays_in_the_background():
-    lidar = background_settings(num_lidar=10_000)
+    lidar = background_settings(lidar=10_000)
     with_cars, without = build({"background": lidar}), build({"background": lidar, "cars": CARS})
     # 60 returns of the moving car in each of the four sweeps that are not held out; its box takes a little road, too.
     assert len(with_cars.nodes["background"].rows) - len(without.nodes["background"].rows) >= 4 * 60

@@ -67,7 +67,7 @@ def make_rows(count: int, seed: int = 0, columns: Mapping[str, Tensor] | None = 
 
 def background(count: int = 20, *, seed: int = 0, mask: StaticMaskSettings | None = None, **changes: Any) -> Background:
     settings = BackgroundSettings(
-        **{**BASE, "mask": mask, "masked": mask is not None, "num_lidar": 0, "num_near": 0, "num_far": 0, **changes}
+        **{**BASE, "mask": mask, "masked": mask is not None, "num_points": 0, "sources": {}, **changes}
     )
     trained = None if mask is None else mask.build(settings.min_gaussians)
     columns = {} if trained is None else trained.initial_columns(count)

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
+from sparsestreet.data.lazy import spread
 from sparsestreet.data.lidar import near_returns
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import TriangulatedPoints
@@ -35,7 +36,7 @@ def coverage(data: TrainingData) -> Coverage:
     """Look at training views; "near" is the window of ``near_returns``. Without any pixel all is uncovered."""
     static = None if data.image_points is None else data.image_points.static
     pixels = by_lidar = by_images = 0
-    for place in range(0, len(data.frames), -(-len(data.frames) // VIEWS)):
+    for place in spread(len(data.frames), VIEWS):
         frame = data.frames[place]
         solid = torch.ones(frame.image.shape[:2], dtype=torch.bool) if frame.sky is None else ~frame.sky
         returned = _near_lidar(frame) & solid
@@ -49,18 +50,12 @@ def coverage(data: TrainingData) -> Coverage:
 def beyond_lidar(data: TrainingData, points: TriangulatedPoints) -> Bool[Tensor, " n"]:
     """Which points no view that shows them has a return near."""
     seen_near = torch.zeros(len(points), dtype=torch.bool)
-    order = np.argsort(points.views, kind="stable")
-    for place, own in zip(*_runs(points.views[order], order), strict=True):
-        column, row = torch.from_numpy(points.pixels[own]).long().unbind(1)
-        near = _near_lidar(data.frames[int(place)])
-        seen_near[torch.from_numpy(points.observed[own][near[row, column].numpy()])] = True
+    for place in range(len(data.frames)):
+        own = points.views == place
+        row, column = _shown_at(points, own)
+        observed = torch.from_numpy(points.observed[own])
+        seen_near[observed[_near_lidar(data.frames[place])[row, column]]] = True
     return ~seen_near
-
-
-def _runs(sorted_values: np.ndarray, order: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Distinct values, and for each the entries of ``order`` that belong to it."""
-    values, starts = np.unique(sorted_values, return_index=True)
-    return values, np.split(order, starts[1:])
 
 
 def _near_lidar(frame: Frame) -> Bool[Tensor, "h w"]:
@@ -71,6 +66,13 @@ def _near_lidar(frame: Frame) -> Bool[Tensor, "h w"]:
 
 def _near_points(points: TriangulatedPoints, place: int, frame: Frame) -> Bool[Tensor, "h w"]:
     shown = torch.zeros(frame.image.shape[:2])
-    column, row = torch.from_numpy(points.pixels[points.views == place]).long().unbind(1)
-    shown[row, column] = 1
+    shown[_shown_at(points, points.views == place)] = 1
     return near_returns(shown)
+
+
+def _shown_at(
+    points: TriangulatedPoints, observations: Bool[np.ndarray, " o"]
+) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
+    """Row and column of the pixels of some observations."""
+    column, row = torch.from_numpy(points.pixels[observations]).long().unbind(1)
+    return row, column

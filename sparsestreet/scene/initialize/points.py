@@ -22,6 +22,7 @@ class Points:
         return Points(self.positions[mask], self.colors[mask])
 
     def at(self, rows: Int[Tensor, " k"]) -> "Points":
+        """Those of some rows, in that order."""
         return Points(self.positions[rows], self.colors[rows])
 
     def sampled(self, limit: int, generator: torch.Generator) -> "Points":
@@ -42,8 +43,8 @@ class Points:
 def thinned(positions: Float[Tensor, "n 3"], voxel: float, generator: torch.Generator) -> Int[Tensor, " k"]:
     """Rows of one random point of each cube of side ``voxel`` meters, in random order."""
     order = torch.randperm(len(positions), generator=generator)
-    cells = (positions[order].double() / voxel).floor().long()
-    _, cell = torch.unique(cells, dim=0, return_inverse=True)
-    first = torch.full((int(cell.max()) + 1 if len(cell) else 0,), len(order))
-    first.scatter_reduce_(0, cell, torch.arange(len(order)), "amin")
+    cubes = (positions[order].double() / voxel).floor().long()
+    distinct, cube = torch.unique(cubes, dim=0, return_inverse=True)
+    # Of each cube the first of the random order.
+    first = torch.full((len(distinct),), len(order)).scatter_reduce(0, cube, torch.arange(len(order)), "amin")
     return order[first.sort().values]

@@ -9,28 +9,55 @@ import torch
 from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.coverage import coverage
+from sparsestreet.scene.initialize.coverage import Coverage, coverage
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.sources import PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.streams import stream
 from sparsestreet.types import Gaussians, View
 
 _log = logging.getLogger(__name__)
+
+_EXTREMES = (Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0))
+"""All is near the lidar, all is near points from images, all is near neither; linear shares are largest at one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class BackgroundSettings(NodeSettings):
-    """Starts from what its sources give."""
+    """Starts from what its sources give.
+
+    Raises ValueError for limits that contradict each other, and for sources that ask for more than all points.
+    """
 
     num_points: int
-    """All sources together; each takes its share by what the training images show."""
+    """Of all sources together, at most; each is asked for its share, by what the training images show."""
     sources: Mapping[str, PointSource]
+    """Each draws from its own stream, so a change of one leaves the points of the others as they are."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.num_points < 0:
+            raise ValueError(f"num_points must be >= 0, got {self.num_points}")
+        for name, source in self.sources.items():
+            if not isinstance(source, PointSource):
+                raise ValueError(
+                    f"a background's sources give points, got {name}={source}: leave one out with "
+                    f"~node.background.sources.{name}"
+                )
+        most = max(sum(source.share(seen) for source in self.sources.values()) for seen in _EXTREMES)
+        if most > 1 + 1e-6:
+            raise ValueError(
+                f"the shares of the sources {', '.join(self.sources)} may add up to 1 at most, got {most:g}: "
+                "lower the part of one"
+            )
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Background":
         """Raises ValueError if there is not a single point to start from."""
         seen = coverage(data)
         drawn = {
-            name: source.draw(round(self.num_points * source.share(seen)), data, generator)
+            name: source.draw(round(self.num_points * source.share(seen)), data, stream(generator.initial_seed(), name))
             for name, source in self.sources.items()
         }
         _log.info(
@@ -42,9 +69,9 @@ class BackgroundSettings(NodeSettings):
         seeds = Seeds.concatenate(list(drawn.values()))
         if len(seeds) == 0:
             raise ValueError(
-                f"the background of {data.log.name!r} has nothing to start from: its sources ({', '.join(drawn)}) give "
-                f"no point that one of {len(data.frames)} training views sees; raise num_points, add a source, or check "
-                "the poses of the cameras"
+                f"the background of {data.log.name!r} has nothing to start from: none of "
+                f"num_points={self.num_points} came from {', '.join(drawn) or 'its sources, which are none'}; raise "
+                f"num_points, add a source, or check the poses of the {len(data.frames)} training views"
             )
         scales = neighbor_scales(seeds.points.positions).clamp(seeds.smallest, seeds.largest)
         rows, mask = self.start(data, seeds.points, scales, seeds.opacities, generator)

@@ -88,7 +88,10 @@ class NodeSettings(ABC):
         generator: torch.Generator,
         buffers: Mapping[str, Tensor] | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """The table of a node that begins, one Gaussian a point, and its mask; ``scales`` in meters, ``opacities`` in (0, 1)."""
+        """The table of a node that begins, one Gaussian a point, and its mask.
+
+        ``scales`` are meters, ``opacities`` in (0, 1).
+        """
         mask = None if self.mask_settings is None else self.mask_settings.build(self.min_gaussians, data.times)
         columns = {} if mask is None else mask.initial_columns(len(points))
         rows = init_gaussians(

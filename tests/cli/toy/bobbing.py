@@ -23,6 +23,7 @@ class BobbingSettings(NodeSettings):
     """Starts with random points in the first box of each track."""
 
     points_per_instance: int
+    initial_opacity: float = 0.5
     stillness: float = 0.1
     """Weight of the regularizer."""
 
@@ -37,7 +38,12 @@ class BobbingSettings(NodeSettings):
         points = Points(torch.cat(parts), torch.full((len(parts) * self.points_per_instance, 3), 0.5))
         instances = torch.arange(len(parts)).repeat_interleave(self.points_per_instance)
         rows, mask = self.start(
-            data, points, neighbor_scales(points.positions), generator, buffers={"instances": instances}
+            data,
+            points,
+            neighbor_scales(points.positions),
+            torch.full((len(points),), self.initial_opacity),
+            generator,
+            buffers={"instances": instances},
         )
         return Bobbing(self, rows, tuple(track.name for track in data.tracks), mask)
 

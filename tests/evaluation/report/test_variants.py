@@ -45,18 +45,18 @@ def test_a_data_sets_own_options_are_no_name_where_nodes_take_them_over():
 
 
 def test_what_follows_from_a_given_option_is_left_to_the_notes():
-    small = make_summary("m", config={"capacity": "small", "node.num_lidar": 20, "node.num_far": 4})
+    small = make_summary("m", config={"capacity": "small", "node.num_points": 20, "node.cap": 4})
     command = "sparsestreet train capacity=paper"
-    paper = make_summary("m", config={"capacity": "paper", "node.num_lidar": 600, "node.num_far": 20}, command=command)
+    paper = make_summary("m", config={"capacity": "paper", "node.num_points": 600, "node.cap": 20}, command=command)
     found = variants([small, paper])
     assert names(found) == [("m capacity=paper", 1), ("m capacity=small", 1)]
-    assert found[0].options == ("capacity=paper", "node.num_far=20", "node.num_lidar=600")
+    assert found[0].options == ("capacity=paper", "node.cap=20", "node.num_points=600")
     # A difference that no command gave, such as a default that has changed, is named where the given ones do not do.
-    changed = make_summary("m", config={"capacity": "paper", "node.num_lidar": 600, "node.num_far": 5}, command=command)
+    changed = make_summary("m", config={"capacity": "paper", "node.num_points": 600, "node.cap": 5}, command=command)
     assert [name for name, _ in names(variants([small, paper, changed]))] == [
-        "m capacity=paper, node.num_far=20, node.num_lidar=600",
-        "m capacity=paper, node.num_far=5, node.num_lidar=600",
-        "m capacity=small, node.num_far=4, node.num_lidar=20",
+        "m capacity=paper, node.cap=20, node.num_points=600",
+        "m capacity=paper, node.cap=5, node.num_points=600",
+        "m capacity=small, node.cap=4, node.num_points=20",
     ]
 
 

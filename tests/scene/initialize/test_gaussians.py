@@ -16,7 +16,7 @@ def seeded(
         colors,
         neighbor_scales(points),
         sh_degree=sh_degree,
-        initial_opacity=opacity,
+        opacities=torch.full((len(points),), opacity),
         generator=generator,
         mask_columns=mask_columns,
     )
@@ -67,7 +67,7 @@ def test_a_mask_brings_its_logits():
 
 @pytest.mark.parametrize("opacity", [0.0, 1.0, -0.1])
 def test_impossible_opacities_are_errors(opacity: float):
-    with pytest.raises(ValueError, match="initial opacity"):
+    with pytest.raises(ValueError, match="initial opacities must lie between 0 and 1, got"):
         seeded(torch.rand(3, 3), torch.rand(3, 3), opacity=opacity)
 
 

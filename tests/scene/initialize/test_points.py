@@ -3,10 +3,13 @@ from dataclasses import replace
 import torch
 
 from sparsestreet.geometry.cameras import project
-from sparsestreet.scene.initialize.points import Points, far_positions, near_positions, random_points, seen_points
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.sources import FarPoints, NearPoints
+from sparsestreet.scene.initialize.sources.guesses import random_points, seen_points
 from tests.scene.street import frame_at
 
 CENTER = torch.tensor([1.0, -2.0, 3.0])
+near_positions, far_positions = NearPoints(part=1.0).positions, FarPoints(part=1.0).positions
 
 
 def test_near_points_fill_the_ball_evenly():

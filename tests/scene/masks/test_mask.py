@@ -105,7 +105,7 @@ def test_the_floor_holds(make: type[Mask]):
 def test_a_node_is_built_with_its_mask(make: type[Mask]):
     """The settings of the mask are asked with K_min of the node and the times of the training frames."""
     wanted = StaticMaskSettings(0.5) if make is static_mask else RisingSettings(0.5)
-    settings = background_settings(num_lidar=50, mask=wanted, masked=True, min_gaussians=7)
+    settings = background_settings(lidar=50, mask=wanted, masked=True, min_gaussians=7)
     node = settings.build(training_data(held_out=frozenset({2})), torch.Generator().manual_seed(0))
     assert node.rows.transient == set(node.mask.columns)
     assert node.mask.min_gaussians == 7

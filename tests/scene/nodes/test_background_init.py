@@ -18,7 +18,7 @@ from tests.scene.street import (
     training_data,
 )
 
-LIDAR_ONLY = background_settings(num_lidar=10_000)
+LIDAR_ONLY = background_settings(lidar=10_000)
 MOVERS = rigid_settings(classes=("Car", "Cyclist"))
 
 
@@ -67,7 +67,7 @@ def test_held_out_sweeps_are_not_used():
 
 
 def test_the_number_of_points_of_each_kind():
-    node = build(background_settings(num_lidar=40, num_near=30, num_far=20, sh_degree=1))
+    node = build(background_settings(lidar=40, near=30, far=20, sh_degree=1))
     log = street_log()
     assert len(node.rows) == 90
     assert node.rows.sh_rest.shape == (90, 3, 3)
@@ -80,7 +80,7 @@ def test_the_number_of_points_of_each_kind():
 
 
 def test_the_same_seed_gives_the_same_rows():
-    settings = background_settings(num_lidar=40, num_near=30, num_far=20)
+    settings = background_settings(lidar=40, near=30, far=20)
     first, second, other = build(settings), build(settings), build(settings, seed=1)
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
     assert not torch.equal(first.rows.means, other.rows.means)
@@ -112,7 +112,7 @@ def test_a_mask_that_is_not_trained_in_this_run_leaves_no_column():
 
 
 def test_a_log_without_lidar_starts_from_random_points():
-    node = build(background_settings(num_lidar=40, num_near=10, num_far=5), log=replace(street_log(), sweeps=()))
+    node = build(background_settings(lidar=40, near=10, far=5), log=replace(street_log(), sweeps=()))
     assert len(node.rows) == 15
 
 

@@ -13,7 +13,7 @@ from sparsestreet.geometry.cameras import project
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.gaussians import MINIMUM_SCALE
 from sparsestreet.scene.initialize.points import Points
-from sparsestreet.scene.initialize.sources.source import PointSource, Seeds
+from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.types import Frame, View
 
@@ -29,13 +29,24 @@ ROUNDS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class Guesses(PointSource):
-    """Positions drawn at random, of which those count that some training view sees, and not as sky."""
+    """Positions drawn at random, of which those count that some training view sees, and not as sky.
+
+    Raises ValueError for settings that cannot be.
+    """
 
     part: float
     """Of the share of the pixels that nothing covers."""
     largest_scale: float = 0.02
     """Of a point's distance from the nearest camera. Their neighbors are meters away, so without a limit (here 1.1
     degrees) they start as a fog that hides the other points and makes every early step slow."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.part <= 1:
+            raise ValueError(
+                f"part must lie in [0, 1], got {self.part}: it is a fraction of what lidar and images leave"
+            )
+        check_positive(largest_scale=self.largest_scale)
 
     def share(self, coverage: Coverage) -> float:
         return self.part * coverage.nothing

@@ -1,7 +1,7 @@
 """Points triangulated from the training images."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Int
@@ -9,21 +9,37 @@ from torch import Tensor
 
 from sparsestreet.scene.initialize.coverage import Coverage, beyond_lidar
 from sparsestreet.scene.initialize.points import Points, thinned
-from sparsestreet.scene.initialize.sources.source import PointSource, Seeds
+from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
+
+Order = Literal["beyond_first", "beyond_only", "random"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePoints(PointSource):
-    """Points of what stands still, those first that no return of the lidar covers."""
+    """Points of what stands still.
 
-    order: Literal["beyond_first", "beyond_only", "random"] = "beyond_first"
+    Raises ValueError for settings that cannot be.
+    """
+
+    order: Order = "beyond_first"
     """Which points are taken: those beyond the lidar before the others, those alone, or any."""
     voxel: float | None = None
     """Meters: of the points in a cube of this side one is taken; None: all."""
     smallest_pixels: float = 0.5
     """Limits of a Gaussian's scale, in pixels of the view that sees the point from nearest."""
     largest_pixels: float = 8.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.order not in get_args(Order):
+            raise ValueError(f"order must be one of {', '.join(get_args(Order))}, got {self.order!r}")
+        check_positive(voxel=self.voxel, smallest_pixels=self.smallest_pixels)
+        if self.largest_pixels < self.smallest_pixels:
+            raise ValueError(
+                f"largest_pixels must be at least smallest_pixels, got {self.largest_pixels} and "
+                f"{self.smallest_pixels}: raise the first or lower the second"
+            )
 
     def share(self, coverage: Coverage) -> float:
         return coverage.images
@@ -39,9 +55,10 @@ class ImagePoints(PointSource):
 
     def _chosen(self, count: int, data: TrainingData, generator: torch.Generator) -> Int[Tensor, " k"]:
         found = data.image_points.static
-        order = torch.randperm(len(found), generator=generator)
-        if self.voxel is not None:
-            order = order[torch.isin(order, thinned(torch.from_numpy(found.positions), self.voxel, generator))]
+        if self.voxel is None:
+            order = torch.randperm(len(found), generator=generator)
+        else:
+            order = thinned(torch.from_numpy(found.positions), self.voxel, generator)
         if self.order != "random":
             beyond = beyond_lidar(data, found)[order]
             rest = order[:0] if self.order == "beyond_only" else order[~beyond]

@@ -7,18 +7,25 @@ import torch
 from sparsestreet.scene.initialize.boxes import outside_boxes
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.points import Points, thinned
-from sparsestreet.scene.initialize.sources.source import PointSource, Seeds
+from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
 
 
 @dataclass(frozen=True, kw_only=True)
 class LidarPoints(PointSource):
-    """Colored returns of the training sweeps outside all moving boxes of their instant."""
+    """Colored returns of the training sweeps outside all moving boxes of their instant.
+
+    Raises ValueError for settings that cannot be.
+    """
 
     box_enlargement: float = 1.1
     """Of a moving object's box, for points that lie just outside an imprecise one."""
     voxel: float | None = None
     """Meters: of the returns in a cube of this side one is taken; None: all."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(box_enlargement=self.box_enlargement, voxel=self.voxel)
 
     def share(self, coverage: Coverage) -> float:
         return coverage.lidar

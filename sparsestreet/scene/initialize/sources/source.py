@@ -40,13 +40,23 @@ class Seeds:
 
 @dataclass(frozen=True, kw_only=True)
 class PointSource(ABC):
-    """One source of initial points."""
+    """One source of initial points.
+
+    Raises ValueError for settings that cannot be.
+    """
 
     initial_opacity: float = 0.1
 
+    def __post_init__(self) -> None:
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"initial_opacity must lie between 0 and 1, got {self.initial_opacity}: take 0.1")
+
     @abstractmethod
     def share(self, coverage: Coverage) -> float:
-        """Of the node's points, at most so many; the shares of all sources should add up to 1."""
+        """The fraction of the node's points that the source is asked for.
+
+        Those of a node's sources add up to 1 at most; what none of them asks for is left out.
+        """
 
     @abstractmethod
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
@@ -58,7 +68,7 @@ class PointSource(ABC):
         smallest: Float[Tensor, " n"] | None = None,
         largest: Float[Tensor, " n"] | None = None,
     ) -> Seeds:
-        """Points with the source's opacity; None: no limit of the scale on that side."""
+        """Points with the source's opacity; limits of the scale in meters, None: none on that side."""
         count = len(points)
         return Seeds(
             points,
@@ -66,3 +76,10 @@ class PointSource(ABC):
             torch.full((count,), torch.inf) if largest is None else largest,
             torch.full((count,), self.initial_opacity),
         )
+
+
+def check_positive(**values: float | None) -> None:
+    """Raises ValueError for a setting that is not above 0; None passes."""
+    for name, value in values.items():
+        if value is not None and not value > 0:
+            raise ValueError(f"{name} must be larger than 0, got {value}")
