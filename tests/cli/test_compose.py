@@ -36,6 +36,8 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["node.background.mask.sparsity_weight=1e-3"], "has no effect with sparsify=none: choose sparsify=masks"),
         (["schedule.lambda_m=3"], "has no effect with sparsify=none"),
         (["sky=null"], "choose one of cube, none"),
+        (["image_points=null"], "choose one of none, sift"),
+        (["node.background.sources.nera.part=0.1"], "did you mean 'node.background.sources.near.part'"),
         (["logger=null"], "choose one of csv, none"),
     ],
 )
@@ -50,6 +52,7 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
     [
         ("schedule.max_steps=abc", "must be int, got 'abc'"),
         ("node.background.num_points=many", "node.background.num_points must be int, got 'many'"),
+        ("node.background.sources.images.order=any", "sources.images.order must be Literal"),
         ("node.background.learning_rates.means.initial=[1]", "learning_rates.means.initial must be float"),
         ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
         ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),

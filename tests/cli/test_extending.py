@@ -1,4 +1,4 @@
-"""What docs/extending.md shows, run: a loss, a rule, a mask, a method, a reader and a number from outside."""
+"""What docs/extending.md shows, run: a source, a loss, a rule, a mask, a method, a reader and a number from outside."""
 
 import csv
 import re
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose
+from hydra.errors import InstantiationException
 from PIL import Image
 
 from sparsestreet.cli.assemble import data_of, recipe_of
@@ -20,6 +21,7 @@ from sparsestreet.evaluation.records import read_run, run_path
 from sparsestreet.export.views import read_views
 from sparsestreet.pruning import Look
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import render
 from tests.cli.conftest import TINY_RIGID
@@ -27,6 +29,8 @@ from tests.cli.toy.loss import MeanColor
 from tests.cli.toy.mask import ProbitMask, ProbitMaskSettings
 from tests.cli.toy.metric import largest_errors
 from tests.cli.toy.rule import SizeRule
+from tests.cli.toy.source import DrivenPoints
+from tests.scene.street import street_log, training_data
 from tests.training.stubs import background, frame_at, make_rows, set_rows
 
 pytestmark = pytest.mark.xdist_group("tiny street")
@@ -56,7 +60,9 @@ def test_the_page_shows_what_is_run():
     page = (ROOT / "docs" / "extending.md").read_text()
     shown = re.findall(r"^`(tests/\S+)`[^\n]*\n\n```\w+\n(.*?)^```", page, flags=re.M | re.S)
     names = {name for name, _ in shown}
-    assert {f"tests/cli/toy/{name}.py" for name in ("bobbing", "loss", "rule", "mask", "reader", "metric")} <= names
+    assert {
+        f"tests/cli/toy/{name}.py" for name in ("bobbing", "source", "loss", "rule", "mask", "reader", "metric")
+    } <= names
     for name, code in shown:
         # Comments in brackets stand for what was left out.
         for part in re.split(r"^ *# \(.*\)\n", code, flags=re.M):
@@ -104,6 +110,22 @@ def test_a_mask():
     probit, sigmoid = ProbitMask(mask.settings), StaticMask(mask.settings)
     assert probit.multipliers(rows, 0.0).tolist() == [0, 1, 1] == probit.keep(rows).keep.tolist()
     assert sigmoid.multipliers(rows, 0.0).tolist() == [1, 1, 1]
+
+
+def test_a_source():
+    chosen = "source@node.background.sources=[lidar,images,near,far,driven]"
+    background = recipe_of(composed(chosen, "node.background.sources.near.part=0.233")).nodes["background"]
+    assert list(background.sources) == ["lidar", "images", "near", "far", "driven"]
+    source = background.sources["driven"]
+    assert source == DrivenPoints(initial_opacity=0.3, part=0.1, height=1.5)
+    assert source.share(Coverage(lidar=0.5, images=0.25)) == pytest.approx(0.025)
+    log = street_log()
+    seeds = source.draw(40, training_data(log), torch.Generator().manual_seed(0))
+    # The cameras drive along x, half a meter an instant, 1.5 m above the ground.
+    assert {tuple(point) for point in seeds.points.positions.tolist()} == {(0.5 * step, 0.0, 0.0) for step in range(5)}
+    assert seeds.opacities.tolist() == pytest.approx([0.3] * 40)
+    with pytest.raises(InstantiationException, match=r"add up to 1 at most, got 1\.1: lower the part of one"):
+        recipe_of(composed(chosen))
 
 
 @pytest.mark.parametrize("sparsify", ["none", "paper", "size"])

@@ -6,12 +6,15 @@ import itertools
 import pytest
 import torch
 from hydra import compose
+from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
+from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, RowLedger
+from sparsestreet.triangulation import ImagePointSettings
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
@@ -76,6 +79,28 @@ def test_k_min_has_one_home():
     assert settings.mask_settings.build(settings.min_gaussians, ()).min_gaussians == 2000
 
 
+def test_the_shares_of_the_sources_are_all_points():
+    """Whatever the images show: what one source is not asked for, another is."""
+    sources = recipe_of(composed()).nodes["background"].sources.values()
+    for seen in (Coverage(0.5, 0.3), Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0)):
+        assert sum(source.share(seen) for source in sources) == pytest.approx(1)
+
+
+def test_sources_are_chosen_left_out_and_refused():
+    chosen = recipe_of(composed("source@node.background.sources=[lidar,far]")).nodes["background"].sources
+    assert list(chosen) == ["lidar", "far"]
+    left = recipe_of(composed("~node.background.sources.near", "node.background.sources.images.order=random"))
+    assert list(left.nodes["background"].sources) == ["lidar", "images", "far"]
+    assert left.nodes["background"].sources["images"].order == "random"
+    with pytest.raises(InstantiationException, match="leave one out with ~node.background.sources.far"):
+        recipe_of(composed("node.background.sources.far=null"))
+
+
+def test_points_from_images_are_made_unless_told_otherwise():
+    assert isinstance(recipe_of(composed()).image_points, ImagePointSettings)
+    assert recipe_of(composed("image_points=none")).image_points is None
+
+
 def test_every_preset_of_the_op_is_an_option():
     from sparsestreet.ops import SplatSettings
     from sparsestreet.ops.settings import _PRESETS
@@ -135,7 +160,8 @@ def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: 
 def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: str, run_train, tmp_path):
     """20 steps in which densification, masking and pruning each come once.
 
-    Quick masks, so that some rows do go, and a small budget of removal, so that it leaves some to the masks.
+    Quick masks, so that some rows do go, and a small budget of removal, so that it leaves some to the masks. One method
+    starts with points from images, the other without.
     """
     masks = ["schedule.mask_learning_rate=1.0", "schedule.lambda_m=10.0"]
     out = run_train(
@@ -148,6 +174,7 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
         "schedule.removal_db=0.01",
         "node.background.density.grad_threshold=1e-6",
         *(masks if sparsify in ("masks", "paper", "removal") else []),
+        *(["image_points=none"] if method == "3dgs" else []),
     )
     with (out / "records" / "counts.csv").open() as file:
         reasons = {row["reason"] for row in csv.DictReader(file)}

@@ -21,6 +21,8 @@ def test_a_tree_becomes_flat():
         {"name": "mine"},
         {"data.root": "/elsewhere"},
         {"data.log.root": "/elsewhere"},
+        {"image_points.cache": "elsewhere"},
+        {"image_points.threads": 8},
         {"resume": "last.ckpt"},
         {"logger": None},
         {"logger.save_dir": "out"},

@@ -1,8 +1,10 @@
 """Small hand-made scenes, rows, cameras and logs; nothing touches the disk."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,7 +21,7 @@ from sparsestreet.scene.masks import Mask, StaticMask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, NodeSettings, Rigid, RigidSettings
 from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.state import SceneState
-from sparsestreet.triangulation import StreetPoints
+from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
 from sparsestreet.types import Camera, Frame, Sweep, Track, View
 
 RATES = {
@@ -111,6 +113,26 @@ def training_data(
     taken = () if movers is None else assign_tracks(log.tracks, {"movers": movers}).claimed
     frames = log.frames.where(lambda view: view.frame_index not in held_out)
     return TrainingData(log, frames, held_out, tracks=taken, moving=taken, image_points=points)
+
+
+def triangulated(
+    positions: list[list[float]],
+    seen: Sequence[tuple[int, int, float, float]] = (),
+    *,
+    color: tuple[float, float, float] = (0.5, 0.5, 0.5),
+    pixel_size: float = 0.01,
+) -> TriangulatedPoints:
+    """Points of one color; ``seen``: (point, place of the view, column, row) of each observation."""
+    count = len(positions)
+    rows = np.array(seen, np.float32).reshape(-1, 4)
+    return TriangulatedPoints(
+        np.array(positions, np.float32).reshape(count, 3),
+        np.full((count, 3), color, np.float32),
+        np.full(count, pixel_size, np.float32),
+        rows[:, 0].astype(np.int64),
+        rows[:, 1].astype(np.int64),
+        rows[:, 2:],
+    )
 
 
 def random_rows(

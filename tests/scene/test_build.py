@@ -6,7 +6,8 @@ import torch
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.sky import SkySettings
-from tests.scene.street import background_settings, rigid_settings, street_log, view_at
+from sparsestreet.triangulation import ImagePointSettings, StreetPoints
+from tests.scene.street import background_settings, rigid_settings, street_log, triangulated, view_at
 
 BACKGROUND = background_settings(lidar=30, near=10, far=10)
 CARS = rigid_settings()
@@ -56,6 +57,26 @@ def test_the_log_says_who_takes_what(caplog):
     assert "node 'cars' takes 1 Car" in caplog.text
     assert "no node takes 1 Car, 1 Cyclist: they are part of the background" in caplog.text
     assert "node 'background' starts with 50 Gaussians" in caplog.text
+
+
+def test_points_from_images_are_made_once_of_what_training_sees(monkeypatch):
+    asked = []
+
+    def made(frames, moving, settings) -> StreetPoints:
+        asked.append(([view.frame_index for view in frames.views], [track.name for track in moving], settings))
+        in_box = triangulated([[0.0, 0.0, 0.0]] * 5000)
+        return StreetPoints(triangulated([[9.0, 0.0, 1.0]] * 7), {"driving": in_box})
+
+    monkeypatch.setattr("sparsestreet.scene.build.cached_street_points", made)
+    log = street_log()
+    frames = log.frames.where(lambda view: view.frame_index != 3)
+    nodes = {"background": background_settings(images=7), "cars": CARS}
+    settings = ImagePointSettings()
+    scene = build_scene(log, frames, frozenset({3}), nodes, None, 0, settings)
+    assert asked == [([0, 1, 2, 4], ["driving"], settings)]
+    assert scene.counts() == {"background": 7, "cars": 5000}
+    build_scene(log, frames, frozenset({3}), {"cars": CARS}, None, 0)
+    assert len(asked) == 1
 
 
 def test_two_nodes_that_claim_one_track_are_an_error():

@@ -3,7 +3,7 @@ from dataclasses import replace
 import torch
 
 from sparsestreet.geometry.cameras import project
-from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.points import Points, thinned
 from sparsestreet.scene.initialize.sources import FarPoints, NearPoints
 from sparsestreet.scene.initialize.sources.guesses import random_points, seen_points
 from tests.scene.street import frame_at
@@ -57,6 +57,16 @@ def test_samples_are_distinct_points_with_their_colors():
     assert torch.equal(sample.positions / 30, sample.colors)
     assert len(points.sampled(99, torch.Generator())) == 10
     assert len(Points.concatenate([])) == 0
+
+
+def test_one_point_of_each_cube_is_left_whichever_it_is():
+    # Cubes of half a meter: the second and third point share one; -0.1 and 0.1 lie on both sides of a face.
+    positions = torch.tensor([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.4, 0.49, 0.2], [0.1, 0.5, 0.0]])
+    kept = [thinned(positions, 0.5, torch.Generator().manual_seed(seed)).tolist() for seed in range(20)]
+    assert {frozenset(rows) for rows in kept} == {frozenset({0, 1, 3}), frozenset({0, 2, 3})}
+    assert all(len(rows) == 3 for rows in kept)
+    assert {rows[0] for rows in kept} == {0, 1, 2, 3}  # in random order
+    assert thinned(torch.zeros(0, 3), 0.5, torch.Generator()).tolist() == []
 
 
 def test_random_points_are_drawn_until_there_are_enough():

@@ -1,3 +1,4 @@
+import logging
 from dataclasses import replace
 
 import pytest
@@ -5,17 +6,21 @@ import torch
 
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
+from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, RigidSettings
+from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Sweep
 from tests.scene.street import (
     CAR_COLOR,
     NUM_FRAMES,
     ROAD_COLOR,
+    SOURCES,
     background_settings,
     rigid_settings,
     street_log,
     training_data,
+    triangulated,
 )
 
 LIDAR_ONLY = background_settings(lidar=10_000)
@@ -79,6 +84,65 @@ def test_the_number_of_points_of_each_kind():
     assert (node.rows.log_scales.exp()[40:, 0] <= 0.02 * from_camera * 1.0001).all()
 
 
+def street_half_covered():
+    """16 of 21 rows are no sky. The lidar covers 8 of them; 33 points, one a column, on three."""
+    log = street_log()
+    depth = torch.zeros_like(log.frames[0].sky, dtype=torch.float32)
+    depth[14:] = 5.0  # and the row above is near
+    frames = tuple(replace(frame, depth=depth) for frame in log.frames)
+    seen = [(point, view, point + 0.5, 8.5) for point in range(33) for view in range(NUM_FRAMES)]
+    across = torch.stack((torch.full((33,), 20.0), torch.linspace(-9, 9, 33), torch.full((33,), 3.0)), 1)
+    points = StreetPoints(triangulated(across.tolist(), seen, pixel_size=0.01), {})
+    return training_data(replace(log, frames=frames), points=points)
+
+
+def started(data, sources=SOURCES, seed: int = 0, **changes) -> Background:
+    settings = background_settings(num_points=160, sources=sources, **changes)
+    return settings.build(data, torch.Generator().manual_seed(seed))
+
+
+def test_each_source_gives_its_share_and_the_log_says_so(caplog):
+    with caplog.at_level(logging.INFO):
+        node = started(street_half_covered())
+    assert len(node.rows) == 160
+    assert (
+        "the lidar covers 50 % of the pixels that are not sky, images 19 % more; "
+        "points from lidar: 80, images: 30, near: 25, far: 25" in caplog.text
+    )
+
+
+def test_a_source_says_how_opaque_and_how_large_its_gaussians_start():
+    opacities = dict(zip(SOURCES, (0.2, 0.3, 0.4, 0.5), strict=True))
+    sources = {name: replace(source, initial_opacity=opacities[name]) for name, source in SOURCES.items()}
+    rows = started(street_half_covered(), sources).rows
+    expected = torch.tensor([0.2] * 80 + [0.3] * 30 + [0.4] * 25 + [0.5] * 25)
+    torch.testing.assert_close(torch.sigmoid(rows.opacity_logits), expected)
+    # The neighbors of points from images are decimeters away; 8 pixels of 1 cm are the limit.
+    torch.testing.assert_close(rows.log_scales[80:110].exp(), torch.full((30, 3), 0.08))
+
+
+def test_a_source_draws_what_it_draws_without_the_others():
+    data = street_half_covered()
+    means = started(data).rows.means
+    without = started(data, {name: source for name, source in SOURCES.items() if name != "images"}).rows.means
+    assert torch.equal(torch.cat((means[:80], means[110:])), without)
+    assert not torch.equal(means[110:135], started(data, seed=1).rows.means[110:135])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"num_points": -1}, "num_points must be >= 0, got -1"),
+        ({"sources": {**SOURCES, "near": None}}, "got near=None: leave one out with ~node.background.sources.near"),
+        ({"sources": {**SOURCES, "near": NearPoints(part=0.7)}}, "add up to 1 at most, got 1.2: lower the part of one"),
+        ({"sources": {"one": LidarPoints(), "two": LidarPoints()}}, "sources one, two may add up to 1 at most, got 2"),
+    ],
+)
+def test_sources_that_cannot_be(changes: dict, said: str):
+    with pytest.raises(ValueError, match=said):
+        background_settings(**changes)
+
+
 def test_the_same_seed_gives_the_same_rows():
     settings = background_settings(lidar=40, near=30, far=20)
     first, second, other = build(settings), build(settings), build(settings, seed=1)
@@ -111,11 +175,22 @@ def test_a_mask_that_is_not_trained_in_this_run_leaves_no_column():
     assert "mask_logits" not in node.rows.columns()
 
 
-def test_a_log_without_lidar_starts_from_random_points():
-    node = build(background_settings(lidar=40, near=10, far=5), log=replace(street_log(), sweeps=()))
-    assert len(node.rows) == 15
+def test_a_log_without_lidar_starts_from_images_and_guesses(caplog):
+    points = triangulated([[20.0, 0.0, 1.0]] * 50, [(point, 0, 16.5, 8.5) for point in range(50)])
+    data = training_data(replace(street_log(), sweeps=()), points=StreetPoints(points, {}))
+    with caplog.at_level(logging.INFO):
+        node = started(data)
+    # 9 of the 16 x 33 pixels of one of five views are near a point: 0.5 of 160 points, the rest is guessed.
+    assert "points from lidar: 0, images: 1, near: 80, far: 80" in caplog.text
+    assert len(node.rows) == 161
+
+
+def test_a_log_of_pictures_alone_starts_from_guesses():
+    assert len(started(training_data(replace(street_log(), sweeps=()))).rows) == 160
 
 
 def test_nothing_to_start_from_is_an_error():
     with pytest.raises(ValueError, match="background of 'hand-made' has nothing to start from"):
         build(LIDAR_ONLY, held_out=frozenset(range(NUM_FRAMES)))
+    with pytest.raises(ValueError, match="num_points=0 came from its sources, which are none; raise num_points"):
+        build(background_settings())

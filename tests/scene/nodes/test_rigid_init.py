@@ -4,6 +4,7 @@ import torch
 
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.nodes import Rigid, RigidSettings
+from sparsestreet.triangulation import StreetPoints
 from tests.scene.street import (
     CAR_COLOR,
     NUM_FRAMES,
@@ -13,6 +14,7 @@ from tests.scene.street import (
     street_log,
     track,
     training_data,
+    triangulated,
 )
 
 CARS = rigid_settings(box_points=50)
@@ -69,6 +71,19 @@ def test_an_instance_that_lidar_never_hit_is_a_gray_box():
     node = build(CARS, log=replace(street_log(), sweeps=()))
     assert instance_counts(node) == [50]
     assert (node.rows.sh_dc.abs() < 1e-6).all()
+
+
+def test_points_from_images_in_the_box_join_those_of_the_lidar():
+    """In the box's frame, in their color; an instance without any lidar starts from them, and is filled up."""
+    inside = [[1.0, 0.5, 0.25], [-1.0, -0.5, 0.0]]
+    points = StreetPoints(triangulated([]), {"driving": triangulated(inside, color=(0.2, 0.4, 0.6))})
+    for log, total in ((street_log(), 60 * NUM_FRAMES + 2), (replace(street_log(), sweeps=()), 50)):
+        node = CARS.build(training_data(log, movers=CARS, points=points), torch.Generator().manual_seed(0))
+        assert instance_counts(node) == [total]
+        assert node.rows.means[:2].tolist() == inside
+        colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
+        torch.testing.assert_close(colors[:2], torch.tensor([[0.2, 0.4, 0.6]] * 2))
+    torch.testing.assert_close(colors, torch.tensor([0.2, 0.4, 0.6]).expand(50, 3))  # the box too
 
 
 def test_scales_are_those_of_each_instance_alone():

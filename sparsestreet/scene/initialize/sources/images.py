@@ -1,7 +1,7 @@
 """Points triangulated from the training images."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Int
@@ -12,9 +12,6 @@ from sparsestreet.scene.initialize.points import Points, thinned
 from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
 
-Order = Literal["beyond_first", "beyond_only", "random"]
-
-
 @dataclass(frozen=True, kw_only=True)
 class ImagePoints(PointSource):
     """Points of what stands still.
@@ -22,7 +19,7 @@ class ImagePoints(PointSource):
     Raises ValueError for settings that cannot be.
     """
 
-    order: Order = "beyond_first"
+    order: Literal["beyond_first", "beyond_only", "random"] = "beyond_first"
     """Which points are taken: those beyond the lidar before the others, those alone, or any."""
     voxel: float | None = None
     """Meters: of the points in a cube of this side one is taken; None: all."""
@@ -32,8 +29,6 @@ class ImagePoints(PointSource):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.order not in get_args(Order):
-            raise ValueError(f"order must be one of {', '.join(get_args(Order))}, got {self.order!r}")
         check_positive(voxel=self.voxel, smallest_pixels=self.smallest_pixels)
         if self.largest_pixels < self.smallest_pixels:
             raise ValueError(

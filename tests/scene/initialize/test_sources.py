@@ -1,0 +1,139 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
+from tests.scene.street import frame_at, street_log, training_data, triangulated
+
+
+def drawn(source: PointSource, count: int, data: TrainingData, seed: int = 0) -> Seeds:
+    return source.draw(count, data, torch.Generator().manual_seed(seed))
+
+
+def data_with(points: TriangulatedPoints) -> TrainingData:
+    return training_data(points=StreetPoints(points, {}))
+
+
+def ten_points() -> TriangulatedPoints:
+    """At x = 0 .. 9; the odd ones are seen in the sky, where the lidar has nothing, the even ones on the road."""
+    at_row = [3.5 if point % 2 else 18.5 for point in range(10)]
+    return triangulated([[float(x), 0.0, 0.0] for x in range(10)], [(x, 0, 16.5, at_row[x]) for x in range(10)])
+
+
+def data_with_lidar() -> TrainingData:
+    """``ten_points``, and returns in the lower half of every image."""
+    depth = torch.zeros_like(frame_at(0).sky, dtype=torch.float32)
+    depth[11:] = 5.0
+    log = street_log()
+    log = replace(log, frames=tuple(replace(frame, depth=depth) for frame in log.frames))
+    return training_data(log, points=StreetPoints(ten_points(), {}))
+
+
+def test_shares_are_those_of_the_pixels():
+    seen = Coverage(lidar=0.5, images=0.3)
+    sources = [LidarPoints(), ImagePoints(), NearPoints(part=0.25), FarPoints(part=0.75)]
+    assert [source.share(seen) for source in sources] == pytest.approx([0.5, 0.3, 0.05, 0.15])
+
+
+def test_points_beyond_the_lidar_come_first_alone_or_in_their_turn():
+    data = data_with_lidar()
+
+    def taken(order: str, count: int) -> list[int]:
+        return drawn(ImagePoints(order=order), count, data).points.positions[:, 0].int().tolist()
+
+    odd = {1, 3, 5, 7, 9}
+    first = taken("beyond_first", 8)
+    assert set(first[:5]) == odd
+    assert len(set(first)) == 8
+    assert set(taken("beyond_first", 3)) < odd
+    assert set(taken("beyond_only", 8)) == odd
+    everything = taken("random", 10)
+    assert sorted(everything) == list(range(10))
+    assert set(everything[:5]) != odd
+
+
+def test_which_points_are_taken_is_chance():
+    data = data_with_lidar()
+    choices = {tuple(drawn(ImagePoints(), 3, data, seed).points.positions[:, 0].tolist()) for seed in range(8)}
+    assert len(choices) > 1
+
+
+def test_points_from_images_bring_limits_by_the_size_of_a_pixel():
+    points = triangulated([[1.0, 2.0, 3.0]] * 4, color=(0.1, 0.2, 0.3), pixel_size=0.02)
+    seeds = drawn(ImagePoints(smallest_pixels=2.0, largest_pixels=5.0, initial_opacity=0.7), 9, data_with(points))
+    assert len(seeds) == 4
+    assert seeds.smallest.tolist() == pytest.approx([0.04] * 4)
+    assert seeds.largest.tolist() == pytest.approx([0.1] * 4)
+    assert seeds.opacities.tolist() == pytest.approx([0.7] * 4)
+    torch.testing.assert_close(seeds.points.colors, torch.tensor([[0.1, 0.2, 0.3]] * 4))
+
+
+def test_a_run_without_points_from_images_gives_none():
+    assert len(drawn(ImagePoints(), 9, training_data())) == 0
+    assert len(drawn(ImagePoints(), 9, data_with(triangulated([])))) == 0
+
+
+@pytest.mark.parametrize("order", ["beyond_first", "random"])
+def test_of_the_points_in_a_cube_one_is_taken(order: str):
+    points = triangulated([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.7, 0.1, 0.1]])
+    for voxel, count in ((None, 3), (0.5, 2), (1.0, 1)):
+        assert len(drawn(ImagePoints(order=order, voxel=voxel), 9, data_with(points))) == count
+    # Returns lie on 25 m x 8 m of flat road and in a car: cubes of 1 km hold one of each side of x, y and z = 0.
+    returns = len(drawn(LidarPoints(), 10_000, training_data()))
+    assert 1 <= len(drawn(LidarPoints(voxel=1000.0), 10_000, training_data())) <= 8 < returns
+
+
+def test_returns_have_no_limits_but_the_smallest_scale():
+    seeds = drawn(LidarPoints(initial_opacity=0.2), 30, training_data())
+    assert len(seeds) == 30
+    assert seeds.smallest.tolist() == pytest.approx([1e-3] * 30)
+    assert set(seeds.largest.tolist()) == {math.inf}
+    assert seeds.opacities.tolist() == pytest.approx([0.2] * 30)
+
+
+@pytest.mark.parametrize("kind", [NearPoints, FarPoints])
+def test_guesses_are_limited_by_the_distance_from_the_nearest_camera(kind: type):
+    data = training_data()
+    seeds = drawn(kind(part=1.0, largest_scale=0.1, initial_opacity=0.05), 30, data)
+    cameras = torch.stack([view.camera.position for view in data.views])
+    distance = (seeds.points.positions[:, None] - cameras).norm(dim=2).min(1).values
+    torch.testing.assert_close(seeds.largest, 0.1 * distance)
+    assert seeds.opacities.tolist() == pytest.approx([0.05] * 30)
+
+
+def test_seeds_of_several_sources_follow_each_other():
+    one = Seeds(Points(torch.ones(2, 3), torch.zeros(2, 3)), torch.ones(2), 2 * torch.ones(2), 0.3 * torch.ones(2))
+    two = Seeds(Points(torch.zeros(1, 3), torch.ones(1, 3)), torch.zeros(1), torch.ones(1), 0.4 * torch.ones(1))
+    both = Seeds.concatenate([one, two])
+    assert both.points.positions[:, 0].tolist() == [1, 1, 0]
+    assert both.points.colors[:, 0].tolist() == [0, 0, 1]
+    assert (both.smallest.tolist(), both.largest.tolist()) == ([1, 1, 0], [2, 2, 1])
+    assert both.opacities.tolist() == pytest.approx([0.3, 0.3, 0.4])
+    assert len(both) == 3
+    assert len(Seeds.concatenate([])) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: LidarPoints(initial_opacity=0.0), "initial_opacity must lie between 0 and 1, got 0.0"),
+        (lambda: ImagePoints(initial_opacity=1.0), "initial_opacity must lie between 0 and 1, got 1.0"),
+        (lambda: LidarPoints(voxel=0.0), "voxel must be larger than 0, got 0.0"),
+        (lambda: LidarPoints(box_enlargement=-1.0), "box_enlargement must be larger than 0, got -1.0"),
+        (lambda: ImagePoints(voxel=-0.5), "voxel must be larger than 0, got -0.5"),
+        (lambda: ImagePoints(smallest_pixels=0.0), "smallest_pixels must be larger than 0, got 0.0"),
+        (lambda: ImagePoints(smallest_pixels=9.0), "largest_pixels must be at least smallest_pixels, got 8.0 and 9.0"),
+        (lambda: NearPoints(part=-0.1), r"part must lie in \[0, 1\], got -0.1"),
+        (lambda: FarPoints(part=1.1), r"part must lie in \[0, 1\], got 1.1"),
+        (lambda: FarPoints(part=0.5, largest_scale=0.0), "largest_scale must be larger than 0, got 0.0"),
+    ],
+)
+def test_settings_that_cannot_be(make, said: str):
+    with pytest.raises(ValueError, match=said):
+        make()
