@@ -12,6 +12,7 @@ from sparsestreet.scene.initialize.points import Points, thinned
 from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
 
+
 @dataclass(frozen=True, kw_only=True)
 class ImagePoints(PointSource):
     """Points of what stands still.
