@@ -25,12 +25,10 @@ VERSION = 1
 _COLUMNS = ("positions", "colors", "pixel_sizes", "observed", "views", "pixels")
 
 
-def cached_street_points(
-    frames: Frames, moving: Sequence[Track], settings: ImagePointSettings
-) -> StreetPoints:
+def cached_street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
     """``street_points``, read from the cache where the same images, poses, boxes and settings made them before.
 
-    Raises OSError where the cache cannot be written.
+    Raises OSError where the cache cannot be written, before any work.
     """
     if settings.cache is None:
         return street_points(frames, moving, settings)
@@ -38,8 +36,8 @@ def cached_street_points(
     if path.is_file():
         log.info("points from images: taken from %s", path)
         return _read(path)
-    points = street_points(frames, moving, settings)
     with whole_file(path) as unfinished:
+        points = street_points(frames, moving, settings)
         _write(unfinished, points)
     return points
 
@@ -50,8 +48,8 @@ def _key(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) 
         said.pop(name)
     digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
     for frame in frames:
-        digest.update(f"{frame.frame_index} {frame.camera_index}".encode())
         camera = frame.camera
+        digest.update(f"{frame.frame_index} {frame.camera_index} {camera.width} {camera.height}".encode())
         for tensor in (camera.camera_from_world, camera.intrinsics, camera.distortion, frame.image, frame.sky):
             digest.update(b"-" if tensor is None else tensor.numpy().tobytes())
     for track in moving:

@@ -11,8 +11,8 @@ SAME_PLACE = 3.0
 NEAREST = 0.5
 """Meters; the least depth of a point in either camera."""
 
-ROWS_AT_ONCE = 2048
-"""Features of the first image compared at a time, so that the table of all pairs need not fit into memory."""
+ROWS_AT_ONCE = 256
+"""Features of the first image compared at a time: a table with all of the second then fits into the cache."""
 
 
 def guided_matches(
@@ -32,7 +32,7 @@ def guided_matches(
         first_rays, second_rays: their normalized image points x/z, y/z.
         second_from_first: relative pose of the cameras, meters.
         tolerance: largest distance from the epipolar line in the second image, in normalized units.
-        ratio: a match is taken if its distance is below this share of that of the next like one elsewhere (Lowe's test).
+        ratio: of a match's distance to that of the next like one elsewhere on the line, at most (Lowe's test).
     """
     rows, columns = _on_epipolar_lines(first_rays, second_rays, second_from_first, tolerance)
     in_front = _in_front(first_rays[rows], second_rays[columns], second_from_first)
@@ -93,9 +93,7 @@ def _distances(first: Float32[np.ndarray, "k 128"], second: Float32[np.ndarray, 
     return np.sqrt(np.maximum(2 - 2 * np.einsum("kd,kd->k", first, second), 0))
 
 
-def _least(
-    values: Float32[np.ndarray, " k"], groups: Int[np.ndarray, " k"], count: int
-) -> Float32[np.ndarray, " n"]:
+def _least(values: Float32[np.ndarray, " k"], groups: Int[np.ndarray, " k"], count: int) -> Float32[np.ndarray, " n"]:
     """The least value of each group; infinity where there is none."""
     least = np.full(count, np.inf, np.float32)
     np.minimum.at(least, groups, values)

@@ -3,9 +3,10 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int
 
-from sparsestreet.types import View
+from sparsestreet.triangulation.matches import NEAREST
+from sparsestreet.types import Camera, View
 
 SAME_CAMERA = (0.6, 2.0)
 """Meters: each image is compared with the next of its camera at least so far away: near ones look alike, far ones give
@@ -27,50 +28,55 @@ LEAST_OVERLAP = 0.1
 """Share of the probes that the other image must see."""
 
 
-def image_pairs(
-    views: Sequence[View], cameras_from_frame: Float64[np.ndarray, "v 4 4"]
-) -> list[tuple[int, int]]:
-    """Pairs (first, second) of views to compare, each once.
+def image_pairs(views: Sequence[View], cameras_from_frame: Float64[np.ndarray, "v 4 4"]) -> list[tuple[int, int]]:
+    """Pairs (first, second) of views to compare, each once; the second is of the same instant or of a later one.
 
-    ``cameras_from_frame`` are the poses in the frame that stands still: the world, or the box of a moving object.
+    Args:
+        views: in the order of their instants.
+        cameras_from_frame: poses in the frame that stands still: the world, or the box of a moving object. Meters.
     """
     rotation, translation = cameras_from_frame[:, :3, :3], cameras_from_frame[:, :3, 3]
     centers = -np.einsum("vji,vj->vi", rotation, translation)
+    instants = np.array([view.frame_index for view in views], np.int64)
+    cameras = np.array([view.camera_index for view in views], np.int64)
     found: dict[tuple[int, int], None] = {}
     for first, view in enumerate(views):
         away = np.linalg.norm(centers - centers[first], axis=1)
-        for second in _partners(first, view, views, away):
-            if away[second] >= LEAST_BASELINE and _overlap(view, views[second], cameras_from_frame[[first, second]]):
-                found[first, second] = None
+        probes = (_probes(view.camera) - translation[first]) @ rotation[first]
+        for second in _partners(first, instants, cameras, away):
+            # Two cameras of one instant would choose each other: their matches must not count twice.
+            if away[second] >= LEAST_BASELINE and (second, first) not in found:
+                seen = in_image(views[second].camera, cameras_from_frame[second], probes)
+                if seen.mean() >= LEAST_OVERLAP:
+                    found[first, second] = None
     return list(found)
 
 
+def in_image(
+    camera: Camera, camera_from_frame: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Which points lie in the image of a camera at some pose, lens distortion aside."""
+    local = points @ camera_from_frame[:3, :3].T + camera_from_frame[:3, 3]
+    ahead = local[:, 2] > NEAREST
+    x, y, _ = (local @ camera.intrinsics.double().numpy().T).T / np.where(ahead, local[:, 2], 1)
+    return ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
 def _partners(
-    first: int, view: View, views: Sequence[View], away: Float64[np.ndarray, " v"]
+    first: int, instants: Int[np.ndarray, " v"], cameras: Int[np.ndarray, " v"], away: Float64[np.ndarray, " v"]
 ) -> Iterator[int]:
-    """For each camera, the first view from ``view`` on that is as far away as each of the distances wants."""
-    for camera in sorted({other.camera_index for other in views}):
-        same = camera == view.camera_index
-        later = [
-            index
-            for index, other in enumerate(views)
-            if other.camera_index == camera and other.frame_index >= view.frame_index and index != first
-        ]
-        for distance in SAME_CAMERA if same else OTHER_CAMERA:
-            yield from [index for index in later if away[index] >= distance][:1]
+    """For each camera, the first view from ``first`` on that is as far away as each of the distances wants."""
+    later = instants >= instants[first]
+    later[first] = False
+    for camera in np.unique(cameras):
+        for distance in SAME_CAMERA if camera == cameras[first] else OTHER_CAMERA:
+            yield from np.flatnonzero(later & (cameras == camera) & (away >= distance))[:1].tolist()
 
 
-def _overlap(first: View, second: View, cameras_from_frame: Float64[np.ndarray, "2 4 4"]) -> bool:
-    """Whether the second view sees enough of what may lie ahead of the first."""
-    camera, other = first.camera, second.camera
+def _probes(camera: Camera) -> Float64[np.ndarray, "p 3"]:
+    """Points of the camera's frame that may lie on surfaces, meters."""
     columns, rows = (np.arange(count) + 0.5 for count in PROBE_GRID)
     at = np.stack(np.meshgrid(columns / PROBE_GRID[0] * camera.width, rows / PROBE_GRID[1] * camera.height), -1)
     pixels = np.concatenate((at.reshape(-1, 2), np.ones((at.size // 2, 1))), 1)
     rays = pixels @ np.linalg.inv(camera.intrinsics.double().numpy()).T
-    probes = np.concatenate([depth * rays for depth in PROBE_DEPTHS])
-    second_from_first = cameras_from_frame[1] @ np.linalg.inv(cameras_from_frame[0])
-    seen = (probes @ second_from_first[:3, :3].T + second_from_first[:3, 3]) @ other.intrinsics.double().numpy().T
-    ahead = seen[:, 2] > 0
-    x, y = (seen[:, :2] / np.where(ahead, seen[:, 2], 1)[:, None]).T
-    inside = ahead & (x >= 0) & (x < other.width) & (y >= 0) & (y < other.height)
-    return bool(inside.mean() >= LEAST_OVERLAP)
+    return np.concatenate([depth * rays for depth in PROBE_DEPTHS])

@@ -1,15 +1,15 @@
 """From views with known poses to points: every feature gathers its matches, and the rays of all of them must meet."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int
+from jaxtyping import Bool, Float32, Float64, Int
 
 from sparsestreet.triangulation.features import Features
 from sparsestreet.triangulation.matches import NEAREST, guided_matches
-from sparsestreet.triangulation.pairs import image_pairs
+from sparsestreet.triangulation.pairs import image_pairs, in_image
 from sparsestreet.triangulation.rays import Observations, meet, relative_depth_error, reprojection_errors, summed
 from sparsestreet.triangulation.settings import ImagePointSettings
 from sparsestreet.types import View
@@ -38,6 +38,9 @@ class Sighting:
     def focal(self) -> float:
         """Pixels per unit of normalized image points."""
         return float(self.view.camera.intrinsics[0, 0])
+
+    def where(self, mask: Bool[np.ndarray, " n"]) -> "Sighting":
+        return replace(self, features=self.features.where(mask), rays=self.rays[mask], colors=self.colors[mask])
 
 
 @dataclass(frozen=True)
@@ -76,21 +79,19 @@ def triangulate(
     matches = _all_matches(sightings, pairs, np.cumsum(counts) - counts, settings, progress)
     centers, features, points = _stars(matches, len(view_of), settings.min_views)
     observations = _observations(sightings, view_of, features, points)
-    agreed = _agreed(observations, len(centers), settings.max_error)
+    agreed, positions = _agreed(observations, len(centers), settings)
     features, observations = features[agreed], observations.where(agreed)
-    positions = meet(observations, len(centers))
     seen = np.bincount(observations.point, minlength=len(centers))
     with_center = np.zeros(len(centers), bool)
     with_center[observations.point[features == centers[observations.point]]] = True
-    good = with_center & (seen >= settings.min_views)
-    good &= relative_depth_error(observations, positions, FEATURE_NOISE) < settings.max_depth_error
+    good = with_center & (relative_depth_error(observations, positions, FEATURE_NOISE) < settings.max_depth_error)
     good &= seen - 1 >= settings.min_support * _lookers(positions, view_of[centers], pairs, sightings)
     good &= ~_twins(centers, features, observations.point, seen, good)
     return _gathered(sightings, view_of, features, observations, positions, good)
 
 
 def _poses(sightings: Sequence[Sighting]) -> Float64[np.ndarray, "v 4 4"]:
-    return np.stack([sighting.camera_from_frame for sighting in sightings]) if sightings else np.zeros((0, 4, 4))
+    return np.array([sighting.camera_from_frame for sighting in sightings]).reshape(-1, 4, 4)
 
 
 def _all_matches(
@@ -132,8 +133,7 @@ def _stars(
     Nothing is joined over more than one match: one wrong link would tie two points together.
     """
     both = np.concatenate((matches, matches[:, ::-1]))
-    degree = np.bincount(both[:, 0], minlength=count)
-    centers = np.flatnonzero(degree >= max(min_views - 1, 1))
+    centers = np.flatnonzero(np.bincount(both[:, 0], minlength=count) >= min_views - 1)
     number = np.full(count, -1)
     number[centers] = np.arange(len(centers))
     both = both[number[both[:, 0]] >= 0]
@@ -153,28 +153,37 @@ def _observations(
     return Observations(points, _poses(sightings)[views], rays[features], focal[views])
 
 
-def _agreed(observations: Observations, count: int, max_error: float) -> np.ndarray:
-    """Which observations are left when each point has dropped its worst one again and again while one is too far off.
+def _agreed(
+    observations: Observations, count: int, settings: ImagePointSettings
+) -> tuple[Bool[np.ndarray, " o"], Float64[np.ndarray, "s 3"]]:
+    """(observations that are left, positions) when each point drops its worst one again and again while one is too far
+    off.
 
-    Points that still have one after all rounds keep nothing.
+    Points that still have one after all rounds, or too few views, keep nothing.
     """
-    left = np.ones(len(observations), bool)
-    for last in [False] * ROUNDS + [True]:
-        now = observations.where(left)
-        error, depth = reprojection_errors(now, meet(now, count))
+    left, positions = np.zeros(len(observations), bool), np.zeros((count, 3))
+    open_rows = np.arange(len(observations))
+    for _ in range(ROUNDS + 1):
+        points, number = np.unique(observations.point[open_rows], return_inverse=True)
+        now = replace(observations.where(open_rows), point=number)
+        met = meet(now, len(points))
+        error, depth = reprojection_errors(now, met)
         error = np.where(depth > NEAREST, error, np.inf)
-        worst = np.zeros(count)
-        np.maximum.at(worst, now.point, error)
-        off = worst[now.point] > max_error
-        drop = off if last else off & (error == worst[now.point])
-        left[np.flatnonzero(left)[drop]] = False
-    return left
+        worst = np.zeros(len(points))
+        np.maximum.at(worst, number, error)
+        settled = worst <= settings.max_error
+        positions[points[settled]] = met[settled]
+        left[open_rows[settled[number]]] = True
+        better = ~settled[number] & (error < worst[number])
+        enough = np.bincount(number[better], minlength=len(points)) >= settings.min_views
+        open_rows = open_rows[better & enough[number]]
+    return left, positions
 
 
 def _lookers(
     positions: Float64[np.ndarray, "s 3"],
     center_views: Int[np.ndarray, " s"],
-    pairs: Iterable[tuple[int, int]],
+    pairs: Sequence[tuple[int, int]],
     sightings: Sequence[Sighting],
 ) -> Int[np.ndarray, " s"]:
     """For each point, in how many of the views that its center was compared with it lies inside the image."""
@@ -182,12 +191,8 @@ def _lookers(
     by_view = [np.flatnonzero(center_views == view) for view in range(len(sightings))]
     for first, second in pairs:
         for own, other in ((first, second), (second, first)):
-            camera, pose = sightings[other].view.camera, sightings[other].camera_from_frame
-            local = positions[by_view[own]] @ pose[:3, :3].T + pose[:3, 3]
-            ahead = local[:, 2] > NEAREST
-            pixels = local @ camera.intrinsics.double().numpy().T
-            x, y = (pixels[:, :2] / np.where(ahead, local[:, 2], 1)[:, None]).T
-            count[by_view[own]] += ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+            view, pose = sightings[other].view, sightings[other].camera_from_frame
+            count[by_view[own]] += in_image(view.camera, pose, positions[by_view[own]])
     return count
 
 
@@ -196,8 +201,8 @@ def _twins(
     features: Int[np.ndarray, " o"],
     points: Int[np.ndarray, " o"],
     seen: Int[np.ndarray, " s"],
-    good: np.ndarray,
-) -> np.ndarray:
+    good: Bool[np.ndarray, " s"],
+) -> Bool[np.ndarray, " s"]:
     """Points whose center belongs to a good point of more views (or as many, and an earlier one) as well."""
     rank = np.empty(len(centers), np.int64)
     rank[np.lexsort((np.arange(len(centers)), -np.where(good, seen, 0)))] = np.arange(len(centers))
@@ -213,7 +218,7 @@ def _gathered(
     features: Int[np.ndarray, " o"],
     observations: Observations,
     positions: Float64[np.ndarray, "s 3"],
-    good: np.ndarray,
+    good: Bool[np.ndarray, " s"],
 ) -> TriangulatedPoints:
     number = np.cumsum(good) - 1
     kept = good[observations.point]

@@ -25,8 +25,9 @@ class Observations:
     def __len__(self) -> int:
         return len(self.rays)
 
-    def where(self, mask: Bool[np.ndarray, " o"]) -> "Observations":
-        return Observations(self.point[mask], self.camera_from_frame[mask], self.rays[mask], self.focal[mask])
+    def where(self, rows: Bool[np.ndarray, " o"] | Int[np.ndarray, " k"]) -> "Observations":
+        """Those of a mask, or of some row numbers."""
+        return Observations(self.point[rows], self.camera_from_frame[rows], self.rays[rows], self.focal[rows])
 
     def directions(self) -> tuple[Float64[np.ndarray, "o 3"], Float64[np.ndarray, "o 3"]]:
         """Camera centers and unit rays in the points' frame."""
@@ -38,7 +39,7 @@ class Observations:
 
 
 def meet(observations: Observations, count: int) -> Float64[np.ndarray, "n 3"]:
-    """The point of least squared reprojection error of each point; NaN of points without observation."""
+    """The position of least squared reprojection error of each point; the origin for one without observation."""
     positions = _nearest_to_rays(observations, count)
     for _ in range(GAUSS_NEWTON_STEPS):
         residual, jacobian, _ = _reprojection(observations, positions)
@@ -67,14 +68,11 @@ def relative_depth_error(
     count = len(positions)
     _, jacobian, _ = _reprojection(observations, positions)
     normal = summed(np.einsum("oki,okj->oij", jacobian, jacobian), observations.point, count)
-    finite = np.isfinite(normal).all((1, 2))
-    weakest = np.zeros(count)
-    weakest[finite] = np.linalg.eigvalsh(normal[finite])[:, 0]
+    weakest = np.linalg.eigvalsh(normal)[:, 0]
     centers, _ = observations.directions()
     distance = np.full(count, np.inf)
     np.minimum.at(distance, observations.point, np.linalg.norm(positions[observations.point] - centers, axis=1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(weakest > 0, noise / np.sqrt(np.maximum(weakest, 1e-300)) / distance, np.inf)
+    return np.where(weakest > 0, noise / np.sqrt(np.maximum(weakest, 1e-300)) / distance, np.inf)
 
 
 def _nearest_to_rays(observations: Observations, count: int) -> Float64[np.ndarray, "n 3"]:
@@ -101,8 +99,8 @@ def _reprojection(
 
 
 def summed(
-    values: Shaped[np.ndarray, "o *s"], point: Int[np.ndarray, " o"], count: int
-) -> Shaped[np.ndarray, "n *s"]:
+    values: Shaped[np.ndarray, " o *s"], point: Int[np.ndarray, " o"], count: int
+) -> Float64[np.ndarray, " n *s"]:
     """The sum over the observations of each point."""
     sums = np.zeros((count, *values.shape[1:]))
     for place in np.ndindex(*values.shape[1:]):

@@ -28,5 +28,8 @@ class ImagePointSettings:
     """Folder in which points are kept; None: they are made anew by every run."""
 
     def __post_init__(self) -> None:
+        for name in ("features", "threads"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"points from images need {name} of at least 1, got {getattr(self, name)}")
         if self.min_views < 2:
             raise ValueError(f"a point must be seen in at least 2 views to be triangulated, got {self.min_views}")

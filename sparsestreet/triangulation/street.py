@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from sparsestreet.geometry.distortion import undistort
 from sparsestreet.triangulation.features import Features, find_features
 from sparsestreet.triangulation.points import Sighting, TriangulatedPoints, triangulate
 from sparsestreet.triangulation.settings import ImagePointSettings
-from sparsestreet.types import Camera, Frame, Track
+from sparsestreet.types import Camera, Frame, Track, View
 
 log = logging.getLogger(__name__)
 
@@ -50,11 +51,13 @@ def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointS
             if moved is not None:
                 through = _through_box(moved, track)
                 still[place] &= ~through
-                own[place] = _where(moved, through)
+                own[place] = moved.where(through)
         in_boxes[track.name] = _inside(triangulate(list(own.values()), settings), list(own), track)
-    static = [_where(sighting, mask) for sighting, mask in zip(sightings, still, strict=True)]
+    static = [sighting.where(mask) for sighting, mask in zip(sightings, still, strict=True)]
     points = StreetPoints(triangulate(static, settings, _report), in_boxes)
-    log.info("points from %d images: %d that stand still, %d in boxes", len(frames), len(points.static), _total(in_boxes))
+    log.info(
+        "points from %d images: %d that stand still, %d in boxes", len(frames), len(points.static), _total(in_boxes)
+    )
     return points
 
 
@@ -70,18 +73,25 @@ def _total(parts: Mapping[str, TriangulatedPoints]) -> int:
 
 def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
     """In the order of the frames; OpenCV lets go of the interpreter, so threads find features beside each other."""
+    reading = Lock()  # what a log remembers of its frames is not made for threads
+
+    def sighting(index: int) -> Sighting:
+        with reading:
+            frame = frames[index]
+        return _sighting(frames.views[index], frame, settings.features)
+
     with ThreadPoolExecutor(settings.threads) as executor:
-        return list(executor.map(lambda index: _sighting(frames[index], settings.features), range(len(frames))))
+        return list(executor.map(sighting, range(len(frames))))
 
 
-def _sighting(frame: Frame, limit: int) -> Sighting:
-    """The features of a frame that are not in the sky."""
+def _sighting(view: View, frame: Frame, limit: int) -> Sighting:
+    """The features of a frame that are not in the sky; its pixels are not kept."""
     image = frame.image.numpy()
     features = find_features(image, limit)
     if frame.sky is not None:
         features = features.where(~frame.sky.numpy()[_pixel(features, frame.camera)])
     return Sighting(
-        frame,
+        view,
         frame.camera.camera_from_world.double().numpy(),
         features,
         _rays(features.pixels, frame.camera),
@@ -102,15 +112,6 @@ def _rays(pixels: Float64[np.ndarray, "n 2"], camera: Camera) -> Float64[np.ndar
     if camera.distortion is None:
         return imaged
     return undistort(torch.from_numpy(imaged), camera.distortion.double()).numpy()
-
-
-def _where(sighting: Sighting, mask: Bool[np.ndarray, " n"]) -> Sighting:
-    return replace(
-        sighting,
-        features=sighting.features.where(mask),
-        rays=sighting.rays[mask],
-        colors=sighting.colors[mask],
-    )
 
 
 def _from_box(sighting: Sighting, track: Track) -> Sighting | None:
