@@ -67,7 +67,6 @@ def _partners(
 ) -> Iterator[int]:
     """For each camera, the first view from ``first`` on that is as far away as each of the distances wants."""
     later = instants >= instants[first]
-    later[first] = False
     for camera in np.unique(cameras):
         for distance in SAME_CAMERA if camera == cameras[first] else OTHER_CAMERA:
             yield from np.flatnonzero(later & (cameras == camera) & (away >= distance))[:1].tolist()

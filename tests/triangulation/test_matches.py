@@ -78,14 +78,16 @@ def test_both_must_like_each_other_best():
     assert _match(two, one) == [[0, 0]]
 
 
-def test_rays_that_meet_behind_a_camera_are_no_match():
-    """Parallax to the wrong side: the rays part ahead of the cameras."""
+def test_rays_that_part_ahead_of_the_cameras_are_no_match():
     assert _match(LOOKED_FOR, _one(((230.0, 100.0), 0.0))) == []
-    behind_second = pose(z=20.0)
-    where = imaged(np.array([[1.0, 0.3, 10.0]]), FIRST)[1]
-    seen_back = imaged(np.array([[1.0, 0.3, 10.0]]), behind_second)[1]
+
+
+@pytest.mark.parametrize("poses", [(FIRST, pose(z=20.0)), (pose(z=20.0), FIRST)], ids=["second", "first"])
+def test_rays_that_meet_behind_one_camera_are_no_match(poses):
+    """10 m ahead of one camera, and 10 m behind the other."""
+    first, second = (imaged(np.array([[1.0, 0.3, 10.0]]), at)[1] for at in poses)
     described = np.eye(1, 128, dtype=np.float32)
-    assert _match(_features(where, described), _features(seen_back, described), (FIRST, behind_second)) == []
+    assert _match(_features(first, described), _features(second, described), poses) == []
 
 
 @pytest.mark.parametrize(("one", "two"), [(0, 5), (5, 0), (0, 0)])

@@ -80,16 +80,26 @@ def test_a_row_of_equal_windows_gives_no_wrong_point():
     _which(triangulate(_sightings(windows, described, rail(0.8 * np.arange(5))), SETTINGS), windows)
 
 
-def test_a_view_that_disagrees_is_dropped_and_the_point_kept():
-    """Its features are 8 pixels along their lines: view 3, compared with 0, 2, 4 and 6, goes on without 4."""
+def _with_one_wrong(shown, wrong):
+    """(points of a rail of 7 views of which some show them, the world's points); one has its features 8 pixels off."""
     points, described, poses = _world(views=7)
-    sightings = _sightings(points, described, poses)
-    sightings[4] = sight(points, described, poses[4], 4, shift=8.0)
-    found = triangulate(sightings, SETTINGS)
-    assert 4 not in found.views
+    views = [np.full(len(points), view in shown) for view in range(7)]
+    sightings = _sightings(points, described, poses, views)
+    sightings[wrong] = sight(points, described, poses[wrong], wrong, shift=8.0)
     everywhere = np.flatnonzero(np.all([imaged(points, at)[2] for at in poses], 0))
     assert len(everywhere) > 10
+    return triangulate(sightings, replace(SETTINGS, min_support=0.0)), points, everywhere
+
+
+def test_a_view_that_disagrees_is_dropped_and_the_point_kept():
+    """View 3 was compared with 0, 2, 4 and 6, none of which were compared with each other; it goes on without 4."""
+    found, points, everywhere = _with_one_wrong(shown=(0, 2, 3, 4, 6), wrong=4)
+    assert 4 not in found.views
     assert set(everywhere) <= set(_which(found, points).tolist())
+
+
+def test_a_point_that_has_too_few_views_left_is_none():
+    assert len(_with_one_wrong(shown=(0, 1, 3), wrong=1)[0]) == 0
 
 
 def test_a_point_that_most_of_the_compared_views_do_not_show_is_none():
