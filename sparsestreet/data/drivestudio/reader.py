@@ -23,7 +23,7 @@ _ABSENT = {
     "sky": "no sky masks: nothing but the images tells sky from scene, and there is no sky term in the loss",
     "human": "no human masks: there are no metrics of human pixels",
     "vehicle": "no vehicle masks: there are no metrics of vehicle pixels",
-    "lidar": "no lidar: Gaussians start from random points, and there is no depth term in the loss",
+    "lidar": "no lidar: Gaussians start from points in images and random ones, and there is no depth term in the loss",
     "boxes": "no boxes: nothing is modeled as moving, whatever moves becomes part of the background",
 }
 
