@@ -19,7 +19,6 @@ from sparsestreet.bench.timing import (
     Draw,
     Spread,
     TimingBudget,
-    clock_of,
     drop_gradients,
     leaves,
     on_device,
@@ -30,6 +29,7 @@ from sparsestreet.bench.timing import (
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu.library import find_library
 from sparsestreet.ops.splat import splat
+from sparsestreet.phases import clock_of
 from sparsestreet.types import Camera, Gaussians
 
 ROWS = (100_000, 500_000, 1_500_000, 5_000_000)

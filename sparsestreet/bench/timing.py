@@ -11,6 +11,7 @@ from torch import Tensor
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Workspace, idle_workspaces
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
+from sparsestreet.phases import clock_of
 from sparsestreet.types import Camera, Gaussians
 
 GROUPS = ("means", "quaternions", "scales", "opacities", "sh")
@@ -181,31 +182,3 @@ def work_of(
 def last_workspace(dtype: torch.dtype) -> Workspace:
     """That of the C++ rendering whose graph was dropped last."""
     return [workspace for workspace in idle_workspaces() if workspace.key == (dtype, FASTEST_VARIANT)][-1]
-
-
-class WallClock:
-    """Seconds of the host."""
-
-    def mark(self) -> float:
-        return time.perf_counter()
-
-    def seconds(self, start: float, end: float) -> float:
-        return end - start
-
-
-class CudaClock:
-    """Seconds of the device between events of its stream, launch gaps included."""
-
-    def mark(self) -> torch.cuda.Event:
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
-
-    def seconds(self, start: torch.cuda.Event, end: torch.cuda.Event) -> float:
-        end.synchronize()
-        return 1e-3 * start.elapsed_time(end)
-
-
-def clock_of(device: torch.device) -> WallClock | CudaClock:
-    """The clock that sees the work of a device."""
-    return CudaClock() if device.type == "cuda" else WallClock()

@@ -1,8 +1,9 @@
 """Steps of training with two implementations: plain torch for any device, and one fused Triton kernel."""
 
-from torch import Tensor, float32
+from torch import Tensor, float32, float64
 
 from sparsestreet.ops.backend import TRITON_REMEDY, has_triton
+from sparsestreet.ops.cpu.library import find_library, remedy
 
 CHOICES = ("auto", "torch", "triton")
 
@@ -30,6 +31,25 @@ def takes_triton(backend: str, *tensors: Tensor) -> bool:
     if device.type != "cuda" and not _interpreting():
         raise ValueError(f"backend 'triton' needs tensors on a CUDA device, got {device}: use backend='torch'")
     return True
+
+
+def fused_backend(backend: str, *tensors: Tensor) -> str:
+    """Whether "torch" or the C++ library ("cpu") does a step; "auto" takes the library where it is built and fits.
+
+    It takes float32 and float64 on the CPU. Raises ValueError for an unknown name, or for "cpu" and tensors it does not
+    take, RuntimeError with the remedy if the library is not built.
+    """
+    if backend not in ("auto", "torch", "cpu"):
+        raise ValueError(f"no backend {backend!r} of this step: choose one of ('auto', 'torch', 'cpu')")
+    fits = all(tensor.device.type == "cpu" and tensor.dtype in (float32, float64) for tensor in tensors)
+    if backend != "cpu":
+        return "cpu" if backend == "auto" and fits and find_library() is not None else "torch"
+    if not fits:
+        kinds = [(tensor.dtype, str(tensor.device)) for tensor in tensors]
+        raise ValueError(f"backend 'cpu' takes float32 or float64 tensors on the CPU, got {kinds}: use backend='torch'")
+    if find_library() is None:
+        raise RuntimeError(f"backend 'cpu' needs the C++ library: {remedy()}")
+    return "cpu"
 
 
 def _interpreting() -> bool:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.sky import Sky
 from sparsestreet.scene.state import FINISHED, SceneState
@@ -46,9 +47,12 @@ def render(
 ) -> SceneRendering:
     """Render the scene as a view sees it, in full precision also under autocast."""
     with torch.autocast(scene.device.type, enabled=False):
-        placed = scene.gaussians_at(view, state)
-        splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
-        rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options.settings)
+        with phase("scene"):
+            placed = scene.gaussians_at(view, state)
+        with phase("splat"):
+            splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
+        with phase("sky"):
+            rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options.settings)
         return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans)
 
 

@@ -1,4 +1,4 @@
-"""One Adam over named parameter groups, each with its own learning rate and decay."""
+"""One Adam over groups of parameters, each with its own learning rate and decay."""
 
 from dataclasses import dataclass
 
@@ -18,26 +18,28 @@ class OptimizerSettings:
     """True: rows whose gradient is exactly zero keep their values and moments (VisibleAdam)."""
 
     def build(self, scene: SceneGraph, radius: float) -> torch.optim.Optimizer:
-        """Adam with one group per parameter, named like it; ``radius`` is the scene's, meters.
+        """Adam with one group per rate, in which parameters of all nodes are stepped together.
+
+        ``radius`` is the scene's, meters.
 
         Raises ValueError for a parameter without a rate.
         """
-        rates = scene.learning_rates()
-        groups = []
+        rates, groups = scene.learning_rates(), {}
         for name, parameter in scene.named_parameters():
-            initial = rates[name].initial * (radius if rates[name].scale_by_scene_radius else 1.0)
-            groups.append({"params": [parameter], "lr": initial, "initial_lr": initial, "name": name})
+            rate = rates[name]
+            initial = rate.initial * (radius if rate.scale_by_scene_radius else 1.0)
+            empty = {"params": [], "lr": initial, "initial_lr": initial, "rate": rate}
+            groups.setdefault(rate, empty)["params"].append(parameter)
         if self.visible_only:
-            return VisibleAdam(groups, eps=self.eps)
-        return torch.optim.Adam(groups, eps=self.eps, fused=True)
+            return VisibleAdam(groups.values(), eps=self.eps)
+        return torch.optim.Adam(groups.values(), eps=self.eps, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Optimizer, scene: SceneGraph, progress: float) -> None:
+def set_rates(optimizer: torch.optim.Optimizer, progress: float) -> None:
     """Give every group its rate at a progress in [0, 1].
 
-    By name and without state, rather than by a scheduler: groups come and go with the masks, and a resumed run needs
-    nothing but its step.
+    Without state, rather than by a scheduler: groups come and go with the masks, and a resumed run needs nothing but
+    its step.
     """
-    rates = scene.learning_rates()
     for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * rates[group["name"]].factor(progress)
+        group["lr"] = group["initial_lr"] * group["rate"].factor(progress)

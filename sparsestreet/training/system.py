@@ -1,6 +1,7 @@
 """The LightningModule: render, sum the losses, log. What changes the scene's rows lives in callbacks."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from torch.optim import Optimizer
 from torchmetrics.aggregation import RunningMean
 
 from sparsestreet.metrics.image import psnr
+from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
@@ -59,7 +61,7 @@ class StreetSystem(LightningModule):
         self.options = options
         self.sh_interval = sh_interval
         self.rendering: SceneRendering | None = None
-        self.train_psnr = RunningMean(window=100)
+        self.train_psnr = RunningMean(window=10)
 
     def state(self, *, training: bool = False) -> SceneState:
         """Where training stands, for whoever renders the scene now."""
@@ -73,10 +75,25 @@ class StreetSystem(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             self.rendering = render(self.scene, frame, state, self.options)
             applicable = {name: loss for name, loss in self.losses.items() if loss.applies(frame)}
-            terms = {name: loss(self.rendering, frame, self.scene) for name, loss in applicable.items()}
-            terms |= self.scene.regularizers(state)
-        self._log_training(terms, frame)
+            terms = {}
+            for name, loss in applicable.items():
+                with phase(f"loss {name}"):
+                    terms[name] = loss(self.rendering, frame, self.scene)
+            with phase("regularizers"):
+                terms |= self.scene.regularizers(state)
+        if self._logs():
+            with phase("logging"):
+                self._log_training(terms, frame)
         return torch.stack(tuple(terms.values())).sum()
+
+    def backward(self, loss: Tensor) -> None:
+        with phase("backward"):
+            loss.backward()
+
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Optimizer, optimizer_closure: Any = None) -> None:
+        # The closure renders and differentiates: its phases take their own time out of this one.
+        with phase("optimizer"):
+            super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
 
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
@@ -88,10 +105,15 @@ class StreetSystem(LightningModule):
         return self.optimizer_settings.build(self.scene, self.radius)
 
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
-        set_rates(self.trainer.optimizers[0], self.scene, self.state().progress)
+        set_rates(self.trainer.optimizers[0], self.state().progress)
+
+    def _logs(self) -> bool:
+        """Whether Lightning's loggers will take what this step says; in other steps nothing is computed for them."""
+        every = self.trainer.log_every_n_steps
+        return every > 0 and (self.global_step + 1) % every == 0
 
     def _log_training(self, terms: Mapping[str, Tensor], frame: Frame) -> None:
-        """Running PSNR and the number of Gaussians in the progress bar, the terms in the log."""
+        """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms."""
         with torch.no_grad():
             image = self.rendering.rgb.detach().clamp(0, 1)
             self.train_psnr(psnr(image, frame.image.to(image.dtype) / 255))

@@ -5,13 +5,13 @@ import math
 import torch
 from torch import Tensor
 
+from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
 from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
-from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.storage import StoredScene

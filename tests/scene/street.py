@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.assignment import assign_tracks
 from sparsestreet.scene.gaussians import Rows
@@ -19,7 +20,6 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import Mask, StaticMask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, NodeSettings, Rigid, RigidSettings
-from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.state import SceneState
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
 from sparsestreet.types import Camera, Frame, Sweep, Track, View

@@ -14,13 +14,13 @@ from sparsestreet.data.datamodule import OrderedFrames
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Split
 from sparsestreet.evaluation.ledger import CountChange
+from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid, RigidSettings
-from sparsestreet.scene.nodes.trajectory import Trajectories
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.sky import Sky
 from sparsestreet.training.callbacks.resizing import RowListener
@@ -140,6 +140,7 @@ class StubTrainer(Trainer):
     # In place of Lightning's properties.
     global_step = 0
     max_steps = 0
+    log_every_n_steps = 1
     optimizers: Sequence[torch.optim.Optimizer] = ()
     datamodule: Any = None
     is_global_zero = True
@@ -282,3 +283,9 @@ class AskedStrategy:
     def _keep(self, what: str, rows: Rows, **given: Any) -> RowPlan:
         self.asked.append({"what": what, **given})
         return RowPlan.keep(torch.ones(len(rows), dtype=torch.bool))
+
+
+def group_of(optimizer: torch.optim.Optimizer, parameter: torch.Tensor) -> dict[str, Any]:
+    """The group that steps a parameter."""
+    (group,) = (g for g in optimizer.param_groups if any(parameter is other for other in g["params"]))
+    return group

@@ -1,4 +1,4 @@
-"""One group a parameter, with the rate that its node says; what decays, what rests, what scales with the scene."""
+"""Every parameter with the rate that its node says; what decays, what rests, what scales with the scene."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.visible_adam import VisibleAdam
-from tests.training.stubs import background, rigid
+from tests.training.stubs import background, group_of, rigid
 
 RATES = {
     "rows": LearningRate(1e-3),
@@ -27,27 +27,27 @@ def scene() -> SceneGraph:
     return SceneGraph(nodes, Sky(SkySettings(resolution=2, learning_rate=LearningRate(1e-2))))
 
 
-def groups(optimizer: torch.optim.Optimizer) -> dict[str, dict]:
-    return {group["name"]: group for group in optimizer.param_groups}
+def rate(optimizer: torch.optim.Optimizer, street: SceneGraph, name: str) -> float:
+    return group_of(optimizer, street.get_parameter(name))["lr"]
 
 
 def test_rates_scale_with_the_scene_and_decay_log_linearly():
     street = scene()
     optimizer = OptimizerSettings().build(street, radius=10.0)
-    by_name = groups(optimizer)
-    assert by_name["nodes.background.rows.means"]["lr"] == pytest.approx(1.6e-3)
+    assert rate(optimizer, street, "nodes.background.rows.means") == pytest.approx(1.6e-3)
     for progress, means in ((0.0, 1.6e-3), (0.5, 1.6e-4), (0.75, 1.6e-3 * 10**-1.5), (1.0, 1.6e-5)):
-        set_rates(optimizer, street, progress)
-        assert by_name["nodes.background.rows.means"]["lr"] == pytest.approx(means)
-        assert by_name["nodes.background.rows.sh_dc"]["lr"] == pytest.approx(1e-3)
-        assert by_name["sky.texels"]["lr"] == pytest.approx(1e-2)
+        set_rates(optimizer, progress)
+        assert rate(optimizer, street, "nodes.background.rows.means") == pytest.approx(means)
+        assert rate(optimizer, street, "nodes.background.rows.sh_dc") == pytest.approx(1e-3)
+        assert rate(optimizer, street, "sky.texels") == pytest.approx(1e-2)
 
 
 def test_every_node_has_rates_of_its_own():
-    by_name = groups(OptimizerSettings().build(scene(), radius=10.0))
-    assert by_name["nodes.rigid.rows.means"]["lr"] == 3e-3  # neither the background's nor times the radius
-    assert by_name["nodes.rigid.rotation_deltas"]["lr"] == 1e-5
-    assert by_name["nodes.rigid.translation_deltas"]["lr"] == 2e-5
+    street = scene()
+    optimizer = OptimizerSettings().build(street, radius=10.0)
+    assert rate(optimizer, street, "nodes.rigid.rows.means") == 3e-3  # neither the background's nor times the radius
+    assert rate(optimizer, street, "nodes.rigid.rotation_deltas") == 1e-5
+    assert rate(optimizer, street, "nodes.rigid.translation_deltas") == 2e-5
 
 
 @pytest.mark.parametrize("visible_only", [False, True])
@@ -62,23 +62,32 @@ def test_a_parameter_with_a_start_rests_before_and_moves_after(visible_only):
     assert not torch.equal(moving, first_moving)
     take_step(optimizer, street, 0.4)
     # The decay counts from the start of the run: 2e-2 * (1/4)^0.4; Adam's step is about one rate.
-    assert groups(optimizer)["nodes.background.rows.sh_rest"]["lr"] == pytest.approx(2e-2 * 0.25**0.4)
+    assert rate(optimizer, street, "nodes.background.rows.sh_rest") == pytest.approx(2e-2 * 0.25**0.4)
     torch.testing.assert_close(resting.detach(), first - 2e-2 * 0.25**0.4)
 
 
 def take_step(optimizer: torch.optim.Optimizer, street: SceneGraph, progress: float) -> None:
     for parameter in street.parameters():
         parameter.grad = torch.ones_like(parameter)
-    set_rates(optimizer, street, progress)
+    set_rates(optimizer, progress)
     optimizer.step()
 
 
 @pytest.mark.parametrize("visible_only", [False, True])
-def test_the_groups_hold_every_parameter_once_under_its_name(visible_only):
+def test_the_groups_hold_every_parameter_once(visible_only):
     street = scene()
     optimizer = OptimizerSettings(visible_only=visible_only).build(street, 1.0)
-    held = [(group["name"], id(parameter)) for group in optimizer.param_groups for parameter in group["params"]]
-    assert sorted(held) == sorted((name, id(parameter)) for name, parameter in street.named_parameters())
+    held = [id(parameter) for group in optimizer.param_groups for parameter in group["params"]]
+    assert sorted(held) == sorted(id(parameter) for parameter in street.parameters())
+
+
+def test_parameters_of_one_rate_are_stepped_together():
+    street = scene()
+    optimizer = OptimizerSettings().build(street, 1.0)
+    # background: all but means and sh_rest; rigid: all rows; two corrections; the sky.
+    assert sorted(len(group["params"]) for group in optimizer.param_groups) == [1, 1, 1, 1, 1, 4, 6]
+    first, second = (street.nodes["rigid"].rows.get_parameter(name) for name in ("means", "sh_dc"))
+    assert group_of(optimizer, first) is group_of(optimizer, second)
 
 
 def test_the_longest_name_wins_and_a_missing_one_is_an_error():
@@ -86,9 +95,10 @@ def test_the_longest_name_wins_and_a_missing_one_is_an_error():
     with pytest.raises(ValueError, match=r"'rows\.log_scales' has no learning rate: add one to node\.background"):
         OptimizerSettings().build(SceneGraph({"background": background(2, learning_rates=rates)}), 1.0)
     rates["rows"] = LearningRate(3.0)
-    by_name = groups(OptimizerSettings().build(SceneGraph({"background": background(2, learning_rates=rates)}), 1.0))
-    assert by_name["nodes.background.rows.means"]["lr"] == 2.0
-    assert by_name["nodes.background.rows.log_scales"]["lr"] == 3.0
+    street = SceneGraph({"background": background(2, learning_rates=rates)})
+    optimizer = OptimizerSettings().build(street, 1.0)
+    assert rate(optimizer, street, "nodes.background.rows.means") == 2.0
+    assert rate(optimizer, street, "nodes.background.rows.log_scales") == 3.0
 
 
 @pytest.mark.parametrize(("visible_only", "kind"), [(False, torch.optim.Adam), (True, VisibleAdam)])

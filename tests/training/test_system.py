@@ -20,13 +20,9 @@ from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.training.visible_adam import VisibleAdam
 from sparsestreet.types import Frame, Gaussians, View
-from tests.training.stubs import StubTrainer, background, fit, frame_at, make_rows, make_system, rigid
+from tests.training.stubs import StubTrainer, background, fit, frame_at, group_of, make_rows, make_system, rigid
 
 RATES = {"rows": LearningRate(1e-3), "means": LearningRate(1e-2, 1e-4, scale_by_scene_radius=True)}
-
-
-def rate(optimizer: torch.optim.Optimizer, name: str) -> float:
-    return next(group["lr"] for group in optimizer.param_groups if group["name"] == name)
 
 
 class Rates(Callback):
@@ -36,7 +32,7 @@ class Rates(Callback):
         self.seen: list[float] = []
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: StreetSystem, optimizer: Any) -> None:
-        self.seen.append(rate(trainer.optimizers[0], "nodes.background.rows.means"))
+        self.seen.append(group_of(trainer.optimizers[0], pl_module.scene.nodes["background"].rows.means)["lr"])
 
 
 def test_rates_decay_from_step_to_step():
@@ -65,7 +61,7 @@ def test_the_optimizer_is_the_configured_one_at_the_radius_of_the_scene():
     optimizer = system.configure_optimizers()
     assert type(optimizer) is VisibleAdam
     assert optimizer.defaults["eps"] == 1e-9
-    assert rate(optimizer, "nodes.background.rows.means") == pytest.approx(7e-2)
+    assert group_of(optimizer, system.scene.nodes["background"].rows.means)["lr"] == pytest.approx(7e-2)
 
 
 class Watched(Background):
@@ -224,6 +220,21 @@ def test_training_logs_the_running_psnr_and_the_number_of_gaussians():
         assert logged["gaussians"] == 16.0
     assert max(values) - min(values) > 0.01
     assert all(how == {"batch_size": 1} for _, _, how in trainer.log_calls)
+
+
+def test_between_two_logs_nothing_is_computed_for_them():
+    trainer = StubTrainer(make_system({"background": background(3)}))
+    trainer.log_every_n_steps = 3
+    said = []
+    for _ in range(6):
+        trainer.train(1, frame_at())
+        said.append(len(trainer.log_calls))
+        trainer.log_calls.clear()
+    assert [count > 0 for count in said] == [False, False, True] * 2
+    assert trainer.system.train_psnr.compute() > 0
+    trainer.log_every_n_steps = 0  # Lightning's word for never
+    trainer.train(3, frame_at())
+    assert trainer.log_calls == []
 
 
 def test_options_reach_the_training_rendering():

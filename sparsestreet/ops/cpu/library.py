@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, for measurements and tests of it."""
-_INTERFACE_VERSION = 6
+_INTERFACE_VERSION = 7
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -77,6 +77,55 @@ class Changes(ctypes.Structure):
     """Pointers to what the removal of each row changes."""
 
     _fields_ = tuple((name, c_void_p) for name in ("largest", "squared"))
+
+
+class RawRows(ctypes.Structure):
+    """Pointers to rows as a node stores them; null: multipliers, instances."""
+
+    _fields_ = (
+        *((name, c_int64) for name in ("count", "stored_rest", "terms")),
+        ("logit_limit", c_double),
+        *((name, c_void_p) for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")),
+        *((name, c_void_p) for name in ("multipliers", "instances")),
+        ("num_instances", c_int64),
+        *((name, c_void_p) for name in ("pose_quaternions", "pose_translations", "present")),
+        ("threads", c_int64),
+    )
+
+
+class ActiveRows(ctypes.Structure):
+    """Pointers to activated rows, or to their gradients."""
+
+    _fields_ = tuple((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh"))
+
+
+class RawGradients(ctypes.Structure):
+    """Pointers to the gradients of stored rows and of the poses of their instances."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")),
+        *((name, c_void_p) for name in ("multipliers", "pose_quaternions", "pose_translations")),
+    )
+
+
+class Keyframes(ctypes.Structure):
+    """Pointers to the tables of trajectories and of their corrections, and the time that is asked for."""
+
+    _fields_ = (
+        *((name, c_int64) for name in ("instances", "length")),
+        *((name, c_void_p) for name in ("times", "quaternions", "translations", "valid", "spans")),
+        *((name, c_void_p) for name in ("rotation_deltas", "translation_deltas")),
+        *((name, c_double) for name in ("time", "max_gap", "tolerance")),
+    )
+
+
+class InstancePoses(ctypes.Structure):
+    """Pointers to poses and to what their gradient needs."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("quaternions", "translations", "present")),
+        *((name, c_void_p) for name in ("slopes", "fractions", "keyframes")),
+    )
 
 
 class Report(ctypes.Structure):
@@ -155,6 +204,10 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_backward": (c_int32, (c_void_p,) * 6),
         "splat_contribution": (c_int32, (c_void_p,) * 5),
         "splat_removal": (c_int32, (c_void_p,) * 6),
+        "splat_activate": (c_int32, (c_int32, c_int32, c_void_p, c_void_p)),
+        "splat_activate_backward": (c_int32, (c_int32, c_int32, c_void_p, c_void_p, c_void_p)),
+        "splat_poses": (None, (c_int32, c_int32, c_void_p, c_void_p)),
+        "splat_poses_backward": (None, (c_int32, c_int32, c_int64, *(c_void_p,) * 5)),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)

@@ -14,6 +14,7 @@ from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_values
+from sparsestreet.phases import phase
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 DTYPES = (torch.float32, torch.float64)
@@ -124,14 +125,15 @@ class _Blend(torch.autograd.Function):
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
-        status = native.load_library().splat_backward(
-            ctx.lease.workspace.handle,
-            byref(ctx.view),
-            byref(_rows(fields, displacements)),
-            transmittance.data_ptr(),
-            byref(_layers(*cotangents)),
-            byref(native.RowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
-        )
+        with phase("splat backward"):
+            status = native.load_library().splat_backward(
+                ctx.lease.workspace.handle,
+                byref(ctx.view),
+                byref(_rows(fields, displacements)),
+                transmittance.data_ptr(),
+                byref(_layers(*cotangents)),
+                byref(native.RowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
+            )
         _raise_for(status, fields, displacements, native.Report())
         return *gradients, screen, None, None, None
 

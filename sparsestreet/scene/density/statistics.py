@@ -40,8 +40,7 @@ class DensityStatistics:
                 "node to its statistics as well"
             )
         drawn = radii > 0
-        half_image = screen_gradient.new_tensor([width / 2, height / 2])
-        norm = (screen_gradient * half_image).norm(dim=-1)
+        norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
         self.gradient_sum += torch.where(drawn, norm, 0.0)
         self.visits += drawn
         self.largest_screen = torch.maximum(self.largest_screen, radii / max(width, height))

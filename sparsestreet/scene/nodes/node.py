@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from sparsestreet.ops.activate import Placement, RawGaussians, activate
+from sparsestreet.ops.poses import Poses
 from sparsestreet.scene.density import DensityStrategy
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import init_gaussians
@@ -21,9 +23,6 @@ from sparsestreet.types import Gaussians, Track, View
 
 BYTES_PER_NUMBER = 4
 """Sizes are stated as float32, whatever precision a test or an optimizer holds them in."""
-
-OPACITY_LOGIT_LIMIT = 15.0
-"""sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,17 +171,16 @@ class Node(nn.Module, ABC):
         """float32 bytes of what moves the rows over time; 0 for a node that stands still."""
         return 0
 
-    def activated(self, view: View, state: SceneState) -> Gaussians:
-        """The rows in their own frame, activated: opacities and scales times the mask's 0 or 1."""
+    def activated(self, view: View, state: SceneState, poses: Poses | None = None) -> Gaussians:
+        """The rows activated, opacities and scales times the mask's 0 or 1; in their own frame, or where ``poses`` puts
+        the instance that the buffer ``instances`` of the table names."""
         rows = self.rows
-        opacities = torch.sigmoid(rows.opacity_logits.clamp(-OPACITY_LOGIT_LIMIT, OPACITY_LOGIT_LIMIT))
-        scales = torch.exp(rows.log_scales)
-        if self.mask is not None:
-            multipliers = self.mask.multipliers(rows, view.time)
-            opacities, scales = opacities * multipliers, scales * multipliers[:, None]
-        rest = rows.sh_rest[:, : (state.sh_degree + 1) ** 2 - 1]
-        sh = torch.cat((rows.sh_dc, rest), dim=1) if rest.shape[1] else rows.sh_dc
-        return Gaussians(rows.means, rows.quaternions, scales, opacities, sh)
+        return activate(
+            RawGaussians(rows.means, rows.log_scales, rows.quaternions, rows.opacity_logits, rows.sh_dc, rows.sh_rest),
+            sh_degree=state.sh_degree,
+            multipliers=None if self.mask is None else self.mask.multipliers(rows, view.time),
+            placement=None if poses is None else Placement(poses, rows.instances),
+        )
 
     def row_bytes(self) -> int:
         """float32 bytes of the rows without their masks (an instance number counts as one number)."""

@@ -1,14 +1,15 @@
 """Objects that move without changing their shape: where they start, and what they answer."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.ops.poses import Poses, poses_at
 from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_boxes
@@ -17,7 +18,6 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
-from sparsestreet.scene.nodes.trajectory import Trajectories, keyframe_interval
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Gaussians, Track, View
 
@@ -99,9 +99,7 @@ def _from_images(track: Track, data: TrainingData) -> Points:
 class Rigid(Node):
     """All instances of one node class: rows in the box frame of the instance named by the buffer ``instances``.
 
-    The pose of a keyframe is its annotation with a learned correction, both zero at the start: rotation
-    R_keyframe exp([rotation_delta]) (a rotation vector in the box frame, radians) and translation t_keyframe +
-    translation_delta (world, meters).
+    The pose of a keyframe is its annotation with learned corrections, zero at the start (see ``ops.poses.poses_at``).
     """
 
     def __init__(
@@ -155,33 +153,22 @@ class Rigid(Node):
 
     def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
         """Every instance's Gaussians at its pose; opacity exactly 0 where the instance is absent."""
-        local = self.activated(view, state)
-        quaternions, translations, active = self.pose_at(view.time)
-        instances: Int[Tensor, " n"] = self.rows.instances
-        # One table, one gather: rotation matrix (9), quaternion (4), translation (3), presence (1) of each row's box.
-        poses = (quat.to_matrix(quaternions).flatten(1), quaternions, translations, active[:, None].to(translations))
-        row_poses = torch.cat(poses, dim=1).index_select(0, instances)
-        rotation, quaternion, translation, presence = row_poses.split((9, 4, 3, 1), dim=1)
-        # Written out instead of a matrix product, which autocast would round to bfloat16: meters become decimeters.
-        means = (rotation.unflatten(1, (3, 3)) * local.means[:, None, :]).sum(-1) + translation
-        return replace(
-            local,
-            means=means,
-            quaternions=quat.multiply(quaternion, local.quaternions),
-            opacities=local.opacities * presence.squeeze(1),
+        return self.activated(view, state, self.pose_at(view.time))
+
+    def pose_at(self, time: float) -> Poses:
+        """Pose and presence of every instance at a normalized time."""
+        return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
+
+    @property
+    def keyframes(self) -> Trajectories:
+        """The annotated poses of the training frames, without corrections."""
+        return Trajectories(
+            self.keyframe_times,
+            self.keyframe_quaternions,
+            self.keyframe_translations,
+            self.keyframe_valid,
+            self.spans,
         )
-
-    def pose_at(self, time: float) -> tuple[Float[Tensor, "i 4"], Float[Tensor, "i 3"], Bool[Tensor, " i"]]:
-        """World-from-box rotation (unit, wxyz), box center (meters) and presence of every instance.
-
-        Between two keyframes the translation is interpolated linearly and the rotation by slerp along the shorter arc.
-        """
-        at = keyframe_interval(self.keyframe_times, self.keyframe_valid, self.spans, time, self.max_gap)
-        rotation_lower, translation_lower = self._refined_keyframes(at.lower)
-        rotation_upper, translation_upper = self._refined_keyframes(at.upper)
-        quaternions = quat.slerp(rotation_lower, rotation_upper, at.fraction)
-        translations = torch.lerp(translation_lower, translation_upper, at.fraction[:, None])
-        return quaternions, translations, at.active
 
     def instances(self) -> Instances:
         """The objects, named as their tracks."""
@@ -197,10 +184,3 @@ class Rigid(Node):
     def pose_bytes(self) -> int:
         """float32 bytes of the keyframes: a time, a quaternion and a translation each, corrections folded in."""
         return BYTES_PER_NUMBER * 8 * int(self.keyframe_valid.sum())
-
-    def _refined_keyframes(self, keyframes: Int[Tensor, " i"]) -> tuple[Float[Tensor, "i 4"], Float[Tensor, "i 3"]]:
-        """Corrected pose of one keyframe per instance."""
-        each = torch.arange(keyframes.shape[0], device=keyframes.device)
-        correction = quat.from_rotation_vector(self.rotation_deltas[each, keyframes])
-        quaternions = quat.multiply(self.keyframe_quaternions[each, keyframes], correction)
-        return quaternions, self.keyframe_translations[each, keyframes] + self.translation_deltas[each, keyframes]

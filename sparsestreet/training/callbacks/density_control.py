@@ -4,6 +4,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.evaluation.ledger import CountChange
+from sparsestreet.phases import phase
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowListener, resize_rows
@@ -62,9 +63,10 @@ class DensityControl(Callback, RowListener):
             return
         splats = pl_module.rendering.splats
         height, width = splats.alpha.shape
-        for name, statistics in self.statistics.items():
-            span = pl_module.rendering.spans[name]
-            statistics.add(splats.screen_offsets.grad[span], splats.radii[span], width, height)
+        with phase("density statistics"):
+            for name, statistics in self.statistics.items():
+                span = pl_module.rendering.spans[name]
+                statistics.add(splats.screen_offsets.grad[span], splats.radii[span], width, height)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int

@@ -66,7 +66,7 @@ def test_means_and_covariances_follow_general_poses():
 
 def test_halfway_between_keyframes():
     moving = track("car", [2, 4], [pose(0.2, (0.0, 0.0, 0.0)), pose(0.6, (4.0, 2.0, 0.0))])
-    quaternions, translations, active = rigid_of([moving]).pose_at(0.35)
+    quaternions, translations, active = vars(rigid_of([moving]).pose_at(0.35)).values()
     expected = quat.from_matrix(pose(0.5, (0, 0, 0))[:3, :3])
     torch.testing.assert_close(quaternions[0], expected, atol=1e-6, rtol=0)  # float32 keyframes
     torch.testing.assert_close(translations[0], torch.tensor([3.0, 1.5, 0.0]).double(), atol=1e-5, rtol=0)
@@ -78,7 +78,7 @@ def test_every_instance_has_its_own_keyframes():
     late = track(
         "late", [1, 2, 3], [pose(0.0, (0.0, 0.0, 0.0)), pose(0.0, (0.0, 8.0, 0.0)), pose(0.0, (0.0, 9.0, 0.0))]
     )
-    _, translations, active = rigid_of([slow, late]).pose_at(0.15)
+    _, translations, active = vars(rigid_of([slow, late]).pose_at(0.15)).values()
     expected = torch.tensor([[1.5, 0.0, 0.0], [0.0, 4.0, 0.0]]).double()
     torch.testing.assert_close(translations, expected, atol=1e-5, rtol=0)
     assert active.tolist() == [True, True]
@@ -88,7 +88,7 @@ def test_yaw_across_180_degrees_takes_the_short_way():
     """from_matrix keeps w >= 0, so the quaternions of 170 and 190 degrees are nearly opposite in sign."""
     first, last = pose(math.radians(170), (0, 0, 0)), pose(math.radians(190), (0, 0, 0))
     assert (quat.from_matrix(first[:3, :3]) * quat.from_matrix(last[:3, :3])).sum() < 0
-    quaternions, _, _ = rigid_of([track("car", [0, 2], [first, last])]).pose_at(0.1)
+    quaternions, _, _ = vars(rigid_of([track("car", [0, 2], [first, last])]).pose_at(0.1)).values()
     expected = pose(math.pi, (0, 0, 0))[:3, :3]
     torch.testing.assert_close(quat.to_matrix(quaternions[0]), expected, atol=1e-6, rtol=0)
 
@@ -98,7 +98,7 @@ def test_absent_outside_the_annotated_span():
     # The tram's gap of 10 frames: present only within 0.2 of its two keyframes.
     presence = {0.0: (0, 1), 0.2: (0, 1), 0.3: (1, 0), 0.35: (1, 0), 0.4: (1, 0), 0.5: (0, 0), 0.8: (0, 1), 1.0: (0, 1)}
     for time, (car, tram) in presence.items():
-        assert node.pose_at(time)[2].tolist() == [bool(car), bool(tram)], time
+        assert node.pose_at(time).present.tolist() == [bool(car), bool(tram)], time
         opacities = node.gaussians_at(view_at(time), degree(1)).opacities
         assert ((opacities > 0) == torch.tensor([car] * 3 + [tram] * 3, dtype=torch.bool)).all()
         assert torch.isfinite(node.gaussians_at(view_at(time), degree(1)).means).all()
@@ -107,10 +107,10 @@ def test_absent_outside_the_annotated_span():
 
 def test_a_track_of_one_frame():
     node = rigid_of([track("car", [5], [pose(1.0, (3.0, 0.0, 0.0))])])
-    assert node.pose_at(0.5)[2].item()
-    torch.testing.assert_close(node.pose_at(0.5)[1][0], torch.tensor([3.0, 0.0, 0.0]).double())
-    assert not node.pose_at(0.4)[2].item()
-    assert not node.pose_at(0.6)[2].item()
+    assert node.pose_at(0.5).present.item()
+    torch.testing.assert_close(node.pose_at(0.5).translations[0], torch.tensor([3.0, 0.0, 0.0]).double())
+    assert not node.pose_at(0.4).present.item()
+    assert not node.pose_at(0.6).present.item()
 
 
 def test_every_frame_time_of_an_odd_log_is_a_knot():
@@ -119,7 +119,7 @@ def test_every_frame_time_of_an_odd_log_is_a_knot():
     rows = random_rows(1, 0, instances=torch.zeros(1, dtype=torch.int64))
     node = rigid(rows, keyframes(tracks, 60), max_gap=0.0)
     for frame in range(60):
-        _, translations, active = node.pose_at(frame / 59)
+        _, translations, active = vars(node.pose_at(frame / 59)).values()
         assert active.item() == (7 <= frame < 53)
         if active.item():
             assert abs(translations[0, 0].item() - frame) < 1e-4  # float32 keyframes and times, 1 m a frame
@@ -129,20 +129,20 @@ def test_held_out_annotations_are_not_used_but_count_as_present():
     poses = [pose(0.1 * f, (float(f), 0.0, 0.0)) for f in range(2, 7)]
     poses[2] = pose(3.0, (99.0, 99.0, 99.0))  # frame 4: a lie that only a held-out annotation tells
     node = rigid_of([track("car", list(range(2, 7)), poses)], held_out=frozenset({4, 6}))
-    quaternions, translations, active = node.pose_at(0.4)
+    quaternions, translations, active = vars(node.pose_at(0.4)).values()
     assert active.item()
     torch.testing.assert_close(translations[0], torch.tensor([4.0, 0.0, 0.0]).double(), atol=1e-5, rtol=0)
     expected = pose(0.4, (0, 0, 0))[:3, :3]
     torch.testing.assert_close(quat.to_matrix(quaternions[0]), expected, atol=1e-6, rtol=0)
     # Frame 6 is the last annotated one, held out: constant velocity from frames 3 and 5; after it the car is gone.
-    quaternions, translations, active = node.pose_at(0.6)
+    quaternions, translations, active = vars(node.pose_at(0.6)).values()
     assert active.item()
     torch.testing.assert_close(translations[0], torch.tensor([6.0, 0.0, 0.0]).double(), atol=1e-5, rtol=0)
     # 0.1 rad beyond the keyframes by a normalized lerp: third order in the step of 0.2 rad.
     torch.testing.assert_close(quat.to_matrix(quaternions[0]), pose(0.6, (0, 0, 0))[:3, :3], atol=2e-4, rtol=0)
-    assert not node.pose_at(0.7)[2].item()
+    assert not node.pose_at(0.7).present.item()
     # Far outside the extrapolation stops at the end of the span instead of running away.
-    torch.testing.assert_close(node.pose_at(1.0)[1][0, 0].item(), 6.0, atol=1e-5, rtol=0)
+    torch.testing.assert_close(node.pose_at(1.0).translations[0, 0].item(), 6.0, atol=1e-5, rtol=0)
 
 
 def test_a_track_seen_only_in_held_out_frames_is_an_error():
@@ -155,12 +155,12 @@ def test_corrections_turn_in_the_box_frame_and_shift_in_metres():
     with torch.no_grad():
         node.rotation_deltas[0, 0] = torch.tensor([0.0, 0.0, 0.1])
         node.translation_deltas[0, 0] = torch.tensor([0.0, 0.25, 0.0])
-    quaternions, translations, _ = node.pose_at(0.0)
+    quaternions, translations, _ = vars(node.pose_at(0.0)).values()
     torch.testing.assert_close(quat.to_matrix(quaternions[0]), pose(0.4, (0, 0, 0))[:3, :3], atol=1e-6, rtol=0)
     torch.testing.assert_close(translations[0], torch.tensor([5.0, 0.25, 0.0]).double(), atol=1e-6, rtol=0)
     with torch.no_grad():  # about the box's own length axis, whatever its heading
         node.rotation_deltas[0, 0] = torch.tensor([0.2, 0.0, 0.0])
-    length_axis = quat.to_matrix(node.pose_at(0.0)[0][0])[:, 0]
+    length_axis = quat.to_matrix(node.pose_at(0.0).quaternions[0])[:, 0]
     torch.testing.assert_close(length_axis, pose(0.3, (0, 0, 0))[:3, 0], atol=1e-6, rtol=0)
 
 

@@ -100,7 +100,7 @@ def test_held_out_frames_give_neither_points_nor_poses():
     node = build(CARS, held_out=frozenset({2}))
     assert instance_counts(node) == [60 * (NUM_FRAMES - 1)]
     assert node.keyframe_valid.sum().item() == NUM_FRAMES - 1
-    assert node.pose_at(0.5)[2].tolist() == [True]
+    assert node.pose_at(0.5).present.tolist() == [True]
 
 
 def test_a_track_only_in_held_out_frames_is_left_out():
@@ -110,4 +110,4 @@ def test_a_track_only_in_held_out_frames_is_left_out():
 def test_the_gap_is_counted_in_frames():
     tracks = (track("car", [0, 4], [car_pose(0), car_pose(4)]),)
     node = build(replace(CARS, max_gap=1), log=replace(street_log(), tracks=tracks))
-    assert [node.pose_at(frame / 4)[2].item() for frame in range(5)] == [True, True, False, True, True]
+    assert [node.pose_at(frame / 4).present.item() for frame in range(5)] == [True, True, False, True, True]

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 6;
+constexpr int32_t INTERFACE_VERSION = 7;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -65,6 +65,47 @@ struct Changes {
 struct Report {
   int64_t pairs;
   int64_t worst_rows[3], worst_pairs[3];
+};
+
+// Rows as a node stores them; null: multipliers (1), instances (no poses).
+struct RawRows {
+  int64_t count, stored_rest, terms;  // coefficients behind the first that are stored; all that are used
+  double logit_limit;
+  const void *means, *log_scales, *quaternions, *opacity_logits, *sh_dc, *sh_rest, *multipliers;
+  const int64_t* instances;  // of the rows
+  int64_t num_instances;
+  const void *pose_quaternions, *pose_translations;
+  const uint8_t* present;
+  int64_t threads;
+};
+
+// Activated rows or their gradients; means and quaternions only of rows with poses.
+struct ActiveRows {
+  void *means, *quaternions, *scales, *opacities, *sh;
+};
+
+// Null: what is not asked for.
+struct RawGradients {
+  void *means, *log_scales, *quaternions, *opacity_logits, *sh_dc, *sh_rest, *multipliers;
+  void *pose_quaternions, *pose_translations;
+};
+
+// Tables [instances, length] of keyframes, those that are valid first.
+struct Keyframes {
+  int64_t instances, length;
+  const void *times, *quaternions, *translations;
+  const uint8_t* valid;
+  const void *spans, *rotation_deltas, *translation_deltas;
+  double time, max_gap, tolerance;
+};
+
+// Poses at a time, and what their gradient needs: derivatives of the quaternion [instances, 4, 6], the fraction, and the
+// two keyframes as rows of the flattened tables.
+struct InstancePoses {
+  void *quaternions, *translations;
+  uint8_t* present;
+  double *slopes, *fractions;
+  int64_t* keyframes;
 };
 
 enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };

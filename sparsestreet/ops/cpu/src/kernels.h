@@ -23,10 +23,19 @@ struct PixelKernels {
   void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
 };
 
+struct NodeKernels {
+  void (*activate)(const RawRows&, const ActiveRows&);
+  void (*activate_backward)(const RawRows&, const ActiveRows& cotangents, const RawGradients&);
+  void (*poses)(const Keyframes&, const InstancePoses&);
+  void (*poses_backward)(int64_t instances, const InstancePoses&, const void* quaternions, const void* translations,
+                         void* rotation_deltas, void* translation_deltas);
+};
+
 struct Kernels {
   const char* name;
   RowKernels rows[2];      // float, double
   PixelKernels pixels[2];
+  NodeKernels nodes[2];
 };
 
 }  // namespace splat

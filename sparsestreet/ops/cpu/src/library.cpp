@@ -7,6 +7,7 @@
   namespace variant {                            \
   void fill_row_kernels(splat::Kernels&);        \
   void fill_pixel_kernels(splat::Kernels&);      \
+  void fill_node_kernels(splat::Kernels&);       \
   }
 SPLAT_DECLARE(baseline)
 #ifdef SPLAT_X86
@@ -18,11 +19,11 @@ namespace {
 
 using namespace splat;
 
-template <class FillRows, class FillPixels>
-Kernels make(const char* name, FillRows fill_rows, FillPixels fill_pixels) {
+template <class... Fill>
+Kernels make(const char* name, Fill... fill) {
   Kernels k{};
   k.name = name;
-  fill_rows(k), fill_pixels(k);
+  (fill(k), ...);
   return k;
 }
 
@@ -42,10 +43,10 @@ bool runs(int variant) {
 
 const Kernels* variant(int index) {
   static const Kernels all[] = {
-      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels),
+      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels, baseline::fill_node_kernels),
 #ifdef SPLAT_X86
-      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels),
-      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels),
+      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels, v3::fill_node_kernels),
+      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels, v4::fill_node_kernels),
 #endif
   };
   return &all[index];
@@ -57,6 +58,9 @@ int fastest() {
     if (runs(index)) best = index;
   return best;
 }
+
+// As splat_variant_name takes them.
+const Kernels& chosen(int index) { return *variant(index < 0 ? fastest() : index); }
 
 struct Handle {
   const Kernels* kernels;
@@ -145,4 +149,27 @@ SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, c
     if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, *sky_image, *changes);
     return status;
   });
+}
+
+// Fills the rows as they are splatted. Variants as in splat_variant_name, here and below.
+SPLAT_API int32_t splat_activate(int32_t is_double, int32_t index, const RawRows* rows, const ActiveRows* out) {
+  return guarded([&]() -> int32_t { return chosen(index).nodes[is_double].activate(*rows, *out), OK; });
+}
+
+SPLAT_API int32_t splat_activate_backward(int32_t is_double, int32_t index, const RawRows* rows,
+                                          const ActiveRows* cotangents, const RawGradients* gradients) {
+  return guarded([&]() -> int32_t {
+    return chosen(index).nodes[is_double].activate_backward(*rows, *cotangents, *gradients), OK;
+  });
+}
+
+SPLAT_API void splat_poses(int32_t is_double, int32_t index, const Keyframes* keyframes, const InstancePoses* out) {
+  chosen(index).nodes[is_double].poses(*keyframes, *out);
+}
+
+SPLAT_API void splat_poses_backward(int32_t is_double, int32_t index, int64_t instances, const InstancePoses* of,
+                                    const void* quaternions, const void* translations, void* rotation_deltas,
+                                    void* translation_deltas) {
+  chosen(index).nodes[is_double].poses_backward(instances, *of, quaternions, translations, rotation_deltas,
+                                                translation_deltas);
 }

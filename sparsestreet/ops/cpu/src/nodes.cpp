@@ -1,0 +1,13 @@
+// What scene nodes do before their rows are splatted. Compiled once per instruction set, with strict IEEE rules.
+#include "activate.hpp"
+#include "kernels.h"
+#include "poses.hpp"
+
+namespace SPLAT_VARIANT {
+
+void fill_node_kernels(Kernels& k) {
+  k.nodes[0] = {activate<float>, activate_backward<float>, poses<float>, poses_backward<float>};
+  k.nodes[1] = {activate<double>, activate_backward<double>, poses<double>, poses_backward<double>};
+}
+
+}  // namespace SPLAT_VARIANT

@@ -1,0 +1,64 @@
+"""Where moving objects are at a time: keyframes with learned corrections, interpolated."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
+from sparsestreet.ops.fused import fused_backend
+
+
+@dataclass(frozen=True)
+class Poses:
+    """World-from-box pose of every instance at one time."""
+
+    quaternions: Float[Tensor, "i 4"]
+    """Unit, wxyz."""
+    translations: Float[Tensor, "i 3"]
+    """Box center in the world, meters."""
+    present: Bool[Tensor, " i"]
+
+
+def poses_at(
+    keyframes: Trajectories,
+    rotation_deltas: Float[Tensor, "i k 3"],
+    translation_deltas: Float[Tensor, "i k 3"],
+    time: float,
+    max_gap: float,
+    *,
+    backend: str = "auto",
+) -> Poses:
+    """The poses at a time; gradients go to the corrections.
+
+    A corrected keyframe has the rotation R exp([rotation_delta]) (a rotation vector in the box frame, radians) and the
+    translation t + translation_delta (world, meters). Between two of them the translation is interpolated linearly and
+    the rotation by slerp along the shorter arc; ``keyframe_interval`` says between which, and what is present.
+
+    All instances are one operation of the C++ library, forward and backward, or dozens of small ones of torch.
+    ``backend``: "torch", "cpu" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
+    """
+    if fused_backend(backend, rotation_deltas, translation_deltas) == "cpu":
+        from sparsestreet.ops.cpu.poses import poses_at as fused_poses
+
+        return Poses(*fused_poses(keyframes, rotation_deltas, translation_deltas, time, max_gap))
+    table = keyframes
+    at = keyframe_interval(table.times, table.valid, table.spans, time, max_gap)
+    lower, upper = (_corrected(table, rotation_deltas, translation_deltas, place) for place in (at.lower, at.upper))
+    quaternions = quat.slerp(lower[0], upper[0], at.fraction)
+    return Poses(quaternions, torch.lerp(lower[1], upper[1], at.fraction[:, None]), at.active)
+
+
+def _corrected(
+    table: Trajectories,
+    rotation_deltas: Float[Tensor, "i k 3"],
+    translation_deltas: Float[Tensor, "i k 3"],
+    keyframes: Int[Tensor, " i"],
+) -> tuple[Float[Tensor, "i 4"], Float[Tensor, "i 3"]]:
+    """Corrected pose of one keyframe per instance."""
+    each = torch.arange(keyframes.shape[0], device=keyframes.device)
+    correction = quat.from_rotation_vector(rotation_deltas[each, keyframes])
+    quaternions = quat.multiply(table.quaternions[each, keyframes], correction)
+    return quaternions, table.translations[each, keyframes] + translation_deltas[each, keyframes]

@@ -1,0 +1,109 @@
+"""Poses of moving objects: the C++ library against torch in double, at every kind of place between two keyframes."""
+
+import pytest
+import torch
+
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.ops.cpu import poses as fused
+from sparsestreet.ops.cpu.library import load_library
+from sparsestreet.ops.poses import poses_at
+
+MAX_GAP = 0.15
+TIMES = [0.0, 0.05, 0.1, 0.15, 0.2, 0.35, 0.5, 0.9, 1.0]
+
+
+def tables(dtype=torch.float64, seed: int = 0, size: float = 0.3) -> tuple[Trajectories, torch.Tensor, torch.Tensor]:
+    """Instances with 5, 2 and 1 keyframes, one that hardly turns, one that turns by more than half a circle and one
+    whose quaternion changes its sign; with corrections."""
+    generator = torch.Generator().manual_seed(seed)
+    counts = [5, 2, 1, 5, 5, 5]
+    turns = torch.randn(6, 5, 4, generator=generator, dtype=torch.float64)
+    turns[3] = turns[3, :1] + 1e-3 * turns[3]
+    turns = turns / turns.norm(dim=-1, keepdim=True)
+    turns[5, 1::2] = -turns[5, :1] + 0.1 * turns[5, 1::2]
+    turns = turns / turns.norm(dim=-1, keepdim=True)
+    times = torch.tensor([0.1, 0.2, 0.3, 0.7, 0.8], dtype=torch.float64).repeat(6, 1)
+    valid = torch.arange(5) < torch.tensor(counts)[:, None]
+    spans = torch.tensor([[0.0, 1.0], [0.1, 0.25], [0.1, 0.1], [0.1, 0.8], [0.05, 0.95], [0.1, 0.8]])
+    shifts = 20 * torch.randn(6, 5, 3, generator=generator, dtype=torch.float64)
+    deltas = [size * torch.randn(6, 5, 3, generator=generator, dtype=torch.float64) for _ in range(2)]
+    table = Trajectories(
+        torch.where(valid, times, 0.0).to(dtype), turns.to(dtype), shifts.to(dtype), valid, spans.to(dtype)
+    )
+    return table, *(delta.to(dtype).requires_grad_() for delta in deltas)
+
+
+def values_and_gradients(deltas, run) -> list[torch.Tensor]:
+    found = run()
+    generator = torch.Generator().manual_seed(1)
+    cotangents = [torch.randn(v.shape, generator=generator, dtype=torch.float64).to(v) for v in found[:2]]
+    total = sum((v * c).sum() for v, c in zip(found[:2], cotangents, strict=True))
+    return [*(v.detach() for v in found), *torch.autograd.grad(total, deltas)]
+
+
+@pytest.mark.parametrize("time", TIMES)
+@pytest.mark.parametrize("size", [0.0, 1e-4, 0.3, 3.0])
+def test_the_library_says_what_torch_says(time, size):
+    table, *deltas = tables(size=size)
+    found, expected = (
+        values_and_gradients(
+            deltas,
+            lambda backend=backend: tuple(vars(poses_at(table, *deltas, time, MAX_GAP, backend=backend)).values()),
+        )
+        for backend in ("cpu", "torch")
+    )
+    assert found[2].tolist() == expected[2].tolist()
+    # The branches near equal rotations and near zero vectors are approximations, both the same.
+    for value, truth in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, truth, rtol=1e-10, atol=1e-11)
+
+
+def test_gradients_are_those_of_finite_differences():
+    table, *deltas = tables()
+
+    def outputs(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        found = poses_at(table, *values, 0.26, MAX_GAP, backend="cpu")
+        return found.quaternions, found.translations
+
+    assert torch.autograd.gradcheck(outputs, deltas)
+
+
+@pytest.mark.parametrize("variant", [0, 1, 2])
+def test_single_precision_is_good_to_its_last_digit(variant):
+    """Computed in double and rounded once: half a unit in the last place of the result, of 50 m and of 1."""
+    if load_library().splat_variant_name(variant) is None:
+        pytest.skip(f"this processor does not run variant {variant}")
+    table, *deltas = tables(torch.float32)
+    doubles = Trajectories(*(v.double() if v.is_floating_point() else v for v in vars(table).values()))
+    for time in TIMES:
+        found = fused.poses_at(table, *deltas, time, MAX_GAP, variant)
+        # The time itself is rounded as those of the table.
+        at = float(torch.tensor(time))
+        truth = fused.poses_at(doubles, *(delta.double() for delta in deltas), at, MAX_GAP)
+        assert found[2].tolist() == truth[2].tolist()
+        torch.testing.assert_close(found[0].double(), truth[0], rtol=0.0, atol=6e-8)
+        torch.testing.assert_close(found[1].double(), truth[1], rtol=6e-8, atol=1e-7)
+
+
+def test_quaternions_are_unit_and_agree_with_their_keyframes():
+    table, *deltas = tables(size=0.0)
+    found = poses_at(table, *deltas, 0.3, MAX_GAP)
+    matrices = quat.to_matrix(table.quaternions[:, 2])
+    torch.testing.assert_close(quat.to_matrix(found.quaternions)[[0, 3, 4, 5]], matrices[[0, 3, 4, 5]])
+    torch.testing.assert_close(found.quaternions.norm(dim=1), torch.ones(6, dtype=torch.float64))
+
+
+def test_only_one_output_is_differentiated():
+    table, *deltas = tables()
+    for field, moved, resting in (("quaternions", 0, 1), ("translations", 1, 0)):
+        gradients = torch.autograd.grad(getattr(poses_at(table, *deltas, 0.26, MAX_GAP), field).sum(), deltas)
+        assert gradients[moved].any()
+        assert not gradients[resting].any()
+
+
+def test_no_instances():
+    table, *deltas = tables()
+    none = Trajectories(*(values[:0] for values in vars(table).values()))
+    found = poses_at(none, deltas[0][:0], deltas[1][:0], 0.5, MAX_GAP)
+    assert [len(values) for values in vars(found).values()] == [0, 0, 0]
