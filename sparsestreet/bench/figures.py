@@ -64,7 +64,7 @@ def draw_pareto(records: Sequence[Record], folder: Path) -> list[Path]:
     )
     paths = []
     for name, cost, error, x_label, y_label in drawn:
-        paths += _save(_pareto_figure(measured, cost, error, x_label, y_label), folder, name)
+        paths += save_figure(_pareto_figure(measured, cost, error, x_label, y_label), folder, name)
     return paths
 
 
@@ -242,10 +242,10 @@ def draw_scaling(
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
-    return _save(figure, folder, "scaling")
+    return save_figure(figure, folder, "scaling")
 
 
-def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
+def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     vector, pixels = folder / f"{name}.svg", folder / f"{name}.png"
     # Text stays text, and nothing depends on the day: an eighth of the size, and a figure redrawn is the same file.

@@ -2,9 +2,11 @@
 
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from hydra.utils import instantiate
+from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.data.datamodule import StreetData
@@ -39,6 +41,20 @@ def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out."""
     log = instantiate(cfg.data.log, _convert_="all").read()
     return StreetData(log, **cfg.split, seed=cfg.seed)
+
+
+def trainer_of(cfg: DictConfig, callbacks: Sequence[Callback], out: Path) -> Trainer:
+    """Lightning's, with these callbacks and nothing of its own beside them."""
+    return instantiate(
+        cfg.trainer,
+        callbacks=list(callbacks),
+        logger=instantiate(cfg.logger) if cfg.logger else False,
+        default_root_dir=str(out),
+        enable_model_summary=False,
+        enable_progress_bar=False,
+        enable_checkpointing=False,
+        max_epochs=-1,
+    )
 
 
 def description_of(cfg: DictConfig, log: DrivingLog, device: torch.device, command: str) -> RunDescription:

@@ -1,4 +1,4 @@
-"""``sparsestreet bench``: what the splat op costs in time, memory and accuracy."""
+"""``sparsestreet bench``: what the splat op and a training step cost in time, memory and accuracy."""
 
 import argparse
 import shlex
@@ -9,6 +9,7 @@ import torch
 
 from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.bench.scenes import BenchScene, Size
+from sparsestreet.cli.compose import override_problem
 from sparsestreet.evaluation.provenance import this_machine, this_source
 
 EXAMPLES = """\
@@ -17,6 +18,8 @@ examples:
   sparsestreet bench knobs --street RUN         the street of a run that train wrote; its exact images take minutes
   sparsestreet bench knobs --quick              the same at sizes that take seconds: to see that it runs
   sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
+  sparsestreet bench step                       phases of a training step: time, operations, distance to their floors
+  sparsestreet bench step sparsify=paper        the same of another training: options as those of train
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -29,10 +32,14 @@ def bench(arguments: list[str]) -> int:
     modes: dict[str, Callable[[argparse.Namespace], bool]] = {
         "knobs": _knobs,
         "blend": _blend,
+        "step": _step,
         "scaling": _scaling,
         "gpu": _gpu,
     }
-    options = _parser(list(modes)).parse_args(arguments)
+    parser = _parser(list(modes))
+    options = parser.parse_args(arguments)
+    if options.overrides and options.mode != "step":
+        parser.error(f"{options.mode} takes no options of train, got {' '.join(options.overrides)}")
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     options.command = shlex.join(["sparsestreet", "bench", *arguments])
@@ -47,6 +54,7 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("mode", nargs="?", default="knobs", choices=modes, help="what to measure (default: knobs)")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument("--street", type=Path, metavar="RUN", help="knobs: the trained street of this run's folder")
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
@@ -83,6 +91,22 @@ def _blend(options: argparse.Namespace) -> bool:
         blend.run_blend(Size(64, 48, 300), [Size(48, 32, 200)], once, once, _file(options))
     else:
         blend.run_blend(blend.MAIN, blend.TRAINING, TimingBudget(), TimingBudget(repeats=3), _file(options))
+    return True
+
+
+def _step(options: argparse.Namespace) -> bool:
+    from tempfile import TemporaryDirectory
+
+    from sparsestreet.bench import step
+    from sparsestreet.cli.step import train_with
+
+    problem = override_problem(options.overrides)
+    if problem:
+        raise SystemExit(f"sparsestreet bench step: {problem}")
+    window = step.QUICK if options.quick else step.FULL
+    with TemporaryDirectory() as folder:
+        train = train_with(options.overrides, Path(folder))
+        step.run_step(" ".join(["train", *options.overrides]), train, window, _file(options), options.out)
     return True
 
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
 from omegaconf import DictConfig
 
-from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command
+from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command, trainer_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.history import draw_history
@@ -71,16 +70,7 @@ def _train(
 ) -> Trainer:
     """Fit to the end, or end the program as the signal wants that came."""
     clock, stop, checkpoint = Clock(), GracefulStop(), _checkpoint(cfg)
-    trainer: Trainer = instantiate(
-        cfg.trainer,
-        callbacks=[clock, *callbacks, TrainingProgress()],
-        logger=instantiate(cfg.logger) if cfg.logger else False,
-        default_root_dir=str(out),
-        enable_model_summary=False,
-        enable_progress_bar=False,
-        enable_checkpointing=False,
-        max_epochs=-1,
-    )
+    trainer = trainer_of(cfg, [clock, *callbacks, TrainingProgress()], out)
     description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
     trainer.callbacks += [RunFiles(out, description, clock), Checkpoints(out / "checkpoints"), stop]
     # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.

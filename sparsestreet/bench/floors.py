@@ -1,0 +1,117 @@
+"""The least that each phase of a training step has to move and to compute.
+
+Bytes count what must be read and what must be written once, float32, caches aside; operations are those of the
+arithmetic that the formula asks for. A phase at its floor waits for memory or arithmetic units all the time.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean
+
+import torch
+from lightning import LightningModule
+
+from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS
+from sparsestreet.ops.ssim_window import WINDOW
+
+NUMBER = 4
+"""Bytes of a float32."""
+_SHAPE_NUMBERS = 11
+"""Means, quaternion, scales, opacity of a row."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Bytes and floating point operations."""
+
+    bytes: float
+    flops: float = 0.0
+
+    def seconds(self, bandwidth: float, peak: float) -> float:
+        """At so many bytes and operations a second; the larger of the two, as if they overlapped."""
+        return max(self.bytes / bandwidth, self.flops / peak)
+
+
+@dataclass(frozen=True)
+class StepWork:
+    """What one step had to do."""
+
+    rows: int
+    visible: int
+    """Rows that were drawn."""
+    terms: int
+    """Coefficients of the spherical harmonics in use."""
+    samples: int | None
+    """(splat, pixel) samples of the forward pass."""
+    parameters: int
+    """Numbers that the optimizer steps."""
+    size: tuple[int, int]
+    """Height and width."""
+    sky_pixels: int
+
+    @staticmethod
+    def of(system: LightningModule, samples: int | None) -> "StepWork":
+        """Of the step that the system has just made."""
+        rendering = system.rendering
+        stepped = (value.numel() for value in system.scene.parameters() if value.grad is not None)
+        degree = system.state().sh_degree
+        seen = 1 - rendering.splats.alpha > system.options.settings.transmittance_min
+        return StepWork(
+            len(rendering.splats.radii),
+            int(rendering.splats.visible.sum()),
+            (min(degree, 3) + 1) ** 2,
+            samples,
+            sum(stepped),
+            tuple(rendering.alpha.shape),
+            int(seen.sum()) if system.scene.sky is not None else 0,
+        )
+
+
+def floors(work: Sequence[StepWork]) -> dict[str, Floor]:
+    """Phase -> its floor, the mean over some steps; phases whose least is next to nothing are left out."""
+    steps = [_floors(step) for step in work]
+    return {
+        name: Floor(mean(step[name].bytes for step in steps), mean(step[name].flops for step in steps))
+        for name in (steps[0] if steps else ())
+    }
+
+
+def _floors(work: StepWork) -> dict[str, Floor]:
+    pixels, color = work.size[0] * work.size[1], 3 * work.terms
+    # Scales, opacity and coefficients are read as they are stored and written as they are splatted.
+    assembly = Floor(NUMBER * 2 * work.rows * (4 + color))
+    read = work.rows * _SHAPE_NUMBERS + work.visible * color
+    window_flops = 2 * 2 * WINDOW  # an 11-tap filter along two axes
+    found = {
+        "scene": assembly,
+        "scene backward": assembly,
+        "sky": Floor(NUMBER * (pixels + work.sky_pixels * (3 + 3))),
+        "sky backward": Floor(NUMBER * work.sky_pixels * (3 + 1 + 3)),
+        # Five means forward; three derivatives backward.
+        "loss photometric": Floor(NUMBER * 2 * 3 * pixels, 5 * window_flops * 3 * pixels),
+        "ssim backward": Floor(NUMBER * 3 * 3 * pixels, 3 * window_flops * 3 * pixels),
+        # Parameter, gradient and two moments are read, all but the gradient written.
+        "optimizer": Floor(NUMBER * 7 * work.parameters),
+        # Gradient and radius are read; three statistics read and written.
+        "density statistics": Floor(NUMBER * work.rows * (3 + 2 * 4)),
+    }
+    if work.samples is not None:
+        found["splat"] = Floor(NUMBER * read, FORWARD_FLOPS * work.samples)
+        written = work.rows * (_SHAPE_NUMBERS + color + 2)
+        found["splat backward"] = Floor(NUMBER * (read + written), BACKWARD_FLOPS * work.samples)
+    return found
+
+
+def measured_bandwidth(device: torch.device, megabytes: int = 256) -> float:
+    """Bytes per second that a copy between two buffers reads and writes, the best of several."""
+    source = torch.zeros(megabytes << 18, device=device)
+    target = torch.empty_like(source)
+    seconds = []
+    for _ in range(6):
+        start = time.perf_counter()
+        target.copy_(source)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds.append(time.perf_counter() - start)
+    return 2 * NUMBER * source.numel() / min(seconds)

@@ -1,0 +1,203 @@
+"""``sparsestreet bench step``: the phases of a training step, what each costs, and how far each is from its floor."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sparsestreet.bench.blend import measured_peak
+from sparsestreet.bench.floors import Floor, StepWork, floors, measured_bandwidth
+from sparsestreet.bench.records import RecordFile
+from sparsestreet.bench.step_figure import draw_step
+from sparsestreet.bench.timing import Spread, last_workspace, spread
+from sparsestreet.phases import PhaseRecorder, clock_of
+
+OP = ("splat", "splat backward")
+LOOP = "loop"
+"""What is in no phase: Lightning, and callbacks that have nothing to do in this step."""
+
+
+@dataclass(frozen=True)
+class StepWindow:
+    """Which steps of a run are looked at: ``timed`` from ``first`` on, then ``counted``."""
+
+    first: int
+    timed: int
+    counted: int
+
+    @property
+    def last(self) -> int:
+        return self.first + self.timed + self.counted
+
+
+FULL, QUICK = StepWindow(740, 100, 10), StepWindow(10, 8, 4)
+
+
+@dataclass(frozen=True)
+class PhaseRecord:
+    """One phase; a floor of None is not known, or next to nothing."""
+
+    name: str
+    time: Spread
+    operations: float
+    """Dispatched tensor operations a step; views are not counted."""
+    floor: Floor | None
+    floor_ms: float | None
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """A step of training, from one batch's end to the next one's; times are milliseconds."""
+
+    what: str
+    gaussians: dict[str, int]
+    width: int
+    height: int
+    step: Spread
+    op: Spread
+    """The splat op, forward and backward."""
+    operations: float
+    bandwidth_gb_s: float
+    peak_gflops: float
+    phases: tuple[PhaseRecord, ...]
+
+    @property
+    def ratio(self) -> float:
+        """The step over its op."""
+        return self.step.median / self.op.median
+
+
+class StepWatch(Callback):
+    """Times the phases of the steps in a window, then counts their operations, then ends training.
+
+    Configure it last: what the other callbacks do at the end of a step is a part of the step.
+    """
+
+    def __init__(self, window: StepWindow) -> None:
+        self.window = window
+        self.seconds: list[dict[str, float]] = []
+        self.work: list[StepWork] = []
+        self.operations: Counter[str] = Counter()
+        self._recorder: PhaseRecorder | None = None
+        self._mode: TorchDispatchMode | None = None
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        step, window = trainer.global_step, self.window
+        if window.first < step <= window.first + window.timed:
+            self.seconds.append(self._recorder.stop())
+            if pl_module.rendering is not None:
+                self.work.append(StepWork.of(pl_module, _samples(pl_module)))
+        if window.first + window.timed < step <= window.last:
+            self._mode.__exit__(None, None, None)
+            self._recorder.stop()
+        if window.first <= step < window.last:
+            self._recorder = PhaseRecorder(clock_of(pl_module.device), outside=LOOP)
+            self._recorder.start()
+            if step >= window.first + window.timed:
+                self._mode = CountedOperations(self._recorder, self.operations)
+                self._mode.__enter__()
+        trainer.should_stop = trainer.should_stop or step >= window.last
+
+
+class CountedOperations(TorchDispatchMode):
+    """Counts what is dispatched, by phase; views cost nothing and are left out."""
+
+    def __init__(self, recorder: PhaseRecorder, counts: Counter[str]) -> None:
+        super().__init__()
+        self._recorder, self._counts = recorder, counts
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if not func.is_view:
+            self._counts[self._recorder.current] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def run_step(
+    what: str,
+    train: Callable[[Callback], LightningModule],
+    window: StepWindow,
+    file: RecordFile,
+    folder: Path,
+    say: Callable[[str], None] = print,
+) -> StepRecord:
+    """Train through a window, write what was seen, draw it.
+
+    Args:
+        what: is trained, in words.
+        train: trains with one more callback, and answers what it trained.
+        window: which steps.
+        file: takes the record.
+        folder: takes the picture.
+        say: hears the table.
+    """
+    watch = StepWatch(window)
+    system = train(watch)
+    record = _record(what, system, watch)
+    file.write("step", record)
+    for line in lines(record):
+        say(line)
+    for path in draw_step(record, folder):
+        say(f"drawn: {path}")
+    return record
+
+
+def _record(what: str, system: LightningModule, watch: StepWatch) -> StepRecord:
+    bandwidth, peak = measured_bandwidth(system.device), measured_peak()
+    least = floors(watch.work)
+    names = sorted({name for seconds in watch.seconds for name in seconds}, key=lambda name: -_total(watch, name))
+    phases = []
+    for name in names:
+        floor = least.get(name)
+        time = spread([seconds.get(name, 0.0) for seconds in watch.seconds])
+        floor_ms = None if floor is None else 1e3 * floor.seconds(bandwidth, peak)
+        phases.append(PhaseRecord(name, time, watch.operations[name] / watch.window.counted, floor, floor_ms))
+    height, width = watch.work[-1].size
+    return StepRecord(
+        what,
+        system.scene.counts(),
+        width,
+        height,
+        spread([sum(seconds.values()) for seconds in watch.seconds]),
+        spread([sum(seconds.get(name, 0.0) for name in OP) for seconds in watch.seconds]),
+        sum(watch.operations.values()) / watch.window.counted,
+        1e-9 * bandwidth,
+        1e-9 * peak,
+        tuple(phases),
+    )
+
+
+def _total(watch: StepWatch, name: str) -> float:
+    return sum(seconds.get(name, 0.0) for seconds in watch.seconds)
+
+
+def _samples(system: LightningModule) -> int | None:
+    """(splat, pixel) samples of the newest rendering, where the backend counts them."""
+    rows = system.rendering.splats.radii
+    return last_workspace(rows.dtype).sample_count() if rows.device.type == "cpu" else None
+
+
+def lines(record: StepRecord) -> list[str]:
+    """The record as a table for the terminal."""
+    counts = ", ".join(f"{name} {count:,}" for name, count in record.gaussians.items())
+    text = [
+        f"{record.what}: {counts}, {record.width}x{record.height}",
+        f"{'phase':<22}{'ms':>8}{'iqr':>7}{'share':>7}{'operations':>12}{'least ms':>10}{'distance':>10}",
+    ]
+    for phase in record.phases:
+        share = phase.time.median / record.step.median
+        floor = "" if phase.floor_ms is None else f"{phase.floor_ms:10.2f}{phase.time.median / phase.floor_ms:9.1f}x"
+        text.append(
+            f"{phase.name:<22}{phase.time.median:8.2f}{phase.time.iqr or 0.0:7.2f}{100 * share:6.0f}%"
+            f"{phase.operations:12.0f}{floor}"
+        )
+    return [
+        *text,
+        f"a step {record.step}; {record.ratio:.2f} times its op {record.op}; {record.operations:.0f} operations",
+        f"floors: {record.bandwidth_gb_s:.0f} GB/s (copy), {record.peak_gflops:.0f} GFLOP/s (float32 matrix product)",
+    ]

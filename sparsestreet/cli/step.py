@@ -1,0 +1,39 @@
+"""The training whose steps ``sparsestreet bench step`` looks at."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from hydra import compose
+from lightning import Callback, seed_everything
+
+from sparsestreet.cli.assemble import data_of, recipe_of, trainer_of
+from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.compose import configuration
+from sparsestreet.cli.run import silence_known_noise
+from sparsestreet.training.system import StreetSystem
+
+NEVER = 10**9
+"""Steps: longer than any run."""
+
+
+def train_with(overrides: Sequence[str], folder: Path) -> Callable[[Callback], StreetSystem]:
+    """Training as these options of ``train`` say, with one more callback, without validation, curves or a run's files.
+
+    What it writes all the same goes into ``folder``. Raises ValueError for options that cannot be.
+    """
+    quiet = [f"folder={folder}", "logger=none", f"trainer.val_check_interval={NEVER}"]
+    with configuration():
+        cfg = compose("train", [*overrides, *quiet])
+    problem = config_problem(cfg)
+    if problem:
+        raise ValueError(problem)
+
+    def train(watch: Callback) -> StreetSystem:
+        seed_everything(cfg.seed, verbose=False)
+        silence_known_noise()
+        recipe, data = recipe_of(cfg), data_of(cfg)
+        system = recipe.build(data)
+        trainer_of(cfg, [*recipe.callbacks.values(), watch], folder).fit(system, datamodule=data)
+        return system
+
+    return train
