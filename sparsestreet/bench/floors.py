@@ -15,7 +15,7 @@ from lightning import LightningModule
 from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS
 from sparsestreet.ops.ssim_window import WINDOW
 
-NUMBER = 4
+NUMBER = 4.0
 """Bytes of a float32."""
 _SHAPE_NUMBERS = 11
 """Means, quaternion, scales, opacity of a row."""
@@ -89,17 +89,17 @@ def _floors(work: StepWork) -> dict[str, Floor]:
         "sky": Floor(NUMBER * (pixels + work.sky_pixels * (3 + 3))),
         "sky backward": Floor(NUMBER * work.sky_pixels * (3 + 1 + 3)),
         # Five means forward; three derivatives backward.
-        "loss photometric": Floor(NUMBER * 2 * 3 * pixels, 5 * window_flops * 3 * pixels),
-        "ssim backward": Floor(NUMBER * 3 * 3 * pixels, 3 * window_flops * 3 * pixels),
+        "loss photometric": Floor(NUMBER * 2 * 3 * pixels, 5.0 * window_flops * 3 * pixels),
+        "ssim backward": Floor(NUMBER * 3 * 3 * pixels, 3.0 * window_flops * 3 * pixels),
         # Parameter, gradient and two moments are read, all but the gradient written.
         "optimizer": Floor(NUMBER * 7 * work.parameters),
         # Gradient and radius are read; three statistics read and written.
         "density statistics": Floor(NUMBER * work.rows * (3 + 2 * 4)),
     }
     if work.samples is not None:
-        found["splat"] = Floor(NUMBER * read, FORWARD_FLOPS * work.samples)
+        found["splat"] = Floor(NUMBER * read, float(FORWARD_FLOPS * work.samples))
         written = work.rows * (_SHAPE_NUMBERS + color + 2)
-        found["splat backward"] = Floor(NUMBER * (read + written), BACKWARD_FLOPS * work.samples)
+        found["splat backward"] = Floor(NUMBER * (read + written), float(BACKWARD_FLOPS * work.samples))
     return found
 
 

@@ -15,10 +15,9 @@ from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.step_figure import draw_step
 from sparsestreet.bench.timing import Spread, last_workspace, spread
 from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.training.callbacks.phase_times import LOOP
 
 OP = ("splat", "splat backward")
-LOOP = "loop"
-"""What is in no phase: Lightning, and callbacks that have nothing to do in this step."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,10 @@ def run_step(
 def _record(what: str, system: LightningModule, watch: StepWatch) -> StepRecord:
     bandwidth, peak = measured_bandwidth(system.device), measured_peak()
     least = floors(watch.work)
-    names = sorted({name for seconds in watch.seconds for name in seconds}, key=lambda name: -_total(watch, name))
+    names = sorted(
+        {name for seconds in watch.seconds for name in seconds} | watch.operations.keys(),
+        key=lambda name: -_total(watch, name),
+    )
     phases = []
     for name in names:
         floor = least.get(name)

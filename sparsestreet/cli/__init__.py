@@ -3,6 +3,8 @@
 import importlib
 import sys
 
+from sparsestreet.cli.process import prepare_process
+
 USAGE = """\
 SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them small, measure what it costs.
 
@@ -33,6 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
     if command in ("-h", "--help", "help"):
         print(USAGE)
         sys.exit(0)
+    prepare_process()
     sys.exit(_run(command, rest))
 
 

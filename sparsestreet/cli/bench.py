@@ -37,7 +37,7 @@ def bench(arguments: list[str]) -> int:
         "gpu": _gpu,
     }
     parser = _parser(list(modes))
-    options = parser.parse_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
     if options.overrides and options.mode != "step":
         parser.error(f"{options.mode} takes no options of train, got {' '.join(options.overrides)}")
     if options.threads is not None:

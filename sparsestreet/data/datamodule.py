@@ -8,6 +8,7 @@ from lightning import LightningDataModule
 from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog, split
+from sparsestreet.phases import phase
 from sparsestreet.types import Frame
 
 
@@ -38,7 +39,9 @@ class ShuffledFrames:
         epoch, position = divmod(self._drawn, len(self.frames))
         for index in self._order(epoch)[position:]:
             self._drawn += 1
-            yield self.frames[index]
+            with phase("data"):
+                frame = self.frames[index]
+            yield frame
 
     def _order(self, epoch: int) -> list[int]:
         # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
@@ -104,4 +107,5 @@ class StreetData(LightningDataModule):
 
     def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
         """The frame on the device (Lightning itself cannot move a frozen dataclass)."""
-        return to_device(batch, device)
+        with phase("data"):
+            return to_device(batch, device)

@@ -17,7 +17,7 @@ def test_help_teaches_by_example(capsys):
         bench(["--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    assert all(f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "scaling", "gpu"))
+    assert all(f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "step", "scaling", "gpu"))
 
 
 def test_unknown_mode_is_refused(capsys):
@@ -33,6 +33,31 @@ def test_records_name_command_and_threads(tmp_path, capsys):
     assert first["provenance"]["command"].startswith("sparsestreet bench scaling --quick")
     assert first["provenance"]["threads"] == torch.get_num_threads()
     assert first["rows"] < min(scaling.ROWS)
+
+
+def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, capsys):
+    assert bench(["step", "--quick", "--out", str(tmp_path), *tiny_street, "sparsify=masks"]) == 0
+    record = json.loads((tmp_path / "step.jsonl").read_text())
+    phases = {phase["name"]: phase for phase in record["phases"]}
+    every_step = {"data", "scene", "splat", "sky", "loss photometric", "loss mask_sparsity", "splat backward",
+                  "scene backward", "backward", "optimizer", "density statistics", "loop"}  # fmt: skip
+    assert every_step <= phases.keys()
+    assert sum(phase["time"]["median"] for phase in phases.values()) == pytest.approx(
+        record["step"]["median"], rel=0.5
+    )  # medians of parts beside the median of the whole
+    assert sum(phase["operations"] for phase in phases.values()) == pytest.approx(record["operations"])
+    assert phases["splat"]["floor_ms"] > 0
+    assert record["gaussians"].keys() == {"background", "rigid"}
+    assert (tmp_path / "step.png").stat().st_size > 10_000
+    assert "times its op" in capsys.readouterr().out
+
+
+def test_step_refuses_what_train_refuses(tmp_path):
+    with pytest.raises(SystemExit, match=r"bench step: no key 'schedule\.max_stps'"):
+        bench(["step", "--quick", "--out", str(tmp_path), "schedule.max_stps=3"])
+    with pytest.raises(SystemExit) as ended:
+        bench(["blend", "--quick", "--out", str(tmp_path), "seed=1"])
+    assert ended.value.code == 2
 
 
 def test_gpu_without_a_device_is_an_error_and_quick_is_not(tmp_path, capsys, monkeypatch):

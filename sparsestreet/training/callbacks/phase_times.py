@@ -1,0 +1,79 @@
+"""Where the steps of a run spend their time, noted now and then."""
+
+import csv
+import io
+from pathlib import Path
+
+from lightning import Callback, LightningModule, Trainer
+
+from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.whole_file import whole_file
+
+LOOP = "loop"
+"""What is in no phase: Lightning, and callbacks that have nothing to do in a step."""
+
+
+class PhaseTimes(Callback):
+    """Writes ``phases.csv`` when training ends, or is interrupted: step, phase, milliseconds.
+
+    A step counts from the end of the one before it to its own. Most steps are not looked at and pay nothing; one that
+    is costs some tens of microseconds more.
+    """
+
+    def __init__(self, path: str | Path, every: int = 50) -> None:
+        """``every``: steps from one that is looked at to the next."""
+        if every < 1:
+            raise ValueError(f"phases are noted every so many steps, at least 1, got {every}")
+        self.path = Path(path)
+        self.every = every
+        self.rows: list[tuple[int, str, float]] = []
+        self._recorder: PhaseRecorder | None = None
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        step = trainer.global_step
+        self._note(step)
+        if (step + 1) % self.every == 0:
+            self._recorder = PhaseRecorder(clock_of(pl_module.device), outside=LOOP)
+            self._recorder.start()
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._forget()
+        self._write(trainer)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._forget()
+        if self.rows and not isinstance(exception, OSError):
+            self._write(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # It would be counted as a part of the step that follows it.
+        self._forget()
+
+    def state_dict(self) -> dict[str, object]:
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+        self.rows = list(state_dict["rows"])
+
+    def _note(self, step: int) -> None:
+        if self._recorder is not None:
+            self.rows += [(step, name, 1e3 * seconds) for name, seconds in self._recorder.stop().items()]
+            self._recorder = None
+
+    def _forget(self) -> None:
+        if self._recorder is not None:
+            self._recorder.stop()
+            self._recorder = None
+
+    def _write(self, trainer: Trainer) -> None:
+        if not trainer.is_global_zero:
+            return
+        buffer = io.StringIO()
+        writer = csv.writer(buffer, lineterminator="\n")
+        writer.writerow(("step", "phase", "milliseconds"))
+        writer.writerows((step, name, f"{value:.4f}") for step, name, value in self.rows)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(self.path) as temporary:
+            temporary.write_text(buffer.getvalue())
