@@ -128,6 +128,18 @@ class InstancePoses(ctypes.Structure):
     )
 
 
+class ImagePair(ctypes.Structure):
+    """Pointers to two images, and the definition of their structural similarity."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("image", "truth")),
+        *((name, c_int64) for name in ("height", "width")),
+        ("taps", c_double * 11),
+        *((name, c_double) for name in ("c1", "c2")),
+        ("threads", c_int64),
+    )
+
+
 class Report(ctypes.Structure):
     """Number of (splat, tile) pairs and the rows with most of them."""
 
@@ -208,6 +220,8 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_activate_backward": (c_int32, (c_int32, c_int32, c_void_p, c_void_p, c_void_p)),
         "splat_poses": (None, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_poses_backward": (None, (c_int32, c_int32, c_int64, *(c_void_p,) * 5)),
+        "splat_ssim": (c_int32, (c_int32, c_int32, *(c_void_p,) * 3)),
+        "splat_ssim_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)

@@ -61,6 +61,17 @@ struct Changes {
   double *largest, *squared;
 };
 
+constexpr int SSIM_WINDOW = 11;
+
+// Two images [h,w,3] whose structural similarity is asked for, and its definition.
+struct ImagePair {
+  const void *image, *truth;
+  int64_t height, width;
+  double taps[SSIM_WINDOW];  // along one axis, symmetric
+  double c1, c2;
+  int64_t threads;
+};
+
 // What went wrong, for the message: pair total and the three rows with most pairs (row -1: none).
 struct Report {
   int64_t pairs;

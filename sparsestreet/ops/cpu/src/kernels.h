@@ -31,11 +31,17 @@ struct NodeKernels {
                          void* rotation_deltas, void* translation_deltas);
 };
 
+struct SimilarityKernels {
+  void (*forward)(const ImagePair&, void* partials, void* mean);
+  void (*backward)(const ImagePair&, void* partials, const void* v_mean, void* v_image);
+};
+
 struct Kernels {
   const char* name;
   RowKernels rows[2];      // float, double
   PixelKernels pixels[2];
   NodeKernels nodes[2];
+  SimilarityKernels similarity[2];
 };
 
 }  // namespace splat

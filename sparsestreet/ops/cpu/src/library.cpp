@@ -8,6 +8,7 @@
   void fill_row_kernels(splat::Kernels&);        \
   void fill_pixel_kernels(splat::Kernels&);      \
   void fill_node_kernels(splat::Kernels&);       \
+  void fill_similarity_kernels(splat::Kernels&); \
   }
 SPLAT_DECLARE(baseline)
 #ifdef SPLAT_X86
@@ -43,10 +44,13 @@ bool runs(int variant) {
 
 const Kernels* variant(int index) {
   static const Kernels all[] = {
-      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels, baseline::fill_node_kernels),
+      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels, baseline::fill_node_kernels,
+           baseline::fill_similarity_kernels),
 #ifdef SPLAT_X86
-      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels, v3::fill_node_kernels),
-      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels, v4::fill_node_kernels),
+      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels, v3::fill_node_kernels,
+           v3::fill_similarity_kernels),
+      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels, v4::fill_node_kernels,
+           v4::fill_similarity_kernels),
 #endif
   };
   return &all[index];
@@ -172,4 +176,15 @@ SPLAT_API void splat_poses_backward(int32_t is_double, int32_t index, int64_t in
                                     void* translation_deltas) {
   chosen(index).nodes[is_double].poses_backward(instances, *of, quaternions, translations, rotation_deltas,
                                                 translation_deltas);
+}
+
+// Mean similarity, and its partial derivatives unless `partials` is null.
+SPLAT_API int32_t splat_ssim(int32_t is_double, int32_t index, const ImagePair* pair, void* partials, void* mean) {
+  return guarded([&]() -> int32_t { return chosen(index).similarity[is_double].forward(*pair, partials, mean), OK; });
+}
+
+// Gradient of the image, from the partial derivatives that splat_ssim left.
+SPLAT_API void splat_ssim_backward(int32_t is_double, int32_t index, const ImagePair* pair, void* partials,
+                                   const void* v_mean, void* v_image) {
+  chosen(index).similarity[is_double].backward(*pair, partials, v_mean, v_image);
 }

@@ -1,0 +1,169 @@
+"""SSIM and its gradient in C++ against torch in float64, finite differences, and which backend takes what."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from sparsestreet.ops import fused
+from sparsestreet.ops.cpu.library import load_library
+from sparsestreet.ops.cpu.ssim import mean_ssim
+from sparsestreet.ops.ssim import ssim
+from tests.ops.scenes import relative_error, with_threads
+
+COTANGENT = -1.7
+# A variance is a mean of squares less the square of a mean, and a mean is rounded 25 times by up to half an ulp: 11
+# taps down, 11 across, and what goes into them. That much of the squares is lost, beside the variances + 2 C2. In noise
+# the squares are no larger than the variances, in flat images, about one of their colors, no larger than 2 C2 = 1.8e-3.
+BAR = 25 * 2.0**-24
+# A constant difference of 0.4 has no variance and the square 0.16, ninety times 2 C2.
+BAR_OF_CONSTANTS = 90 * BAR
+# In float64 torch is rounded as well, and takes variances about zero: squares of up to 4 beside C2.
+BAR_OF_DOUBLES = 25 * 2.0**-53 * 4 / 9e-4
+
+
+def noise(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Two images of float32 noise, in float64, that are half alike."""
+    generator = torch.Generator().manual_seed(seed)
+    image, other = (torch.rand(height, width, 3, generator=generator).double() for _ in range(2))
+    return image, ((image + other) / 2).float().double()
+
+
+def bright_and_flat() -> tuple[Tensor, Tensor]:
+    """A sky of one color and a little noise, and its picture a hundredth away."""
+    image, other = noise(30, 45, seed=2)
+    truth = 0.9 + 1e-3 * image
+    return (truth + 1e-2 * other).float().double(), truth.float().double()
+
+
+CASES = {
+    "one window": noise(11, 11),
+    "few windows": noise(12, 37, seed=1),
+    "odd sizes": noise(97, 61, seed=2),
+    "wider than a block": noise(13, 203, seed=3),
+    "out of [0, 1]": (4 * noise(20, 31)[0] - 1, 3 - 5 * noise(20, 31)[1]),
+    "bright and flat": bright_and_flat(),
+    "constant": tuple(torch.full((18, 23, 3), value).double() for value in (0.3, 0.7)),
+}
+
+
+def value_and_gradient(image: Tensor, truth: Tensor, call=ssim, **options) -> tuple[Tensor, Tensor]:
+    leaf = image.clone().requires_grad_()
+    value = call(leaf, truth, **options)
+    (COTANGENT * value).backward()
+    return value.detach().double(), leaf.grad.double()
+
+
+def assert_matches(result: tuple[Tensor, Tensor], image: Tensor, truth: Tensor, bar: float) -> None:
+    value, gradient = value_and_gradient(image, truth, backend="torch")
+    assert gradient.norm() > 0
+    assert abs(result[0] - value) <= bar
+    assert relative_error(result[1], gradient) <= bar
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_in_double_it_is_torchs(name):
+    assert_matches(value_and_gradient(*CASES[name], backend="cpu"), *CASES[name], BAR_OF_DOUBLES)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("variant", [0, 1, 2])
+def test_in_float_with_every_instruction_set(name, variant):
+    if load_library().splat_variant_name(variant) is None:
+        pytest.skip(f"this processor does not run variant {variant}")
+    image, truth = CASES[name]
+    result = value_and_gradient(image.float(), truth.float(), mean_ssim, variant=variant)
+    assert_matches(result, image, truth, BAR_OF_CONSTANTS if name == "constant" else BAR)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equal_images_have_similarity_one_and_no_gradient(dtype):
+    image = noise(19, 22)[0].to(dtype)
+    value, gradient = value_and_gradient(image, image, backend="cpu")
+    assert float(value) == pytest.approx(1.0, abs=2 * torch.finfo(dtype).eps)  # two quotients of equal numbers
+    assert float(gradient.abs().max()) == 0.0
+
+
+def test_finite_differences():
+    image, truth = noise(13, 14)
+    assert torch.autograd.gradcheck(lambda leaf: ssim(leaf, truth, backend="cpu"), image.requires_grad_())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_same_bits_for_any_number_of_threads(dtype):
+    image, truth = (plane.to(dtype) for plane in noise(97, 203))
+    results = with_threads((1, 2, 3), lambda: value_and_gradient(image, truth, backend="cpu"))
+    for other in results[1:]:
+        assert torch.equal(results[0][0], other[0])
+        assert torch.equal(results[0][1], other[1])
+
+
+def test_every_output_is_written(monkeypatch):
+    """Tensors hold NaN before the library runs."""
+
+    def poisoned(empty):
+        return lambda *arguments, **options: empty(*arguments, **options).fill_(torch.nan)
+
+    image, truth = CASES["wider than a block"]
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "empty_like", poisoned(torch.empty_like))
+        patch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
+        result = value_and_gradient(image, truth, backend="cpu")
+    assert_matches(result, image, truth, BAR_OF_DOUBLES)
+
+
+def test_views_of_images_and_no_gradient():
+    """A loss may hand over what is not contiguous; without a gradient to come no derivative is kept."""
+    image, truth = noise(13, 17)
+    turned = image.transpose(0, 1).contiguous().transpose(0, 1).requires_grad_()
+    plain = ssim(image, truth, backend="cpu")
+    assert not plain.requires_grad
+    assert torch.equal(plain, ssim(turned, truth, backend="cpu").detach())
+
+
+def test_the_truth_gets_no_gradient():
+    image, truth = (plane.requires_grad_() for plane in noise(11, 12))
+    ssim(image, truth, backend="cpu").backward()
+    assert truth.grad is None
+    assert bool((image.grad != 0).all())
+
+
+def test_a_pixel_that_is_no_number_is_not_hidden():
+    image, truth = noise(20, 20)
+    image[4, 7, 1] = torch.nan
+    assert bool(ssim(image, truth, backend="cpu").isnan())
+
+
+@pytest.mark.parametrize("built", [True, False])
+def test_auto_takes_the_library_where_it_is_built(monkeypatch, built):
+    if not built:
+        monkeypatch.setattr(fused, "find_library", lambda: None)
+    image, truth = (plane.float() for plane in CASES["odd sizes"])
+    gradients = {
+        backend: value_and_gradient(image, truth, mean_ssim)[1]
+        if backend == "cpu"
+        else value_and_gradient(image, truth, backend=backend)[1]
+        for backend in ("auto", "cpu", "torch")
+    }
+    assert not torch.equal(gradients["cpu"], gradients["torch"])  # both round, each in its way
+    assert torch.equal(gradients["auto"], gradients["cpu" if built else "torch"])
+
+
+def test_what_the_library_does_not_take_is_torchs():
+    image, truth = noise(12, 13)
+    mixed = (image, truth.float())
+    assert torch.equal(ssim(*mixed), ssim(*mixed, backend="torch"))
+    with pytest.raises(ValueError, match=r"all float32 or all float64, got .*use backend='torch'"):
+        ssim(*mixed, backend="cpu")
+    with pytest.raises(ValueError, match=r"tensors on the cpu.*meta"):
+        ssim(image.to("meta"), truth.to("meta"), backend="cpu")
+
+
+def test_backends_that_cannot_run(monkeypatch):
+    image, truth = noise(12, 13)
+    with pytest.raises(ValueError, match=r"no backend 'cuda' of a fused step: choose one of .*'cpu'"):
+        ssim(image, truth, backend="cuda")
+    with pytest.raises(ValueError, match="instruction set 3 does not run here"):
+        mean_ssim(image, truth, 3)
+    monkeypatch.setattr(fused, "find_library", lambda: None)
+    with pytest.raises(RuntimeError, match="'cpu' is not built: install a C\\+\\+17 compiler"):
+        ssim(image, truth, backend="cpu")
