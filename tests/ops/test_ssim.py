@@ -129,10 +129,12 @@ def test_the_truth_gets_no_gradient():
     assert bool((image.grad != 0).all())
 
 
-def test_a_pixel_that_is_no_number_is_not_hidden():
-    image, truth = noise(20, 20)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_pixel_that_is_no_number_is_not_hidden(dtype):
+    image, truth = (plane.to(dtype) for plane in noise(20, 20))
     image[4, 7, 1] = torch.nan
-    assert bool(ssim(image, truth, backend="cpu").isnan())
+    variants = [variant for variant in range(3) if load_library().splat_variant_name(variant)]
+    assert all(bool(mean_ssim(image, truth, variant).isnan()) for variant in variants)
 
 
 @pytest.mark.parametrize("built", [True, False])

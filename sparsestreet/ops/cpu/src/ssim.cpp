@@ -1,4 +1,5 @@
-// Compiled once per instruction set, with the rules of arithmetic loosened so that the loops vectorize.
+// Compiled once per instruction set, with the rules of arithmetic loosened so that the loops vectorize. A NaN in an
+// image reaches the mean all the same: nothing here compares.
 #include "ssim.hpp"
 
 #include "kernels.h"
