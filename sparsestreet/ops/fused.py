@@ -36,16 +36,16 @@ def takes_triton(backend: str, *tensors: Tensor) -> bool:
 def fused_backend(backend: str, *tensors: Tensor) -> str:
     """Whether "torch" or the C++ library ("cpu") does a step; "auto" takes the library where it is built and fits.
 
-    It takes float32 and float64 on the CPU. Raises ValueError for an unknown name, or for "cpu" and tensors it does not
-    take, RuntimeError with the remedy if the library is not built.
+    It takes tensors on the CPU that are all float32 or all float64. Raises ValueError for an unknown name, or for "cpu"
+    and tensors it does not take, RuntimeError with the remedy if the library is not built.
     """
     if backend not in ("auto", "torch", "cpu"):
         raise ValueError(f"no backend {backend!r} of this step: choose one of ('auto', 'torch', 'cpu')")
-    fits = all(tensor.device.type == "cpu" and tensor.dtype in (float32, float64) for tensor in tensors)
+    kinds = {(tensor.dtype, tensor.device.type) for tensor in tensors}
+    fits = kinds in ({(float32, "cpu")}, {(float64, "cpu")})
     if backend != "cpu":
         return "cpu" if backend == "auto" and fits and find_library() is not None else "torch"
     if not fits:
-        kinds = [(tensor.dtype, str(tensor.device)) for tensor in tensors]
         raise ValueError(f"backend 'cpu' takes float32 or float64 tensors on the CPU, got {kinds}: use backend='torch'")
     if find_library() is None:
         raise RuntimeError(f"backend 'cpu' needs the C++ library: {remedy()}")

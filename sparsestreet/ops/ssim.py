@@ -11,23 +11,27 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from sparsestreet.ops.cpu import ssim as cpu_ssim
-from sparsestreet.ops.fused import takes_cpu, takes_triton
+from sparsestreet.ops.fused import fused_backend, takes_triton
 from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
+
+BACKENDS = ("auto", "torch", "cpu", "triton")
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backend: str = "auto") -> Float[Tensor, ""]:
     """Mean SSIM over the pixels whose window lies inside the image. Gradients go to the image only.
 
     ``backend``: "torch", "cpu" (C++), "triton", or "auto" for the one that suits the tensors; raises as
-    :func:`sparsestreet.ops.fused.takes_cpu` and :func:`~sparsestreet.ops.fused.takes_triton`, and ValueError below
+    :func:`sparsestreet.ops.fused.fused_backend` and :func:`~sparsestreet.ops.fused.takes_triton`, and ValueError below
     11x11 pixels or for different shapes.
     """
+    if backend not in BACKENDS:
+        raise ValueError(f"no backend {backend!r} of SSIM: choose one of {BACKENDS}")
     if image.shape != truth.shape:
         raise ValueError(f"SSIM compares images of one shape, got {tuple(image.shape)} and {tuple(truth.shape)}")
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, got {tuple(image.shape[:2])}")
     image, truth = image.contiguous(), truth.detach().contiguous()
-    if takes_cpu(backend, image, truth):
+    if backend != "triton" and fused_backend(backend, image, truth) == "cpu":
         return cpu_ssim.mean_ssim(image, truth)
     if takes_triton(backend, image, truth):
         from sparsestreet.ops.triton.ssim import mean_ssim

@@ -20,7 +20,7 @@ def mean_ssim(
     """``sparsestreet.ops.ssim.ssim`` of contiguous images, both float32 or both float64. Bitwise the same for any
     number of threads; ``variant`` picks an instruction set, as in :func:`sparsestreet.ops.cpu.rasterizer.rasterize`.
 
-    Raises MemoryError without room for the sums, ValueError for a variant that does not run here.
+    Raises MemoryError without room for the sums.
     """
     return _MeanSSIM.apply(image, truth, variant)
 
@@ -38,10 +38,8 @@ class _MeanSSIM(torch.autograd.Function):
         status = native.load_library().splat_ssim(
             *kind, byref(_pair(image, truth)), partials.data_ptr() if kept else None, mean.data_ptr()
         )
-        if status == native.STATUS_OUT_OF_MEMORY:
-            raise MemoryError("no memory for the sums of SSIM: compare smaller images")
         if status != native.STATUS_OK:
-            raise ValueError(f"instruction set {variant} does not run here: take {FASTEST_VARIANT}, the fastest")
+            raise MemoryError("no memory for the sums of SSIM: compare smaller images")
         ctx.save_for_backward(image, truth, partials)
         ctx.kind = kind
         return mean
