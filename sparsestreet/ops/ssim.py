@@ -1,7 +1,7 @@
 """Structural similarity with an 11x11 Gaussian window, as a training loss (Wang et al. 2004; 3DGS's D-SSIM).
 
 Written here because the loss runs at every step: in plain torch it takes a quarter of the time of
-``kornia.losses.ssim_loss`` at 320x192 on two cores, and in C++ (``cpu/ssim.py``) a sixth of that and less. Tested
+``kornia.losses.ssim_loss`` at 320x192 on two cores, and in C++ (``cpu/ssim.py``) a seventh of that. Tested
 against kornia. Reported SSIM is another definition (``metrics/``).
 """
 
