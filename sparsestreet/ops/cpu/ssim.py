@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
 from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
+from sparsestreet.phases import phase
 
 TAPS = (c_double * WINDOW)(*window())
 
@@ -49,9 +50,10 @@ class _MeanSSIM(torch.autograd.Function):
     def backward(ctx, v_mean):
         image, truth, partials = ctx.saved_tensors
         v_image = torch.empty_like(image)
-        native.load_library().splat_ssim_backward(
-            *ctx.kind, byref(_pair(image, truth)), partials.data_ptr(), v_mean.data_ptr(), v_image.data_ptr()
-        )
+        with phase("ssim backward"):
+            native.load_library().splat_ssim_backward(
+                *ctx.kind, byref(_pair(image, truth)), partials.data_ptr(), v_mean.data_ptr(), v_image.data_ptr()
+            )
         return v_image, None, None
 
 

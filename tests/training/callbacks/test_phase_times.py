@@ -8,7 +8,9 @@ from sparsestreet import phases
 from sparsestreet.training.callbacks import PhaseTimes
 from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system
 
-IN_EVERY_STEP = {"scene", "splat", "loss photometric", "backward", "splat backward", "optimizer", "loop"}
+IN_EVERY_STEP = {
+    "scene", "splat", "loss photometric", "backward", "splat backward", "ssim backward", "optimizer", "loop",
+}  # fmt: skip
 
 
 def steps_of(path) -> dict[int, set[str]]:
