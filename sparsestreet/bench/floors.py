@@ -88,8 +88,8 @@ def _floors(work: StepWork) -> dict[str, Floor]:
         "scene backward": assembly,
         "sky": Floor(NUMBER * (pixels + work.sky_pixels * (3 + 3))),
         "sky backward": Floor(NUMBER * work.sky_pixels * (3 + 1 + 3)),
-        # Five means forward; three derivatives backward.
-        "loss photometric": Floor(NUMBER * 2 * 3 * pixels, 5.0 * window_flops * 3 * pixels),
+        # Four means forward, of sums and differences; three derivatives backward.
+        "loss photometric": Floor(NUMBER * 2 * 3 * pixels, 4.0 * window_flops * 3 * pixels),
         "ssim backward": Floor(NUMBER * 3 * 3 * pixels, 3.0 * window_flops * 3 * pixels),
         # Parameter, gradient and two moments are read, all but the gradient written.
         "optimizer": Floor(NUMBER * 7 * work.parameters),
