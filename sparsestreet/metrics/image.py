@@ -100,8 +100,19 @@ def _window_means(stack: Float64[Tensor, "k c h w"]) -> Float64[Tensor, "k c h w
     """Mean over the 7x7 pixels around each pixel, mirrored at the border with the edge pixel repeated."""
     rows, columns = (_mirrored(length, stack.device) for length in stack.shape[-2:])
     padded = stack[:, :, rows][:, :, :, columns]
-    vertical = torch.nn.functional.avg_pool2d(padded, (WINDOW, 1), stride=1)
-    return torch.nn.functional.avg_pool2d(vertical, (1, WINDOW), stride=1)
+    return _sliding_sums(_sliding_sums(padded, -2), -1) / WINDOW**2
+
+
+def _sliding_sums(values: Float64[Tensor, "*b"], dim: int) -> Float64[Tensor, "*c"]:
+    """Sums of seven neighbors along a dimension, in four additions; torch's pooling takes twice as long."""
+    length = values.shape[dim] - WINDOW + 1
+
+    def shifted(sums: Tensor, by: int, count: int) -> Tensor:
+        return sums.narrow(dim, by, count)
+
+    pairs = shifted(values, 0, length + 5) + shifted(values, 1, length + 5)
+    fours = shifted(pairs, 0, length) + shifted(pairs, 2, length)
+    return fours + shifted(pairs, 4, length) + shifted(values, 6, length)
 
 
 def _mirrored(length: int, device: torch.device) -> Int[Tensor, " padded"]:
