@@ -3,24 +3,11 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
+from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.scene.learning_rate import LearningRate
-
-# Rows of each face: outward axis, direction of increasing column, direction of increasing row.
-# Faces +x, -x, +y, -y, +z, -z. Which way a face lies on its square is our own choice; nobody else reads it.
-_FACES = torch.tensor(
-    [
-        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[-1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [[0, 1, 0], [1, 0, 0], [0, 0, 1]],
-        [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-        [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
-        [[0, 0, -1], [1, 0, 0], [0, 1, 0]],
-    ],
-    dtype=torch.float64,
-)
 
 
 @dataclass(frozen=True)
@@ -44,55 +31,7 @@ class Sky(nn.Module):
         self.settings = settings
         side = settings.resolution
         self.texels = nn.Parameter(torch.full((6, side, side, 3), settings.initial_color))
-        self.register_buffer("bordered", _bordered_texels(side), persistent=False)
 
     def colors(self, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Color seen along world directions of any non-zero length; gradients go to the texels only."""
-        corners, weights = self._corners(directions.detach().reshape(-1, 3).to(self.texels.dtype))
-        # gather, because of the ways to read rows its backward is the fast one on the CPU.
-        index = corners.reshape(-1, 1).expand(-1, 3)
-        values = self.texels.reshape(-1, 3).gather(0, index).reshape(-1, 4, 3)
-        return (values * weights[..., None]).sum(1).reshape(directions.shape)
-
-    def _corners(self, directions: Float[Tensor, "p 3"]) -> tuple[Int[Tensor, "p 4"], Float[Tensor, "p 4"]]:
-        """The four texels around each direction (flat index) and their bilinear weights."""
-        side = self.texels.shape[1]
-        face, column, row = _face_coordinates(directions, side)
-        left, top = column.floor(), row.floor()
-        right_share, bottom_share = column - left, row - top
-        # The border is one texel wide, so texel 0 of the face is at 1 of the bordered table.
-        stride = side + 2
-        first = (face * stride + (top.long() + 1)) * stride + (left.long() + 1)
-        corners = self.bordered[torch.stack((first, first + 1, first + stride, first + stride + 1), dim=1)]
-        left_share, top_share = 1 - right_share, 1 - bottom_share
-        weights = (left_share * top_share, right_share * top_share, left_share * bottom_share)
-        return corners, torch.stack((*weights, right_share * bottom_share), dim=1)
-
-
-def _face_coordinates(
-    directions: Float[Tensor, "p 3"], side: int
-) -> tuple[Int[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
-    """Face, column and row of directions, in texels with centers at whole numbers: both in [-0.5, side - 0.5]."""
-    largest = directions.abs().argmax(1, keepdim=True)
-    component = directions.gather(1, largest)
-    on_cube = directions / component.abs()
-    face = 2 * largest.squeeze(1) + (component.squeeze(1) < 0)
-    # Column axis: y on the x faces, else x. Row axis: y on the z faces, else z.
-    across = torch.where(largest == 0, on_cube[:, 1:2], on_cube[:, 0:1]).squeeze(1)
-    down = torch.where(largest == 2, on_cube[:, 1:2], on_cube[:, 2:3]).squeeze(1)
-    return face, (across + 1) * (0.5 * side) - 0.5, (down + 1) * (0.5 * side) - 0.5
-
-
-def _bordered_texels(side: int) -> Int[Tensor, " n"]:
-    """Flat texel index for every entry of the faces with a border of one texel, flattened [6, side + 2, side + 2].
-
-    A border entry is the texel of the neighboring face that its direction hits: bilinear interpolation then mixes
-    the same two texels on either side of an edge, and the sky has no seams.
-    """
-    centers = (torch.arange(-1, side + 1, dtype=torch.float64) + 0.5) * (2 / side) - 1
-    row, column = torch.meshgrid(centers, centers, indexing="ij")
-    on_face = torch.stack((torch.ones_like(row), column, row), dim=-1)
-    directions = torch.einsum("rca,fab->frcb", on_face, _FACES)
-    face, column, row = _face_coordinates(directions.reshape(-1, 3), side)
-    column, row = (texel.round().long().clamp(0, side - 1) for texel in (column, row))
-    return (face * side + row) * side + column
+        return colors_along(self.texels, directions.reshape(-1, 3)).reshape(directions.shape)
