@@ -35,11 +35,15 @@ def bordered_texels(side: int, device: torch.device) -> Int[Tensor, " n"]:
     """Flat texel index for every entry of the faces with a border of one texel, flattened [6, side + 2, side + 2].
 
     A border entry is the texel of the neighboring face that its direction hits: bilinear interpolation then mixes
-    the same two texels on either side of an edge, and the sky has no seams.
+    the same two texels on either side of an edge, and the sky has no seams. Where three faces meet, all of them take
+    the x face's texel for their corner entry, which keeps it so up to the corners of the cube.
     """
     centers = (torch.arange(-1, side + 1, dtype=torch.float64) + 0.5) * (2 / side) - 1
     row, column = torch.meshgrid(centers, centers, indexing="ij")
     on_face = torch.stack((torch.ones_like(row), column, row), dim=-1)
+    # The sign is the cube's corner, where all three axes are equal and the first is taken as the largest.
+    at_corner = (row.abs() > 1) & (column.abs() > 1)
+    on_face = torch.where(at_corner[..., None], on_face.sign(), on_face)
     directions = torch.einsum("rca,fab->frcb", on_face, _FACES)
     face, column, row = _face_coordinates(directions.reshape(-1, 3), side)
     column, row = (texel.round().long().clamp(0, side - 1) for texel in (column, row))

@@ -54,21 +54,31 @@ def test_halfway_between_two_texels():
     torch.testing.assert_close(sky.colors(between[None, None])[0, 0], expected, atol=1e-12, rtol=0)
 
 
-def test_no_seam_along_the_edges():
+@pytest.mark.parametrize("side", [1, 2, 5, 8])
+def test_no_seam_along_the_edges_up_to_the_corners(side: int):
     """Stepping 2e-9 across any edge must not change the color of a random cube map beyond that step's slope."""
-    sky, side = random_sky(8), 8
+    sky = random_sky(side)
     generator = torch.Generator().manual_seed(1)
     for _ in range(200):
         edge = torch.empty(3, dtype=torch.float64)
         first, second, along = torch.randperm(3, generator=generator).tolist()
-        signs = torch.randint(0, 2, (2,), generator=generator) * 2 - 1
+        signs = torch.randint(0, 2, (3,), generator=generator) * 2 - 1
         edge[first], edge[second] = signs[0], signs[1]
-        # Up to the last texel center; at the very corner three faces meet and nothing bilinear is continuous.
-        edge[along] = (torch.rand((), generator=generator, dtype=torch.float64) * 2 - 1) * (1 - 1 / side)
+        # Half of them within half a texel of a corner of the cube, where three faces meet.
+        reach = 1 - torch.rand((), generator=generator, dtype=torch.float64) * (1 / side if signs[2] > 0 else 2)
+        edge[along] = reach * signs[2]
         step = torch.zeros(3, dtype=torch.float64)
         step[first] = 1e-9 * signs[0]
         here, there = sky.colors(torch.stack((edge + step, edge - step))[None])[0]
         assert (here - there).abs().max() < 1e-7  # slope of at most 8 texels a unit, times 2e-9, rounded up
+
+
+@pytest.mark.parametrize("side", [1, 2, 5, 8])
+def test_all_faces_agree_at_a_corner_of_the_cube(side: int):
+    sky = random_sky(side)
+    for corner in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3):
+        colors = sky.colors((1 + 1e-9 * torch.eye(3).double()) * corner)  # one direction on each of the three faces
+        assert (colors - colors[0]).abs().max() < 1e-7  # slope of at most 8 texels a unit, times 1e-9, rounded up
 
 
 def test_near_a_corner_the_jump_is_less_than_a_texel():
