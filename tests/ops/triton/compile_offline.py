@@ -54,7 +54,7 @@ def _compile(kernel: KernelInterface, launch: dict, arch: int) -> dict:
         **resources,
         "tensor_core": sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
         + compiled.asm["ptx"].count("tf32"),
-        "atomics": sum(text.split()[0].startswith(("ATOM", "RED.")) for _, text in instructions),
+        "atomics": sum(text.split()[0].startswith(("ATOM", "RED.", "REDG.")) for _, text in instructions),
         "sample": _per_sample(instructions),
         "code": hashlib.sha256(repr(instructions).encode()).hexdigest(),
     }
