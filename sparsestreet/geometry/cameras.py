@@ -32,6 +32,14 @@ def project(
     return pixels, depth, inside
 
 
+def ray_matrix(camera: Camera) -> list[list[float]]:
+    """The 3x3 matrix, in float64, that takes a place (x, y, 1) in the image of a pinhole, pixels, to its direction in
+    the world: R^T K^-1. The directions are not of unit length."""
+    pose, ((fx, _, cx), (_, fy, cy), _) = camera.camera_from_world.tolist(), camera.intrinsics.tolist()
+    columns = zip(*(row[:3] for row in pose[:3]), strict=True)
+    return [[right / fx, down / fy, ahead - right * cx / fx - down * cy / fy] for right, down, ahead in columns]
+
+
 def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[Tensor, "h w 3"]:
     """Unit directions in the world through the pixel centers, in the camera's dtype on a device."""
     like = {"dtype": camera.intrinsics.dtype, "device": device}

@@ -4,14 +4,16 @@
    it demands of its inputs (``validate``) and which rows it does not draw (``guards``);
 2. the backends: which one runs (``backend``), what each hands back (``raster``), the truth (``reference``), C++
    (``cpu``), GPUs (``triton``); ``spherical_harmonics`` is the formula that all of them follow;
-3. steps of training in torch and as one fused kernel (``fused`` chooses): D-SSIM (``ssim``, its window in
-   ``ssim_window``) and Adam of the rows that were seen (``visible_adam``).
+3. steps of training in torch and as one fused kernel (``fused`` chooses): the sky behind the splats (``sky``, its
+   geometry in ``cube_map``), D-SSIM (``ssim``, its window in ``ssim_window``) and Adam of the rows that were seen
+   (``visible_adam``).
 """
 
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.guards import Guards, guards
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.splat import contribution, leave_one_out, splat
 
 __all__ = [
@@ -21,6 +23,7 @@ __all__ = [
     "contribution",
     "guards",
     "leave_one_out",
+    "over_sky",
     "resolve_backend",
     "splat",
 ]

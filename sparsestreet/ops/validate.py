@@ -44,7 +44,7 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
         raise ValueError(f"means must be floating point, got {means.dtype}: convert the Gaussians to float32")
     if gaussians.sh.shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"sh must hold 1, 4, 9 or 16 terms (degree 0 to 3), got {gaussians.sh.shape[1]}")
-    _check_camera(camera)
+    check_camera(camera)
     moved = gaussians.displacements
     if moved is not None and (moved.shape != means.shape or moved.dtype != means.dtype or moved.device != means.device):
         raise ValueError(
@@ -116,7 +116,8 @@ def _check_size(camera: Camera) -> None:
         )
 
 
-def _check_camera(camera: Camera) -> None:
+def check_camera(camera: Camera) -> None:
+    """A size, a pose, intrinsics and effects that a camera can have; raises ValueError."""
     _check_size(camera)
     for name, shape in (("camera_from_world", (4, 4)), ("intrinsics", (3, 3))):
         matrix = getattr(camera, name)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
-from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops import SplatSettings, over_sky, splat
 from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.sky import Sky
@@ -52,7 +52,7 @@ def render(
         with phase("splat"):
             splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
         with phase("sky"):
-            rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options.settings)
+            rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options)
         return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans)
 
 
@@ -61,13 +61,8 @@ def sky_image(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | Non
     return None if scene.sky is None else scene.sky.colors(ray_directions(camera, scene.device))
 
 
-def _over_sky(splats: Rendering, sky: Sky, camera: Camera, settings: SplatSettings) -> Float[Tensor, "h w 3"]:
-    """Sky behind the splats, looked up only where more light gets through than at which the op stops a pixel.
-
-    In a street that is a fifth of the image: the sky costs what is seen of it.
-    """
-    transmittance = 1 - splats.alpha.flatten()
-    seen = torch.nonzero(transmittance > settings.transmittance_min).squeeze(1)
-    colors = sky.colors(ray_directions(camera, seen.device).reshape(-1, 3)[seen])
-    light = transmittance[seen, None] * colors
-    return splats.rgb.reshape(-1, 3).index_add(0, seen, light).reshape(splats.rgb.shape)
+def _over_sky(splats: Rendering, sky: Sky, camera: Camera, options: RenderOptions) -> Float[Tensor, "h w 3"]:
+    """Sky behind the splats where more light gets through than at which the op stops a pixel, by the same backend."""
+    backend = "torch" if options.backend == "reference" else options.backend
+    limit = options.settings.transmittance_min
+    return over_sky(splats.rgb, splats.alpha, sky.texels, camera, transmittance_min=limit, backend=backend)

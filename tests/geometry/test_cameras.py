@@ -2,7 +2,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.geometry.cameras import exact_position, project, ray_directions
+from sparsestreet.geometry.cameras import exact_position, project, ray_directions, ray_matrix
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.types import Camera
 
@@ -55,6 +55,14 @@ def test_rays_project_onto_their_pixel_centers(seed: int, distance: float):
     visible = depth > 0.2
     assert torch.equal(inside, visible)
     torch.testing.assert_close(pixels[visible], expected[visible], atol=1e-9, rtol=0)
+
+
+def test_the_matrix_of_rays_has_their_directions():
+    camera = camera_of(4)
+    row, column = torch.meshgrid(torch.arange(7).double() + 0.5, torch.arange(13).double() + 0.5, indexing="ij")
+    places = torch.stack((column, row, torch.ones_like(row)), dim=-1)
+    found = places @ torch.tensor(ray_matrix(camera), dtype=torch.float64).T
+    torch.testing.assert_close(found / found.norm(dim=-1, keepdim=True), ray_directions(camera), atol=1e-14, rtol=0)
 
 
 def test_no_points():

@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from sparsestreet.geometry.cameras import ray_directions
-from sparsestreet.ops import SplatSettings
+from sparsestreet.ops import SplatSettings, over_sky
+from sparsestreet.scene import rendering
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
@@ -99,6 +100,20 @@ def test_the_sky_shines_through_what_alpha_leaves():
     over_black = rendered(scene)
     expected = over_black.rgb + (1 - over_black.alpha[..., None]) * sky
     torch.testing.assert_close(with_sky.rgb, expected, atol=1e-6, rtol=0)  # one float32 rounding
+
+
+@pytest.mark.parametrize(("backend", "taken"), [("reference", "torch"), ("cpu", "cpu"), ("auto", "auto")])
+def test_the_sky_takes_the_backend_of_the_splats(monkeypatch, backend, taken):
+    asked = []
+
+    def recorded(*arguments, **options):
+        asked.append(options["backend"])
+        return over_sky(*arguments, **options)
+
+    monkeypatch.setattr(rendering, "over_sky", recorded)
+    result = render(scene_of(), view_at(0.5, CAMERA), options=RenderOptions(backend=backend))
+    assert asked == [taken]
+    torch.testing.assert_close(result.rgb, rendered(scene_of()).rgb, atol=1e-5, rtol=0)  # the bar of the splats
 
 
 def test_an_empty_scene_is_the_sky():

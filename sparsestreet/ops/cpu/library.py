@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, for measurements and tests of it."""
-_INTERFACE_VERSION = 8
+_INTERFACE_VERSION = 9
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -77,6 +77,17 @@ class Changes(ctypes.Structure):
     """Pointers to what the removal of each row changes."""
 
     _fields_ = tuple((name, c_void_p) for name in ("largest", "squared"))
+
+
+class Sky(ctypes.Structure):
+    """A cube map behind an image and the camera that sees it."""
+
+    _fields_ = (
+        ("rays", c_double * 9),
+        ("transmittance_min", c_double),
+        *((name, c_int64) for name in ("width", "height", "side", "threads")),
+        *((name, c_void_p) for name in ("bordered", "texels", "directions")),
+    )
 
 
 class RawRows(ctypes.Structure):
@@ -216,6 +227,8 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_backward": (c_int32, (c_void_p,) * 6),
         "splat_contribution": (c_int32, (c_void_p,) * 5),
         "splat_removal": (c_int32, (c_void_p,) * 6),
+        "splat_over_sky": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
+        "splat_over_sky_backward": (None, (c_int32, c_int32, *(c_void_p,) * 5)),
         "splat_activate": (c_int32, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_activate_backward": (c_int32, (c_int32, c_int32, c_void_p, c_void_p, c_void_p)),
         "splat_poses": (None, (c_int32, c_int32, c_void_p, c_void_p)),

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 8;
+constexpr int32_t INTERFACE_VERSION = 9;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -59,6 +59,16 @@ struct Backdrop {
 // How far a view moves when a row alone is removed.
 struct Changes {
   double *largest, *squared;
+};
+
+// A cube map behind an image, and the camera that sees it; pointers to float or double.
+struct Sky {
+  double rays[9];  // a place (x, y, 1) in the image, pixels, to its direction in the world
+  double transmittance_min;
+  int64_t width, height, side, threads;
+  const int64_t* bordered;  // the texel of each entry of the faces with a border [6,side+2,side+2]
+  const void* texels;       // [6,side,side,3]
+  const void* directions;   // of the pixels in the world [h,w,3]; null: those of `rays`
 };
 
 constexpr int SSIM_WINDOW = 11;

@@ -23,6 +23,11 @@ struct PixelKernels {
   void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
 };
 
+struct SkyKernels {
+  void (*over)(const Sky&, const void* rgb, const void* alpha, void* out);
+  void (*backward)(const Sky&, const void* alpha, const void* v_out, void* v_alpha, void* v_texels);
+};
+
 struct NodeKernels {
   void (*activate)(const RawRows&, const ActiveRows&);
   void (*activate_backward)(const RawRows&, const ActiveRows& cotangents, const RawGradients&);
@@ -40,6 +45,7 @@ struct Kernels {
   const char* name;
   RowKernels rows[2];      // float, double
   PixelKernels pixels[2];
+  SkyKernels sky[2];
   NodeKernels nodes[2];
   SimilarityKernels similarity[2];
 };

@@ -7,6 +7,7 @@
   namespace variant {                            \
   void fill_row_kernels(splat::Kernels&);        \
   void fill_pixel_kernels(splat::Kernels&);      \
+  void fill_sky_kernels(splat::Kernels&);        \
   void fill_node_kernels(splat::Kernels&);       \
   void fill_similarity_kernels(splat::Kernels&); \
   }
@@ -44,13 +45,13 @@ bool runs(int variant) {
 
 const Kernels* variant(int index) {
   static const Kernels all[] = {
-      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels, baseline::fill_node_kernels,
-           baseline::fill_similarity_kernels),
+      make("baseline", baseline::fill_row_kernels, baseline::fill_pixel_kernels, baseline::fill_sky_kernels,
+           baseline::fill_node_kernels, baseline::fill_similarity_kernels),
 #ifdef SPLAT_X86
-      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels, v3::fill_node_kernels,
-           v3::fill_similarity_kernels),
-      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels, v4::fill_node_kernels,
-           v4::fill_similarity_kernels),
+      make("x86-64-v3", v3::fill_row_kernels, v3::fill_pixel_kernels, v3::fill_sky_kernels,
+           v3::fill_node_kernels, v3::fill_similarity_kernels),
+      make("x86-64-v4", v4::fill_row_kernels, v4::fill_pixel_kernels, v4::fill_sky_kernels,
+           v4::fill_node_kernels, v4::fill_similarity_kernels),
 #endif
   };
   return &all[index];
@@ -155,7 +156,18 @@ SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, c
   });
 }
 
-// Fills the rows as they are splatted. Variants as in splat_variant_name, here and below.
+// Sky behind an image. Variants as in splat_variant_name, here and below.
+SPLAT_API void splat_over_sky(int32_t is_double, int32_t index, const Sky* sky, const void* rgb, const void* alpha,
+                              void* out) {
+  chosen(index).sky[is_double].over(*sky, rgb, alpha, out);
+}
+
+SPLAT_API void splat_over_sky_backward(int32_t is_double, int32_t index, const Sky* sky, const void* alpha,
+                                       const void* v_out, void* v_alpha, void* v_texels) {
+  chosen(index).sky[is_double].backward(*sky, alpha, v_out, v_alpha, v_texels);
+}
+
+// Fills the rows as they are splatted.
 SPLAT_API int32_t splat_activate(int32_t is_double, int32_t index, const RawRows* rows, const ActiveRows* out) {
   return guarded([&]() -> int32_t { return chosen(index).nodes[is_double].activate(*rows, *out), OK; });
 }

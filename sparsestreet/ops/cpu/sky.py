@@ -1,0 +1,73 @@
+"""The sky behind an image in C++, as an autograd function over torch tensors."""
+
+import itertools
+from ctypes import byref, c_double
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sparsestreet.geometry.cameras import ray_directions, ray_matrix
+from sparsestreet.ops.cpu import library as native
+from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
+from sparsestreet.ops.cube_map import bordered_texels
+from sparsestreet.types import Camera
+
+
+def over_sky(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    texels: Float[Tensor, "6 r r 3"],
+    camera: Camera,
+    transmittance_min: float,
+    variant: int = FASTEST_VARIANT,
+) -> Float[Tensor, "h w 3"]:
+    """``sparsestreet.ops.over_sky`` of contiguous tensors of one dtype, float32 or float64. Bitwise the same, gradients
+    too, for any number of threads. ``variant`` as for the splats."""
+    return _OverSky.apply(rgb, alpha, texels, camera, transmittance_min, variant)
+
+
+class _OverSky(torch.autograd.Function):
+    """Backward looks everything up once more: an image of colors would cost more to keep."""
+
+    @staticmethod
+    def forward(ctx, rgb, alpha, texels, camera, transmittance_min, variant):
+        out = torch.empty_like(rgb)
+        directions = None if camera.distortion is None else ray_directions(camera).to(rgb)
+        sky = _sky(texels, camera, transmittance_min, directions)
+        native.load_library().splat_over_sky(
+            rgb.dtype == torch.float64, variant, byref(sky), rgb.data_ptr(), alpha.data_ptr(), out.data_ptr()
+        )
+        ctx.save_for_backward(alpha, texels, directions)
+        ctx.camera, ctx.transmittance_min, ctx.variant = camera, transmittance_min, variant
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_out):
+        alpha, texels, directions = ctx.saved_tensors
+        _, wants_alpha, wants_texels, *_ = ctx.needs_input_grad
+        v_alpha = torch.empty_like(alpha) if wants_alpha else None
+        v_texels = torch.empty_like(texels) if wants_texels else None
+        sky = _sky(texels, ctx.camera, ctx.transmittance_min, directions)
+        cotangent = v_out.contiguous()
+        native.load_library().splat_over_sky_backward(
+            alpha.dtype == torch.float64, ctx.variant, byref(sky), alpha.data_ptr(), cotangent.data_ptr(),
+            *(None if gradient is None else gradient.data_ptr() for gradient in (v_alpha, v_texels)),
+        )  # fmt: skip
+        return v_out, v_alpha, v_texels, None, None, None
+
+
+def _sky(texels: Tensor, camera: Camera, transmittance_min: float, directions: Tensor | None) -> native.Sky:
+    return native.Sky(
+        rays=(c_double * 9)(*itertools.chain(*ray_matrix(camera))),
+        transmittance_min=transmittance_min,
+        width=camera.width,
+        height=camera.height,
+        side=texels.shape[1],
+        threads=native.thread_count(),
+        bordered=bordered_texels(texels.shape[1], texels.device).data_ptr(),
+        texels=texels.data_ptr(),
+        directions=None if directions is None else directions.data_ptr(),
+    )

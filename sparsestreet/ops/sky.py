@@ -1,0 +1,86 @@
+"""The sky behind an image: a cube map, looked up only where it is seen.
+
+In a street that is a fifth of the pixels. Fused because a training step would else dispatch a hundred small operations
+for it.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.geometry.cameras import ray_directions
+from sparsestreet.ops.cpu import sky as cpu
+from sparsestreet.ops.cube_map import colors_along
+from sparsestreet.ops.fused import fused_backend, takes_triton
+from sparsestreet.ops.validate import check_camera
+from sparsestreet.types import Camera
+
+BACKENDS = ("auto", "torch", "cpu", "triton")
+
+
+def over_sky(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    texels: Float[Tensor, "6 r r 3"],
+    camera: Camera,
+    *,
+    transmittance_min: float,
+    backend: str = "auto",
+) -> Float[Tensor, "h w 3"]:
+    """``rgb`` plus the light 1 - alpha times the sky's color, where that light is more than ``transmittance_min``.
+
+    Differentiable in ``rgb``, ``alpha`` and ``texels``, not in the camera. The sky is at infinity: a pixel sees it
+    along its ray (``ray_directions``), as if there were no rolling shutter.
+
+    Args:
+        rgb: color premultiplied by alpha.
+        alpha: coverage by what stands before the sky.
+        texels: a cube map (``cube_map``), r >= 1.
+        camera: of the image's size.
+        transmittance_min: that of the splats' settings, below which their pixels are finished.
+        backend: "torch", "cpu", "triton", or "auto" for the one that suits the tensors. The gradient of the texels is
+            the same to the last bit in every run with "cpu", for any number of threads; with "triton" it is not.
+
+    Raises:
+        ValueError: tensors of other shapes, of several dtypes or devices; a camera that the splats would refuse; an
+            unknown backend, or tensors that it does not take.
+        RuntimeError: the backend asked for is not built.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"no backend {backend!r} of the sky: choose one of {BACKENDS}")
+    check_camera(camera)
+    _check(rgb, alpha, texels, camera)
+    rgb, alpha, texels = rgb.contiguous(), alpha.contiguous(), texels.contiguous()
+    if backend != "triton" and fused_backend(backend, rgb, alpha, texels) == "cpu":
+        return cpu.over_sky(rgb, alpha, texels, camera, transmittance_min)
+    if takes_triton(backend, rgb, alpha, texels):
+        from sparsestreet.ops.triton import sky as triton
+
+        return triton.over_sky(rgb, alpha, texels, camera, transmittance_min)
+    return _over_sky(rgb, alpha, texels, camera, transmittance_min)
+
+
+def _over_sky(rgb: Tensor, alpha: Tensor, texels: Tensor, camera: Camera, transmittance_min: float) -> Tensor:
+    transmittance = 1 - alpha.flatten()
+    seen = torch.nonzero(transmittance > transmittance_min).squeeze(1)
+    colors = colors_along(texels, ray_directions(camera, seen.device).reshape(-1, 3)[seen])
+    light = transmittance[seen, None] * colors
+    return rgb.reshape(-1, 3).index_add(0, seen, light).reshape(rgb.shape)
+
+
+def _check(rgb: Tensor, alpha: Tensor, texels: Tensor, camera: Camera) -> None:
+    side = max(1, *texels.shape[1:2])
+    shapes = {"rgb": (camera.height, camera.width, 3), "alpha": (camera.height, camera.width)}
+    tensors = {"rgb": rgb, "alpha": alpha, "texels": texels}
+    for name, shape in (shapes | {"texels": (6, side, side, 3)}).items():
+        given = tensors[name]
+        if tuple(given.shape) != shape:
+            raise ValueError(
+                f"{name} must have shape {list(shape)} for an image of {camera.width}x{camera.height} pixels, got "
+                f"{list(given.shape)}: give the camera that rendered it"
+            )
+        if given.dtype != rgb.dtype or given.device != rgb.device:
+            raise ValueError(
+                f"rgb, alpha and texels must share one dtype and device: rgb is {rgb.dtype} on {rgb.device}, {name} is "
+                f"{given.dtype} on {given.device}; convert it with .to(rgb)"
+            )
