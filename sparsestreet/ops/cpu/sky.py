@@ -12,6 +12,7 @@ from sparsestreet.geometry.cameras import ray_directions, ray_matrix
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
 from sparsestreet.ops.cube_map import bordered_texels
+from sparsestreet.phases import phase
 from sparsestreet.types import Camera
 
 
@@ -46,17 +47,18 @@ class _OverSky(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, v_out):
-        alpha, texels, directions = ctx.saved_tensors
-        _, wants_alpha, wants_texels, *_ = ctx.needs_input_grad
-        v_alpha = torch.empty_like(alpha) if wants_alpha else None
-        v_texels = torch.empty_like(texels) if wants_texels else None
-        sky = _sky(texels, ctx.camera, ctx.transmittance_min, directions)
-        cotangent = v_out.contiguous()
-        native.load_library().splat_over_sky_backward(
-            alpha.dtype == torch.float64, ctx.variant, byref(sky), alpha.data_ptr(), cotangent.data_ptr(),
-            *(None if gradient is None else gradient.data_ptr() for gradient in (v_alpha, v_texels)),
-        )  # fmt: skip
-        return v_out, v_alpha, v_texels, None, None, None
+        with phase("sky backward"):
+            alpha, texels, directions = ctx.saved_tensors
+            _, wants_alpha, wants_texels, *_ = ctx.needs_input_grad
+            v_alpha = torch.empty_like(alpha) if wants_alpha else None
+            v_texels = torch.empty_like(texels) if wants_texels else None
+            sky = _sky(texels, ctx.camera, ctx.transmittance_min, directions)
+            cotangent = v_out.contiguous()
+            native.load_library().splat_over_sky_backward(
+                alpha.dtype == torch.float64, ctx.variant, byref(sky), alpha.data_ptr(), cotangent.data_ptr(),
+                *(None if gradient is None else gradient.data_ptr() for gradient in (v_alpha, v_texels)),
+            )  # fmt: skip
+            return v_out, v_alpha, v_texels, None, None, None
 
 
 def _sky(texels: Tensor, camera: Camera, transmittance_min: float, directions: Tensor | None) -> native.Sky:

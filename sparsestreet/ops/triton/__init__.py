@@ -11,5 +11,6 @@
 ``screen`` starts the first two stages, ``pixels`` the third and the pixels' half of the fourth, ``rasterizer`` makes an
 autograd function of them.
 
-No atomics: two runs agree to the last bit. Nothing here is imported before a backend "triton" is asked for.
+No atomics: two runs agree to the last bit, but for the texels of the sky (``sky``). Nothing here is imported before a
+backend "triton" is asked for.
 """
