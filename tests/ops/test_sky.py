@@ -12,6 +12,7 @@ from sparsestreet.ops import fused, over_sky
 from sparsestreet.ops import sky as torch_sky
 from sparsestreet.ops.cpu import sky as cpu
 from sparsestreet.ops.cpu.library import load_library
+from sparsestreet.phases import PhaseRecorder, WallClock
 from sparsestreet.types import Camera
 from tests.ops.scenes import device_of, every_fast_precision, relative_error, with_threads
 
@@ -223,6 +224,13 @@ def test_one_gradient_alone(backend, dtype, name):
     out.backward(torch.randn(out.shape, generator=torch.Generator().manual_seed(2)).to(out))
     wanted = answer(given, view, backend, dtype)[1][name]
     torch.testing.assert_close(tensors[name].grad.cpu().double(), wanted, atol=1e-5 * (backend == "triton"), rtol=0)
+
+
+def test_the_backward_pass_is_a_phase():
+    recorder = PhaseRecorder(WallClock())
+    recorder.start()
+    answer(image(camera(9, 7), 3), camera(9, 7), "cpu")
+    assert "sky backward" in recorder.stop()
 
 
 def test_auto_takes_what_is_fast(monkeypatch):
