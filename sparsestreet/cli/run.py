@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command, trainer_of
 from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.records import read_run, run_path
@@ -36,6 +37,8 @@ def run(cfg: DictConfig, out: Path) -> float:
     Raises ValueError for a configuration that cannot be or a log that is broken, OSError for files. Ends the program
     with the status of the signal that ended training.
     """
+    # A sweep's launcher starts processes of its own.
+    keep_freed_memory()
     problem = config_problem(cfg)
     if problem:
         raise ValueError(problem)
