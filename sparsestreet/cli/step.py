@@ -10,6 +10,7 @@ from sparsestreet.cli.assemble import data_of, recipe_of, trainer_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import configuration
 from sparsestreet.cli.run import silence_known_noise
+from sparsestreet.training.callbacks import PhaseTimes
 from sparsestreet.training.system import StreetSystem
 
 NEVER = 10**9
@@ -33,7 +34,9 @@ def train_with(overrides: Sequence[str], folder: Path) -> Callable[[Callback], S
         silence_known_noise()
         recipe, data = recipe_of(cfg), data_of(cfg)
         system = recipe.build(data)
-        trainer_of(cfg, [*recipe.callbacks.values(), watch], folder).fit(system, datamodule=data)
+        # One recorder at a time.
+        callbacks = [callback for callback in recipe.callbacks.values() if not isinstance(callback, PhaseTimes)]
+        trainer_of(cfg, [*callbacks, watch], folder).fit(system, datamodule=data)
         return system
 
     return train

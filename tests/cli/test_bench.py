@@ -36,7 +36,12 @@ def test_records_name_command_and_threads(tmp_path, capsys):
 
 
 def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, capsys):
-    assert bench(["step", "--quick", "--out", str(tmp_path), *tiny_street, "sparsify=masks"]) == 0
+    assert (
+        bench(
+            ["step", "--quick", "--out", str(tmp_path), *tiny_street, "sparsify=masks", "callback.phase_times.every=1"]
+        )
+        == 0
+    )
     record = json.loads((tmp_path / "step.jsonl").read_text())
     phases = {phase["name"]: phase for phase in record["phases"]}
     every_step = {"data", "scene", "splat", "sky", "loss photometric", "loss mask_sparsity", "splat backward",
