@@ -1,5 +1,6 @@
-"""From rows as a node stores them to rows as they are splatted: activated, masked, and placed in the world."""
+"""From rows as nodes store them to rows as they are splatted: activated, masked, placed in the world, in one table."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,8 +17,16 @@ OPACITY_LOGIT_LIMIT = 15.0
 
 
 @dataclass(frozen=True)
+class Placement:
+    """In which instance's box each row lies, and where the boxes are."""
+
+    poses: Poses
+    instances: Int[Tensor, " n"]
+
+
+@dataclass(frozen=True)
 class RawGaussians:
-    """Gaussians as they are learned, in the frame of their node or of their instance's box."""
+    """Gaussians as they are learned, in the world or in the boxes of their instances."""
 
     means: Float[Tensor, "n 3"]
     log_scales: Float[Tensor, "n 3"]
@@ -27,48 +36,44 @@ class RawGaussians:
     sh_dc: Float[Tensor, "n 1 3"]
     sh_rest: Float[Tensor, "n k 3"]
     """The coefficients behind the first, k in {0, 3, 8, 15}."""
+    multipliers: Float[Tensor, " n"] | None = None
+    """Of opacities and scales (a mask's); None: 1."""
+    placement: Placement | None = None
+    """Moves means and quaternions from their boxes to the world; rows of an absent instance get opacity 0."""
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def terms(self, sh_degree: int) -> int:
+        """Coefficients in use up to a degree; rows that store fewer use what they have."""
+        return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])
 
 
-@dataclass(frozen=True)
-class Placement:
-    """In which instance's box each row lies, and where the boxes are."""
+def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "auto") -> Gaussians:
+    """All parts one after the other: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
 
-    poses: Poses
-    instances: Int[Tensor, " n"]
+    With gradients to all that is learned; a part that uses fewer coefficients than another is padded with zeros. One
+    operation of the C++ library and one backward, whatever the number of parts and instances, or a few dozen of torch
+    for each part.
 
-
-def activate(
-    raw: RawGaussians,
-    *,
-    sh_degree: int,
-    multipliers: Float[Tensor, " n"] | None = None,
-    placement: Placement | None = None,
-    backend: str = "auto",
-) -> Gaussians:
-    """Scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree; with gradients to all that is learned.
-
-    One operation of the C++ library and one backward, or the same in a few dozen of torch.
-
-    Args:
-        raw: the stored rows.
-        sh_degree: highest degree in use; rows that store fewer coefficients use what they have.
-        multipliers: of opacities and scales (a mask's); None: 1.
-        placement: moves means and quaternions from their boxes to the world; rows of an absent instance get opacity 0.
-        backend: "torch", "cpu" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
+    ``backend``: "torch", "cpu" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
     """
-    terms = min((sh_degree + 1) ** 2, 1 + raw.sh_rest.shape[1])
-    if fused_backend(backend, raw.means) == "cpu":
+    if fused_backend(backend, *(part.means for part in parts)) == "cpu":
         from sparsestreet.ops.cpu.activate import activate as fused_activate
 
-        return fused_activate(raw, terms, multipliers, placement, OPACITY_LOGIT_LIMIT)
+        return fused_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
+    return Gaussians.concatenate([_activated(part, part.terms(sh_degree)) for part in parts])
+
+
+def _activated(raw: RawGaussians, terms: int) -> Gaussians:
     opacities = torch.sigmoid(raw.opacity_logits.clamp(-OPACITY_LOGIT_LIMIT, OPACITY_LOGIT_LIMIT))
     scales = torch.exp(raw.log_scales)
-    if multipliers is not None:
-        opacities, scales = opacities * multipliers, scales * multipliers[:, None]
+    if raw.multipliers is not None:
+        opacities, scales = opacities * raw.multipliers, scales * raw.multipliers[:, None]
     sh = torch.cat((raw.sh_dc, raw.sh_rest[:, : terms - 1]), dim=1) if terms > 1 else raw.sh_dc
-    if placement is None:
+    if raw.placement is None:
         return Gaussians(raw.means, raw.quaternions, scales, opacities, sh)
-    means, quaternions, presence = _placed(raw, placement)
+    means, quaternions, presence = _placed(raw, raw.placement)
     return Gaussians(means, quaternions, scales, opacities * presence, sh)
 
 

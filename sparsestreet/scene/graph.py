@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sparsestreet.ops.activate import activate
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
 from sparsestreet.scene.sky import Sky
@@ -42,11 +43,11 @@ class SceneGraph(nn.Module):
         """Activated Gaussians of all nodes in the world, seen from a view."""
         parts, spans, start = [], {}, 0
         for name, node in self.nodes.items():
-            part = node.gaussians_at(view, state)
+            part = node.raw_at(view, state)
             parts.append(part)
             spans[name] = slice(start, start + len(part))
             start += len(part)
-        return SceneGaussians(Gaussians.concatenate(parts), spans)
+        return SceneGaussians(activate(parts, sh_degree=state.sh_degree), spans)
 
     def counts(self) -> dict[str, int]:
         """Number of rows of every node, absent instances included."""

@@ -1,5 +1,7 @@
 """Rows as they are stored to rows as they are splatted: C++ against torch in double, and what both promise."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -35,6 +37,10 @@ def closed_every_third(count: int, dtype=torch.float64) -> torch.Tensor:
     return (torch.arange(count) % 3 > 0).to(dtype).requires_grad_()
 
 
+def fields_of(raw: RawGaussians) -> list[torch.Tensor]:
+    return [raw.means, raw.log_scales, raw.quaternions, raw.opacity_logits, raw.sh_dc, raw.sh_rest]
+
+
 def values_and_gradients(inputs: list[torch.Tensor], run) -> list[torch.Tensor]:
     """Outputs, and the gradients of all inputs under a fixed random cotangent."""
     outputs = [field for field in vars(run()).values() if field is not None]
@@ -46,14 +52,14 @@ def values_and_gradients(inputs: list[torch.Tensor], run) -> list[torch.Tensor]:
 
 
 def case(rest: int, degree: int, masked: bool, placed: bool, dtype=torch.float64, count: int = ROWS):
-    raw = raw_rows(count, rest, dtype)
     multipliers = closed_every_third(count, dtype) if masked else None
     where = placement(count, dtype) if placed else None
-    inputs = [*vars(raw).values(), *([] if multipliers is None else [multipliers])]
+    raw = replace(raw_rows(count, rest, dtype), multipliers=multipliers, placement=where)
+    inputs = [*fields_of(raw), *([] if multipliers is None else [multipliers])]
     inputs += [] if where is None else [where.poses.quaternions, where.poses.translations]
 
     def run(backend: str):
-        return activate(raw, sh_degree=degree, multipliers=multipliers, placement=where, backend=backend)
+        return activate([raw], sh_degree=degree, backend=backend)
 
     return inputs, run
 
@@ -69,18 +75,34 @@ def test_the_library_says_what_torch_says(rest, degree, masked, placed):
         torch.testing.assert_close(value, truth, rtol=1e-12, atol=1e-12)
 
 
+def parts_of_three_kinds(dtype=torch.float64) -> tuple[list[torch.Tensor], list[RawGaussians]]:
+    """Plain rows of degree 3; none at all; masked and placed ones of degree 1."""
+    where, closed = placement(40, dtype), closed_every_third(40, dtype)
+    parts = [raw_rows(70, 15, dtype), raw_rows(0, 8, dtype), raw_rows(40, 3, dtype, seed=3)]
+    inputs = [field for part in parts for field in fields_of(part)]
+    parts[2] = replace(parts[2], multipliers=closed, placement=where)
+    return [*inputs, closed, where.poses.quaternions, where.poses.translations], parts
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_parts_stand_one_after_the_other(degree):
+    inputs, parts = parts_of_three_kinds()
+    found = values_and_gradients(inputs, lambda: activate(parts, sh_degree=degree, backend="cpu"))
+    expected = values_and_gradients(inputs, lambda: activate(parts, sh_degree=degree, backend="torch"))
+    assert found[4].shape == (110, (degree + 1) ** 2, 3)
+    for value, truth in zip(found, expected, strict=True):
+        torch.testing.assert_close(value, truth, rtol=1e-12, atol=1e-12)
+    alone = activate(parts[2:], sh_degree=degree, backend="cpu")
+    assert torch.equal(found[0][70:], alone.means.detach())
+
+
 def test_gradients_are_those_of_finite_differences():
     inputs, _ = case(3, 1, masked=True, placed=True, count=4)
 
     def outputs(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
         where = Placement(Poses(values[7], values[8], torch.tensor([True, False, True])), torch.tensor([2, 0, 1, 0]))
-        return tuple(
-            field
-            for field in vars(
-                activate(RawGaussians(*values[:6]), sh_degree=1, multipliers=values[6], placement=where, backend="cpu")
-            ).values()
-            if field is not None
-        )
+        found = activate([RawGaussians(*values[:7], placement=where)], sh_degree=1, backend="cpu")
+        return tuple(field for field in vars(found).values() if field is not None)
 
     assert torch.autograd.gradcheck(outputs, inputs)
 
@@ -91,7 +113,7 @@ def test_single_precision_is_good_to_its_last_digits():
     logs = torch.linspace(-87.0, 88.0, 20001).reshape(-1, 3)
     raw = raw_rows(len(logs), 0, torch.float32)
     raw = RawGaussians(raw.means, logs, raw.quaternions, logs[:, 0] / 4, raw.sh_dc, raw.sh_rest)
-    found = activate(raw, sh_degree=0, backend="cpu")
+    found = activate([raw], sh_degree=0, backend="cpu")
     exact = torch.exp(logs.double())
     assert float((found.scales.double() / exact - 1).abs().max()) < 2.4e-7
     opacities = torch.sigmoid((logs[:, 0] / 4).clamp(-OPACITY_LOGIT_LIMIT, OPACITY_LOGIT_LIMIT).double())
@@ -117,7 +139,7 @@ def test_the_ends_of_the_range():
     n = len(given)
     raw = raw_rows(n, 0, torch.float32)
     raw = RawGaussians(raw.means, given[:, None].expand(n, 3), raw.quaternions, given, raw.sh_dc, raw.sh_rest)
-    found, expected = (activate(raw, sh_degree=0, backend=backend) for backend in ("cpu", "torch"))
+    found, expected = (activate([raw], sh_degree=0, backend=backend) for backend in ("cpu", "torch"))
     # Subnormal results (below 1e-38) are good to a subnormal's last digit.
     torch.testing.assert_close(found.scales, expected.scales, rtol=3e-7, atol=3e-45, equal_nan=True)
     torch.testing.assert_close(found.opacities, expected.opacities, rtol=4e-7, atol=0.0, equal_nan=True)
@@ -129,7 +151,7 @@ def test_a_held_logit_gets_no_gradient():
     raw = RawGaussians(raw.means, raw.log_scales, raw.quaternions, logits, raw.sh_dc, raw.sh_rest)
     gradients = []
     for backend in ("cpu", "torch"):
-        (gradient,) = torch.autograd.grad(activate(raw, sh_degree=0, backend=backend).opacities.sum(), logits)
+        (gradient,) = torch.autograd.grad(activate([raw], sh_degree=0, backend=backend).opacities.sum(), logits)
         gradients.append(gradient.tolist())
     assert gradients[0] == gradients[1]
     assert gradients[0][0] == gradients[0][2] == 0 < gradients[0][1]
@@ -156,13 +178,10 @@ def test_every_instruction_set(variant, dtype):
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
     raw, where, closed = raw_rows(37, 15, dtype), placement(37, dtype), closed_every_third(37, dtype)
-    inputs = [*vars(raw).values(), closed, where.poses.quaternions, where.poses.translations]
-    found = values_and_gradients(
-        inputs, lambda: fused.activate(raw, 16, closed, where, OPACITY_LOGIT_LIMIT, variant=variant)
-    )
-    expected = values_and_gradients(
-        inputs, lambda: activate(raw, sh_degree=3, multipliers=closed, placement=where, backend="torch")
-    )
+    inputs = [*fields_of(raw), closed, where.poses.quaternions, where.poses.translations]
+    raw = replace(raw, multipliers=closed, placement=where)
+    found = values_and_gradients(inputs, lambda: fused.activate([raw], 3, OPACITY_LOGIT_LIMIT, variant=variant))
+    expected = values_and_gradients(inputs, lambda: activate([raw], sh_degree=3, backend="torch"))
     for value, truth in zip(found, expected, strict=True):
         torch.testing.assert_close(value, truth)
 
@@ -177,7 +196,7 @@ def test_no_rows():
 def test_a_backend_that_does_not_fit_is_an_error():
     raw = raw_rows(2, 0, torch.float16)
     with pytest.raises(ValueError, match=r"takes float32 or float64 tensors on the CPU.*use backend='torch'"):
-        activate(raw, sh_degree=0, backend="cpu")
+        activate([raw], sh_degree=0, backend="cpu")
     with pytest.raises(ValueError, match="no backend 'cuda'"):
-        activate(raw, sh_degree=0, backend="cuda")
-    assert activate(raw, sh_degree=0).scales.dtype == torch.float16
+        activate([raw], sh_degree=0, backend="cuda")
+    assert activate([raw], sh_degree=0).scales.dtype == torch.float16

@@ -9,6 +9,7 @@ from lightning import Callback, Trainer
 from torch import Tensor
 
 from sparsestreet.ops import SplatSettings
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes import Background
@@ -19,7 +20,7 @@ from sparsestreet.training.losses import Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.training.visible_adam import VisibleAdam
-from sparsestreet.types import Frame, Gaussians, View
+from sparsestreet.types import Frame, View
 from tests.training.stubs import StubTrainer, background, fit, frame_at, group_of, make_rows, make_system, rigid
 
 RATES = {"rows": LearningRate(1e-3), "means": LearningRate(1e-2, 1e-4, scale_by_scene_radius=True)}
@@ -71,9 +72,9 @@ class Watched(Background):
         super().__init__(settings, make_rows(count))
         self.asked: list[SceneState] = []
 
-    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
         self.asked.append(state)
-        return super().gaussians_at(view, state)
+        return super().raw_at(view, state)
 
     def regularizers(self, state: SceneState) -> dict[str, Tensor]:
         self.asked.append(state)

@@ -1,95 +1,127 @@
 """Activation of stored rows by the C++ library, as an autograd function."""
 
+from collections.abc import Sequence
 from ctypes import byref
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.activate import Placement, RawGaussians
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
 from sparsestreet.phases import phase
 from sparsestreet.types import Gaussians
 
+FIELDS = 6
+"""Means, log-scales, quaternions, opacity logits, first coefficient, the others."""
+INPUTS = 11
+"""Tensors of a part: its fields, multipliers, pose quaternions, pose translations, instances, presence."""
+LEARNED = 9
+"""The first so many of them have gradients."""
+
 
 def activate(
-    raw: RawGaussians,
-    terms: int,
-    multipliers: Float[Tensor, " n"] | None,
-    placement: Placement | None,
-    logit_limit: float,
-    variant: int = FASTEST_VARIANT,
+    parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float, variant: int = FASTEST_VARIANT
 ) -> Gaussians:
-    """As ``sparsestreet.ops.activate``, with so many coefficients; the same bits for any number of threads."""
-    poses = (None,) * 4
-    if placement is not None:
-        at = placement.poses
-        poses = (at.quaternions, at.translations, placement.instances, at.present)
-    fields = (raw.means, raw.log_scales, raw.quaternions, raw.opacity_logits, raw.sh_dc, raw.sh_rest)
-    scales, opacities, sh, *placed = _Activate.apply(*fields, multipliers, *poses, terms, logit_limit, variant)
-    means, quaternions = placed if placement is not None else (raw.means, raw.quaternions)
-    return Gaussians(means, quaternions, scales, opacities, sh)
+    """As ``sparsestreet.ops.activate``; the same bits for any number of threads."""
+    terms = [part.terms(sh_degree) for part in parts]
+    tensors = [tensor for part in parts for tensor in _tensors(part)]
+    return Gaussians(*_Activate.apply(_Call(terms, logit_limit, variant), *tensors))
+
+
+@dataclass(frozen=True)
+class _Call:
+    """What all parts have in common, and the number of coefficients of each."""
+
+    terms: list[int]
+    logit_limit: float
+    variant: int
 
 
 class _Activate(torch.autograd.Function):
-    """Stored rows, multipliers and poses to scales, opacities, coefficients and, with poses, means and quaternions."""
+    """Stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities and coefficients."""
 
     @staticmethod
-    def forward(ctx, *given):
-        *tensors, terms, logit_limit, variant = given
-        tensors = [None if tensor is None else tensor.contiguous() for tensor in tensors]
-        means, placed = tensors[0], tensors[7] is not None
-        n = means.shape[0]
-        sh = means.new_empty(n, terms, 3)
-        outputs = [torch.empty_like(means), means.new_empty(n, 4)] if placed else [None, None]
-        outputs += [torch.empty_like(means), means.new_empty(n), sh]
-        ctx.settings = (terms, logit_limit, variant)
-        status = native.load_library().splat_activate(
-            int(means.dtype == torch.float64), variant, byref(_rows(tensors, terms, logit_limit)),
-            byref(native.ActiveRows(*_pointers(outputs))),
-        )  # fmt: skip
-        _raise_for(status)
+    def forward(ctx, call, *given):
+        tensors = [None if tensor is None else tensor.contiguous() for tensor in given]
+        means = tensors[0]
+        n = sum(len(part[0]) for part in _parts(tensors))
+        widths = ((3,), (4,), (3,), (), (max(call.terms), 3))
+        outputs = [means.new_empty(n, *width) for width in widths]
+        for rows, part, terms in _walk(tensors, call):
+            status = native.load_library().splat_activate(
+                int(means.dtype == torch.float64), call.variant, byref(_rows(part, terms, call)),
+                byref(native.ActiveRows(*_pointers([output[rows] for output in outputs]))),
+            )  # fmt: skip
+            _raise_for(status)
         ctx.save_for_backward(*tensors)
-        return (*outputs[2:], *outputs[:2]) if placed else tuple(outputs[2:])
+        ctx.call = call
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_scales, v_opacities, v_sh, v_means=None, v_quaternions=None):
-        tensors = list(ctx.saved_tensors)
-        terms, logit_limit, variant = ctx.settings
-        placed = tensors[7] is not None
-        cotangents = [
-            None if value is None else value.contiguous()
-            for value in (v_means, v_quaternions, v_scales, v_opacities, v_sh)
-        ]
-        # Means and quaternions that are not placed did not come through here.
-        gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in tensors[:9]]
-        if not placed:
-            gradients[0] = gradients[2] = None
-        # As in torch: an optimizer leaves alone what has no part in the image yet.
-        if terms == 1:
-            gradients[5] = None
+    def backward(ctx, *cotangents):
+        call, gradients = ctx.call, []
         with phase("scene backward"):
-            status = native.load_library().splat_activate_backward(
-                int(tensors[1].dtype == torch.float64), variant, byref(_rows(tensors, terms, logit_limit)),
-                byref(native.ActiveRows(*_pointers(cotangents))), byref(native.RawGradients(*_pointers(gradients))),
-            )  # fmt: skip
-        _raise_for(status)
-        return *gradients, None, None, None, None, None
+            cotangents = [value.contiguous() for value in cotangents]
+            for rows, part, terms in _walk(list(ctx.saved_tensors), call):
+                gradients += _part_backward(part, terms, call, [value[rows] for value in cotangents])
+        return None, *gradients
 
 
-def _rows(tensors: list[Tensor | None], terms: int, logit_limit: float) -> native.RawRows:
-    """The struct of six fields, multipliers, pose quaternions, pose translations, instances, presence."""
-    *fields, multipliers, turns, shifts, instances, present = tensors
-    pointers = _pointers([*fields, multipliers, instances])
-    poses = _pointers([turns, shifts, present])
-    rest = fields[5].shape[1]
-    num_instances = 0 if turns is None else turns.shape[0]
-    return native.RawRows(
-        fields[0].shape[0], rest, terms, logit_limit, *pointers, num_instances, *poses, native.thread_count()
+def _part_backward(part: list[Tensor | None], terms: int, call: _Call, cotangents: list[Tensor]) -> list[Tensor | None]:
+    """Gradients of the inputs of one part, from those of its rows."""
+    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
+    if part[LEARNED] is None:
+        # Means and quaternions went through as they are.
+        gradients[0] = gradients[2] = None
+    # As in torch: an optimizer leaves alone what has no part in the image yet.
+    if terms == 1:
+        gradients[FIELDS - 1] = None
+    status = native.load_library().splat_activate_backward(
+        int(part[0].dtype == torch.float64), call.variant, byref(_rows(part, terms, call)),
+        byref(native.ActiveRows(*_pointers(cotangents))), byref(native.RawGradients(*_pointers(gradients))),
+    )  # fmt: skip
+    _raise_for(status)
+    if part[LEARNED] is None:
+        gradients[0], gradients[2] = cotangents[:2]
+    return [*gradients, None, None]
+
+
+def _tensors(part: RawGaussians) -> list[Tensor | None]:
+    """The inputs of a part."""
+    fields = (part.means, part.log_scales, part.quaternions, part.opacity_logits, part.sh_dc, part.sh_rest)
+    where = part.placement
+    poses = (
+        (None,) * 4
+        if where is None
+        else (where.poses.quaternions, where.poses.translations, where.instances, where.poses.present)
     )
+    return [*fields, part.multipliers, *poses]
+
+
+def _parts(tensors: list[Tensor | None]) -> list[list[Tensor | None]]:
+    return [tensors[start : start + INPUTS] for start in range(0, len(tensors), INPUTS)]
+
+
+def _walk(tensors: list[Tensor | None], call: _Call) -> list[tuple[slice, list[Tensor | None], int]]:
+    """Every part: its rows in the whole, its inputs, its number of coefficients."""
+    found, start = [], 0
+    for part, terms in zip(_parts(tensors), call.terms, strict=True):
+        found.append((slice(start, start + len(part[0])), part, terms))
+        start += len(part[0])
+    return found
+
+
+def _rows(part: list[Tensor | None], terms: int, call: _Call) -> native.RawRows:
+    *fields, multipliers, turns, shifts, instances, present = part
+    return native.RawRows(
+        fields[0].shape[0], fields[-1].shape[1], terms, max(call.terms), call.logit_limit,
+        *_pointers([*fields, multipliers, instances]), 0 if turns is None else turns.shape[0],
+        *_pointers([turns, shifts, present]), native.thread_count(),
+    )  # fmt: skip
 
 
 def _pointers(tensors: list[Tensor | None]) -> list[int | None]:

@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, for measurements and tests of it."""
-_INTERFACE_VERSION = 9
+_INTERFACE_VERSION = 10
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -94,7 +94,7 @@ class RawRows(ctypes.Structure):
     """Pointers to rows as a node stores them; null: multipliers, instances."""
 
     _fields_ = (
-        *((name, c_int64) for name in ("count", "stored_rest", "terms")),
+        *((name, c_int64) for name in ("count", "stored_rest", "terms", "stride")),
         ("logit_limit", c_double),
         *((name, c_void_p) for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")),
         *((name, c_void_p) for name in ("multipliers", "instances")),

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.coverage import Coverage, coverage
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
@@ -16,7 +17,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.state import SceneState
 from sparsestreet.scene.streams import stream
-from sparsestreet.types import Gaussians, View
+from sparsestreet.types import View
 
 _log = logging.getLogger(__name__)
 
@@ -84,6 +85,6 @@ class BackgroundSettings(NodeSettings):
 class Background(Node):
     """Static Gaussians; their rows are in the world frame already."""
 
-    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
-        """The same Gaussians in every view, activated, with the mask applied."""
-        return self.activated(view, state)
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """The same Gaussians in every view, but for the mask."""
+        return self.stored(view)

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from sparsestreet.ops.activate import Placement, RawGaussians, activate
-from sparsestreet.ops.poses import Poses
+from sparsestreet.ops.activate import RawGaussians, activate
 from sparsestreet.scene.density import DensityStrategy
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import init_gaussians
@@ -127,7 +126,7 @@ class Node(nn.Module, ABC):
 
     The rows hold ``means``, ``log_scales``, ``quaternions``, ``opacity_logits``, ``sh_dc`` [n, 1, 3],
     ``sh_rest`` [n, k - 1, 3] and, while a mask is being trained, the mask's columns. They stay unmasked: only
-    ``gaussians_at`` applies the mask, so densification, culling and regularizers see what the mask hides
+    activation applies the mask, so densification, culling and regularizers see what the mask hides
     (a scale of 0 has no logarithm and no ratio).
     """
 
@@ -144,12 +143,15 @@ class Node(nn.Module, ABC):
         self.mask = mask
 
     @abstractmethod
-    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
-        """The node's Gaussians in the world, seen from a view, activated, with the mask applied.
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """The node's Gaussians as a view sees them, before activation, and how they are masked and placed.
 
-        ``sh`` has (min(state.sh_degree, stored degree) + 1)^2 terms. A view without frame and camera index is a novel
-        one: it is answered from its time alone.
+        A view without frame and camera index is a novel one: it is answered from its time alone.
         """
+
+    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
+        """The node's Gaussians in the world, activated, with the mask applied."""
+        return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)
 
     def regularizers(self, state: SceneState) -> dict[str, Float[Tensor, ""]]:
         """Terms of the loss that concern the node alone, by name, each with its weight."""
@@ -171,15 +173,17 @@ class Node(nn.Module, ABC):
         """float32 bytes of what moves the rows over time; 0 for a node that stands still."""
         return 0
 
-    def activated(self, view: View, state: SceneState, poses: Poses | None = None) -> Gaussians:
-        """The rows activated, opacities and scales times the mask's 0 or 1; in their own frame, or where ``poses`` puts
-        the instance that the buffer ``instances`` of the table names."""
+    def stored(self, view: View) -> RawGaussians:
+        """The rows as they are learned, with the mask as it is at the time of a view."""
         rows = self.rows
-        return activate(
-            RawGaussians(rows.means, rows.log_scales, rows.quaternions, rows.opacity_logits, rows.sh_dc, rows.sh_rest),
-            sh_degree=state.sh_degree,
+        return RawGaussians(
+            rows.means,
+            rows.log_scales,
+            rows.quaternions,
+            rows.opacity_logits,
+            rows.sh_dc,
+            rows.sh_rest,
             multipliers=None if self.mask is None else self.mask.multipliers(rows, view.time),
-            placement=None if poses is None else Placement(poses, rows.instances),
         )
 
     def row_bytes(self) -> int:

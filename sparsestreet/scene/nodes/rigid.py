@@ -1,7 +1,7 @@
 """Objects that move without changing their shape: where they start, and what they answer."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.ops.activate import Placement, RawGaussians
 from sparsestreet.ops.poses import Poses, poses_at
 from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
@@ -19,7 +20,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Gaussians, Track, View
+from sparsestreet.types import Track, View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,9 +152,9 @@ class Rigid(Node):
         self.rotation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
         self.translation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
 
-    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
         """Every instance's Gaussians at its pose; opacity exactly 0 where the instance is absent."""
-        return self.activated(view, state, self.pose_at(view.time))
+        return replace(self.stored(view), placement=Placement(self.pose_at(view.time), self.rows.instances))
 
     def pose_at(self, time: float) -> Poses:
         """Pose and presence of every instance at a normalized time."""

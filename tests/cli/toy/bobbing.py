@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.points import Points
@@ -15,7 +16,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes import Instances, Node, NodeSettings
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Gaussians, View
+from sparsestreet.types import View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +60,8 @@ class Bobbing(Node):
         self.names = names
         self.lift = nn.Sequential(nn.Linear(1, 4), nn.Tanh(), nn.Linear(4, 1))
 
-    def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
-        local = self.activated(view, state)
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        local = self.stored(view)
         height = torch.tanh(self.lift(torch.tensor([view.time], device=local.means.device)))
         return replace(local, means=local.means + torch.cat((torch.zeros_like(height).expand(2), height)))
 

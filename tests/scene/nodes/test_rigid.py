@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.ops.activate import activate
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.nodes import Rigid
 from tests.scene.street import degree, keyframes, pose, random_rows, rigid, track, view_at
@@ -55,7 +56,8 @@ def test_means_and_covariances_follow_general_poses():
         matrices.append(matrix)
     node = rigid_of([track(str(i), [4], [matrix]) for i, matrix in enumerate(matrices)])
     view, state = view_at(0.4), degree(1)
-    local, world = node.activated(view, state), node.gaussians_at(view, state)
+    local = activate([node.stored(view)], sh_degree=state.sh_degree)
+    world = node.gaussians_at(view, state)
     for row, instance in enumerate(node.rows.instances.tolist()):
         rotation, translation = matrices[instance][:3, :3], matrices[instance][:3, 3]
         # Trajectories are float32: 1e-6 of values of a few meters.

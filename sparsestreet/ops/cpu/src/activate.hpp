@@ -20,14 +20,14 @@ inline int64_t rows_of_part(int64_t rows) {
 
 template <class T>
 struct StoredRows {
-  int64_t count, stored_rest, terms;
+  int64_t count, stored_rest, terms, stride;
   T limit;
   const T *means, *log_scales, *quaternions, *logits, *dc, *rest, *multipliers;
   const int64_t* instances;
   const T *turns, *shifts;  // quaternions and translations of the instances
   const uint8_t* present;
   explicit StoredRows(const RawRows& r)
-      : count(r.count), stored_rest(r.stored_rest), terms(r.terms), limit(T(r.logit_limit)),
+      : count(r.count), stored_rest(r.stored_rest), terms(r.terms), stride(r.stride), limit(T(r.logit_limit)),
         means(static_cast<const T*>(r.means)), log_scales(static_cast<const T*>(r.log_scales)),
         quaternions(static_cast<const T*>(r.quaternions)), logits(static_cast<const T*>(r.opacity_logits)),
         dc(static_cast<const T*>(r.sh_dc)), rest(static_cast<const T*>(r.sh_rest)),
@@ -87,16 +87,17 @@ void activate(const RawRows& r, const ActiveRows& out) {
   const auto poses = instance_poses(r, in);
   T *means = static_cast<T*>(out.means), *quaternions = static_cast<T*>(out.quaternions);
   T *scales = static_cast<T*>(out.scales), *opacities = static_cast<T*>(out.opacities), *sh = static_cast<T*>(out.sh);
-  const int64_t part = rows_of_part(in.count), rest = 3 * (in.terms - 1);
+  const int64_t part = rows_of_part(in.count), rest = 3 * (in.terms - 1), pad = 3 * (in.stride - in.terms);
 #pragma omp parallel for num_threads(r.threads) schedule(static)
   for (int64_t first = 0; first < in.count; first += part) {
     const int64_t last = std::min(first + part, in.count);
     scales_of(in, first, last - first, scales + 3 * first);
     opacities_of(in, first, last - first, opacities + first);
     for (int64_t row = first; row < last; ++row) {
-      T* to = sh + (3 + rest) * row;
+      T* to = sh + 3 * in.stride * row;
       std::memcpy(to, in.dc + 3 * row, 3 * sizeof(T));
       std::memcpy(to + 3, in.rest + 3 * in.stored_rest * row, rest * sizeof(T));
+      std::memset(static_cast<void*>(to + 3 + rest), 0, pad * sizeof(T));
     }
     if (in.multipliers)
       for (int64_t row = first; row < last; ++row) {
@@ -108,6 +109,10 @@ void activate(const RawRows& r, const ActiveRows& out) {
         opacities[row] *= in.presence(row);
         place_row(in, poses, row, means + 3 * row, quaternions + 4 * row);
       }
+    else {
+      std::memcpy(means + 3 * first, in.means + 3 * first, 3 * (last - first) * sizeof(T));
+      std::memcpy(quaternions + 4 * first, in.quaternions + 4 * first, 4 * (last - first) * sizeof(T));
+    }
   }
 }
 
@@ -161,7 +166,7 @@ inline void activate_rows_backward(const StoredRows<T>& in, int64_t first, int64
     if (v_multipliers) v_multipliers[row] = v_multiplier;
     const bool held = in.logits[row] > in.limit || in.logits[row] < -in.limit;
     v_logits[row] = held ? T(0) : v_opacities[row] * multiplier * presence * opacity * (1 - opacity);
-    const T* from = v_sh + (3 + rest) * row;
+    const T* from = v_sh + 3 * in.stride * row;
     std::memcpy(v_dc + 3 * row, from, 3 * sizeof(T));
     if (!v_rest) continue;
     std::memcpy(v_rest + stored * row, from + 3, rest * sizeof(T));

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 9;
+constexpr int32_t INTERFACE_VERSION = 10;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -91,6 +91,7 @@ struct Report {
 // Rows as a node stores them; null: multipliers (1), instances (no poses).
 struct RawRows {
   int64_t count, stored_rest, terms;  // coefficients behind the first that are stored; all that are used
+  int64_t stride;                     // coefficients of a row as it is splatted; those not used are 0
   double logit_limit;
   const void *means, *log_scales, *quaternions, *opacity_logits, *sh_dc, *sh_rest, *multipliers;
   const int64_t* instances;  // of the rows
@@ -100,7 +101,7 @@ struct RawRows {
   int64_t threads;
 };
 
-// Activated rows or their gradients; means and quaternions only of rows with poses.
+// Activated rows or their gradients.
 struct ActiveRows {
   void *means, *quaternions, *scales, *opacities, *sh;
 };
