@@ -5,8 +5,8 @@
 2. the backends: which one runs (``backend``), what each hands back (``raster``), the truth (``reference``), C++
    (``cpu``), GPUs (``triton``); ``spherical_harmonics`` is the formula that all of them follow;
 3. steps around it, in torch and as one fused kernel (``fused`` chooses): from the rows of all nodes to Gaussians
-   (``activate``), where boxes are (``poses``), the sky behind the splats (``sky``, its geometry in ``cube_map``), D-SSIM (``ssim``, its window in ``ssim_window``) and Adam of the rows that were seen
-   (``visible_adam``).
+   (``activate``), where boxes are (``poses``), the sky behind the splats (``sky``; its geometry is in ``cube_map``),
+   D-SSIM (``ssim``, its window in ``ssim_window``) and Adam of the rows that were seen (``visible_adam``).
 """
 
 from sparsestreet.ops.backend import resolve_backend

@@ -20,7 +20,7 @@ class PhaseTimes(Callback):
     is costs some tens of microseconds more.
     """
 
-    def __init__(self, path: str | Path, every: int = 50) -> None:
+    def __init__(self, path: str | Path, every: int = 47) -> None:
         """``every``: steps from one that is looked at to the next."""
         if every < 1:
             raise ValueError(f"phases are noted every so many steps, at least 1, got {every}")
