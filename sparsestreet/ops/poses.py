@@ -37,14 +37,20 @@ def poses_at(
     translation t + translation_delta (world, meters). Between two of them the translation is interpolated linearly and
     the rotation by slerp along the shorter arc; ``keyframe_interval`` says between which, and what is present.
 
-    All instances are one operation of the C++ library, forward and backward, or dozens of small ones of torch.
-    ``backend``: "torch", "cpu" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
+    All instances are one operation of the C++ library or of Triton, forward and backward, or dozens of small ones of
+    torch. ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
     """
-    if fused_backend(backend, rotation_deltas, translation_deltas) == "cpu":
-        from sparsestreet.ops.cpu.poses import poses_at as fused_poses
-
-        return Poses(*fused_poses(keyframes, rotation_deltas, translation_deltas, time, max_gap))
     table = keyframes
+    numbers = (table.times, table.quaternions, table.translations, table.spans, rotation_deltas, translation_deltas)
+    chosen = fused_backend(backend, *numbers)
+    if chosen == "cpu":
+        from sparsestreet.ops.cpu.poses import poses_at as cpu_poses
+
+        return Poses(*cpu_poses(table, rotation_deltas, translation_deltas, time, max_gap))
+    if chosen == "triton":
+        from sparsestreet.ops.triton.poses import poses_at as triton_poses
+
+        return Poses(*triton_poses(table, rotation_deltas, translation_deltas, time, max_gap))
     at = keyframe_interval(table.times, table.valid, table.spans, time, max_gap)
     lower, upper = (_corrected(table, rotation_deltas, translation_deltas, place) for place in (at.lower, at.upper))
     quaternions = quat.slerp(lower[0], upper[0], at.fraction)

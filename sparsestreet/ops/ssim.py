@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from sparsestreet.ops.cpu import ssim as cpu_ssim
-from sparsestreet.ops.fused import fused_backend, takes_triton
+from sparsestreet.ops.fused import fused_backend
 from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
 
 BACKENDS = ("auto", "torch", "cpu", "triton")
@@ -21,8 +21,7 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backen
     """Mean SSIM over the pixels whose window lies inside the image. Gradients go to the image only.
 
     ``backend``: "torch", "cpu" (C++), "triton", or "auto" for the one that suits the tensors; raises as
-    :func:`sparsestreet.ops.fused.fused_backend` and :func:`~sparsestreet.ops.fused.takes_triton`, and ValueError below
-    11x11 pixels or for different shapes.
+    :func:`sparsestreet.ops.fused.fused_backend`, and ValueError below 11x11 pixels or for different shapes.
     """
     if backend not in BACKENDS:
         raise ValueError(f"no backend {backend!r} of SSIM: choose one of {BACKENDS}")
@@ -31,9 +30,10 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backen
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, got {tuple(image.shape[:2])}")
     image, truth = image.contiguous(), truth.detach().contiguous()
-    if backend != "triton" and fused_backend(backend, image, truth) == "cpu":
+    chosen = fused_backend(backend, image, truth)
+    if chosen == "cpu":
         return cpu_ssim.mean_ssim(image, truth)
-    if takes_triton(backend, image, truth):
+    if chosen == "triton":
         from sparsestreet.ops.triton.ssim import mean_ssim
 
         return mean_ssim(image, truth)

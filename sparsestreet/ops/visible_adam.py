@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.ops.fused import takes_triton
+from sparsestreet.ops.fused import fused_backend
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ def adam_step_(
     """Adam's update of ``parameter`` and both moments where ``visible``; other rows keep every bit.
 
     With all rows visible it is torch.optim.Adam without weight decay. ``backend``: "torch", "triton", or "auto" for
-    the one that suits the tensors; raises as :func:`sparsestreet.ops.fused.takes_triton`, and ValueError for tensors of
-    different shapes.
+    the one that suits the tensors; raises as :func:`sparsestreet.ops.fused.fused_backend`, and ValueError for tensors
+    of different shapes.
     """
     shapes = [tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)]
     if len(set(shapes)) != 1:
         raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")
-    if takes_triton(backend, parameter, exp_avg, exp_avg_sq):
+    if fused_backend(backend, parameter, exp_avg, exp_avg_sq, choices=("torch", "triton")) == "triton":
         from sparsestreet.ops.triton.adam import step_rows_
 
         moments = (exp_avg, exp_avg_sq)

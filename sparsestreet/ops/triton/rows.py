@@ -8,6 +8,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.harmonics import basis, direction_of, raw_color
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.lens import pinhole
+from sparsestreet.ops.triton.quaternions import unit_quaternion
 from sparsestreet.ops.triton.shape import (
     DETERMINANT_MIN,
     LARGEST,
@@ -18,12 +19,11 @@ from sparsestreet.ops.triton.shape import (
     conic,
     cutoff_of,
     reach_of,
-    unit_quaternion,
 )
 from sparsestreet.ops.triton.shutter import ROLL_LEAST, roll, velocity
 from sparsestreet.ops.triton.tiles import BOX_MARGIN, count_tiles
 from sparsestreet.ops.triton.unscented import unscented, within_fold
-from sparsestreet.ops.triton.vectors import times
+from sparsestreet.ops.triton.vectors import load_row, times
 from sparsestreet.ops.triton.view import (
     ALPHA_MIN,
     NEAR,
@@ -40,15 +40,6 @@ HALF_LARGEST = constant(65504.0)
 def block_of(view: View) -> int:
     """Rows of a program: fewer where a lane holds the eight points of a distorted row."""
     return 32 if view.distorted else 128
-
-
-@jit
-def load_row(field, row, mask, COUNT: tl.constexpr):
-    """COUNT numbers of each lane's row."""
-    values = ()
-    for i in tl.static_range(COUNT):
-        values += (tl.load(field + row * COUNT + i, mask, 0.0),)
-    return values
 
 
 @jit

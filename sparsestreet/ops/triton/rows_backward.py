@@ -8,7 +8,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.harmonics import color_backward
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.lens import pinhole, pinhole_backward
-from sparsestreet.ops.triton.rows import load_row
+from sparsestreet.ops.triton.quaternions import unit_quaternion
 from sparsestreet.ops.triton.shape import (
     LOG2_SCALE,
     TWO_LN2,
@@ -17,23 +17,16 @@ from sparsestreet.ops.triton.shape import (
     camera_axes,
     compensation,
     conic_backward,
-    unit_quaternion,
 )
 from sparsestreet.ops.triton.shutter import roll, roll_backward, velocity, velocity_backward
 from sparsestreet.ops.triton.unscented import unscented, unscented_backward
-from sparsestreet.ops.triton.vectors import plus, times, transposed_times
+from sparsestreet.ops.triton.vectors import load_row, plus, store_row, times, transposed_times
 from sparsestreet.ops.triton.view import ROTATION, View, in_camera, load_matrix
 
 
 def block_of(view: View) -> int:
     """Rows of a program: as many lanes hold the eight points of a distorted row, so that none spills registers."""
     return 16 if view.distorted else 128
-
-
-@jit
-def store_row(field, row, values, mask, COUNT: tl.constexpr):
-    for i in tl.static_range(COUNT):
-        tl.store(field + row * COUNT + i, values[i], mask)
 
 
 @jit

@@ -5,6 +5,7 @@ import math
 import triton.language as tl
 
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.quaternions import rotation_backward, rotation_of, unit_backward
 from sparsestreet.ops.triton.vectors import dot, product, transposed
 from sparsestreet.ops.triton.view import ALPHA_MIN, BLUR, BOX_REACH, LOG2_ALPHA_MIN
 
@@ -12,40 +13,10 @@ from sparsestreet.ops.triton.view import ALPHA_MIN, BLUR, BOX_REACH, LOG2_ALPHA_
 LOG2_SCALE = constant(math.sqrt(math.log2(math.e) / 2))
 TWO_LN2 = constant(2 * math.log(2))
 HALF_LOG2_E = constant(math.log2(math.e) / 2)
-# Of geometry/quaternions.py, in float32: the length below which gradients stop growing.
-SHORTEST = constant(2.0**-126 / 2.0**-23)
 # Of ops/reference: COMPENSATION_FLOOR squared, and DETERMINANT_MIN.
 RATIO_FLOOR = constant(2.5e-5)
 DETERMINANT_MIN = constant(1e-12)
 LARGEST = constant(3.4028234663852886e38)
-
-
-@jit
-def unit_quaternion(q):
-    """Unit quaternion and 1 / length; an exact zero is the identity with 1 / length 0.
-
-    By the largest component first: squares would leave float32's range long before the length does. 1 / length stays
-    below 1 / SHORTEST, where it would leave it.
-    """
-    largest = tl.maximum(tl.maximum(tl.abs(q[0]), tl.abs(q[1])), tl.maximum(tl.abs(q[2]), tl.abs(q[3])))
-    scale = 1.0 / tl.maximum(largest, SHORTEST)
-    w, x, y, z = q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
-    squared = w * w + x * x + y * y + z * z
-    usable = squared > 0
-    inverse = tl.where(usable, 1.0 / tl.sqrt(tl.where(usable, squared, 1.0)), 0.0)
-    unit = (tl.where(usable, w * inverse, 1.0), x * inverse, y * inverse, z * inverse)
-    return unit, tl.minimum(scale * inverse, 1.0 / SHORTEST)
-
-
-@jit
-def rotation_of(q):
-    """world_from_gaussian of a unit quaternion wxyz."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
 
 
 @jit
@@ -72,15 +43,7 @@ def axes_backward(rotation, q, inverse_length, scales, v_axes):
     r, columns = transposed(rotation_of(q)), transposed(v)
     v_scales = (dot(columns[0], r[0]), dot(columns[1], r[1]), dot(columns[2], r[2]))
     v = times_columns(v, scales)
-    a, b, c = v[0], v[1], v[2]
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    gw = 2 * (x * (c[1] - b[2]) + y * (a[2] - c[0]) + z * (b[0] - a[1]))
-    gx = 2 * (w * (c[1] - b[2]) + y * (a[1] + b[0]) + z * (a[2] + c[0])) - 4 * x * (b[1] + c[2])
-    gy = 2 * (w * (a[2] - c[0]) + x * (a[1] + b[0]) + z * (b[2] + c[1])) - 4 * y * (a[0] + c[2])
-    gz = 2 * (w * (b[0] - a[1]) + x * (a[2] + c[0]) + y * (b[2] + c[1])) - 4 * z * (a[0] + b[1])
-    along = gw * w + gx * x + gy * y + gz * z
-    k = inverse_length
-    return ((gw - along * w) * k, (gx - along * x) * k, (gy - along * y) * k, (gz - along * z) * k), v_scales
+    return unit_backward(q, inverse_length, rotation_backward(q, v)), v_scales
 
 
 @jit

@@ -1,8 +1,23 @@
-"""Vectors and matrices of a lane: tuples of three numbers, and of three rows."""
+"""Vectors and matrices of a lane: tuples of three numbers, and of three rows; reading and writing of vectors."""
 
-import triton.language as tl  # noqa: F401  (the interpreter looks for it beside each function)
+import triton.language as tl
 
 from sparsestreet.ops.triton.language import jit
+
+
+@jit
+def load_row(field, row, mask, COUNT: tl.constexpr):
+    """COUNT numbers of each lane's row."""
+    values = ()
+    for i in tl.static_range(COUNT):
+        values += (tl.load(field + row * COUNT + i, mask, 0.0),)
+    return values
+
+
+@jit
+def store_row(field, row, values, mask, COUNT: tl.constexpr):
+    for i in tl.static_range(COUNT):
+        tl.store(field + row * COUNT + i, values[i], mask)
 
 
 @jit

@@ -1,0 +1,82 @@
+"""Rotations of a lane: quaternions wxyz as tuples of four numbers, as in geometry/quaternions.py."""
+
+import triton.language as tl
+
+from sparsestreet.ops.triton.language import constant, jit
+
+# Of geometry/quaternions.py, in float32: the length below which gradients stop growing.
+SHORTEST = constant(2.0**-126 / 2.0**-23)
+
+
+@jit
+def inner(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+
+
+@jit
+def weighted(k, a, m, b):
+    """k a + m b."""
+    return k * a[0] + m * b[0], k * a[1] + m * b[1], k * a[2] + m * b[2], k * a[3] + m * b[3]
+
+
+@jit
+def unit_quaternion(q):
+    """Unit quaternion and 1 / length; an exact zero is the identity with 1 / length 0.
+
+    By the largest component first: squares would leave float32's range long before the length does. 1 / length stays
+    below 1 / SHORTEST, where it would leave it.
+    """
+    largest = tl.maximum(tl.maximum(tl.abs(q[0]), tl.abs(q[1])), tl.maximum(tl.abs(q[2]), tl.abs(q[3])))
+    scale = 1.0 / tl.maximum(largest, SHORTEST)
+    w, x, y, z = q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
+    squared = w * w + x * x + y * y + z * z
+    usable = squared > 0
+    inverse = tl.where(usable, 1.0 / tl.sqrt(tl.where(usable, squared, 1.0)), 0.0)
+    unit = (tl.where(usable, w * inverse, 1.0), x * inverse, y * inverse, z * inverse)
+    return unit, tl.minimum(scale * inverse, 1.0 / SHORTEST)
+
+
+@jit
+def unit_backward(q, inverse_length, v):
+    """From the gradient of a unit quaternion to that of the given one."""
+    return weighted(inverse_length, v, -inverse_length * inner(v, q), q)
+
+
+@jit
+def rotation_of(q):
+    """The matrix of a unit quaternion."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@jit
+def rotation_backward(q, v):
+    """From the gradient of the matrix to that of the unit quaternion."""
+    a, b, c = v[0], v[1], v[2]
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        2 * (x * (c[1] - b[2]) + y * (a[2] - c[0]) + z * (b[0] - a[1])),
+        2 * (w * (c[1] - b[2]) + y * (a[1] + b[0]) + z * (a[2] + c[0])) - 4 * x * (b[1] + c[2]),
+        2 * (w * (a[2] - c[0]) + x * (a[1] + b[0]) + z * (b[2] + c[1])) - 4 * y * (a[0] + c[2]),
+        2 * (w * (b[0] - a[1]) + x * (a[2] + c[0]) + y * (b[2] + c[1])) - 4 * z * (a[0] + b[1]),
+    )
+
+
+@jit
+def conjugate(q):
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@jit
+def multiply(a, b):
+    """The Hamilton product; with one factor conjugated it is its own transpose."""
+    return (
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
