@@ -11,7 +11,7 @@ from torch import Tensor
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops.cpu import sky as cpu
 from sparsestreet.ops.cube_map import colors_along
-from sparsestreet.ops.fused import fused_backend, takes_triton
+from sparsestreet.ops.fused import fused_backend
 from sparsestreet.ops.validate import check_camera
 from sparsestreet.types import Camera
 
@@ -51,9 +51,10 @@ def over_sky(
     check_camera(camera)
     _check(rgb, alpha, texels, camera)
     rgb, alpha, texels = rgb.contiguous(), alpha.contiguous(), texels.contiguous()
-    if backend != "triton" and fused_backend(backend, rgb, alpha, texels) == "cpu":
+    chosen = fused_backend(backend, rgb, alpha, texels)
+    if chosen == "cpu":
         return cpu.over_sky(rgb, alpha, texels, camera, transmittance_min)
-    if takes_triton(backend, rgb, alpha, texels):
+    if chosen == "triton":
         from sparsestreet.ops.triton import sky as triton
 
         return triton.over_sky(rgb, alpha, texels, camera, transmittance_min)

@@ -184,3 +184,17 @@ def with_threads(counts: tuple[int, ...], call: Callable[[], Answer]) -> list[An
     finally:
         torch.set_num_threads(before)
     return results
+
+
+def fill_buffers_with_nan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is allocated without a value holds NaN (1, if it holds whole numbers) from now on."""
+
+    def filled(empty: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        def call(*arguments, **options) -> Tensor:
+            tensor = empty(*arguments, **options)
+            return tensor.fill_(torch.nan if tensor.is_floating_point() else 1)
+
+        return call
+
+    monkeypatch.setattr(torch, "empty_like", filled(torch.empty_like))
+    monkeypatch.setattr(torch.Tensor, "new_empty", filled(torch.Tensor.new_empty))

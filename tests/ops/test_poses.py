@@ -34,6 +34,10 @@ def tables(dtype=torch.float64, seed: int = 0, size: float = 0.3) -> tuple[Traje
     return table, *(delta.to(dtype).requires_grad_() for delta in deltas)
 
 
+def in_double(table: Trajectories) -> Trajectories:
+    return Trajectories(*(v.cpu().double() if v.is_floating_point() else v.cpu() for v in vars(table).values()))
+
+
 def values_and_gradients(deltas, run) -> list[torch.Tensor]:
     found = run()
     generator = torch.Generator().manual_seed(1)
@@ -75,7 +79,7 @@ def test_single_precision_is_good_to_its_last_digit(variant):
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
     table, *deltas = tables(torch.float32)
-    doubles = Trajectories(*(v.double() if v.is_floating_point() else v for v in vars(table).values()))
+    doubles = in_double(table)
     for time in TIMES:
         found = fused.poses_at(table, *deltas, time, MAX_GAP, variant)
         # The time itself is rounded as those of the table.

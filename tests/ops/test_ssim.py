@@ -8,7 +8,7 @@ from sparsestreet.ops import fused
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.cpu.ssim import mean_ssim
 from sparsestreet.ops.ssim import ssim
-from tests.ops.scenes import relative_error, with_threads
+from tests.ops.scenes import fill_buffers_with_nan, relative_error, with_threads
 
 COTANGENT = -1.7
 # A variance is a mean of squares less the square of a mean, and a mean is rounded 25 times by up to half an ulp: 11
@@ -100,15 +100,9 @@ def test_the_same_bits_for_any_number_of_threads(dtype):
 
 
 def test_every_output_is_written(monkeypatch):
-    """Tensors hold NaN before the library runs."""
-
-    def poisoned(empty):
-        return lambda *arguments, **options: empty(*arguments, **options).fill_(torch.nan)
-
     image, truth = CASES["wider than a block"]
     with monkeypatch.context() as patch:
-        patch.setattr(torch, "empty_like", poisoned(torch.empty_like))
-        patch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
+        fill_buffers_with_nan(patch)
         result = value_and_gradient(image, truth, backend="cpu")
     assert_matches(result, image, truth, BAR_OF_DOUBLES)
 

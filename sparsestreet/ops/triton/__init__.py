@@ -9,7 +9,10 @@
    (``rows_backward``, and the backward halves beside each formula).
 
 ``screen`` starts the first two stages, ``pixels`` the third and the pixels' half of the fourth, ``rasterizer`` makes an
-autograd function of them.
+autograd function of them. ``quaternions`` and ``vectors`` are what formulas are made of.
+
+The other steps of a training step, a file each: ``poses`` and ``activate`` before the op, ``sky`` and ``ssim`` behind
+it, and ``adam``.
 
 No atomics: two runs agree to the last bit, but for the texels of the sky (``sky``). Nothing here is imported before a
 backend "triton" is asked for.

@@ -1,8 +1,8 @@
 """Activation and placement of stored rows and their gradients, one kernel each: ``sparsestreet.ops.activate``.
 
-A lane is a row; harmonics are copied in tiles of rows and columns, so that neighbors read and write neighbors. Gradients
-of poses are sums over rows: each program adds up its own, instance by instance, and torch adds the programs'. No
-atomics: two runs agree to the last bit.
+A lane is a row; coefficients are copied in tiles of rows and columns, so that neighbors read and write neighbors.
+Gradients of poses are sums over rows: each program adds up its own, instance by instance, and torch adds the programs'.
+No atomics: two runs agree to the last bit.
 """
 
 from functools import partial
@@ -111,7 +111,7 @@ def opacity_of(logit, limit):
 
 @jit
 def tile(row, given, COLUMN: tl.constexpr, WIDTH: tl.constexpr):
-    """Rows and the columns from COLUMN, and which of those are within the WIDTH of the first and of all coefficients."""
+    """Rows, the columns from COLUMN, which of them are the first coefficient's, and which the others' up to WIDTH."""
     column = COLUMN + tl.arange(0, COLUMNS)[None, :]
     return row[:, None], column, given[:, None] & (column < 3), given[:, None] & (column >= 3) & (column < WIDTH)
 

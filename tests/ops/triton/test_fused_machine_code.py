@@ -5,43 +5,70 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
+from sparsestreet.ops.triton import activate as fused_activate
 from sparsestreet.ops.triton import adam
+from sparsestreet.ops.triton import poses as fused_poses
 from sparsestreet.ops.triton import sky as fused_sky
 from sparsestreet.ops.triton import ssim as fused_ssim
 from sparsestreet.ops.visible_adam import AdamStep, adam_step_
 from tests.ops.scenes import camera, device_of
+from tests.ops.test_activate import case
+from tests.ops.test_activate import values_and_gradients as activated
+from tests.ops.test_poses import MAX_GAP
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
+from tests.ops.triton.test_poses import on_device
 
 # One process compiles for all tests.
 pytestmark = pytest.mark.xdist_group("machine code")
 DEVICE = device_of("triton")
-# Measured with Triton 3.7.1: 22, 32, 40, 64, 64. A streaming multiprocessor has 65536 registers: at 32 in each lane it
-# holds all the warps it can, at 64 half of them.
+# Measured with Triton 3.7.1: 62, 88, 41, 64, 22, 32, 40, 64, 64. A streaming multiprocessor has 65536 registers: at 32
+# in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on their
+# way at once; of poses there is a warp or two.
 REGISTERS = {
-    "step_numbers": 32, "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64
+    "activate_rows": 64, "activate_rows_backward": 88, "interpolate": 41, "interpolate_backward": 64,
+    "step_numbers": 32, "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
 }  # fmt: skip
+# Where the sine of an angle above 1e5 would be reduced.
+STACK = {"interpolate": 32, "interpolate_backward": 32}
 
 
 @pytest.fixture(scope="module", params=[90, pytest.param(80, marks=pytest.mark.slow)], ids=["sm_90", "sm_80"])
 def compiled(request) -> list[tuple[Launch, dict]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        launches = record_launches(monkeypatch, (adam, fused_sky, fused_ssim))
+        launches = record_launches(monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim))
+        launch_nodes()
+        launch_images()
         for shape in ((2, 3), (2, 15, 3)):
             fields = [torch.zeros(shape, device=DEVICE) for _ in range(4)]
             adam_step_(*fields, torch.ones(2, dtype=torch.bool, device=DEVICE), AdamStep(1, 0.1), backend="triton")
-        image = torch.zeros(11, 11, 3, device=DEVICE)
-        ssim(image, image, backend="triton")
-        ssim(image.requires_grad_(), image, backend="triton").backward()
-        texels = torch.zeros(6, 2, 2, 3, device=DEVICE)
-        for view in (camera(11, 11), replace(camera(11, 11), distortion=torch.zeros(5))):
-            over_sky(image, image[..., 0], texels, view, transmittance_min=0.1, backend="triton").sum().backward()
     return compile_launches(launches, request.param)
+
+
+def launch_nodes() -> None:
+    """The largest and the smallest kernels."""
+    for rest, degree, masked, placed in ((15, 3, True, True), (0, 0, False, False)):
+        inputs, run = case(rest, degree, masked, placed, torch.float32, count=2, device=DEVICE)
+        activated(inputs, lambda run=run: run("triton"))
+    table, deltas = on_device(0.3)
+    poses_at(table, *deltas, 0.3, MAX_GAP, backend="triton").translations.sum().backward()
+
+
+def launch_images() -> None:
+    image = torch.zeros(11, 11, 3, device=DEVICE)
+    ssim(image, image, backend="triton")
+    ssim(image.requires_grad_(), image, backend="triton").backward()
+    texels = torch.zeros(6, 2, 2, 3, device=DEVICE)
+    for view in (camera(11, 11), replace(camera(11, 11), distortion=torch.zeros(5))):
+        over_sky(image, image[..., 0], texels, view, transmittance_min=0.1, backend="triton").sum().backward()
 
 
 def test_every_kernel_is_compiled(compiled):
     assert sorted(launch.name for launch, _ in compiled) == [
+        "activate_rows", "activate_rows", "activate_rows_backward", "activate_rows_backward",
+        "interpolate", "interpolate_backward",
         "lay_over_sky", "lay_over_sky", "lay_over_sky_backward", "lay_over_sky_backward",
         "similarity", "similarity", "similarity_backward", "step_numbers", "step_numbers"
     ]  # fmt: skip
@@ -49,7 +76,7 @@ def test_every_kernel_is_compiled(compiled):
 
 def test_nothing_spills_and_registers_are_few(compiled):
     for launch, found in compiled:
-        assert found["spilled"] == 0, launch
+        assert found["spilled"] <= STACK.get(launch.name, 0), launch
         assert found["registers"] <= REGISTERS[launch.name], (launch, found)
 
 

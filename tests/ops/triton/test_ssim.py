@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sparsestreet.ops.ssim import ssim
 from sparsestreet.ops.triton import ssim as fused
-from tests.ops.scenes import device_of, relative_error
+from tests.ops.scenes import device_of, fill_buffers_with_nan, relative_error
 
 DEVICE = device_of("triton")
 COTANGENT = -1.7
@@ -68,13 +68,7 @@ def test_equal_images_have_similarity_one_and_no_gradient():
 
 
 def test_every_output_is_written(monkeypatch):
-    """Buffers hold NaN before the kernels run."""
-
-    def poisoned(empty):
-        return lambda *arguments, **options: empty(*arguments, **options).fill_(torch.nan)
-
-    monkeypatch.setattr(torch, "empty_like", poisoned(torch.empty_like))
-    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
+    fill_buffers_with_nan(monkeypatch)
     assert_matches_float64(*noise(12, 13, seed=3))
 
 

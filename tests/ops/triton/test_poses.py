@@ -1,0 +1,72 @@
+"""Poses by Triton and the gradients of their corrections, against torch in float64."""
+
+import pytest
+import torch
+
+from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.ops.poses import poses_at
+from sparsestreet.ops.triton import poses as fused
+from tests.ops.scenes import device_of, fill_buffers_with_nan
+from tests.ops.test_poses import MAX_GAP, in_double, tables, values_and_gradients
+
+DEVICE = device_of("triton")
+
+
+def on_device(size: float) -> tuple[Trajectories, list[torch.Tensor]]:
+    table, *deltas = tables(torch.float32, size=size)
+    leaves = [delta.detach().to(DEVICE, copy=True).requires_grad_() for delta in deltas]
+    return Trajectories(*(value.to(DEVICE) for value in vars(table).values())), leaves
+
+
+def assert_matches_float64(time: float, size: float) -> None:
+    table, deltas = on_device(size)
+    doubles = [delta.detach().cpu().double().requires_grad_() for delta in deltas]
+
+    def run(table, deltas, time, backend):
+        return tuple(vars(poses_at(table, *deltas, time, MAX_GAP, backend=backend)).values())
+
+    found = values_and_gradients(deltas, lambda: run(table, deltas, time, "triton"))
+    # The time itself is rounded as those of the table.
+    rounded = float(torch.tensor(time))
+    expected = values_and_gradients(doubles, lambda: run(in_double(table), doubles, rounded, "torch"))
+    assert found[2].tolist() == expected[2].tolist()
+    # A pose at twice the way between two keyframes doubles the rounding of both; gradients are of size 1 to 3.
+    for value, truth, bar in zip(found, expected, (4e-7, 1e-5, 0.0, 2e-6, 4e-7), strict=True):
+        torch.testing.assert_close(value.cpu().double(), truth.double(), rtol=0.0, atol=bar)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.05, 0.1, 0.15, 0.35, 0.9])
+@pytest.mark.parametrize("size", [1e-4, 0.3, 3.0])
+def test_it_says_what_torch_says(monkeypatch, time, size):
+    """Turns near zero and beyond half a circle; several programs."""
+    monkeypatch.setattr(fused, "LANES", 4)
+    assert_matches_float64(time, size)
+
+
+def test_every_output_is_written(monkeypatch):
+    fill_buffers_with_nan(monkeypatch)
+    assert_matches_float64(0.26, 0.3)
+
+
+def test_only_one_output_is_differentiated():
+    table, deltas = on_device(0.3)
+    for field, moved, resting in (("quaternions", 0, 1), ("translations", 1, 0)):
+        poses = poses_at(table, *deltas, 0.26, MAX_GAP, backend="triton")
+        gradients = torch.autograd.grad(getattr(poses, field).sum(), deltas)
+        assert gradients[moved].any()
+        assert not gradients[resting].any()
+
+
+def test_no_instances():
+    table, deltas = on_device(0.3)
+    none = Trajectories(*(values[:0] for values in vars(table).values()))
+    found = poses_at(none, *(delta[:0] for delta in deltas), 0.5, MAX_GAP, backend="triton")
+    assert [len(values) for values in vars(found).values()] == [0, 0, 0]
+    gradients = torch.autograd.grad(found.translations.sum(), deltas)
+    assert not any(bool(gradient.any()) for gradient in gradients)
+
+
+def test_tables_in_double_are_refused():
+    table, deltas = on_device(0.3)
+    with pytest.raises(ValueError, match=r"'triton' takes contiguous float32 tensors.*use backend='torch'"):
+        poses_at(in_double(table), *deltas, 0.5, MAX_GAP, backend="triton")
