@@ -35,12 +35,24 @@ def assert_matches_float64(time: float, size: float) -> None:
         torch.testing.assert_close(value.cpu().double(), truth.double(), rtol=0.0, atol=bar)
 
 
-@pytest.mark.parametrize("time", [0.0, 0.05, 0.1, 0.15, 0.35, 0.9])
+@pytest.mark.parametrize("time", [0.05, 0.1, 0.17, 0.53, 0.9])
 @pytest.mark.parametrize("size", [1e-4, 0.3, 3.0])
 def test_it_says_what_torch_says(monkeypatch, time, size):
-    """Turns near zero and beyond half a circle; several programs."""
+    """Turns near zero and beyond half a circle, times outside of spans and too far from any keyframe; many programs."""
     monkeypatch.setattr(fused, "LANES", 4)
     assert_matches_float64(time, size)
+
+
+@pytest.mark.parametrize(("time", "present"), [(0.05, False), (0.6, True), (0.62, False)])
+def test_padding_is_no_keyframe_and_equal_distances_may_differ_by_rounding(time, present):
+    """One keyframe at 0.5; in float32 0.6 is farther from it than 0.1."""
+    table, deltas = on_device(0.3)
+    times, valid = torch.zeros_like(table.times), torch.zeros_like(table.valid)
+    times[:, 0], valid[:, 0] = 0.5, True
+    spans = torch.tensor([[0.0, 1.0]], device=DEVICE).expand(6, 2).contiguous()
+    table = Trajectories(times, table.quaternions, table.translations, valid, spans)
+    found = poses_at(table, *deltas, time, 0.1, backend="triton")
+    assert found.present.tolist() == [present] * 6
 
 
 def test_every_output_is_written(monkeypatch):
