@@ -15,6 +15,9 @@ from sparsestreet.types import Gaussians
 OPACITY_LOGIT_LIMIT = 15.0
 """sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
 
+INPUTS, LEARNED = 11, 9
+"""Tensors of a part, and how many of them, the first ones, are of real numbers and have gradients."""
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -44,6 +47,14 @@ class RawGaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def tensors(self) -> list[Tensor | None]:
+        """Six fields, multipliers, the poses' quaternions and translations, and then instances and presence."""
+        fields = [self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest]
+        if self.placement is None:
+            return [*fields, self.multipliers, None, None, None, None]
+        poses, instances = self.placement.poses, self.placement.instances
+        return [*fields, self.multipliers, poses.quaternions, poses.translations, instances, poses.present]
+
     def terms(self, sh_degree: int) -> int:
         """Coefficients in use up to a degree; rows that store fewer use what they have."""
         return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])
@@ -53,15 +64,22 @@ def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "a
     """All parts one after the other: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
 
     With gradients to all that is learned; a part that uses fewer coefficients than another is padded with zeros. One
-    operation of the C++ library and one backward, whatever the number of parts and instances, or a few dozen of torch
-    for each part.
+    operation of the C++ library and one backward, whatever the number of parts and instances; of Triton a kernel for
+    each part; or a few dozen operations of torch for each. But for torch's, which adds up the gradients of poses by
+    atomics on a GPU, two runs agree to the last bit.
 
-    ``backend``: "torch", "cpu" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
+    ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
     """
-    if fused_backend(backend, *(part.means for part in parts)) == "cpu":
-        from sparsestreet.ops.cpu.activate import activate as fused_activate
+    numbers = [tensor for part in parts for tensor in part.tensors()[:LEARNED] if tensor is not None]
+    chosen = fused_backend(backend, *numbers)
+    if chosen == "cpu":
+        from sparsestreet.ops.cpu.activate import activate as cpu_activate
 
-        return fused_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
+        return cpu_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
+    if chosen == "triton":
+        from sparsestreet.ops.triton.activate import activate as triton_activate
+
+        return triton_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
     return Gaussians.concatenate([_activated(part, part.terms(sh_degree)) for part in parts])
 
 

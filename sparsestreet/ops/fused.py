@@ -28,7 +28,8 @@ def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHO
         return backend
     if "cpu" in choices and _fit_library(tensors) and find_library() is not None:
         return "cpu"
-    if "triton" in choices and tensors[0].device.type == "cuda" and _fit_triton(tensors) and has_triton():
+    on_gpu = {tensor.device.type for tensor in tensors} == {"cuda"}
+    if "triton" in choices and on_gpu and _fit_triton(tensors) and has_triton():
         return "triton"
     return "torch"
 

@@ -14,27 +14,27 @@ ROWS = 2500
 """More than two of the parts in which sums over rows are taken."""
 
 
-def raw_rows(count: int, rest: int, dtype=torch.float64, seed: int = 0) -> RawGaussians:
+def raw_rows(count: int, rest: int, dtype=torch.float64, seed: int = 0, device="cpu") -> RawGaussians:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype).requires_grad_()
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).to(device, dtype).requires_grad_()
 
     shapes = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, rest, 3))
     return RawGaussians(*(normal(*shape) for shape in shapes))
 
 
-def placement(count: int, dtype=torch.float64, instances: int = 3) -> Placement:
+def placement(count: int, dtype=torch.float64, instances: int = 3, device="cpu") -> Placement:
     generator = torch.Generator().manual_seed(1)
     turns = torch.randn(instances, 4, generator=generator, dtype=torch.float64)
     shifts = 50 * torch.randn(instances, 3, generator=generator, dtype=torch.float64)
     of_rows = torch.randint(instances, (count,), generator=generator)
-    leaves = [values.to(dtype).requires_grad_() for values in (turns / turns.norm(dim=1, keepdim=True), shifts)]
-    return Placement(Poses(*leaves, torch.tensor([True, False, True])), of_rows)
+    leaves = [values.to(device, dtype).requires_grad_() for values in (turns / turns.norm(dim=1, keepdim=True), shifts)]
+    return Placement(Poses(*leaves, torch.tensor([True, False, True], device=device)), of_rows.to(device))
 
 
-def closed_every_third(count: int, dtype=torch.float64) -> torch.Tensor:
-    return (torch.arange(count) % 3 > 0).to(dtype).requires_grad_()
+def closed_every_third(count: int, dtype=torch.float64, device="cpu") -> torch.Tensor:
+    return (torch.arange(count) % 3 > 0).to(device, dtype).requires_grad_()
 
 
 def fields_of(raw: RawGaussians) -> list[torch.Tensor]:
@@ -51,10 +51,10 @@ def values_and_gradients(inputs: list[torch.Tensor], run) -> list[torch.Tensor]:
     return [*(out.detach() for out in outputs), *gradients]
 
 
-def case(rest: int, degree: int, masked: bool, placed: bool, dtype=torch.float64, count: int = ROWS):
-    multipliers = closed_every_third(count, dtype) if masked else None
-    where = placement(count, dtype) if placed else None
-    raw = replace(raw_rows(count, rest, dtype), multipliers=multipliers, placement=where)
+def case(rest: int, degree: int, masked: bool, placed: bool, dtype=torch.float64, count: int = ROWS, device="cpu"):
+    multipliers = closed_every_third(count, dtype, device) if masked else None
+    where = placement(count, dtype, device=device) if placed else None
+    raw = replace(raw_rows(count, rest, dtype, device=device), multipliers=multipliers, placement=where)
     inputs = [*fields_of(raw), *([] if multipliers is None else [multipliers])]
     inputs += [] if where is None else [where.poses.quaternions, where.poses.translations]
 
@@ -75,10 +75,11 @@ def test_the_library_says_what_torch_says(rest, degree, masked, placed):
         torch.testing.assert_close(value, truth, rtol=1e-12, atol=1e-12)
 
 
-def parts_of_three_kinds(dtype=torch.float64) -> tuple[list[torch.Tensor], list[RawGaussians]]:
+def parts_of_three_kinds(dtype=torch.float64, device="cpu") -> tuple[list[torch.Tensor], list[RawGaussians]]:
     """Plain rows of degree 3; none at all; masked and placed ones of degree 1."""
-    where, closed = placement(40, dtype), closed_every_third(40, dtype)
-    parts = [raw_rows(70, 15, dtype), raw_rows(0, 8, dtype), raw_rows(40, 3, dtype, seed=3)]
+    where, closed = placement(40, dtype, device=device), closed_every_third(40, dtype, device)
+    counts = ((70, 15), (0, 8), (40, 3))
+    parts = [raw_rows(*count, dtype, seed, device) for seed, count in enumerate(counts)]
     inputs = [field for part in parts for field in fields_of(part)]
     parts[2] = replace(parts[2], multipliers=closed, placement=where)
     return [*inputs, closed, where.poses.quaternions, where.poses.translations], parts

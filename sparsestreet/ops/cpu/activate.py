@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.activate import INPUTS, LEARNED, RawGaussians
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
 from sparsestreet.phases import phase
@@ -16,10 +16,6 @@ from sparsestreet.types import Gaussians
 
 FIELDS = 6
 """Means, log-scales, quaternions, opacity logits, first coefficient, the others."""
-INPUTS = 11
-"""Tensors of a part: its fields, multipliers, pose quaternions, pose translations, instances, presence."""
-LEARNED = 9
-"""The first so many of them have gradients."""
 
 
 def activate(
@@ -27,7 +23,7 @@ def activate(
 ) -> Gaussians:
     """As ``sparsestreet.ops.activate``; the same bits for any number of threads."""
     terms = [part.terms(sh_degree) for part in parts]
-    tensors = [tensor for part in parts for tensor in _tensors(part)]
+    tensors = [tensor for part in parts for tensor in part.tensors()]
     return Gaussians(*_Activate.apply(_Call(terms, logit_limit, variant), *tensors))
 
 
@@ -88,18 +84,6 @@ def _part_backward(part: list[Tensor | None], terms: int, call: _Call, cotangent
     if part[LEARNED] is None:
         gradients[0], gradients[2] = cotangents[:2]
     return [*gradients, None, None]
-
-
-def _tensors(part: RawGaussians) -> list[Tensor | None]:
-    """The inputs of a part."""
-    fields = (part.means, part.log_scales, part.quaternions, part.opacity_logits, part.sh_dc, part.sh_rest)
-    where = part.placement
-    poses = (
-        (None,) * 4
-        if where is None
-        else (where.poses.quaternions, where.poses.translations, where.instances, where.poses.present)
-    )
-    return [*fields, part.multipliers, *poses]
 
 
 def _parts(tensors: list[Tensor | None]) -> list[list[Tensor | None]]:

@@ -1,19 +1,21 @@
-"""Activation and placement of stored rows and their gradients, one kernel each: ``sparsestreet.ops.activate``.
+"""Activation and placement of stored rows and their gradients, one kernel each a part: ``sparsestreet.ops.activate``.
 
 A lane is a row; coefficients are copied in tiles of rows and columns, so that neighbors read and write neighbors.
 Gradients of poses are sums over rows: each program adds up its own, instance by instance, and torch adds the programs'.
 No atomics: two runs agree to the last bit.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import torch
 import triton.language as tl
-from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from triton.runtime.jit import KernelInterface
 
-from sparsestreet.ops.activate import Placement, RawGaussians
+from sparsestreet.ops.activate import INPUTS, RawGaussians
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.quaternions import (
@@ -23,6 +25,7 @@ from sparsestreet.ops.triton.quaternions import (
     rotation_of,
     unit_backward,
     unit_quaternion,
+    weighted,
 )
 from sparsestreet.ops.triton.vectors import load_row, plus, scaled, store_row, times, transposed_times
 from sparsestreet.types import Gaussians
@@ -32,73 +35,83 @@ COLUMNS = constant(16)
 """Numbers of a row that are copied at once."""
 
 
-def activate(
-    raw: RawGaussians,
-    terms: int,
-    multipliers: Float[Tensor, " n"] | None,
-    placement: Placement | None,
-    logit_limit: float,
-) -> Gaussians:
-    """``sparsestreet.ops.activate`` of contiguous float32 tensors, with so many coefficients."""
-    poses = (None,) * 4
-    if placement is not None:
-        at = placement.poses
-        poses = (at.quaternions, at.translations, placement.instances.contiguous(), at.present.contiguous())
-    scales, opacities, sh, *placed = _Activate.apply(*vars(raw).values(), multipliers, *poses, terms, logit_limit)
-    means, quaternions = placed if placement is not None else (raw.means, raw.quaternions)
-    return Gaussians(means, quaternions, scales, opacities, sh)
+def activate(parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float) -> Gaussians:
+    """``sparsestreet.ops.activate`` of contiguous float32 tensors."""
+    terms = max(part.terms(sh_degree) for part in parts)
+    tensors = [tensor for part in parts for tensor in part.tensors()]
+    return Gaussians(*_Activate.apply(terms, logit_limit, *tensors))
 
 
 class _Activate(torch.autograd.Function):
-    """Stored rows, multipliers and poses to scales, opacities, coefficients and, with poses, means and quaternions."""
+    """Stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities and coefficients."""
 
     @staticmethod
-    def forward(ctx, *given):
-        *tensors, terms, logit_limit = given
-        means, quaternions = tensors[0], tensors[2]
-        outputs = [torch.empty_like(means), means.new_empty(len(means)), means.new_empty(len(means), terms, 3)]
-        placed = [torch.empty_like(means), torch.empty_like(quaternions)] if tensors[7] is not None else []
-        ctx.save_for_backward(*tensors)
+    def forward(ctx, terms, logit_limit, *tensors):
         ctx.terms, ctx.logit_limit = terms, logit_limit
-        _launch(activate_rows, ctx, tensors, *outputs, *(placed or (means, quaternions)))
-        return *outputs, *placed
+        ctx.save_for_backward(*tensors)
+        rows = sum(len(means) for means in tensors[::INPUTS])
+        outputs = [tensors[0].new_empty(rows, *width) for width in ((3,), (4,), (3,), (), (terms, 3))]
+        for part in _parts(tensors):
+            _launch(activate_rows, ctx, part, *outputs)
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *cotangents):
-        tensors = list(ctx.saved_tensors)
-        means, turns = tensors[0], tensors[7]
-        placed, count = turns is not None, 0 if turns is None else len(turns)
-        gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in tensors[:7]]
-        # Means and quaternions that are not placed did not come through here.
-        if not placed:
-            gradients[0] = gradients[2] = None
-        # As in torch: an optimizer leaves alone what has no part in the image yet.
-        if ctx.terms == 1:
-            gradients[5] = None
-        # A line for each program: four numbers of each instance's quaternion, then three of each translation.
-        sums = means.new_zeros(-(-len(means) // LANES), 7 * count) if placed else means
-        _launch(
-            activate_rows_backward, ctx, tensors,
-            *(value.contiguous() for value in cotangents), *(() if placed else (means, means)),
-            *(means if value is None else value for value in gradients), sums, count,
-        )  # fmt: skip
-        if placed:
-            turn, shift = sums.sum(0).split((4 * count, 3 * count))
-            gradients += [turn.view(-1, 4), shift.view(-1, 3)]
-        return *gradients, *(None,) * (len(tensors) + 2 - len(gradients))
+        cotangents = [value.contiguous() for value in cotangents]
+        gradients = []
+        for part in _parts(ctx.saved_tensors):
+            gradients += _part_backward(ctx, part, cotangents)
+        return None, None, *gradients
 
 
-def _launch(kernel, ctx, tensors: list[Tensor | None], *others: Tensor | int) -> None:
-    """Start a kernel on the six fields, multipliers, pose quaternions and translations, instances, presence."""
-    *floats, instances, present = tensors
-    means, placed = tensors[0], present is not None
+@dataclass(frozen=True)
+class _Part:
+    """The inputs of a part, and its rows among all."""
+
+    tensors: Sequence[Tensor | None]
+    rows: slice
+
+
+def _parts(tensors: Sequence[Tensor | None]) -> list[_Part]:
+    found, start = [], 0
+    for i in range(0, len(tensors), INPUTS):
+        found.append(_Part(tensors[i : i + INPUTS], slice(start, start + len(tensors[i]))))
+        start = found[-1].rows.stop
+    return found
+
+
+def _part_backward(ctx, part: _Part, cotangents: list[Tensor]) -> list[Tensor | None]:
+    """Gradients of the inputs of one part, from those of all rows."""
+    means, turns = part.tensors[0], part.tensors[7]
+    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part.tensors[:7]]
+    if turns is None:
+        # Means and quaternions went through as they are.
+        gradients[0] = gradients[2] = None
+    # As in torch: an optimizer leaves alone what has no part in the image yet.
+    if min(ctx.terms, 1 + part.tensors[5].shape[1]) == 1:
+        gradients[5] = None
+    # A line for each program: four numbers of each instance's quaternion, then three of each translation.
+    count = 0 if turns is None else len(turns)
+    sums = means if turns is None else means.new_zeros(-(-len(means) // LANES), 7 * count)
+    written = [means if value is None else value for value in gradients]
+    _launch(activate_rows_backward, ctx, part, *cotangents, *written, sums, count)
+    if turns is None:
+        gradients[0], gradients[2] = cotangents[0][part.rows], cotangents[1][part.rows]
+        return [*gradients, None, None, None, None]
+    v_turns, v_shifts = sums.sum(0).split((4 * count, 3 * count))
+    return [*gradients, v_turns.view(-1, 4), v_shifts.view(-1, 3), None, None]
+
+
+def _launch(kernel: KernelInterface, ctx, part: _Part, *others: Tensor | int) -> None:
+    *floats, instances, present = part.tensors
+    means, placed = floats[0], present is not None
     # Means stand for what is not read: multipliers without a mask, all that is about poses without a placement.
     floats = [means if tensor is None else tensor for tensor in floats]
-    indices = (instances, present.view(torch.uint8)) if placed else (means, means)
+    indices = (instances.contiguous(), present.contiguous().view(torch.uint8)) if placed else (means, means)
     launch(
-        kernel, len(means), LANES, *floats, *indices, *others, len(means), ctx.logit_limit,
-        TERMS=ctx.terms, STORED=1 + tensors[5].shape[1], MASKED=tensors[6] is not None, PLACED=placed,
+        kernel, len(means), LANES, *floats, *indices, *others, part.rows.start, len(means), ctx.logit_limit,
+        TERMS=ctx.terms, STORED=1 + floats[5].shape[1], MASKED=part.tensors[6] is not None, PLACED=placed,
     )  # fmt: skip
 
 
@@ -110,21 +123,25 @@ def opacity_of(logit, limit):
 
 
 @jit
-def tile(row, given, COLUMN: tl.constexpr, WIDTH: tl.constexpr):
-    """Rows, the columns from COLUMN, which of them are the first coefficient's, and which the others' up to WIDTH."""
+def tile(row, given, COLUMN: tl.constexpr):
+    """Rows and columns from COLUMN, and which of them are given, of the first coefficient and of the others."""
     column = COLUMN + tl.arange(0, COLUMNS)[None, :]
-    return row[:, None], column, given[:, None] & (column < 3), given[:, None] & (column >= 3) & (column < WIDTH)
+    return row[:, None], column, given[:, None] & (column < 3), given[:, None] & (column >= 3)
 
 
-@partial(jit, do_not_specialize=["rows"])
+@partial(jit, do_not_specialize=["start", "rows"])
 def activate_rows(
     means, log_scales, quaternions, logits, dc, rest, multipliers, turns, shifts, instances, present,
-    scales, opacities, sh, placed_means, placed_quaternions, rows, limit,
+    out_means, out_quaternions, scales, opacities, sh, start, rows, limit,
     TERMS: tl.constexpr, STORED: tl.constexpr, MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``turns``, ``shifts``: quaternions and translations of the instances; STORED: coefficients of a row."""
+    """``turns``, ``shifts``: quaternions and translations of the instances; ``start``: the first row to write.
+
+    TERMS, STORED: coefficients of a row that are written and that are stored; what is not stored is 0.
+    """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    given = row < rows
+    given, to = row < rows, start + row
+    mean, q = load_row(means, row, given, 3), load_row(quaternions, row, given, 4)
     log_scale = load_row(log_scales, row, given, 3)
     size = (tl.exp(log_scale[0]), tl.exp(log_scale[1]), tl.exp(log_scale[2]))
     opacity = opacity_of(tl.load(logits + row, given, 0.0), limit)
@@ -136,51 +153,55 @@ def activate_rows(
         opacity *= tl.load(present + instance, given, 0).to(tl.float32)
         turn = load_row(turns, instance, given, 4)
         unit, _ = unit_quaternion(turn)
-        mean = times(rotation_of(unit), load_row(means, row, given, 3))
-        store_row(placed_means, row, plus(mean, load_row(shifts, instance, given, 3)), given, 3)
-        store_row(placed_quaternions, row, multiply(turn, load_row(quaternions, row, given, 4)), given, 4)
-    store_row(scales, row, size, given, 3)
-    tl.store(opacities + row, opacity, given)
+        mean = plus(times(rotation_of(unit), mean), load_row(shifts, instance, given, 3))
+        q = multiply(turn, q)
+    store_row(out_means, to, mean, given, 3)
+    store_row(out_quaternions, to, q, given, 4)
+    store_row(scales, to, size, given, 3)
+    tl.store(opacities + to, opacity, given)
     for first in tl.static_range(0, 3 * TERMS, COLUMNS):
-        of, column, begins, follows = tile(row, given, first, 3 * TERMS)
-        to = sh + of * (3 * TERMS) + column
-        tl.store(to, tl.load(dc + of * 3 + column, begins), begins)
-        tl.store(to, tl.load(rest + of * (3 * STORED - 3) + column - 3, follows), follows)
+        of, column, begins, follows = tile(row, given, first)
+        value = tl.where(
+            column < 3,
+            tl.load(dc + of * 3 + column, begins, 0.0),
+            tl.load(rest + of * (3 * STORED - 3) + column - 3, follows & (column < 3 * STORED), 0.0),
+        )
+        tl.store(sh + (start + of) * (3 * TERMS) + column, value, given[:, None] & (column < 3 * TERMS))
 
 
-@partial(jit, do_not_specialize=["rows"])
+@partial(jit, do_not_specialize=["count", "start", "rows"])
 def activate_rows_backward(
     means, log_scales, quaternions, logits, dc, rest, multipliers, turns, shifts, instances, present,
-    v_scales, v_opacities, v_sh, v_placed_means, v_placed_quaternions,
-    v_means, v_log_scales, v_quaternions, v_logits, v_dc, v_rest, v_multipliers, sums, count, rows, limit,
+    v_out_means, v_out_quaternions, v_scales, v_opacities, v_sh,
+    v_means, v_log_scales, v_quaternions, v_logits, v_dc, v_rest, v_multipliers, sums, count, start, rows, limit,
     TERMS: tl.constexpr, STORED: tl.constexpr, MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``sums`` [programs, 7 count] are 0 before: the gradients of the poses of ``count`` instances."""
+    """Means and quaternions only with a placement, and then ``sums`` [programs, 7 count], which are 0 before."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    given = row < rows
+    given, at = row < rows, start + row
     multiplier = tl.load(multipliers + row, given, 0.0) if MASKED else 1.0
-    logit, v_opacity = tl.load(logits + row, given, 0.0), tl.load(v_opacities + row, given, 0.0)
+    logit, v_opacity = tl.load(logits + row, given, 0.0), tl.load(v_opacities + at, given, 0.0)
     opacity = opacity_of(logit, limit)
     if PLACED:
         instance = tl.load(instances + row, given, 0)
         v_opacity *= tl.load(present + instance, given, 0).to(tl.float32)
-        v_mean, mean = load_row(v_placed_means, row, given, 3), load_row(means, row, given, 3)
-        turn, q = load_row(turns, instance, given, 4), load_row(quaternions, row, given, 4)
-        v_q = load_row(v_placed_quaternions, row, given, 4)
+        v_mean, mean = load_row(v_out_means, at, given, 3), load_row(means, row, given, 3)
+        v_q, q = load_row(v_out_quaternions, at, given, 4), load_row(quaternions, row, given, 4)
+        turn = load_row(turns, instance, given, 4)
         unit, inverse_length = unit_quaternion(turn)
         store_row(v_means, row, transposed_times(rotation_of(unit), v_mean), given, 3)
         store_row(v_quaternions, row, multiply(conjugate(turn), v_q), given, 4)
         v_rotation = (scaled(v_mean[0], mean), scaled(v_mean[1], mean), scaled(v_mean[2], mean))
         through_matrix = unit_backward(unit, inverse_length, rotation_backward(unit, v_rotation))
-        through_product = multiply(v_q, conjugate(q))
+        v_turn = weighted(1.0, through_matrix, 1.0, multiply(v_q, conjugate(q)))
         to = sums + tl.program_id(0).to(tl.int64) * (7 * count)
         for i in range(tl.min(instance), tl.max(instance) + 1):
             own = given & (instance == i)
             for k in tl.static_range(4):
-                tl.store(to + 4 * i + k, tl.sum(tl.where(own, through_matrix[k] + through_product[k], 0.0)))
+                tl.store(to + 4 * i + k, tl.sum(tl.where(own, v_turn[k], 0.0)))
             for k in tl.static_range(3):
                 tl.store(to + 4 * count + 3 * i + k, tl.sum(tl.where(own, v_mean[k], 0.0)))
-    log_scale, v_size = load_row(log_scales, row, given, 3), load_row(v_scales, row, given, 3)
+    log_scale, v_size = load_row(log_scales, row, given, 3), load_row(v_scales, at, given, 3)
     along = (v_size[0] * tl.exp(log_scale[0]), v_size[1] * tl.exp(log_scale[1]), v_size[2] * tl.exp(log_scale[2]))
     store_row(v_log_scales, row, scaled(multiplier, along), given, 3)
     held = (logit > limit) | (logit < -limit)
@@ -188,8 +209,8 @@ def activate_rows_backward(
     if MASKED:
         tl.store(v_multipliers + row, v_opacity * opacity + along[0] + along[1] + along[2], given)
     for first in tl.static_range(0, 3 * STORED if TERMS > 1 else 3, COLUMNS):
-        of, column, begins, follows = tile(row, given, first, 3 * STORED)
-        v = tl.load(v_sh + of * (3 * TERMS) + column, (begins | follows) & (column < 3 * TERMS), 0.0)
+        of, column, begins, follows = tile(row, given, first)
+        v = tl.load(v_sh + (start + of) * (3 * TERMS) + column, given[:, None] & (column < 3 * TERMS), 0.0)
         tl.store(v_dc + of * 3 + column, v, begins)
         if TERMS > 1:
-            tl.store(v_rest + of * (3 * STORED - 3) + column - 3, v, follows)
+            tl.store(v_rest + of * (3 * STORED - 3) + column - 3, v, follows & (column < 3 * STORED))

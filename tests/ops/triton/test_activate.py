@@ -1,13 +1,22 @@
 """Rows activated and placed by Triton, and their gradients, against torch in float64."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from sparsestreet.ops.activate import Placement, RawGaussians, activate
+from sparsestreet.ops.activate import Placement, activate
 from sparsestreet.ops.poses import Poses
 from sparsestreet.ops.triton import activate as fused
 from tests.ops.scenes import device_of, fill_buffers_with_nan
-from tests.ops.test_activate import case, placement, raw_rows, values_and_gradients
+from tests.ops.test_activate import (
+    case,
+    fields_of,
+    parts_of_three_kinds,
+    placement,
+    raw_rows,
+    values_and_gradients,
+)
 
 DEVICE = device_of("triton")
 ROWS = 150
@@ -38,15 +47,25 @@ def test_it_says_what_torch_says(rest, degree, masked, placed):
     assert_matches_float64(*results(rest, degree, masked, placed))
 
 
-def test_every_output_is_written(monkeypatch):
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_parts_stand_one_after_the_other_and_every_output_is_written(monkeypatch, degree):
     fill_buffers_with_nan(monkeypatch)
-    assert_matches_float64(*results(15, 1, True, True))
+    answers = []
+    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, "cpu")):
+        inputs, parts = parts_of_three_kinds(dtype, device)
+
+        def run(parts=parts, backend=backend):
+            return activate(parts, sh_degree=degree, backend=backend)
+
+        answers.append(values_and_gradients(inputs, run))
+    assert_matches_float64(*answers)
 
 
 @pytest.mark.parametrize("lanes", [16, 128])
 def test_programs_that_hold_rows_of_some_instances_only(monkeypatch, lanes):
     """Rows in the order of their instances, of which one has none; opacities tell whose are absent."""
     monkeypatch.setattr(fused, "LANES", lanes)
+    fill_buffers_with_nan(monkeypatch)
     of_rows = torch.tensor([0] * 20 + [1] * 13 + [2] * 9 + [4] * 8)
     generator = torch.Generator().manual_seed(4)
     turns, shifts = torch.randn(5, 4, generator=generator).double(), torch.randn(5, 3, generator=generator).double()
@@ -55,11 +74,11 @@ def test_programs_that_hold_rows_of_some_instances_only(monkeypatch, lanes):
         raw = raw_rows(len(of_rows), 0, dtype, device=device)
         leaves = [value.to(device, dtype, copy=True).requires_grad_() for value in (turns, shifts)]
         poses = Poses(*leaves, torch.tensor([True, True, False, True, True], device=device))
-        where = Placement(poses, of_rows.to(device))
-        inputs = [*vars(raw).values(), *leaves]
+        inputs = [*fields_of(raw), *leaves]
+        raw = replace(raw, placement=Placement(poses, of_rows.to(device)))
 
-        def run(raw=raw, where=where, backend=backend):
-            return activate(raw, sh_degree=0, placement=where, backend=backend)
+        def run(raw=raw, backend=backend):
+            return activate([raw], sh_degree=0, backend=backend)
 
         assert ((run().opacities == 0).cpu() == (of_rows == 2)).all()
         answers.append(values_and_gradients(inputs, run))
@@ -73,8 +92,7 @@ def test_logits_at_and_beyond_the_limit():
     for backend, device in (("triton", DEVICE), ("torch", "cpu")):
         raw = raw_rows(len(given), 0, torch.float32, device=device)
         logits = torch.tensor(given, device=device, requires_grad=True)
-        raw = RawGaussians(raw.means, raw.log_scales, raw.quaternions, logits, raw.sh_dc, raw.sh_rest)
-        opacities = activate(raw, sh_degree=0, backend=backend).opacities
+        opacities = activate([replace(raw, opacity_logits=logits)], sh_degree=0, backend=backend).opacities
         (gradient,) = torch.autograd.grad(opacities.sum(), logits)
         answers.append((opacities.detach().cpu(), gradient.cpu()))
     (opacities, gradient), (wanted, wanted_gradient) = answers
@@ -87,15 +105,13 @@ def test_logits_at_and_beyond_the_limit():
     assert bool(gradient[6].isnan())
 
 
-def test_what_is_not_used_gets_no_gradient_and_what_is_not_moved_is_handed_through():
+def test_coefficients_that_are_not_used_get_no_gradient():
     raw = raw_rows(3, 15, torch.float32, device=DEVICE)
-    active = activate(raw, sh_degree=0, backend="triton")
-    assert active.means is raw.means
-    assert active.quaternions is raw.quaternions
-    gradients = torch.autograd.grad(active.sh.sum(), (raw.sh_dc, raw.sh_rest, raw.means), allow_unused=True)
-    assert gradients[0] is not None
-    assert gradients[1:] == (None, None)
-    (v_rest,) = torch.autograd.grad(activate(raw, sh_degree=1, backend="triton").sh.sum(), raw.sh_rest)
+    sh = activate([raw], sh_degree=0, backend="triton").sh
+    v_dc, v_rest = torch.autograd.grad(sh.sum(), (raw.sh_dc, raw.sh_rest), allow_unused=True)
+    assert v_dc.tolist() == [[[1.0] * 3]] * 3
+    assert v_rest is None
+    (v_rest,) = torch.autograd.grad(activate([raw], sh_degree=1, backend="triton").sh.sum(), raw.sh_rest)
     assert v_rest.sum((0, 2)).tolist() == [9.0] * 3 + [0.0] * 12
 
 
@@ -107,9 +123,9 @@ def test_no_rows():
 
 
 def test_tensors_of_another_kind_are_refused():
-    raw, where = raw_rows(2, 3, torch.float32, device=DEVICE), placement(2, torch.float64, device=DEVICE)
-    with pytest.raises(ValueError, match=r"'triton' takes contiguous float32 tensors.*use backend='torch'"):
-        activate(raw, sh_degree=0, placement=where, backend="triton")
-    strided = torch.ones(4, device=DEVICE)[::2]
-    with pytest.raises(ValueError, match=r"'triton' takes contiguous float32 tensors.*use backend='torch'"):
-        activate(raw, sh_degree=0, multipliers=strided, backend="triton")
+    raw = raw_rows(2, 3, torch.float32, device=DEVICE)
+    in_double = replace(raw, placement=placement(2, torch.float64, device=DEVICE))
+    strided = replace(raw, multipliers=torch.ones(4, device=DEVICE)[::2])
+    for refused in (in_double, strided):
+        with pytest.raises(ValueError, match=r"'triton' takes contiguous float32 tensors.*use backend='torch'"):
+            activate([raw, refused], sh_degree=0, backend="triton")

@@ -28,7 +28,7 @@ DEVICE = device_of("triton")
 # in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on their
 # way at once; of poses there is a warp or two.
 REGISTERS = {
-    "activate_rows": 64, "activate_rows_backward": 88, "interpolate": 41, "interpolate_backward": 64,
+    "activate_rows": 64, "activate_rows_backward": 96, "interpolate": 41, "interpolate_backward": 64,
     "step_numbers": 32, "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
 }  # fmt: skip
 # Where the sine of an angle above 1e5 would be reduced.
