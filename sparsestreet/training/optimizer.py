@@ -1,10 +1,11 @@
 """One Adam over groups of parameters, each with its own learning rate and decay."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import torch
 
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.training.visible_adam import VisibleAdam
 
 
@@ -28,7 +29,8 @@ class OptimizerSettings:
         for name, parameter in scene.named_parameters():
             rate = rates[name]
             initial = rate.initial * (radius if rate.scale_by_scene_radius else 1.0)
-            empty = {"params": [], "lr": initial, "initial_lr": initial, "rate": rate}
+            # Plain values: a checkpoint keeps them.
+            empty = {"params": [], "lr": initial, "initial_lr": initial, "rate": asdict(rate)}
             groups.setdefault(rate, empty)["params"].append(parameter)
         if self.visible_only:
             return VisibleAdam(groups.values(), eps=self.eps)
@@ -42,4 +44,4 @@ def set_rates(optimizer: torch.optim.Optimizer, progress: float) -> None:
     its step.
     """
     for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * group["rate"].factor(progress)
+        group["lr"] = group["initial_lr"] * LearningRate(**group["rate"]).factor(progress)

@@ -13,7 +13,7 @@ from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, RowLedger
+from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, PhaseTimes, RowLedger
 from sparsestreet.triangulation import ImagePointSettings
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
@@ -44,7 +44,7 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     assert list(recipe.losses) == [*plain.losses, *(["mask_sparsity"] if masked else [])]
     rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
     added = ([MaskTraining] if masked else []) + ([BackgroundPruning] if sparsify in rules else [])
-    assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, *added]
+    assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:
         pruning = recipe.callbacks["background_pruning"]
         assert type(pruning.rule) is rules[sparsify]
