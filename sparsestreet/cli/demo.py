@@ -18,7 +18,7 @@ sparsify=removal (the paper's masks, then our rule). The overrides go to all thr
 """
 SPARSIFY = ("none", "paper", "removal")
 STEPS = 1200
-"""Three runs, their pictures and the setting-up in ten minutes on two cores; a run of one's own takes 2,000 steps."""
+"""Three runs, their pictures and the setting-up in four minutes on two cores; a run of one's own takes 2,000 steps."""
 
 
 def demo(arguments: list[str]) -> int:
