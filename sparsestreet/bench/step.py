@@ -201,5 +201,6 @@ def lines(record: StepRecord) -> list[str]:
     return [
         *text,
         f"a step {record.step}; {record.ratio:.2f} times its op {record.op}; {record.operations:.0f} operations",
-        f"floors: {record.bandwidth_gb_s:.0f} GB/s (addition in place), {record.peak_gflops:.0f} GFLOP/s (float32 matrix product)",
+        f"floors: {record.bandwidth_gb_s:.0f} GB/s (addition in place), "
+        f"{record.peak_gflops:.0f} GFLOP/s (float32 matrix product)",
     ]
