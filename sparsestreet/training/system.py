@@ -109,8 +109,8 @@ class StreetSystem(LightningModule):
 
     def _logs(self) -> bool:
         """Whether Lightning's loggers will take what this step says; in other steps nothing is computed for them."""
-        every = self.trainer.log_every_n_steps
-        return every > 0 and (self.global_step + 1) % every == 0
+        # Lightning's own word: in a resumed run its count of batches is not the step.
+        return self.trainer._logger_connector.should_update_logs
 
     def _log_training(self, terms: Mapping[str, Tensor], frame: Frame) -> None:
         """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms."""

@@ -168,6 +168,11 @@ class StubTrainer(Trainer):
         for callback in self.callbacks:
             callback.setup(self, system, "fit")
 
+    @property
+    def _logger_connector(self) -> SimpleNamespace:
+        every = self.log_every_n_steps
+        return SimpleNamespace(should_update_logs=every > 0 and (self.global_step + 1) % every == 0)
+
     def start(self) -> None:
         for callback in self.callbacks:
             callback.on_train_start(self, self.system)
