@@ -21,7 +21,8 @@ def keep_freed_memory() -> None:
     """Let freed memory stay with the process, where the C library is glibc.
 
     A training step frees and takes the same hundred megabytes again. By default glibc gives large blocks back to the
-    system at once, which then clears them page by page when they are taken again: a fifth of a step.
+    system at once, which then clears them page by page when they are taken again: thousands of page faults a step
+    (docs/scaling.md).
     """
     if not sys.platform.startswith("linux") or any(name.startswith("MALLOC_") for name in os.environ):
         return
