@@ -13,9 +13,9 @@ from sparsestreet.cli.process import SPINS, wait_politely
 )
 def test_threads_sleep_unless_the_environment_says_otherwise(monkeypatch, given, expected):
     for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # so that whatever is set here is taken back
+        monkeypatch.delenv(name)
     for name, value in given.items():
         monkeypatch.setenv(name, value)
     wait_politely()
     assert os.environ.get("GOMP_SPINCOUNT") == expected
-    monkeypatch.setenv("GOMP_SPINCOUNT", "")  # so that monkeypatch takes back what was set here
