@@ -135,6 +135,21 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+class BodyPoses:
+    """How a person's 24 joints (SMPL's, in its order) are turned; one entry per annotated frame of the track.
+
+    The body's own frame: y up, x to the person's left, z forward, at rest in T-pose.
+    """
+
+    rotations: Float[Tensor, "f 24 4"]
+    """Unit, wxyz; joint 0: world_from_root, the others relative to their parent."""
+    valid: Bool[Tensor, " f"]
+    """Whether the frame has a pose."""
+    shape: Float[Tensor, "10"]
+    """SMPL's betas."""
+
+
+@dataclass(frozen=True)
 class Track:
     """One annotated object. Box frame: x along the length (heading), y left, z up, origin at the box center."""
 
@@ -145,6 +160,8 @@ class Track:
     world_from_object: Float64[Tensor, "f 4 4"]
     size: Float[Tensor, "3"]
     """Length, width, height, meters (mean over the annotated frames)."""
+    body: BodyPoses | None = None
+    """How a person moves inside the box; None: unknown, or no person."""
 
     @property
     def path_length(self) -> float:

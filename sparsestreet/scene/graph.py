@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.ops.activate import activate
+from sparsestreet.ops.activate import RawGaussians, activate
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
 from sparsestreet.scene.sky import Sky
@@ -22,6 +22,8 @@ class SceneGaussians:
     gaussians: Gaussians
     spans: dict[str, slice]
     """Name of a node -> its rows in ``gaussians``."""
+    parts: dict[str, RawGaussians]
+    """Name of a node -> what it answered."""
 
 
 class SceneGraph(nn.Module):
@@ -41,24 +43,23 @@ class SceneGraph(nn.Module):
 
     def gaussians_at(self, view: View, state: SceneState = FINISHED) -> SceneGaussians:
         """Activated Gaussians of all nodes in the world, seen from a view."""
-        parts, spans, start = [], {}, 0
-        for name, node in self.nodes.items():
-            part = node.raw_at(view, state)
-            parts.append(part)
+        parts = {name: node.raw_at(view, state) for name, node in self.nodes.items()}
+        spans, start = {}, 0
+        for name, part in parts.items():
             spans[name] = slice(start, start + len(part))
             start += len(part)
-        return SceneGaussians(activate(parts, sh_degree=state.sh_degree), spans)
+        return SceneGaussians(activate(list(parts.values()), sh_degree=state.sh_degree), spans, parts)
 
     def counts(self) -> dict[str, int]:
         """Number of rows of every node, absent instances included."""
         return {name: len(node.rows) for name, node in self.nodes.items()}
 
-    def regularizers(self, state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        """The weighted terms of all nodes, named node/term."""
+    def regularizers(self, parts: Mapping[str, RawGaussians], state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """The weighted terms of all nodes, named node/term; ``parts`` is what they answered for the view."""
         return {
             f"{name}/{term}": value
             for name, node in self.nodes.items()
-            for term, value in node.regularizers(state).items()
+            for term, value in node.regularizers(parts[name], state).items()
         }
 
     def learning_rates(self) -> dict[str, LearningRate]:

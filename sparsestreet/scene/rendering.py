@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import SplatSettings, over_sky, splat
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.sky import Sky
@@ -29,6 +30,8 @@ class SceneRendering:
     """The op's answer, row-wise fields included."""
     spans: dict[str, slice]
     """Name of a node -> its rows in ``splats``."""
+    parts: dict[str, RawGaussians]
+    """Name of a node -> what it answered for the view, before activation."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ def render(
             splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
         with phase("sky"):
             rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options)
-        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans)
+        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts)
 
 
 def sky_image(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:

@@ -20,13 +20,14 @@ from torch import Tensor
 from sparsestreet.scene.encoding import decode_as, encode
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.masks import BakedMaskSettings
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import View
 from sparsestreet.whole_file import whole_file
 
-VERSION = 1
+VERSION = 2
 """Raised when an older program could not read the file."""
 
 FILE_NAME = "scene.safetensors"
@@ -66,7 +67,12 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
         "options": encode(stored.options),
         "sky": None if scene.sky is None else encode(scene.sky.settings),
         "nodes": {
-            name: {"settings": encode(node.settings), "header": node.header(), "columns": sorted(node.rows.columns())}
+            name: {
+                "settings": encode(node.settings),
+                "header": node.header(),
+                "columns": sorted(node.rows.columns()),
+                "mask": None if node.mask is None else encode(node.mask.settings),
+            }
             for name, node in scene.nodes.items()
         },
     }
@@ -122,7 +128,11 @@ def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
         {name: column for name, column in columns.items() if column.is_floating_point()},
         {name: column for name, column in columns.items() if not column.is_floating_point()},
     )
-    return decode_as(NodeSettings, entry["settings"]).restore(rows, tensors, entry["header"])
+    node = decode_as(NodeSettings, entry["settings"]).restore(rows, tensors, entry["header"])
+    # Files of version 1 know no mask.
+    if entry.get("mask") is not None:
+        node.mask = decode_as(BakedMaskSettings, entry["mask"]).restored(tensors["mask.times"])
+    return node
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -132,13 +142,11 @@ def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 @torch.no_grad()
 def _without_masks(scene: SceneGraph) -> SceneGraph:
     """A copy in which the masks have done their work; the scene itself where it has none."""
-    if all(node.mask is None for node in scene.nodes.values()):
+    if not any(node.mask is not None and node.mask.columns for node in scene.nodes.values()):
         return scene
     scene = copy.deepcopy(scene)
     for node in scene.nodes.values():
-        if node.mask is not None:
+        if node.mask is not None and node.mask.columns:
             node.rows.resize(node.mask.keep(node.rows).plan())
-            for column in node.mask.columns:
-                node.rows.drop_column(column)
-            node.mask = node.mask.finish()
+            node.finish_mask()
     return scene

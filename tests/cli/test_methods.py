@@ -76,7 +76,7 @@ def test_k_min_has_one_home():
     assert "4000" not in text.replace("num_points: 40000", "")
     settings = recipe_of(cfg).nodes["background"]
     assert settings.min_gaussians == 2000
-    assert settings.mask_settings.build(settings.min_gaussians, ()).min_gaussians == 2000
+    assert settings.mask_settings.build(settings.min_gaussians).min_gaussians == 2000
 
 
 def test_the_shares_of_the_sources_are_all_points():

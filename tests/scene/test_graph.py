@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.sky import Sky, SkySettings
@@ -81,20 +82,24 @@ def test_masks_are_those_of_masked_nodes_only():
 class Heavy(Background):
     """A node with two terms of its own."""
 
-    def regularizers(self, state: SceneState) -> dict[str, torch.Tensor]:
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, torch.Tensor]:
         return {"weight": self.rows.means.sum(), "age": torch.tensor(state.progress)}
 
 
 def test_regularizers_are_named_by_node_and_term():
     heavy = Heavy(background_settings(), random_rows(3, 2))
     scene = SceneGraph({"road": background(random_rows(4, 0)), "heavy": heavy, "cars": cars(3)})
-    terms = scene.regularizers(SceneState(progress=0.25, training=True))
+    state = SceneState(progress=0.25, training=True)
+    parts = scene.gaussians_at(VIEW, state).parts
+    terms = scene.regularizers(parts, state)
     assert list(terms) == ["heavy/weight", "heavy/age"]
     assert terms["heavy/age"].item() == 0.25
     assert torch.equal(terms["heavy/weight"], heavy.rows.means.sum())
     sum(terms.values()).backward()
     assert torch.equal(heavy.rows.means.grad, torch.ones(3, 3))
-    assert SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]}).regularizers(SceneState()) == {}
+    assert (
+        SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]}).regularizers(parts, SceneState()) == {}
+    )
 
 
 def test_bytes_of_every_part():

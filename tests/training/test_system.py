@@ -76,7 +76,7 @@ class Watched(Background):
         self.asked.append(state)
         return super().raw_at(view, state)
 
-    def regularizers(self, state: SceneState) -> dict[str, Tensor]:
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Tensor]:
         self.asked.append(state)
         return {"size": 0.25 * self.rows.log_scales.sum(), "nothing": torch.zeros(())}
 

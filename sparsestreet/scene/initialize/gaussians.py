@@ -42,12 +42,14 @@ def init_gaussians(
     opacities: Float[Tensor, " n"],
     sh_degree: int,
     generator: torch.Generator,
+    columns: Mapping[str, Tensor] | None = None,
     mask_columns: Mapping[str, Tensor] | None = None,
     buffers: Mapping[str, Tensor] | None = None,
 ) -> Rows:
     """Isotropic Gaussians with random rotations (as in 3DGS), one per point; colors RGB in [0, 1], scales meters.
 
-    ``mask_columns`` are parameters that a mask learns, ``buffers`` what else is known of each row.
+    ``columns`` are further parameters of a node, ``mask_columns`` those that a mask learns, ``buffers`` what else is
+    known of each row.
 
     Raises ValueError if an opacity is outside (0, 1) or the degree outside 0 to 3.
     """
@@ -66,5 +68,5 @@ def init_gaussians(
         "sh_dc": ((colors.float() - 0.5) / SH_CONSTANT)[:, None, :],
         "sh_rest": torch.zeros(num_rows, (sh_degree + 1) ** 2 - 1, 3),
     }
-    masks = mask_columns or {}
-    return Rows(parameters | masks, buffers, transient=masks.keys())
+    masks = dict(mask_columns or {})
+    return Rows(parameters | dict(columns or {}) | masks, buffers, transient=masks.keys())

@@ -1,6 +1,5 @@
 """One learnable keep score per Gaussian, the same at all times (the paper's mask of static and rigid nodes)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
-from sparsestreet.scene.masks.mask import Mask
+from sparsestreet.scene.masks.mask import Mask, MaskScope
 
 COLUMN = "mask_logits"
 
@@ -33,7 +32,8 @@ class StaticMaskSettings:
         if not 0 <= self.threshold < 1:
             raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
 
-    def build(self, min_gaussians: int, times: Sequence[float] = ()) -> "StaticMask":
+    def build(self, min_gaussians: int, scope: MaskScope | None = None) -> "StaticMask":
+        """``scope`` does not matter: the same at all times."""
         return StaticMask(self, min_gaussians)
 
 
@@ -70,8 +70,9 @@ class StaticMask(Mask):
         scores = self.scores(rows).detach()
         return keep_best(scores, scores <= self.settings.threshold, self.min_gaussians)
 
-    def finish(self) -> None:
+    def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
         """Nothing: M = 1 for all rows that stayed."""
+        return None, {}
 
     def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float:
         """The threshold, lowered where needed so that K_min (or all) rows pass; ties all pass."""

@@ -8,15 +8,16 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from sparsestreet.ops.activate import RawGaussians, activate
 from sparsestreet.scene.density import DensityStrategy
-from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.gaussians import Rows, drop_parameter
 from sparsestreet.scene.initialize.gaussians import init_gaussians
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import Mask, MaskSettings
+from sparsestreet.scene.masks import Mask, MaskScope, MaskSettings
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Gaussians, Track, View
 
@@ -35,6 +36,8 @@ class NodeSettings(ABC):
     """Class names of the log whose tracks the node takes."""
     min_path_length: float = 0.0
     """Meters; a track that travels no farther is left to the static nodes."""
+    posed: bool | None = None
+    """True: only tracks that come with body poses; False: only those without; None: both."""
     min_gaussians: int
     """K_min of the paper: neither masks nor pruning leave fewer Gaussians in the node class."""
     max_gaussians: int | None
@@ -62,7 +65,8 @@ class NodeSettings(ABC):
 
     def takes(self, track: Track) -> bool:
         """Whether the node claims a track of the log."""
-        return track.class_name in self.classes and track.path_length > self.min_path_length
+        fits = self.posed is None or self.posed == (track.body is not None)
+        return fits and track.class_name in self.classes and track.path_length > self.min_path_length
 
     @property
     def mask_settings(self) -> MaskSettings | None:
@@ -84,14 +88,19 @@ class NodeSettings(ABC):
         scales: Float[Tensor, " n"],
         opacities: Float[Tensor, " n"],
         generator: torch.Generator,
+        *,
+        columns: Mapping[str, Tensor] | None = None,
         buffers: Mapping[str, Tensor] | None = None,
+        scope: MaskScope | None = None,
     ) -> tuple[Rows, Mask | None]:
         """The table of a node that begins, one Gaussian a point, and its mask.
 
-        ``scales`` are meters, ``opacities`` in (0, 1).
+        ``scales`` are meters, ``opacities`` in (0, 1); ``columns`` are learned beside those of every node, ``buffers``
+        what else is known of each row; ``scope`` where and when the mask's instances are, None: everywhere, always.
         """
-        mask = None if self.mask_settings is None else self.mask_settings.build(self.min_gaussians, data.times)
-        columns = {} if mask is None else mask.initial_columns(len(points))
+        if scope is None:
+            scope = MaskScope.whole(data.times, data.log.center, data.log.radius)
+        mask = None if self.mask_settings is None else self.mask_settings.build(self.min_gaussians, scope)
         rows = init_gaussians(
             points.positions,
             points.colors,
@@ -99,7 +108,8 @@ class NodeSettings(ABC):
             opacities=opacities,
             sh_degree=self.sh_degree,
             generator=generator,
-            mask_columns=columns,
+            columns=columns,
+            mask_columns={} if mask is None else mask.initial_columns(len(points)),
             buffers=buffers,
         )
         return rows, mask
@@ -153,8 +163,11 @@ class Node(nn.Module, ABC):
         """The node's Gaussians in the world, activated, with the mask applied."""
         return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)
 
-    def regularizers(self, state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        """Terms of the loss that concern the node alone, by name, each with its weight."""
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """Terms of the loss that concern the node alone, by name, each with its weight.
+
+        ``raw`` is what the node answered for the view of this step, so that nothing need be computed twice.
+        """
         return {}
 
     def outside(self) -> Bool[Tensor, " n"] | None:
@@ -186,13 +199,36 @@ class Node(nn.Module, ABC):
             multipliers=None if self.mask is None else self.mask.multipliers(rows, view.time),
         )
 
+    def finish_mask(self, optimizer: Optimizer | None = None) -> None:
+        """The mask has done its work: what it learned goes, from the optimizer too, and what it says stays is left.
+
+        A node whose mask is finished already, or that has none, stays as it is.
+        """
+        if self.mask is None or not self.mask.columns:
+            return
+        learned, (self.mask, buffers) = self.mask, self.mask.finish(self.rows)
+        for name in learned.columns:
+            self.rows.drop_column(name, optimizer)
+        for parameter in learned.parameters():
+            if optimizer is not None:
+                drop_parameter(optimizer, parameter)
+        for name, values in buffers.items():
+            self.rows.register_buffer(name, values)
+
     def row_bytes(self) -> int:
-        """float32 bytes of the rows without their masks (an instance number counts as one number)."""
+        """float32 bytes of the rows without their masks (an instance number counts as one number; bits are packed)."""
         columns = self.rows.columns()
-        return BYTES_PER_NUMBER * sum(columns[name].numel() for name in columns.keys() - self.rows.transient)
+        return sum(_bytes(columns[name]) for name in columns.keys() - self.rows.transient)
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        """A checkpoint from after the mask stage comes without the mask's columns: then the mask goes too."""
+        """A checkpoint from after the mask stage comes without the mask's columns: then the mask is finished here too.
+
+        Its rows are those of the start still; what they say is replaced by what the checkpoint says.
+        """
         if self.mask is not None and not any(f"{prefix}rows.{name}" in state_dict for name in self.mask.columns):
-            self.mask = self.mask.finish()
+            self.finish_mask()
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _bytes(column: Tensor) -> int:
+    return column.numel() * (1 if column.dtype == torch.uint8 else BYTES_PER_NUMBER)

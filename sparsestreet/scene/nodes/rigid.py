@@ -1,187 +1,36 @@
-"""Objects that move without changing their shape: where they start, and what they answer."""
+"""Objects that move without changing their shape."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Bool
+from torch import Tensor
 
-from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.ops.activate import Placement, RawGaussians
-from sparsestreet.ops.poses import Poses, poses_at
+from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.scene.density import outside_boxes
-from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_boxes
-from sparsestreet.scene.initialize.gaussians import neighbor_scales
-from sparsestreet.scene.initialize.points import Points
-from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.masks import Mask
-from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
+from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Track, View
+from sparsestreet.types import View
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigidSettings(NodeSettings):
-    """Starts from the lidar returns of all training instants, pooled in the frame of each object's box, and from the
-    points that images gave there."""
+class RigidSettings(TrackedSettings):
+    """As ``TrackedSettings``, and how far a Gaussian may leave its box."""
 
-    points_per_instance: int = 5000
-    box_points: int = 1000
-    """An instance with fewer points than this is filled up with random points on the faces of its box."""
-    initial_opacity: float = 0.1
-    max_gap: int = 2
-    """Frames; an object is present within its span up to this far from a training annotation."""
     box_margin: float = 0.1
     """Meters by which a row's center may lie outside its box: annotated boxes are about this tight."""
 
-    def build(self, data: TrainingData, generator: torch.Generator) -> "Rigid | None":
-        """Boxes of frames without training image (held out, or outside the training range) are not used."""
-        tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
-        if not tracks:
-            return None
-        measured = lidar_in_boxes(tracks, data.sweeps)
-        objects = [
-            self._object_points(track, Points.concatenate([_from_images(track, data), returns]), generator)
-            for track, returns in zip(tracks, measured, strict=True)
-        ]
-        counts = torch.tensor([len(points) for points in objects])
-        rows, mask = self.start(
-            data,
-            Points.concatenate(objects),
-            # Per instance: in their own frames all objects lie on top of each other.
-            torch.cat([neighbor_scales(points.positions) for points in objects]),
-            torch.full((int(counts.sum()),), self.initial_opacity),
-            generator,
-            buffers={"instances": torch.repeat_interleave(torch.arange(len(tracks)), counts)},
-        )
-        return Rigid(
-            self,
-            rows,
-            Trajectories.from_tracks(tracks, data.held_out, data.log.num_frames),
-            torch.stack([track.size.float() for track in tracks]),
-            names=tuple(track.name for track in tracks),
-            max_gap=self.max_gap / max(data.log.num_frames - 1, 1),
-            mask=mask,
-        )
-
-    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Rigid":
-        trajectories = Trajectories(
-            tensors["keyframe_times"],
-            tensors["keyframe_quaternions"],
-            tensors["keyframe_translations"],
-            tensors["keyframe_valid"],
-            tensors["spans"],
-        )
-        names = tuple(header["names"])
-        return Rigid(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
-
-    def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
-        """One object's colored points in its box frame, filled up where there are too few."""
-        points = measured.sampled(self.points_per_instance, generator)
-        missing = min(self.box_points, self.points_per_instance) - len(points)
-        if missing <= 0:
-            return points
-        color = points.colors.mean(0) if len(points) else torch.full((3,), 0.5)
-        surface = box_surface_points(missing, track.size.float(), generator)
-        return Points.concatenate([points, Points(surface, color.expand(missing, 3))])
+    @property
+    def node_class(self) -> "type[Rigid]":
+        return Rigid
 
 
-def _from_images(track: Track, data: TrainingData) -> Points:
-    """What images gave inside the track's box, in its frame."""
-    if data.image_points is None:
-        return Points.concatenate([])
-    found = data.image_points.in_boxes[track.name]
-    return Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors))
-
-
-class Rigid(Node):
-    """All instances of one node class: rows in the box frame of the instance named by the buffer ``instances``.
-
-    The pose of a keyframe is its annotation with learned corrections, zero at the start (see ``ops.poses.poses_at``).
-    """
-
-    def __init__(
-        self,
-        settings: RigidSettings,
-        rows: Rows,
-        keyframes: Trajectories,
-        sizes: Float[Tensor, "i 3"],
-        *,
-        names: Sequence[str] | None = None,
-        max_gap: float = 0.05,
-        mask: Mask | None = None,
-    ) -> None:
-        """Make a node of the tables.
-
-        Args:
-            settings: what is said about the node.
-            rows: columns as in ``Node``, and the buffer ``instances`` [n] int64: row of ``keyframes``.
-            keyframes: training poses of every instance.
-            sizes: length, width, height of every instance's box, meters.
-            names: of the instances' tracks; None: their numbers.
-            max_gap: normalized time to the nearest keyframe beyond which an instance counts as absent.
-            mask: the mask, if the rows have its columns.
-
-        Raises:
-            ValueError: if sizes, names and keyframes disagree in their number of instances, or a row names none of
-                them.
-        """
-        super().__init__(settings, rows, mask)
-        num_instances = keyframes.times.shape[0]
-        self.names = tuple(str(index) for index in range(num_instances)) if names is None else tuple(names)
-        if sizes.shape[0] != num_instances or len(self.names) != num_instances:
-            raise ValueError(
-                f"every instance needs a box size and a name, got {sizes.shape[0]} sizes and {len(self.names)} names "
-                f"for {num_instances} instances"
-            )
-        if len(rows) and not 0 <= int(rows.instances.min()) <= int(rows.instances.max()) < num_instances:
-            raise ValueError(
-                f"rows name instances {int(rows.instances.min())} to {int(rows.instances.max())}, but there are "
-                f"{num_instances}: number them as the rows of the keyframes"
-            )
-        self.max_gap = max_gap
-        self.register_buffer("sizes", sizes)
-        self.register_buffer("keyframe_times", keyframes.times)
-        self.register_buffer("keyframe_quaternions", keyframes.quaternions)
-        self.register_buffer("keyframe_translations", keyframes.translations)
-        self.register_buffer("keyframe_valid", keyframes.valid)
-        self.register_buffer("spans", keyframes.spans)
-        self.rotation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
-        self.translation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
+class Rigid(Tracked):
+    """Objects whose Gaussians keep their places in the box."""
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
         """Every instance's Gaussians at its pose; opacity exactly 0 where the instance is absent."""
-        return replace(self.stored(view), placement=Placement(self.pose_at(view.time), self.rows.instances))
-
-    def pose_at(self, time: float) -> Poses:
-        """Pose and presence of every instance at a normalized time."""
-        return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
-
-    @property
-    def keyframes(self) -> Trajectories:
-        """The annotated poses of the training frames, without corrections."""
-        return Trajectories(
-            self.keyframe_times,
-            self.keyframe_quaternions,
-            self.keyframe_translations,
-            self.keyframe_valid,
-            self.spans,
-        )
-
-    def instances(self) -> Instances:
-        """The objects, named as their tracks."""
-        return Instances(self.names, self.rows.instances, self.sizes)
+        return self.placed(view)
 
     def outside(self) -> Bool[Tensor, " n"]:
         """Rows whose center left its box by more than ``box_margin``."""
         return outside_boxes(self.rows.means, self.rows.instances, self.sizes, margin=self.settings.box_margin)
-
-    def header(self) -> dict[str, Any]:
-        return {"names": list(self.names), "max_gap": self.max_gap}
-
-    def pose_bytes(self) -> int:
-        """float32 bytes of the keyframes: a time, a quaternion and a translation each, corrections folded in."""
-        return BYTES_PER_NUMBER * 8 * int(self.keyframe_valid.sum())

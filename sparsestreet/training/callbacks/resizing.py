@@ -5,7 +5,7 @@ import logging
 from lightning import Trainer
 
 from sparsestreet.evaluation.ledger import CountChange
-from sparsestreet.scene.gaussians import RowPlan, drop_parameter
+from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
@@ -32,11 +32,6 @@ def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan
 
 
 def end_mask(trainer: Trainer, system: StreetSystem, node: str) -> None:
-    """Take a node's mask out of the scene and the optimizer; what it says stays is left in its place."""
-    masked, optimizer = system.scene.nodes[node], trainer.optimizers[0]
-    for column in masked.mask.columns:
-        masked.rows.drop_column(column, optimizer)
-    for parameter in masked.mask.parameters():
-        drop_parameter(optimizer, parameter)
-    masked.mask = masked.mask.finish()
+    """Finish a node's mask, and take what it learned out of the optimizer."""
+    system.scene.nodes[node].finish_mask(trainer.optimizers[0])
     system.rendering = None

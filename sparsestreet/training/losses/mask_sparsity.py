@@ -26,7 +26,7 @@ class MaskSparsity:
         rows = max(sum(scene.counts().values()), 1)
         total = torch.zeros((), device=rendering.rgb.device)
         for name, node in scene.nodes.items():
-            if node.mask is not None:
+            if node.mask is not None and node.mask.columns:
                 visible = rendering.splats.visible[rendering.spans[name]]
                 total = total + node.mask.sparsity_weight * node.mask.sparsity(node.rows, frame.time, visible)
         return self.weight * total / rows

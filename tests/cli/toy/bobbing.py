@@ -65,7 +65,7 @@ class Bobbing(Node):
         height = torch.tanh(self.lift(torch.tensor([view.time], device=local.means.device)))
         return replace(local, means=local.means + torch.cat((torch.zeros_like(height).expand(2), height)))
 
-    def regularizers(self, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
         return {"stillness": self.settings.stillness * self.lift[2].weight.square().sum()}
 
     def instances(self) -> Instances:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
-from sparsestreet.scene.masks import Mask, straight_through
+from sparsestreet.scene.masks import Mask, MaskScope, straight_through
 
 
 @dataclass(frozen=True)
@@ -18,8 +18,9 @@ class RisingSettings:
     sparsity_weight: float = 0.5
     built_with: list = field(default_factory=list)
 
-    def build(self, min_gaussians: int, times: Sequence[float]) -> "RisingMask":
-        self.built_with.append((min_gaussians, tuple(times)))
+    def build(self, min_gaussians: int, scope: MaskScope) -> "RisingMask":
+        times = tuple(scope.times[0].tolist())
+        self.built_with.append((min_gaussians, times))
         return RisingMask(self.sparsity_weight, min_gaussians, times)
 
 
@@ -51,5 +52,5 @@ class RisingMask(Mask):
         best = torch.stack([self.scores(rows, time).detach() for time in self.times]).amax(0)
         return keep_best(best, best <= 0.5, self.min_gaussians)
 
-    def finish(self) -> None:
-        return None
+    def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
+        return None, {}

@@ -111,7 +111,7 @@ def test_a_node_is_built_with_its_mask(make: type[Mask]):
     assert node.mask.min_gaussians == 7
     assert node.mask.sparsity_weight == 0.5
     if make is RisingMask:
-        times = tuple(frame.time for frame in street_log().frames if frame.frame_index != 2)
+        times = tuple(training_data(held_out=frozenset({2})).times)
         assert wanted.built_with == [(7, times)]
         assert len(times) == NUM_FRAMES - 1
     unmasked = replace(settings, masked=False)
@@ -133,9 +133,7 @@ def test_rows_of_a_finished_mask_are_unmasked(make: type[Mask]):
     node = masked(make())
     node.rows.resize(node.mask.keep(node.rows).plan())
     expected = opacities(node, 1.0)
-    for column in node.mask.columns:
-        node.rows.drop_column(column)
-    node.mask = node.mask.finish()
+    node.finish_mask()
     assert node.mask is None
     assert torch.equal(opacities(node, 0.0), expected)  # M = 1 at all times
     assert not set(node.rows.columns()) & node.rows.transient
@@ -147,9 +145,7 @@ def test_a_checkpoint_from_after_the_mask_stage_loads_into_a_masked_node(make: t
     """A run that is resumed builds its nodes anew, with masks; the checkpoint says that they are over."""
     finished = masked(make())
     finished.rows.resize(finished.mask.keep(finished.rows).plan())
-    for column in finished.mask.columns:
-        finished.rows.drop_column(column)
-    finished.mask = None
+    finished.finish_mask()
     fresh = SceneGraph({"road": masked(make(), count=4)})
     fresh.load_state_dict(SceneGraph({"road": finished}).state_dict())
     road = fresh.nodes["road"]

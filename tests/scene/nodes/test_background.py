@@ -85,8 +85,7 @@ def test_a_finished_mask_ends_the_masking():
     node = background(random_rows(3, 0, mask=mask), mask)
     with torch.no_grad():
         node.rows.mask_logits[0] = -9.0
-    node.rows.drop_column("mask_logits")
-    node.mask = mask.finish()
+    node.finish_mask()
     assert node.mask is None
     assert (node.gaussians_at(view_at(0.0), degree(0)).opacities > 0).all()
 

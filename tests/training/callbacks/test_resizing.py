@@ -79,10 +79,10 @@ class TwoScores(Mask):
     def keep(self, rows: Rows) -> Selection:
         return Selection(torch.ones(len(rows), dtype=torch.bool), False, 0)
 
-    def finish(self) -> Mask:
+    def finish(self, rows: Rows) -> tuple[Mask, dict[str, Tensor]]:
         finished = TwoScores()
         finished.columns = ()
-        return finished.requires_grad_(False)
+        return finished.requires_grad_(False), {}
 
 
 @pytest.mark.parametrize("trained", [False, True])

@@ -1,0 +1,85 @@
+"""What a trained mask over time leaves behind: a bit per Gaussian and training frame, and no network."""
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from sparsestreet.geometry.trajectories import TIME_TOLERANCE
+from sparsestreet.scene.gaussians import Rows, Selection, keep_best
+from sparsestreet.scene.masks.mask import Mask
+
+BITS = "mask_bits"
+"""Buffer of the table: [n, ceil(frames / 8)] uint8, the first frame in the lowest bit of the first byte."""
+
+
+@dataclass(frozen=True)
+class BakedMaskSettings:
+    """Nothing is left to choose."""
+
+    def restored(self, times: Float[Tensor, " t"]) -> "BakedMask":
+        """The mask of a scene file, whose table has the bits."""
+        return BakedMask(times)
+
+
+class BakedMask(Mask):
+    """M of every row at every training frame; between two frames a row shows if it shows at either.
+
+    Before the first and behind the last frame the nearest one counts.
+    """
+
+    columns = ()
+    sparsity_weight = 0.0
+
+    def __init__(self, times: Float[Tensor, " t"]) -> None:
+        """``times``: normalized, of the training frames, in order."""
+        super().__init__()
+        self.settings = BakedMaskSettings()
+        self.register_buffer("times", times)
+
+    def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
+        return {}
+
+    def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
+        before, after = self._frames_around(time)
+        shown = _bit(rows.mask_bits, before)
+        if after != before:
+            shown = shown | _bit(rows.mask_bits, after)
+        return shown.to(rows.means.dtype)
+
+    def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+        """Nothing is learned any more."""
+        return rows.means.new_zeros(())
+
+    def keep(self, rows: Rows) -> Selection:
+        """All: what shows at no time went when the mask was finished."""
+        everything = torch.ones(len(rows), dtype=torch.bool, device=rows.mask_bits.device)
+        return keep_best(everything.float(), ~everything, 0)
+
+    def finish(self, rows: Rows) -> tuple[Mask, dict[str, Tensor]]:
+        """It is finished."""
+        return self, {}
+
+    def _frames_around(self, time: float) -> tuple[int, int]:
+        """The frame at a time, twice; or those before and after it."""
+        times = self.times.tolist()
+        after = bisect_left(times, time - TIME_TOLERANCE)
+        if after == len(times):
+            return after - 1, after - 1
+        exact = after == 0 or times[after] <= time + TIME_TOLERANCE
+        return (after, after) if exact else (after - 1, after)
+
+
+def packed(shown: Bool[Tensor, "n t"]) -> UInt8[Tensor, "n b"]:
+    """Eight frames a byte."""
+    rows, frames = shown.shape
+    padded = torch.zeros(rows, -(-frames // 8) * 8, dtype=torch.uint8, device=shown.device)
+    padded[:, :frames] = shown
+    weights = 2 ** torch.arange(8, dtype=torch.uint8, device=shown.device)
+    return (padded.reshape(rows, -1, 8) * weights).sum(-1, dtype=torch.uint8)
+
+
+def _bit(bits: UInt8[Tensor, "n b"], frame: int) -> Bool[Tensor, " n"]:
+    return (bits[:, frame // 8] >> (frame % 8) & 1).bool()

@@ -1,0 +1,154 @@
+"""A keep score for every Gaussian and time (the paper's mask of nodes that change their shape)."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from sparsestreet.scene.gaussians import Rows, Selection, keep_best
+from sparsestreet.scene.masks.baked import BITS, BakedMask, packed
+from sparsestreet.scene.masks.mask import Mask, MaskScope
+from sparsestreet.scene.masks.static import straight_through
+
+FEATURES = "mask_features"
+
+_GOLDEN = (math.sqrt(5) - 1) / 2
+"""Multiples of it, modulo 1, fill the unit interval evenly: the frames of successive steps."""
+
+_TIMES_AT_ONCE = 8
+"""Scores of all training frames are computed for so many frames at a time, to bound the memory."""
+
+
+@dataclass(frozen=True)
+class TemporalMaskSettings:
+    """Raises ValueError for a negative weight, a threshold that is no value of a sigmoid, or sizes below 1."""
+
+    sparsity_weight: float
+    """lambda_n of the paper."""
+    threshold: float = 0.01
+    """epsilon of the paper."""
+    initial_logit: float = 1.0
+    features: int = 8
+    """d of the paper: numbers that are learned of each Gaussian."""
+    frames: int = 4
+    """T of the paper: training frames at which the loss looks in a step, beside the current one."""
+    width: int = 64
+    """Of the two hidden layers."""
+    octaves: int = 4
+    """Of the sines and cosines that encode time and position."""
+    visible_only: bool = False
+    """True: the loss pushes a row only in views that draw it (see ``StaticMaskSettings``)."""
+
+    def __post_init__(self) -> None:
+        if not self.sparsity_weight >= 0:
+            raise ValueError(f"a mask's sparsity_weight must be >= 0, got {self.sparsity_weight}")
+        if not 0 <= self.threshold < 1:
+            raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
+        if min(self.features, self.width) < 1 or min(self.frames, self.octaves) < 0:
+            raise ValueError(
+                "a mask over time needs features and width >= 1, frames and octaves >= 0, got "
+                f"{self.features}, {self.width}, {self.frames} and {self.octaves}"
+            )
+
+    def build(self, min_gaussians: int, scope: MaskScope) -> "TemporalMask":
+        return TemporalMask(self, min_gaussians, scope)
+
+
+class TemporalMask(Mask):
+    """sigma(MLP(f_k, t, p_k)) > epsilon, with the features f as the column ``mask_features``.
+
+    p is the mean in units of its instance's half size, without gradient; t and p are encoded by sines and cosines. The
+    network answers a logit: with a sigmoid at its end, as the paper writes it, and another one behind it no score would
+    be below 0.5. The first layer is a sum of what row and time bring, so that several times cost little more than one.
+    """
+
+    columns = (FEATURES,)
+
+    def __init__(self, settings: TemporalMaskSettings, min_gaussians: int, scope: MaskScope) -> None:
+        super().__init__()
+        self.settings = settings
+        self.min_gaussians = min_gaussians
+        self.sparsity_weight = settings.sparsity_weight
+        encoded = 1 + 2 * settings.octaves
+        self.of_row = nn.Linear(settings.features + 3 * encoded, settings.width)
+        self.of_time = nn.Linear(encoded, settings.width, bias=False)
+        self.hidden = nn.Linear(settings.width, settings.width)
+        self.last = nn.Linear(settings.width, 1)
+        nn.init.normal_(self.last.weight, std=1e-3)
+        nn.init.constant_(self.last.bias, settings.initial_logit)
+        for name in ("times", "valid", "centers", "half_sizes"):
+            self.register_buffer(name, getattr(scope, name))
+        # Lowered by ``keep`` where K_min needs it, so that what it keeps shows too.
+        self.register_buffer("limit", torch.tensor(settings.threshold))
+        self.register_buffer("draws", torch.zeros((), dtype=torch.float64))
+
+    def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
+        """Random features of a hundredth: rows in one place learn masks of their own."""
+        generator = torch.Generator().manual_seed(num_rows)
+        return {FEATURES: 0.01 * torch.randn(num_rows, self.settings.features, generator=generator)}
+
+    def scores(self, rows: Rows, times: Float[Tensor, "#n t"]) -> Float[Tensor, "n t"]:
+        """sigma of every row at its times, float32 under any precision."""
+        with torch.autocast(rows.mask_features.device.type, enabled=False):
+            of_row = self.of_row(torch.cat((rows.mask_features, self._encoded(self._places(rows))), dim=1))
+            of_time = self.of_time(self._encoded(times[..., None]))
+            hidden = torch.relu(self.hidden(torch.relu(of_row[:, None] + of_time)))
+            return torch.sigmoid(self.last(hidden).squeeze(-1))
+
+    def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
+        scores = self.scores(rows, self.times.new_full((1, 1), time)).squeeze(1)
+        return straight_through(scores, self.limit)
+
+    def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+        """Means over the current time and T training frames of the row's own instance, summed over the rows."""
+        drawn = self._drawn_frames()[_instances(rows)]
+        now = drawn.new_full((len(rows), 1), time)
+        scores = self.scores(rows, torch.cat((now, drawn), dim=1)).mean(1)
+        return (scores * visible if self.settings.visible_only else scores).sum()
+
+    @torch.no_grad()
+    def keep(self, rows: Rows) -> Selection:
+        """Rows that are open in any training frame of their instance; K_min by the best of its scores."""
+        best = self._at_training_frames(rows).masked_fill(~self.valid[_instances(rows)], -1.0).amax(1)
+        selection = keep_best(best, best <= self.settings.threshold, self.min_gaussians)
+        self.floor_firings += selection.floor_hit
+        lowest = torch.where(selection.keep, best, 1.0).amin() if len(best) else best.new_ones(())
+        # One step below the lowest score that must pass, since the comparison is strict.
+        below = torch.nextafter(lowest, torch.full_like(lowest, -1.0))
+        self.limit.copy_(below.clamp(max=self.settings.threshold))
+        return selection
+
+    @torch.no_grad()
+    def finish(self, rows: Rows) -> tuple[BakedMask, dict[str, Tensor]]:
+        """A bit per row and training frame, of all instances together."""
+        times = torch.unique(self.times[self.valid])
+        chunks = [self.scores(rows, part[None].expand(1, -1)) > self.limit for part in times.split(_TIMES_AT_ONCE)]
+        return BakedMask(times), {BITS: packed(torch.cat(chunks, dim=1))}
+
+    def _at_training_frames(self, rows: Rows) -> Float[Tensor, "n k"]:
+        times = self.times[_instances(rows)]
+        return torch.cat([self.scores(rows, part) for part in times.split(_TIMES_AT_ONCE, dim=1)], dim=1)
+
+    def _drawn_frames(self) -> Float[Tensor, "i t"]:
+        """T training frames of every instance, spread over all of its own; others in every step."""
+        self.draws += 1
+        spread = torch.arange(self.settings.frames, device=self.times.device) / max(self.settings.frames, 1)
+        places = (spread + self.draws * _GOLDEN) % 1.0
+        chosen = (places[None] * self.valid.sum(1, keepdim=True)).long()
+        return self.times.gather(1, chosen.clamp(max=self.times.shape[1] - 1))
+
+    def _places(self, rows: Rows) -> Float[Tensor, "n 3"]:
+        instances = _instances(rows)
+        return (rows.means.detach() - self.centers[instances]) / self.half_sizes[instances]
+
+    def _encoded(self, values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b e"]:
+        """The values, and sine and cosine of pi, 2 pi, 4 pi ... times them."""
+        octaves = [math.pi * 2**octave * values for octave in range(self.settings.octaves)]
+        return torch.cat([values, *map(torch.sin, octaves), *map(torch.cos, octaves)], dim=-1)
+
+
+def _instances(rows: Rows) -> Int[Tensor, " n"]:
+    named = rows.columns().get("instances")
+    return torch.zeros(len(rows), dtype=torch.int64, device=rows.means.device) if named is None else named
