@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +33,7 @@ class TrainSchema:
     resume: str | None = None
     data: Any = MISSING
     schedule: Any = MISSING
+    assignment: Any = MISSING
     method: Any = MISSING
     sparsify: Any = MISSING
     node: Any = MISSING
@@ -55,8 +56,14 @@ def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     return values[_root_.capacity]
 
 
+def joined(*lists: Iterable[Any]) -> list[Any]:
+    """The resolver of conf/assignment: all lists as one."""
+    return [entry for entries in lists for entry in entries]
+
+
 ConfigStore.instance().store(name="train_schema", node=TrainSchema)
 OmegaConf.register_new_resolver("by_capacity", by_capacity, replace=True)
+OmegaConf.register_new_resolver("joined", joined, replace=True)
 
 
 @contextmanager

@@ -19,7 +19,6 @@ from tests.scene.street import (
     degree,
     random_rows,
     static_mask,
-    street_log,
     training_data,
     view_at,
 )
