@@ -75,10 +75,11 @@ class BakedMask(Mask):
 def packed(shown: Bool[Tensor, "n t"]) -> UInt8[Tensor, "n b"]:
     """Eight frames a byte."""
     rows, frames = shown.shape
-    padded = torch.zeros(rows, -(-frames // 8) * 8, dtype=torch.uint8, device=shown.device)
+    width = -(-frames // 8)
+    padded = torch.zeros(rows, 8 * width, dtype=torch.uint8, device=shown.device)
     padded[:, :frames] = shown
     weights = 2 ** torch.arange(8, dtype=torch.uint8, device=shown.device)
-    return (padded.reshape(rows, -1, 8) * weights).sum(-1, dtype=torch.uint8)
+    return (padded.reshape(rows, width, 8) * weights).sum(-1, dtype=torch.uint8)
 
 
 def _bit(bits: UInt8[Tensor, "n b"], frame: int) -> Bool[Tensor, " n"]:

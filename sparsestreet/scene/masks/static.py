@@ -86,7 +86,7 @@ class StaticMask(Mask):
         return float(torch.nextafter(lowest_kept, torch.full_like(lowest_kept, -1.0)))
 
 
-def straight_through(scores: Float[Tensor, " n"], threshold: float) -> Float[Tensor, " n"]:
+def straight_through(scores: Float[Tensor, " n"], threshold: float | Float[Tensor, ""]) -> Float[Tensor, " n"]:
     """1[score > threshold] forward, d/dscore = 1 backward (the paper's M_k; Bengio et al. 2013).
 
     Scores are sigmoids already: no second one here.
