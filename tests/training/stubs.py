@@ -180,6 +180,7 @@ class StubTrainer(Trainer):
     def train(self, steps: int, frame: Frame) -> None:
         """Optimizer steps on one frame."""
         for _ in range(steps):
+            self._start_step(frame)
             self.system.on_train_batch_start(frame, 0)
             loss = self.system.training_step(frame, 0)
             self.optimizers[0].zero_grad()
@@ -192,7 +193,12 @@ class StubTrainer(Trainer):
     def walk(self, until: int) -> None:
         """Let the steps up to ``until`` pass: callbacks hear that they ended, nothing is rendered."""
         while self.global_step < until:
+            self._start_step(None)
             self._end_step(None)
+
+    def _start_step(self, frame: Frame | None) -> None:
+        for callback in self.callbacks:
+            callback.on_train_batch_start(self, self.system, frame, 0)
 
     def save_checkpoint(self, filepath: Path, weights_only: bool | None = None, storage_options: Any = None) -> None:
         """The step, in place of all that Lightning writes."""

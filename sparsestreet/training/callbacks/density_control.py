@@ -75,7 +75,12 @@ class DensityControl(Callback, RowListener):
         if self.refine_in.due(step, steps) and not self._recovering(step):
             for name in self.statistics:
                 self._refine(trainer, pl_module, name)
-        if self.reset_in.due(step, steps):
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        # Before the next step rather than behind the last one: a look at held-out views that falls between the two
+        # would see a scene that has just lost its opacities.
+        step = trainer.global_step
+        if step > 0 and self.reset_in.due(step, trainer.max_steps):
             self.last_reset = step
             for name in self.statistics:
                 node = pl_module.scene.nodes[name]

@@ -1,6 +1,7 @@
 """The mask over time: its formula, the frames it looks at, what it keeps, and what it leaves behind."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -14,11 +15,11 @@ from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import RATES, background, degree, random_rows, view_at
 
 SETTINGS = TemporalMaskSettings(0.5, features=3, frames=2, width=5, octaves=2)
-TIMES = [0.0, 0.25, 0.5, 1.0]
+TIMES = (0.0, 0.25, 0.5, 1.0)
 MASK_RATES = {**RATES, "mask": RATES["means"], "mask_features": RATES["means"]}
 
 
-def scope(times: list[list[float]] = [TIMES]) -> MaskScope:
+def scope(times: Sequence[Sequence[float]] = (TIMES,)) -> MaskScope:
     """Instances at a height of their own, 4 m long; times beyond a list's end are not valid."""
     longest = max(map(len, times))
     table = torch.tensor([[*each, *[9.0] * (longest - len(each))] for each in times])

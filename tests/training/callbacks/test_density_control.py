@@ -138,6 +138,9 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only():
     optimizer = trainer.optimizers[0]
     assert optimizer.state[node.rows.opacity_logits]["exp_avg"].any()
     trainer.walk(5)
+    # Whoever looks at the scene behind step 5, as validation does, still sees it with its opacities.
+    assert torch.equal(node.rows.opacity_logits, before)
+    trainer.walk(6)
     limit = torch.logit(torch.tensor(0.01))
     torch.testing.assert_close(node.rows.opacity_logits.detach(), before.clamp(max=limit))
     assert bool((node.rows.opacity_logits < before).all())

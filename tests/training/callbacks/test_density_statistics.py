@@ -77,12 +77,13 @@ def test_statistics_start_anew_after_a_refinement_and_only_then():
     assert not control.statistics["background"].visits.any()
     assert not control.statistics["background"].gradient_sum.any()
     assert not control.statistics["background"].largest_screen.any()
+    trainer.train(1, frame_at())
     trainer.global_step = 18
     trainer.train(2, frame_at())
-    assert control.statistics["background"].visits.max() == 2
+    assert control.statistics["background"].visits.max() == 3
     trainer.global_step = 29
     trainer.train(1, frame_at())
-    assert strategy.asked[-1]["statistics"].visits.max() == 3  # those of the pause as well
+    assert strategy.asked[-1]["statistics"].visits.max() == 4  # those of the pause as well
 
 
 def test_after_the_last_refinement_nothing_is_counted_any_more():
