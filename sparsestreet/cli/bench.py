@@ -20,6 +20,7 @@ examples:
   sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
   sparsestreet bench step                       phases of a training step: time, operations, distance to their floors
   sparsestreet bench step sparsify=paper        the same of another training: options as those of train
+  sparsestreet bench masks                      a mask over time: its network a frame, and the bits that it leaves
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -33,6 +34,7 @@ def bench(arguments: list[str]) -> int:
         "knobs": _knobs,
         "blend": _blend,
         "step": _step,
+        "masks": _masks,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -107,6 +109,15 @@ def _step(options: argparse.Namespace) -> bool:
     with TemporaryDirectory() as folder:
         train = train_with(options.overrides, Path(folder))
         step.run_step(" ".join(["train", *options.overrides]), train, window, _file(options), options.out)
+    return True
+
+
+def _masks(options: argparse.Namespace) -> bool:
+    from sparsestreet.bench import masks
+    from sparsestreet.bench.timing import TimingBudget
+
+    sizes, budget = ((100,), TimingBudget(repeats=2, least=1)) if options.quick else (masks.ROWS, TimingBudget(100))
+    masks.run_masks(sizes, masks.FRAMES, budget, _file(options))
     return True
 
 

@@ -17,7 +17,7 @@ def test_help_teaches_by_example(capsys):
         bench(["--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    assert all(f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "step", "scaling", "gpu"))
+    assert all(f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "step", "masks", "scaling", "gpu"))
 
 
 def test_unknown_mode_is_refused(capsys):
@@ -33,6 +33,16 @@ def test_records_name_command_and_threads(tmp_path, capsys):
     assert first["provenance"]["command"].startswith("sparsestreet bench scaling --quick")
     assert first["provenance"]["threads"] == torch.get_num_threads()
     assert first["rows"] < min(scaling.ROWS)
+
+
+def test_a_masks_network_is_timed_beside_its_bits(tmp_path, capsys):
+    assert bench(["masks", "--quick", "--out", str(tmp_path)]) == 0
+    record = json.loads((tmp_path / "masks.jsonl").read_text())
+    assert record["rows"] == 100
+    assert record["bytes_of_bits"] == 100 * -(-record["frames"] // 8)
+    assert 0 < record["bits"]["minimum"] <= record["bits"]["median"]
+    assert 0 < record["network"]["minimum"] <= record["network"]["median"]
+    assert "ms saved a frame" in capsys.readouterr().out
 
 
 def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, capsys):
