@@ -11,9 +11,9 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.cli.compose import CONF, configuration, override_problem
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, PhaseTimes, RowLedger
+from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.triangulation import ImagePointSettings
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
@@ -31,7 +31,7 @@ def composed(*overrides: str):
 
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
-    assert {"none", "masks", "importance", "paper", "removal"} == set(SPARSIFY)
+    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity"} == set(SPARSIFY)
 
 
 @pytest.mark.parametrize(("method", "sparsify"), PAIRS)
@@ -43,13 +43,17 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
     assert list(recipe.losses) == [*plain.losses, *(["mask_sparsity"] if masked else [])]
     rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
-    added = ([MaskTraining] if masked else []) + ([BackgroundPruning] if sparsify in rules else [])
+    rules |= {"random": RandomRule, "opacity": OpacityRule}
+    added = ([MaskTraining] if masked else []) + ([Pruning] if sparsify in rules else [])
     assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:
-        pruning = recipe.callbacks["background_pruning"]
+        pruning = recipe.callbacks["pruning"]
         assert type(pruning.rule) is rules[sparsify]
         # The paper prunes once, at 28,000 of 30,000 steps, whatever the schedule.
-        assert sparsify == "removal" or pruning.at == (0.93334,)
+        assert (pruning.at == (0.93334,)) == (rules[sparsify] is ImportanceRule)
+        # And the background alone.
+        touched = [name for name, settings in recipe.nodes.items() if pruning.rule.touches(name, settings)]
+        assert touched == (["background"] if rules[sparsify] is ImportanceRule else list(recipe.nodes))
     assert cfg.name == method + ("" if sparsify == "none" else f"+{sparsify}")
 
 
@@ -144,7 +148,7 @@ def test_every_option_can_be_set_without_plus_signs(override: str):
         (["sparsify=masks", "~loss.mask_sparsity"], "no MaskSparsity among the losses"),
         (["sparsify=masks", "~callback.mask_training"], "no MaskTraining among the callbacks"),
         (["sparsify=masks", "sparsify.masks=false"], "no node trains a mask"),
-        (["sparsify=importance", "node.background.prunable=false"], "no node is prunable"),
+        (["sparsify=importance", "node.background.prunable=false"], "may touch no node"),
         (["node.background.density=null", "node.rigid.density=null"], "every node's density is null"),
     ],
 )
@@ -180,5 +184,40 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
         reasons = {row["reason"] for row in csv.DictReader(file)}
     assert {"start", "densify"} <= reasons
     assert ("mask" in reasons) == (sparsify in ("masks", "paper", "removal"))
-    assert ("background pruning" in reasons) == (sparsify in ("importance", "paper", "removal"))
+    assert ("pruning" in reasons) == (sparsify not in ("none", "masks"))
     assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["global_step"] == 20
+
+
+BASELINE_TERMS = [
+    "loss=[photometric,sky,depth,opacity_entropy,inverse_depth_smoothness,dynamic_region]",
+    "loss.depth.inverse=false",
+    "loss.depth.weight=0.01",
+    "node.background.sharp_shape=0.1",
+    "node.rigid.sharp_shape=0.1",
+    "node.rigid.temporal_smooth=0.01",
+]
+
+
+def test_the_terms_of_the_baselines_are_options():
+    losses = recipe_of(composed(*BASELINE_TERMS)).losses
+    dynamic = losses.pop("dynamic_region")
+    assert (dynamic.weight, dynamic.threshold, dynamic.from_progress) == (1.0, 0.2, 0.6666)
+    assert {name: loss.weight for name, loss in losses.items()} == {
+        "photometric": 1.0,
+        "sky": 0.05,
+        "depth": 0.01,
+        "opacity_entropy": 0.05,
+        "inverse_depth_smoothness": 0.001,
+    }
+    assert not losses["depth"].inverse
+
+
+def test_the_terms_of_the_baselines_train_and_a_control_prunes_every_node(run_train, tmp_path):
+    """All terms in one run, the dynamic region in its last third, and pruning to given numbers."""
+    counts = "callback.pruning.rule.keep={background: 500, rigid: 0.5}"
+    out = run_train(tmp_path, *BASELINE_TERMS, "sparsify=random", counts, "trainer.fast_dev_run=6")
+    with (out / "records" / "counts.csv").open() as file:
+        pruned = {row["node"]: row for row in csv.DictReader(file) if row["reason"] == "pruning"}
+    assert pruned["background"]["after"] == "500"
+    # Objects have floors of their own.
+    assert 0.5 * int(pruned["rigid"]["before"]) <= int(pruned["rigid"]["after"]) < int(pruned["rigid"]["before"])
