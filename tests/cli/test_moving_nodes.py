@@ -1,0 +1,40 @@
+"""Nodes that move or change their shape without boxes, trained on the tiny street from their own files in conf/."""
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from sparsestreet import load_scene
+from sparsestreet.cli.train import train
+from sparsestreet.scene.nodes import Node
+
+pytestmark = pytest.mark.xdist_group("tiny street")
+
+
+def trained(tiny_street: list[str], out: Path, name: str, *overrides: str) -> tuple[Node, list[dict[str, str]]]:
+    """The only node of a run, and its curves."""
+    own = [word.replace("node.background", f"node.{name}") for word in tiny_street]
+    assert train([*own, "method=3dgs", f"node=[{name}]", "trainer.log_every_n_steps=1", f"out={out}", *overrides]) == 0
+    with (out / "curves" / "metrics.csv").open() as file:
+        return load_scene(out).scene.nodes[name], list(csv.DictReader(file))
+
+
+def of_steps(curves: list[dict[str, str]], name: str) -> list[float]:
+    return [float(row[name]) for row in curves if row.get(name)]
+
+
+def test_a_vibrating_street(tiny_street, tmp_path):
+    """Its loss falls, its times and velocities are learned, and it grows where and when images ask for it."""
+    thresholds = ["node.vibrating.density.grad_threshold=1e9", "node.vibrating.density.peak_threshold=1e-4"]
+    node, curves = trained(tiny_street, tmp_path / "run", "vibrating", *thresholds)
+    losses = of_steps(curves, "train/photometric")
+    assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
+    assert of_steps(curves, "train/vibrating/velocity")[-1] > 0
+    assert node.rows.velocities.any()
+    assert len(node.rows.log_life_spans.unique()) > 100
+    with (tmp_path / "run" / "records" / "counts.csv").open() as file:
+        grown = [row for row in csv.DictReader(file) if row["reason"] == "densify"]
+    assert int(grown[-1]["after"]) > int(grown[0]["before"])  # by the life peaks alone
+    assert torch.isfinite(node.rows.life_peaks).all()
