@@ -38,3 +38,12 @@ def test_a_vibrating_street(tiny_street, tmp_path):
         grown = [row for row in csv.DictReader(file) if row["reason"] == "densify"]
     assert int(grown[-1]["after"]) > int(grown[0]["before"])  # by the life peaks alone
     assert torch.isfinite(node.rows.life_peaks).all()
+
+
+def test_a_street_deformed_by_a_network(tiny_street, tmp_path):
+    """Its loss falls, and what moves is learned from the time on at which it begins."""
+    node, curves = trained(tiny_street, tmp_path / "run", "field", "node.field.deform_from=0.5")
+    losses = of_steps(curves, "train/photometric")
+    assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
+    assert node.network.last.weight.any()
+    assert torch.isfinite(node.network.last.weight).all()

@@ -73,8 +73,8 @@ class GradientDensity:
 
         With g the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the
         scene radius in meters: a row with g > grad_threshold (``urgency`` > 1) is split if s_max > split_scale R (or,
-        up to ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are at
-        mu + R(q) (s * z) with z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies
+        up to ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are
+        at mu + R(q) (s * z) with z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies
         inherit all other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep
         theirs.
 

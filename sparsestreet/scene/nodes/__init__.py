@@ -1,10 +1,13 @@
 """What the scene is made of; each node class is one module: what is said about it, how it starts, what it answers.
 
-``node`` is what all have in common. Of a whole street: ``background`` stands still, ``vibrating`` is a background whose
-Gaussians swing and fade. Of objects: ``rigid`` moves them along their tracks (``tracked``) without changing their shape.
+``node`` is what all have in common. Of a whole street: ``background`` stands still, the Gaussians of ``vibrating``
+swing and fade, those of ``field`` are deformed by a ``network``. Of objects: ``rigid`` moves them along their tracks
+(``tracked``) without changing their shape.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
+from sparsestreet.scene.nodes.field import Field, FieldSettings
+from sparsestreet.scene.nodes.network import NetworkSettings
 from sparsestreet.scene.nodes.node import Instances, Node, NodeSettings
 from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
@@ -13,7 +16,10 @@ from sparsestreet.scene.nodes.vibrating import Vibrating, VibratingSettings
 __all__ = [
     "Background",
     "BackgroundSettings",
+    "Field",
+    "FieldSettings",
     "Instances",
+    "NetworkSettings",
     "Node",
     "NodeSettings",
     "Rigid",

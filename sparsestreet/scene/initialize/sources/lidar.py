@@ -37,9 +37,6 @@ class LidarPoints(PointSource):
             parts.append(Points(sweep.points, sweep.colors).where(sweep.colored & outside))
             times.append(torch.full((len(parts[-1]),), sweep.index / max(data.log.num_frames - 1, 1)))
         points = Points.concatenate(parts)
-        if self.voxel is None:
-            chosen = torch.arange(len(points))
-        else:
-            chosen = thinned(points.positions, self.voxel, generator)
-        chosen = at_most(count, chosen, generator)
+        rows = torch.arange(len(points)) if self.voxel is None else thinned(points.positions, self.voxel, generator)
+        chosen = at_most(count, rows, generator)
         return self.seeds(points.at(chosen), times=torch.cat(times)[chosen])
