@@ -2,10 +2,11 @@
 
 ``node`` is what all have in common. Of a whole street: ``background`` stands still, the Gaussians of ``vibrating``
 swing and fade, those of ``field`` are deformed by a ``network``. Of objects: ``rigid`` moves them along their tracks
-(``tracked``) without changing their shape.
+(``tracked``) without changing their shape, ``deformable`` with a network that changes it.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
+from sparsestreet.scene.nodes.deformable import Deformable, DeformableSettings
 from sparsestreet.scene.nodes.field import Field, FieldSettings
 from sparsestreet.scene.nodes.network import NetworkSettings
 from sparsestreet.scene.nodes.node import Instances, Node, NodeSettings
@@ -16,6 +17,8 @@ from sparsestreet.scene.nodes.vibrating import Vibrating, VibratingSettings
 __all__ = [
     "Background",
     "BackgroundSettings",
+    "Deformable",
+    "DeformableSettings",
     "Field",
     "FieldSettings",
     "Instances",

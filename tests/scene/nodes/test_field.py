@@ -152,7 +152,7 @@ def test_rows_come_and_go():
     node = street(5)
     node.rows.resize(RowPlan(5, torch.tensor([3, 3]), torch.tensor([False, True])))
     raw = node.raw_at(view_at(0.3), FINISHED)
-    assert torch.equal(raw.means[0], raw.means[1])
+    torch.testing.assert_close(raw.means[0], raw.means[1])  # a product of matrices sums rows in their own order
     assert len(street(0).raw_at(view_at(0.3), state(0.5, training=True))) == 0
 
 
