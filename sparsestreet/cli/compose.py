@@ -61,9 +61,15 @@ def joined(*lists: Iterable[Any]) -> list[Any]:
     return [entry for entries in lists for entry in entries]
 
 
+def times(factor: float, rate: float) -> float:
+    """The resolver of conf/node: a rate of the schedule times a number."""
+    return float(factor) * float(rate)
+
+
 ConfigStore.instance().store(name="train_schema", node=TrainSchema)
 OmegaConf.register_new_resolver("by_capacity", by_capacity, replace=True)
 OmegaConf.register_new_resolver("joined", joined, replace=True)
+OmegaConf.register_new_resolver("times", times, replace=True)
 
 
 @contextmanager

@@ -50,3 +50,18 @@ def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[
     in_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)
     in_world = in_camera @ camera.camera_from_world[:3, :3].to(device)
     return in_world / in_world.norm(dim=-1, keepdim=True)
+
+
+def distance_to_view(camera: Camera, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Float[Tensor, " n"]:
+    """Meters by which world points lie outside of what a camera sees, at least; negative inside.
+
+    What it sees ends at the sides of an image that is larger by ``margin`` of its size on each side, and at the camera.
+    A lens and a shutter are left out: a margin makes up for what they show beyond. Waits for no device.
+    """
+    right, down, ahead = camera.intrinsics
+    limits = [(camera.width, right), (camera.height, down)]
+    low = [-row - margin * size * ahead for size, row in limits]
+    high = [row - (1 + margin) * size * ahead for size, row in limits]
+    normals = torch.nn.functional.normalize(torch.stack((*low, *high, -ahead)), dim=1)
+    planes = (normals @ camera.camera_from_world[:3]).to(points)
+    return (points @ planes[:, :3].T + planes[:, 3]).amax(1)

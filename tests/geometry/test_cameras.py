@@ -2,9 +2,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.geometry.cameras import exact_position, project, ray_directions, ray_matrix
+from sparsestreet.geometry.cameras import distance_to_view, exact_position, project, ray_directions, ray_matrix
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.types import Camera
+from tests.scene.street import camera_at
 
 
 def camera_of(seed: int, width: int = 13, height: int = 7) -> Camera:
@@ -75,3 +76,27 @@ def test_points_may_be_on_any_device():
     camera = Camera(torch.eye(4), torch.eye(3), 8, 6)
     found = project(camera, torch.zeros(5, 3, device="meta"))  # which computes nothing, but refuses to mix devices
     assert [tensor.device.type for tensor in found] == ["meta"] * 3
+
+
+def test_distance_to_view_is_a_lower_bound_and_exact_beside_a_side():
+    """Against the nearest of many points that the camera sees."""
+    camera = camera_at(2.0, 33, 21)
+    generator = torch.Generator().manual_seed(0)
+    around = (torch.rand(200_000, 3, generator=generator) - 0.5) * torch.tensor([20.0, 20.0, 20.0])
+    seen = around[project(camera, around, near=1e-6)[2]].double()
+    points = around[:400].double()
+    distances = distance_to_view(camera, points)
+    assert torch.equal(distances < 0, project(camera, points, near=1e-6)[2])
+    nearest = torch.cdist(points, seen).min(1).values
+    assert (distances <= nearest).all()
+    # 90 degrees: the side planes stand at 45 degrees; a point 6 m ahead and 6 m + 2 m to the left is 2 sin 45 away.
+    beside = torch.tensor([[8.0, 8.0, 1.5], [8.0, -8.0, 1.5], [-1.0, 0.0, 1.5]])
+    torch.testing.assert_close(distance_to_view(camera, beside), torch.tensor([2**0.5, 2**0.5, 3.0]))
+
+
+def test_a_margin_enlarges_the_image():
+    camera = camera_at(0.0, 40, 20)
+    # 10 m ahead the image is 20 m wide and 10 m high; with a quarter on each side 30 m and 15 m.
+    points = torch.tensor([[10.0, 14.9, 1.5], [10.0, -15.1, 1.5], [10.0, 0.0, 8.9], [10.0, 0.0, -6.1]])
+    assert (distance_to_view(camera, points, margin=0.25) < 0).tolist() == [True, False, True, False]
+    assert (distance_to_view(camera, points) > 0).all()

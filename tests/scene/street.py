@@ -51,13 +51,21 @@ SOURCES = {"lidar": LidarPoints(), "images": ImagePoints(), "near": NearPoints(p
 """All there are, half of the guesses near and half far."""
 
 
-def background_settings(lidar: int = 0, images: int = 0, near: int = 0, far: int = 0, **changes) -> BackgroundSettings:
+def background_settings(
+    lidar: int = 0,
+    images: int = 0,
+    near: int = 0,
+    far: int = 0,
+    *,
+    kind: type[BackgroundSettings] = BackgroundSettings,
+    **changes,
+) -> BackgroundSettings:
     """So many points of each source; no limits, no mask, no density control, unless said."""
     asked = {"lidar": lidar, "images": images, "near": near, "far": far}
     total = sum(asked.values())
     sources = {name: Asked(source=SOURCES[name], part=count / total) for name, count in asked.items() if count}
     said = {"num_points": total, "sources": sources, "learning_rates": RATES, "prunable": True}
-    return BackgroundSettings(**(_UNLIMITED | said | changes))
+    return kind(**(_UNLIMITED | said | changes))
 
 
 def rigid_settings(**changes) -> RigidSettings:

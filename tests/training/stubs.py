@@ -269,6 +269,8 @@ class Listener(Callback, RowListener):
 class AskedStrategy:
     """A density strategy that writes down what it is asked, and changes nothing."""
 
+    watched = ()
+
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
 

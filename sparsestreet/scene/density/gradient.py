@@ -6,6 +6,7 @@ unmasked values: a closed mask would make the scale 0.
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -48,6 +49,8 @@ class GradientDensity:
     reset_opacity_to: float = 0.01
     """What a reset leaves of an opacity at most."""
 
+    watched: ClassVar[tuple[str, ...]] = ()
+
     def __post_init__(self) -> None:
         if self.split_children < 2:
             raise ValueError(f"a split needs at least 2 children, got split_children={self.split_children}")
@@ -69,9 +72,9 @@ class GradientDensity:
         """Clone small rows and split large ones where the image asks for detail.
 
         With g the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the
-        scene radius in meters: a row with g > grad_threshold is split if s_max > split_scale R (or, up to
-        ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are at
-        mu + R(q) (s * z) with z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies
+        scene radius in meters: a row with g > grad_threshold (``urgency`` > 1) is split if s_max > split_scale R (or,
+        up to ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are
+        at mu + R(q) (s * z) with z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies
         inherit all other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep
         theirs.
 
@@ -79,13 +82,38 @@ class GradientDensity:
         if the statistics do not belong to the rows or hold a gradient that is not finite.
         """
         _check_same_rows(rows, statistics)
-        gradients = statistics.mean_gradients()
-        wanted = gradients > self.grad_threshold
-        large = _largest_scale(rows) > self.split_scale * radius
+        urgency = self.urgency(statistics)
+        wanted = urgency > 1
+        large = _largest_scale(rows) > self.split_size(rows, radius)
         if progress <= self.screen_size_until:
             large = large | (statistics.largest_screen > self.split_screen)
-        wanted = wanted & _within_cap(gradients, wanted, large, self, max_gaussians)
-        return _grow(rows, wanted & large, wanted & ~large, self, generator)
+        wanted = wanted & _within_cap(urgency, wanted, large, self, max_gaussians)
+        return self.grow(rows, wanted & large, wanted & ~large, generator)
+
+    def urgency(self, statistics: DensityStatistics) -> Float[Tensor, " n"]:
+        """How much detail the image asks of each row: above 1 it is cloned or split, the highest first."""
+        return statistics.mean_gradients() / self.grad_threshold
+
+    def split_size(self, rows: Rows, radius: float) -> float | Float[Tensor, " n"]:
+        """The largest scale, meters, up to which a row is cloned."""
+        return self.split_scale * radius
+
+    def grow(
+        self, rows: Rows, split: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], generator: torch.Generator
+    ) -> RowPlan:
+        """The plan that splits and clones the given rows; the children stand last in it."""
+        survivors = torch.nonzero(torch.ones_like(split) if self.keep_parent else ~split).squeeze(-1)
+        clones = torch.nonzero(clone).squeeze(-1)
+        children = torch.nonzero(split).squeeze(-1).repeat_interleave(self.split_children)
+        source = torch.cat((survivors, clones, children))
+        fresh = torch.arange(len(source), device=source.device) >= len(survivors)
+
+        means = rows.means.detach()[source]
+        first_child = len(survivors) + len(clones)
+        means[first_child:] += _offsets(rows, children, generator)
+        log_scales = rows.log_scales.detach()[source]
+        log_scales[split[source]] -= math.log(self.split_shrink)
+        return RowPlan(len(rows), source, fresh, edits={"means": means, "log_scales": log_scales})
 
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
         """Drop rows that are faint (opacity < cull_opacity), after ``cull_scale_from`` those that are huge (largest
@@ -138,44 +166,22 @@ def _largest_scale(rows: Rows) -> Float[Tensor, " n"]:
 
 
 def _within_cap(
-    gradients: Float[Tensor, " n"],
+    urgency: Float[Tensor, " n"],
     wanted: Bool[Tensor, " n"],
     large: Bool[Tensor, " n"],
     settings: GradientDensity,
     max_gaussians: int | None,
 ) -> Bool[Tensor, " n"]:
-    """Which rows may grow under the cap: highest gradient first, ties by row, until one has no room."""
+    """Which rows may grow under the cap: most urgent first, ties by row, until one has no room."""
     if max_gaussians is None:
         return torch.ones_like(wanted)
     split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
     growth = torch.where(large, split_growth, 1) * wanted
-    order = torch.sort(gradients, descending=True, stable=True).indices
+    order = torch.sort(urgency, descending=True, stable=True).indices
     room = max(max_gaussians - wanted.shape[0], 0)
     allowed = torch.zeros_like(wanted)
     allowed[order] = growth[order].cumsum(0) <= room
     return allowed
-
-
-def _grow(
-    rows: Rows,
-    split: Bool[Tensor, " n"],
-    clone: Bool[Tensor, " n"],
-    settings: GradientDensity,
-    generator: torch.Generator,
-) -> RowPlan:
-    """The plan that splits and clones the given rows."""
-    survivors = torch.nonzero(torch.ones_like(split) if settings.keep_parent else ~split).squeeze(-1)
-    clones = torch.nonzero(clone).squeeze(-1)
-    children = torch.nonzero(split).squeeze(-1).repeat_interleave(settings.split_children)
-    source = torch.cat((survivors, clones, children))
-    fresh = torch.arange(len(source), device=source.device) >= len(survivors)
-
-    means = rows.means.detach()[source]
-    first_child = len(survivors) + len(clones)
-    means[first_child:] += _offsets(rows, children, generator)
-    log_scales = rows.log_scales.detach()[source]
-    log_scales[split[source]] -= math.log(settings.split_shrink)
-    return RowPlan(len(rows), source, fresh, edits={"means": means, "log_scales": log_scales})
 
 
 def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:

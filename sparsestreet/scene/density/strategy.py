@@ -1,5 +1,6 @@
 """What every density strategy of a node answers: where the scene needs more Gaussians, and where fewer."""
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -14,6 +15,9 @@ class DensityStrategy(Protocol):
 
     ``radius`` is the scene's, meters; ``progress`` the fraction of the run.
     """
+
+    watched: Sequence[str]
+    """Columns with one number a row whose gradients the statistics have to follow."""
 
     def densify(
         self,

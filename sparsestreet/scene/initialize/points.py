@@ -27,9 +27,7 @@ class Points:
 
     def sampled(self, limit: int, generator: torch.Generator) -> "Points":
         """At most ``limit`` of the points, drawn without replacement."""
-        if len(self) <= limit:
-            return self
-        return self.at(torch.randperm(len(self), generator=generator)[:limit])
+        return self.at(at_most(limit, torch.arange(len(self)), generator))
 
     @staticmethod
     def concatenate(parts: Sequence["Points"]) -> "Points":
@@ -38,6 +36,11 @@ class Points:
             torch.cat([empty, *(part.positions for part in parts)]),
             torch.cat([empty, *(part.colors for part in parts)]),
         )
+
+
+def at_most(limit: int, rows: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tensor, " k"]:
+    """All rows where ``limit`` allows it, else so many of them, drawn without replacement."""
+    return rows if len(rows) <= limit else rows[torch.randperm(len(rows), generator=generator)[:limit]]
 
 
 def thinned(positions: Float[Tensor, "n 3"], voxel: float, generator: torch.Generator) -> Int[Tensor, " k"]:

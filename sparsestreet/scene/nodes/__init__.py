@@ -1,22 +1,34 @@
 """What the scene is made of; each node class is one module: what is said about it, how it starts, what it answers.
 
-``node`` is what all have in common; ``background`` stands still, ``rigid`` moves its objects along their tracks
-(``tracked``) without changing their shape.
+``node`` is what all have in common. Of a whole street: ``background`` stands still, the Gaussians of ``vibrating``
+swing and fade, those of ``field`` are deformed by a ``network``. Of objects: ``rigid`` moves them along their tracks
+(``tracked``) without changing their shape, ``deformable`` with a network that changes it.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
+from sparsestreet.scene.nodes.deformable import Deformable, DeformableSettings
+from sparsestreet.scene.nodes.field import Field, FieldSettings
+from sparsestreet.scene.nodes.network import NetworkSettings
 from sparsestreet.scene.nodes.node import Instances, Node, NodeSettings
 from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
+from sparsestreet.scene.nodes.vibrating import Vibrating, VibratingSettings
 
 __all__ = [
     "Background",
     "BackgroundSettings",
+    "Deformable",
+    "DeformableSettings",
+    "Field",
+    "FieldSettings",
     "Instances",
+    "NetworkSettings",
     "Node",
     "NodeSettings",
     "Rigid",
     "RigidSettings",
     "Tracked",
     "TrackedSettings",
+    "Vibrating",
+    "VibratingSettings",
 ]

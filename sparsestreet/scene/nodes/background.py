@@ -14,6 +14,7 @@ from sparsestreet.scene.initialize.coverage import Coverage, coverage
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.sources import PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.state import SceneState
 from sparsestreet.scene.streams import stream
@@ -56,6 +57,10 @@ class BackgroundSettings(NodeSettings):
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Background":
         """Raises ValueError if there is not a single point to start from."""
+        return Background(self, *self.start_from(self.seeds(data, generator), data, generator))
+
+    def seeds(self, data: TrainingData, generator: torch.Generator) -> Seeds:
+        """What the sources give. Raises ValueError if there is not a single point."""
         seen = coverage(data)
         drawn = {
             name: source.draw(round(self.num_points * source.share(seen)), data, stream(generator.initial_seed(), name))
@@ -74,9 +79,18 @@ class BackgroundSettings(NodeSettings):
                 f"num_points={self.num_points} came from {', '.join(drawn) or 'its sources, which are none'}; raise "
                 f"num_points, add a source, or check the poses of the {len(data.frames)} training views"
             )
+        return seeds
+
+    def start_from(
+        self,
+        seeds: Seeds,
+        data: TrainingData,
+        generator: torch.Generator,
+        columns: Mapping[str, Tensor] | None = None,
+    ) -> tuple[Rows, Mask | None]:
+        """``start`` with the scales, meters, that seeds and their neighbors allow."""
         scales = neighbor_scales(seeds.points.positions).clamp(seeds.smallest, seeds.largest)
-        rows, mask = self.start(data, seeds.points, scales, seeds.opacities, generator)
-        return Background(self, rows, mask)
+        return self.start(data, seeds.points, scales, seeds.opacities, generator, columns=columns)
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Background":
         return Background(self, rows)

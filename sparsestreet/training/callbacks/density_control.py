@@ -45,8 +45,8 @@ class DensityControl(Callback, RowListener):
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         for name, node in pl_module.scene.nodes.items():
-            if node.settings.density is not None:
-                self.statistics.setdefault(name, DensityStatistics(len(node.rows)))
+            if (strategy := node.settings.density) is not None:
+                self.statistics.setdefault(name, DensityStatistics(len(node.rows), watched=strategy.watched))
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # Only now are rows on their device, and statistics of a checkpoint restored.
@@ -66,7 +66,9 @@ class DensityControl(Callback, RowListener):
         with phase("density statistics"):
             for name, statistics in self.statistics.items():
                 span = pl_module.rendering.spans[name]
-                statistics.add(splats.screen_offsets.grad[span], splats.radii[span], width, height)
+                columns = pl_module.scene.nodes[name].rows.columns()
+                watched = {column: columns[column].grad for column in statistics.watched}
+                statistics.add(splats.screen_offsets.grad[span], splats.radii[span], width, height, watched)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int

@@ -79,3 +79,30 @@ def test_a_node_without_rows():
     statistics.add(torch.zeros(0, 2), torch.zeros(0), 4, 4)
     statistics.resize(RowPlan.keep(torch.zeros(0, dtype=torch.bool)))
     assert statistics.mean_gradients().shape == (0,)
+
+
+def watching() -> DensityStatistics:
+    statistics = DensityStatistics(3, watched=("life_peaks",))
+    view = (torch.zeros(3, 2), torch.tensor([1.0, 0.0, 1.0]), 4, 4)
+    statistics.add(*view, {"life_peaks": torch.tensor([-2.0, 7.0, 1.0])})
+    statistics.add(*view, {"life_peaks": torch.tensor([4.0, 7.0, 0.0])})
+    return statistics
+
+
+def test_gradients_of_a_watched_column_are_averaged_over_the_visits():
+    statistics = watching()
+    assert statistics.mean_gradients("life_peaks").tolist() == [3.0, 0.0, 0.5]
+    assert statistics.mean_gradients().tolist() == [0.0, 0.0, 0.0]
+    statistics.add(torch.zeros(3, 2), torch.ones(3), 4, 4, {"life_peaks": torch.full((3,), torch.nan)})
+    with pytest.raises(ValueError, match="gradients of life_peaks must be finite, but row 0 of 3"):
+        statistics.mean_gradients("life_peaks")
+
+
+def test_watched_columns_follow_the_rows_are_forgotten_and_survive_a_checkpoint():
+    statistics = watching()
+    resumed = DensityStatistics.from_state(statistics.state_dict())
+    statistics.resize(RowPlan(3, torch.tensor([2, 0, 2]), torch.tensor([False, False, True])))
+    assert statistics.mean_gradients("life_peaks").tolist() == [0.5, 3.0, 0.0]
+    assert resumed.mean_gradients("life_peaks").tolist() == [3.0, 0.0, 0.5]
+    resumed.reset()
+    assert resumed.mean_gradients("life_peaks").tolist() == [0.0, 0.0, 0.0]

@@ -97,6 +97,23 @@ def test_returns_have_no_limits_but_the_smallest_scale():
     assert seeds.opacities.tolist() == pytest.approx([0.2] * 30)
 
 
+@pytest.mark.parametrize(("voxel", "count"), [(None, 10_000), (None, 40), (0.5, 10_000), (0.5, 20)])
+def test_returns_know_the_time_of_their_sweep(voxel: float | None, count: int):
+    """Those of sweep 3 of 5 were measured at 3/4, whichever of them are taken."""
+    data = training_data(held_out=frozenset({1}))
+    seeds = drawn(LidarPoints(voxel=voxel), count, data)
+    at = {tuple(p): sweep.index / 4 for sweep in data.sweeps for p in sweep.points.tolist()}
+    assert seeds.times.tolist() == [at[tuple(p)] for p in seeds.points.positions.tolist()]
+    assert len(set(seeds.times.tolist())) == 4
+
+
+def test_guesses_and_points_from_images_know_no_time():
+    for source in (NearPoints(part=1.0), FarPoints(part=1.0), ImagePoints()):
+        seeds = drawn(source, 5, data_with(ten_points()))
+        assert len(seeds) == 5
+        assert seeds.times.isnan().all()
+
+
 @pytest.mark.parametrize("kind", [NearPoints, FarPoints])
 def test_guesses_are_limited_by_the_distance_from_the_nearest_camera(kind: type):
     data = training_data()
@@ -108,13 +125,17 @@ def test_guesses_are_limited_by_the_distance_from_the_nearest_camera(kind: type)
 
 
 def test_seeds_of_several_sources_follow_each_other():
-    one = Seeds(Points(torch.ones(2, 3), torch.zeros(2, 3)), torch.ones(2), 2 * torch.ones(2), 0.3 * torch.ones(2))
-    two = Seeds(Points(torch.zeros(1, 3), torch.ones(1, 3)), torch.zeros(1), torch.ones(1), 0.4 * torch.ones(1))
+    points, twice = Points(torch.ones(2, 3), torch.zeros(2, 3)), torch.ones(2)
+    one = Seeds(points, twice, 2 * twice, 0.3 * twice, 0.2 * twice)
+    two = Seeds(
+        Points(torch.zeros(1, 3), torch.ones(1, 3)), torch.zeros(1), torch.ones(1), torch.tensor([0.4]), torch.ones(1)
+    )
     both = Seeds.concatenate([one, two])
     assert both.points.positions[:, 0].tolist() == [1, 1, 0]
     assert both.points.colors[:, 0].tolist() == [0, 0, 1]
     assert (both.smallest.tolist(), both.largest.tolist()) == ([1, 1, 0], [2, 2, 1])
     assert both.opacities.tolist() == pytest.approx([0.3, 0.3, 0.4])
+    assert both.times.tolist() == pytest.approx([0.2, 0.2, 1.0])
     assert len(both) == 3
     assert len(Seeds.concatenate([])) == 0
 

@@ -6,7 +6,7 @@ import torch
 
 from sparsestreet.scene.initialize.boxes import outside_boxes
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.scene.initialize.points import Points, thinned
+from sparsestreet.scene.initialize.points import Points, at_most, thinned
 from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
 
@@ -31,11 +31,12 @@ class LidarPoints(PointSource):
         return coverage.lidar
 
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
-        parts = []
+        parts, times = [], [torch.zeros(0)]
         for sweep in data.sweeps:
             outside = outside_boxes(data.moving, sweep.index, sweep.points, self.box_enlargement)
             parts.append(Points(sweep.points, sweep.colors).where(sweep.colored & outside))
+            times.append(torch.full((len(parts[-1]),), sweep.index / max(data.log.num_frames - 1, 1)))
         points = Points.concatenate(parts)
-        if self.voxel is not None:
-            points = points.at(thinned(points.positions, self.voxel, generator))
-        return self.seeds(points.sampled(count, generator))
+        rows = torch.arange(len(points)) if self.voxel is None else thinned(points.positions, self.voxel, generator)
+        chosen = at_most(count, rows, generator)
+        return self.seeds(points.at(chosen), times=torch.cat(times)[chosen])

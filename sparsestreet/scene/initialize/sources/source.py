@@ -23,6 +23,8 @@ class Seeds:
     """Limits of a Gaussian's scale, meters; between them the distance to its neighbors decides."""
     largest: Float[Tensor, " n"]
     opacities: Float[Tensor, " n"]
+    times: Float[Tensor, " n"]
+    """Normalized time at which each was measured; NaN where it is known of no time."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -35,6 +37,7 @@ class Seeds:
             torch.cat([empty, *(part.smallest for part in parts)]),
             torch.cat([empty, *(part.largest for part in parts)]),
             torch.cat([empty, *(part.opacities for part in parts)]),
+            torch.cat([empty, *(part.times for part in parts)]),
         )
 
 
@@ -67,14 +70,17 @@ class PointSource(ABC):
         points: Points,
         smallest: Float[Tensor, " n"] | None = None,
         largest: Float[Tensor, " n"] | None = None,
+        times: Float[Tensor, " n"] | None = None,
     ) -> Seeds:
-        """Points with the source's opacity; limits of the scale in meters, None: none on that side."""
+        """Points with the source's opacity; limits of the scale in meters, None: none on that side; normalized times
+        of their measurement, None: not known."""
         count = len(points)
         return Seeds(
             points,
             torch.full((count,), MINIMUM_SCALE) if smallest is None else smallest,
             torch.full((count,), torch.inf) if largest is None else largest,
             torch.full((count,), self.initial_opacity),
+            torch.full((count,), torch.nan) if times is None else times,
         )
 
 

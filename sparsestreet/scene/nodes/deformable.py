@@ -1,0 +1,89 @@
+"""Objects that change their shape while they move, such as cyclists (as in OmniRe, Chen et al. 2025)."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sparsestreet.geometry.quaternions import normalized
+from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
+from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import View
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeformableSettings(TrackedSettings):
+    """As ``TrackedSettings``, and how the objects are deformed."""
+
+    network: NetworkSettings = field(default_factory=lambda: NetworkSettings(scales=False))
+    features: int = 16
+    """Numbers that are learned of each instance, for the network that all of them share."""
+    deform_from: float = 0.1
+    """Fraction of the run from which rows are deformed: first there must be something to deform."""
+    detach_means: bool = True
+    """From then on rows keep their place in the box, and only the network moves them (DriveStudio)."""
+    refine_boxes: bool = True
+    """Whether the annotated poses are corrected. DriveStudio means to, and does not."""
+    outside_weight: float = 1.0
+    """Of the regularizer: meters by which the coordinates of deformed rows lie outside their box, on average."""
+
+    @property
+    def node_class(self) -> "type[Deformable]":
+        return Deformable
+
+    def build(self, data: TrainingData, generator: torch.Generator) -> "Deformable | None":
+        """Boxes of frames without training image (held out, or outside the training range) are not used."""
+        node = super().build(data, generator)
+        if node is not None:
+            node.start_network(generator.initial_seed())
+        return node
+
+
+class Deformable(Tracked):
+    """Rows in their boxes that one network deforms, by place, time and instance; ``embeddings`` [i, f] tell the
+    instances apart."""
+
+    def __init__(self, *args: Any, **keywords: Any) -> None:
+        """Takes what ``Tracked`` takes; the network starts from seed 0."""
+        super().__init__(*args, **keywords)
+        for corrections in (self.rotation_deltas, self.translation_deltas):
+            corrections.requires_grad_(self.settings.refine_boxes)
+        self.start_network(0)
+
+    def start_network(self, seed: int) -> None:
+        """Weights and embeddings, uniform in [0, 1), of a seed's own stream."""
+        features, generator = self.settings.features, torch.Generator().manual_seed(seed)
+        self.embeddings = nn.Parameter(torch.rand(len(self.names), features, generator=generator).to(self.sizes))
+        self.network = DeformationNetwork(self.settings.network, features, seed).to(self.sizes)
+
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """Every instance's Gaussians, deformed and at its pose; opacity exactly 0 where the instance is absent."""
+        placed = self.placed(view)
+        if state.progress < self.settings.deform_from:
+            return placed
+        means, instances = self.rows.means.detach(), self.rows.instances
+        heights = self.sizes[:, 2:].index_select(0, instances)
+        change = self.network(2 * means / heights, view.time, self.embeddings, instances)
+        scales = placed.log_scales if change.log_scales is None else placed.log_scales + change.log_scales
+        return replace(
+            placed,
+            means=(means if self.settings.detach_means else placed.means) + change.means,
+            quaternions=normalized(placed.quaternions) + change.quaternions,
+            log_scales=scales,
+        )
+
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """``out_of_box`` in place of a cull: arms and legs may leave a box for a moment."""
+        beyond = torch.relu(raw.means.abs() - self.sizes.index_select(0, self.rows.instances) / 2)
+        return {"out_of_box": self.settings.outside_weight * beyond.sum() / max(beyond.numel(), 1)}
+
+    def pose_bytes(self) -> int:
+        """float32 bytes of keyframes, network and embeddings."""
+        learned = sum(parameter.numel() for parameter in (self.embeddings, *self.network.parameters()))
+        return super().pose_bytes() + BYTES_PER_NUMBER * learned

@@ -1,0 +1,141 @@
+"""A whole street that one network deforms over time (Deformable 3DGS, Yang et al. 2024): what moves needs no box."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry.cameras import distance_to_view
+from sparsestreet.geometry.quaternions import normalized
+from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.masks import Mask
+from sparsestreet.scene.nodes.background import BackgroundSettings
+from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
+from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.streams import stream
+from sparsestreet.types import View
+
+_MARGIN = 0.25
+"""Of the image size, for what lenses and shutters show beyond the image of a pinhole."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldSettings(BackgroundSettings):
+    """Starts from the points of a background.
+
+    Raises ValueError for a reach that cannot be.
+    """
+
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    deform_from: float = 0.1
+    """Fraction of the run from which rows are deformed: first there must be something to deform."""
+    time_noise: float = 0.1
+    """Standard deviation of the time that a training step shows the network, in frames; falls linearly to 0."""
+    time_noise_until: float = 0.667
+    """Fraction of the run at which it is 0."""
+    reach: float | None = 5.0
+    """Meters; rows of which the view would see nothing if they came nearer by so much are left as they are, because the
+    network is most of the cost. None: all rows are deformed (and no GPU waits for their number)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reach is not None and self.reach < 0:
+            raise ValueError(f"reach is a distance in meters and must be >= 0, got {self.reach}; null: no limit")
+
+    def build(self, data: TrainingData, generator: torch.Generator) -> "Field":
+        """Raises ValueError if there is not a single point to start from."""
+        rows, mask = self.start_from(self.seeds(data, generator), data, generator)
+        log = data.log
+        return Field(
+            self,
+            rows,
+            center=log.center,
+            radius=log.radius,
+            num_frames=log.num_frames,
+            seed=generator.initial_seed(),
+            mask=mask,
+        )
+
+    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Field":
+        return Field(self, rows, center=tensors["center"], **header)
+
+
+class Field(Node):
+    """Canonical rows in the world, and the network that moves, turns and scales them."""
+
+    def __init__(
+        self,
+        settings: FieldSettings,
+        rows: Rows,
+        *,
+        center: Float[Tensor, "3"],
+        radius: float,
+        num_frames: int,
+        seed: int = 0,
+        mask: Mask | None = None,
+    ) -> None:
+        """``center`` and ``radius`` of the scene, meters, are the ball in which the network's positions are linear;
+        ``seed`` is that of weights and noise."""
+        super().__init__(settings, rows, mask)
+        self.radius = radius
+        self.num_frames = num_frames
+        self.seed = seed
+        self.register_buffer("center", center)
+        self.network = DeformationNetwork(settings.network, seed=seed)
+
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """The rows in or near the view deformed, the others as they are."""
+        stored = self.stored(view)
+        if state.progress < self.settings.deform_from:
+            return stored
+        near = self._near(view)
+        positions = self.rows.means.detach()
+        time = view.time + (self._time_noise(state) if state.training else 0.0)
+        change = self.network(self._contracted(positions if near is None else positions[near]), time)
+
+        def changed(values: Tensor, by: Tensor) -> Tensor:
+            return values + by if near is None else values.index_add(0, near, by)
+
+        return replace(
+            stored,
+            means=changed(stored.means, change.means),
+            quaternions=changed(normalized(stored.quaternions), change.quaternions),
+            log_scales=stored.log_scales
+            if change.log_scales is None
+            else changed(stored.log_scales, change.log_scales),
+        )
+
+    def header(self) -> dict[str, Any]:
+        return {"radius": self.radius, "num_frames": self.num_frames, "seed": self.seed}
+
+    def pose_bytes(self) -> int:
+        """float32 bytes of the network."""
+        return BYTES_PER_NUMBER * sum(parameter.numel() for parameter in self.network.parameters())
+
+    @torch.no_grad()
+    def _near(self, view: View) -> Int[Tensor, " k"] | None:
+        """Rows that the view may see once they are deformed; a row ends three standard deviations from its center."""
+        if self.settings.reach is None:
+            return None
+        sizes = 3 * self.rows.log_scales.amax(1).exp()
+        distances = distance_to_view(view.camera, self.rows.means, _MARGIN)
+        return torch.nonzero(distances < sizes + self.settings.reach).squeeze(1)
+
+    def _contracted(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """The ball of the scene as [0.25, 0.75] in each direction, everything beyond it within [0, 1]."""
+        scaled = (positions - self.center) / self.radius
+        lengths = scaled.norm(dim=1, keepdim=True).clamp(min=1.0)
+        return scaled * (2 - 1 / lengths) / lengths / 4 + 0.5
+
+    def _time_noise(self, state: SceneState) -> float:
+        """From the step alone, so that a resumed run draws what the uninterrupted one does."""
+        settings = self.settings
+        left = max(1 - state.progress / settings.time_noise_until, 0.0) if settings.time_noise_until > 0 else 0.0
+        normal = torch.randn((), generator=stream(self.seed, f"time noise {state.progress}")).item()
+        return normal * left * settings.time_noise / max(self.num_frames - 1, 1)

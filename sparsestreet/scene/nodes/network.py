@@ -1,0 +1,118 @@
+"""A network that says how each Gaussian of a node is deformed at a time (Deformable 3DGS, Yang et al. 2024)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Sizes of a deformation network; the defaults are DriveStudio's. Raises ValueError for sizes that cannot be."""
+
+    width: int = 256
+    depth: int = 8
+    """Hidden layers."""
+    skip: int = 5
+    """Behind this layer the inputs come again; 0: nowhere."""
+    position_octaves: int = 10
+    """Of the sines and cosines that encode a position: wavelengths of 2 pi, pi, pi / 2 ..."""
+    time_octaves: int = 10
+    scales: bool = True
+    """Whether scales are deformed too."""
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.depth < 1 or min(self.position_octaves, self.time_octaves) < 0:
+            raise ValueError(
+                "a network needs width and depth of at least 1 and octaves of at least 0, got "
+                f"{self.width}, {self.depth}, {self.position_octaves} and {self.time_octaves}"
+            )
+        if not 0 <= self.skip < self.depth:
+            raise ValueError(
+                f"skip={self.skip} must be a layer before the last of depth={self.depth}: take 0 for a network "
+                "without skip"
+            )
+
+
+@dataclass(frozen=True)
+class Deformation:
+    """What is added to the rows."""
+
+    means: Float[Tensor, "n 3"]
+    quaternions: Float[Tensor, "n 4"]
+    """To quaternions of unit length."""
+    log_scales: Float[Tensor, "n 3"] | None
+    """None: the scales stay."""
+
+
+class DeformationNetwork(nn.Module):
+    """(position, time, what is learned of the instance) -> Deformation, all rows at once, zero at the start.
+
+    A layer that sees the inputs is a sum of what the row and what the instant brings: time and instance are the same
+    for many rows, so that their part is computed once for each instance.
+    """
+
+    def __init__(self, settings: NetworkSettings, features: int = 0, seed: int = 0) -> None:
+        """``features`` are numbers that are learned of an instance; ``seed`` is that of the weights."""
+        super().__init__()
+        self.settings = settings
+        width = settings.width
+        # Weights of its own stream, whatever else was drawn.
+        with torch.random.fork_rng(devices=()):
+            torch.default_generator.manual_seed(seed)
+            self.first = _Inputs(settings, features)
+            self.again = _Inputs(settings, features) if settings.skip else None
+            self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.depth - 1))
+            self.last = nn.Linear(width, 10 if settings.scales else 7)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(
+        self,
+        positions: Float[Tensor, "n 3"],
+        time: float,
+        features: Float[Tensor, "i f"] | None = None,
+        instances: Int[Tensor, " n"] | None = None,
+    ) -> Deformation:
+        """``features`` of the instances and the instance of each row, or neither."""
+        rows = encoded(positions, self.settings.position_octaves)
+        instants = encoded(positions.new_full((1, 1), time), self.settings.time_octaves)
+        if features is not None:
+            instants = torch.cat((instants.expand(len(features), -1), features), dim=1)
+        values = torch.relu_(self.first(rows, instants, instances))
+        for number, layer in enumerate(self.hidden, start=1):
+            values = layer(values)
+            if number == self.settings.skip:
+                values = values + self.again(rows, instants, instances)
+            values = torch.relu_(values)
+        means, quaternions, *scales = self.last(values).split((3, 4, 3)[: 3 if self.settings.scales else 2], dim=1)
+        return Deformation(means, quaternions, scales[0] if scales else None)
+
+
+class _Inputs(nn.Module):
+    """The part of a layer that sees the inputs: one linear layer of them all, computed in two parts."""
+
+    def __init__(self, settings: NetworkSettings, features: int) -> None:
+        super().__init__()
+        self.of_row = nn.Linear(3 * (1 + 2 * settings.position_octaves), settings.width)
+        self.of_instant = nn.Linear(1 + 2 * settings.time_octaves + features, settings.width, bias=False)
+
+    def forward(self, rows: Tensor, instants: Tensor, instances: Tensor | None) -> Tensor:
+        if instances is None:
+            # One instant for all rows is a bias.
+            bias = self.of_row.bias + self.of_instant(instants)[0]
+            return nn.functional.linear(rows, self.of_row.weight, bias)
+        return self.of_row(rows) + self.of_instant(instants).index_select(0, instances)
+
+
+def encoded(values: Float[Tensor, "n c"], octaves: int) -> Float[Tensor, "n e"]:
+    """The values, and sines and cosines of 1, 2, 4 ... times them, each octave from the one before."""
+    parts = [values]
+    for octave in range(octaves):
+        if octave == 0:
+            sine, cosine = torch.sin(values), torch.cos(values)
+        else:
+            sine, cosine = 2 * sine * cosine, 1 - 2 * sine.square()
+        parts += [sine, cosine]
+    return torch.cat(parts, dim=1)

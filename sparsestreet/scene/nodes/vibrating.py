@@ -1,0 +1,123 @@
+"""A whole street of Gaussians that swing and fade (PVG, Chen et al. 2023): what moves needs no box."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.masks import Mask
+from sparsestreet.scene.nodes.background import BackgroundSettings
+from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.streams import stream
+from sparsestreet.scene.vibration import displacements, faded_logits, mean_velocities
+from sparsestreet.types import View
+
+
+@dataclass(frozen=True, kw_only=True)
+class VibratingSettings(BackgroundSettings):
+    """Starts from the points of a background, at rest; a return of the lidar peaks at the time of its sweep, any other
+    point at a random one.
+
+    Raises ValueError for times or a probability that cannot be.
+    """
+
+    frame_time: float = 0.02
+    """The node's time from one frame to the next; cycle and life spans are in this unit."""
+    cycle: float = 0.2
+    """Period of a swing."""
+    initial_life_span: float = math.sqrt(0.1)
+    """Standard deviation of the opacity over time."""
+    min_factor: float = 0.05
+    """A row whose opacity has faded to this fraction of its peak, or below, is not drawn."""
+    velocity_weight: float = 0.001
+    """Of the regularizer: the mean length of the mean velocities."""
+    smoothing_probability: float = 0.5
+    """Of a training step in which rows are taken from another time nearby, and moved here by their mean velocity."""
+    smoothing_frames: float = 1.5
+    """How far that time is away at most."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("frame_time", "cycle", "initial_life_span"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is a time and must be above 0, got {getattr(self, name)}")
+        if not 0 < self.min_factor < 1:
+            raise ValueError(f"min_factor must lie between 0 and 1, got {self.min_factor}: PVG has 0.05")
+        if not 0 <= self.smoothing_probability <= 1:
+            raise ValueError(f"smoothing_probability must lie in [0, 1], got {self.smoothing_probability}")
+
+    def build(self, data: TrainingData, generator: torch.Generator) -> "Vibrating":
+        """Raises ValueError if there is not a single point to start from."""
+        seed, num_frames = generator.initial_seed(), data.log.num_frames
+        seeds = self.seeds(data, generator)
+        anywhere = torch.rand(len(seeds), generator=stream(seed, "life peaks"))
+        peaks = torch.where(seeds.times.isnan(), anywhere, seeds.times) * self.frame_time * (num_frames - 1)
+        columns = {
+            "velocities": torch.zeros(len(seeds), 3),
+            "life_peaks": peaks,
+            "log_life_spans": torch.full((len(seeds),), math.log(self.initial_life_span)),
+        }
+        rows, mask = self.start_from(seeds, data, generator, columns)
+        return Vibrating(self, rows, num_frames=num_frames, seed=seed, mask=mask)
+
+    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Vibrating":
+        return Vibrating(self, rows, num_frames=header["num_frames"], seed=header["seed"])
+
+
+class Vibrating(Node):
+    """Rows in the world with three more columns: ``velocities`` [n, 3] at the life peak, meters per unit of the node's
+    time, ``life_peaks`` [n] and ``log_life_spans`` [n]."""
+
+    def __init__(
+        self, settings: VibratingSettings, rows: Rows, *, num_frames: int, seed: int = 0, mask: Mask | None = None
+    ) -> None:
+        """``num_frames`` of the log say how long the drive lasts; ``seed`` is that of the temporal smoothing."""
+        super().__init__(settings, rows, mask)
+        self.num_frames = num_frames
+        self.seed = seed
+
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """Every row where it has swung to, as opaque as it is at that age; faded rows are hidden."""
+        rows, settings, stored = self.rows, self.settings, self.stored(view)
+        shift = self._shift(state) if state.training else 0.0
+        ages = view.time * settings.frame_time * (self.num_frames - 1) + shift - rows.life_peaks
+        means = rows.means + displacements(rows.velocities, ages, settings.cycle)
+        if shift:
+            means = means - shift * self.mean_velocities()
+        deviations = ages * torch.exp(-rows.log_life_spans)
+        seen = (deviations.detach().abs() < math.sqrt(-2 * math.log(settings.min_factor))).to(means.dtype)
+        return replace(
+            stored,
+            means=means,
+            opacity_logits=faded_logits(rows.opacity_logits, -0.5 * deviations.square()),
+            multipliers=seen if stored.multipliers is None else stored.multipliers * seen,
+        )
+
+    def mean_velocities(self) -> Float[Tensor, "n 3"]:
+        """By which a row moves on average, meters per unit of the node's time."""
+        return mean_velocities(self.rows.velocities, self.rows.log_life_spans, self.settings.cycle)
+
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """``velocity`` holds still what need not move."""
+        lengths = self.mean_velocities().norm(dim=1)
+        return {"velocity": self.settings.velocity_weight * lengths.sum() / max(len(lengths), 1)}
+
+    def header(self) -> dict[str, Any]:
+        return {"num_frames": self.num_frames, "seed": self.seed}
+
+    def _shift(self, state: SceneState) -> float:
+        """From the view's time to that from which its rows are taken; from the step alone, so that a resumed run
+        draws what the uninterrupted one does."""
+        settings = self.settings
+        chance, place = torch.rand(2, generator=stream(self.seed, f"smoothing {state.progress}")).tolist()
+        if chance >= settings.smoothing_probability:
+            return 0.0
+        return (2 * place - 1) * settings.smoothing_frames * settings.frame_time

@@ -1,0 +1,76 @@
+"""Nodes that move or change their shape without boxes, trained on the tiny street from their own files in conf/."""
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+
+from sparsestreet import load_scene
+from sparsestreet.cli.train import train
+from sparsestreet.scene.graph import SceneGraph
+
+pytestmark = pytest.mark.xdist_group("tiny street")
+
+
+def trained(tiny_street: list[str], out: Path, *overrides: str) -> tuple[SceneGraph, list[dict[str, str]]]:
+    """The scene of a run, and its curves."""
+    assert train([*tiny_street, "method=3dgs", "trainer.log_every_n_steps=1", f"out={out}", *overrides]) == 0
+    with (out / "curves" / "metrics.csv").open() as file:
+        return load_scene(out).scene, list(csv.DictReader(file))
+
+
+def in_place_of_background(tiny_street: list[str], name: str) -> list[str]:
+    return [*(word.replace("node.background", f"node.{name}") for word in tiny_street), f"node=[{name}]"]
+
+
+def of_steps(curves: list[dict[str, str]], name: str) -> list[float]:
+    return [float(row[name]) for row in curves if row.get(name)]
+
+
+def test_a_vibrating_street(tiny_street, tmp_path):
+    """Its loss falls, its times and velocities are learned, and it grows where and when images ask for it."""
+    thresholds = ["node.vibrating.density.grad_threshold=1e9", "node.vibrating.density.peak_threshold=1e-4"]
+    scene, curves = trained(in_place_of_background(tiny_street, "vibrating"), tmp_path / "run", *thresholds)
+    node = scene.nodes["vibrating"]
+    losses = of_steps(curves, "train/photometric")
+    assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
+    assert of_steps(curves, "train/vibrating/velocity")[-1] > 0
+    assert node.rows.velocities.any()
+    assert len(node.rows.log_life_spans.unique()) > 100
+    with (tmp_path / "run" / "records" / "counts.csv").open() as file:
+        grown = [row for row in csv.DictReader(file) if row["reason"] == "densify"]
+    assert int(grown[-1]["after"]) > int(grown[0]["before"])  # by the life peaks alone
+    assert torch.isfinite(node.rows.life_peaks).all()
+
+
+def test_a_street_deformed_by_a_network(tiny_street, tmp_path):
+    """Its loss falls, and what moves is learned from the time on at which it begins."""
+    street = in_place_of_background(tiny_street, "field")
+    scene, curves = trained(street, tmp_path / "run", "node.field.deform_from=0.5")
+    node = scene.nodes["field"]
+    losses = of_steps(curves, "train/photometric")
+    assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
+    assert node.network.last.weight.any()
+    assert torch.isfinite(node.network.last.weight).all()
+
+
+def test_objects_deformed_by_a_network(tiny_street, tmp_path):
+    """Its loss falls, the network and the boxes are learned, rows come and go, with a mask over time."""
+    scene, curves = trained(
+        tiny_street,
+        tmp_path / "run",
+        "node=[background,deformable]",
+        "sparsify=masks",
+        "node.deformable.posed=null",
+        "node.deformable.deform_from=0.5",
+        "node.deformable.points_per_instance=100",
+        "node.deformable.min_gaussians=60",
+    )
+    node = scene.nodes["deformable"]
+    losses = of_steps(curves, "train/photometric")
+    assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
+    assert node.network.last.weight.any()
+    assert node.translation_deltas.any()
+    assert max(of_steps(curves, "train/deformable/out_of_box")) > 0
+    assert len(node.instances().names) > 0

@@ -1,0 +1,54 @@
+"""How a vibrating Gaussian moves and fades, against a path that is integrated and logits in float64."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.scene.vibration import displacements, faded_logits, mean_velocities
+
+CYCLE = 0.2
+
+
+def test_it_moves_by_its_velocity_at_the_peak_and_swings_with_the_cycle():
+    """x'' = -a^2 x from x(0) = 0, x'(0) = v, in steps of a thousandth of a cycle, is where it is at each age."""
+    velocity, rate, step = torch.tensor([[3.0, -1.0, 0.5]]).double(), 2 * math.pi / CYCLE, CYCLE / 1000
+    place, speed = torch.zeros(1, 3).double(), velocity + 0.0
+    for index in range(1500):
+        if index % 250 == 0:
+            age = torch.tensor([index * step]).double()
+            # The leapfrog's error is (a step)^2 / 24 of the swing of |v| / a = 0.1 m, times the swings.
+            torch.testing.assert_close(displacements(velocity, age, CYCLE), place, rtol=0, atol=1e-5)
+            torch.testing.assert_close(displacements(velocity, -age, CYCLE), -place, rtol=0, atol=1e-5)
+        middle = place + 0.5 * step * speed
+        speed = speed - step * rate**2 * middle
+        place = middle + 0.5 * step * speed
+
+
+def test_who_lives_long_goes_nowhere():
+    velocities = torch.tensor([[2.0, 0.0, -4.0]] * 3)
+    log_spans = torch.tensor([0.02, 0.2, 20.0]).log()  # staticness 0.1, 1, 100
+    expected = velocities * torch.tensor([math.exp(-0.05), math.exp(-0.5), math.exp(-50)])[:, None]
+    torch.testing.assert_close(mean_velocities(velocities, log_spans, CYCLE), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_faded_logit_gives_the_product(dtype: torch.dtype):
+    """sigmoid(l) g from numpy's longdouble; float32 loses no more than it loses to the logit itself."""
+    logits = torch.tensor([-15.0, -4.0, 0.0, 3.0, 12.0, 15.0], dtype=dtype)[:, None]
+    factors = torch.tensor([0.05, 0.3, 0.999, 1 - 1e-6, 1.0], dtype=dtype)
+    made = torch.sigmoid(faded_logits(logits.expand(6, 5).flatten(), factors.log().expand(6, 5).flatten()))
+    product = factors.numpy().astype(np.longdouble) / (1 + np.exp(-logits.numpy().astype(np.longdouble)))
+    epsilon = torch.finfo(dtype).eps
+    np.testing.assert_allclose(made.double().numpy(), product.astype(np.float64).ravel(), rtol=30 * epsilon, atol=0)
+
+
+def test_gradients_of_a_faded_logit_are_finite_at_the_ends_and_those_of_finite_differences():
+    logits = torch.tensor([-100.0, -15.0, 15.0, 100.0, 0.3], requires_grad=True)
+    logs = torch.tensor([0.0, -3.0, 0.0, -1e-7, -0.5], requires_grad=True)
+    faded_logits(logits, logs).sum().backward()
+    assert logits.grad.isfinite().all()
+    assert logs.grad.isfinite().all()
+    inside = (torch.tensor([-9.0, -1.0, 0.5, 8.0]).double(), torch.tensor([-0.1, -2.9, -1e-3, -0.7]).double())
+    assert torch.autograd.gradcheck(faded_logits, [value.requires_grad_() for value in inside])
