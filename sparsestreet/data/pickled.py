@@ -133,8 +133,8 @@ def _scalar(made: _Made) -> np.generic:
 
 def _numbers(data: Any, dtype: Any) -> np.ndarray:
     """A writable array of its own; Python 2 wrote bytes as text."""
-    data = _worked_out(data)
-    return np.frombuffer(bytearray(data.encode("latin1") if isinstance(data, str) else data), _worked_out(dtype))
+    kind, data = _worked_out(dtype), _worked_out(data)
+    return np.frombuffer(bytearray(data.encode("latin1") if isinstance(data, str) else data), kind)
 
 
 def _dtype(made: _Made) -> np.dtype:
