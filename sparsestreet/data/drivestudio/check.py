@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
 from sparsestreet.data.drivestudio.poses import read_intrinsics, read_pose
@@ -41,6 +42,7 @@ def _required(layout: Layout) -> list[Path]:
         files += [path for path in paths if path is not None]
     if layout.has_lidar:
         files += [layout.sweep(frame) for frame in layout.frames]
+    files += [layout.bodies] if layout.has_bodies else []
     return files + ([layout.instances] if layout.has_instances else [])
 
 
@@ -67,7 +69,7 @@ def _check_cameras(layout: Layout, ignore_distortion: bool) -> list[Problem]:
 
 
 def _check_poses(layout: Layout) -> list[Problem]:
-    """Poses and boxes, and whether all of them are within one scene."""
+    """Poses, boxes and bodies, and whether all of them are within one scene."""
     problems: list[Problem] = []
     placed: list[tuple[Path, torch.Tensor]] = []
     for path in filter(Path.is_file, _pose_files(layout)):
@@ -79,6 +81,8 @@ def _check_poses(layout: Layout) -> list[Problem]:
     if layout.instances.is_file():
         tracks = attempt(problems, partial(read_instances, layout)) or []
         placed += [(layout.instances, position) for track in tracks for position in track.world_from_object[:, :3, 3]]
+        if layout.bodies.is_file() and tracks:
+            attempt(problems, partial(with_bodies, tracks, layout))
     return problems + _check_extent(placed)
 
 

@@ -1,6 +1,7 @@
 """Annotated objects from the instances JSON."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,10 @@ def window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -> Track |
         return None
     poses = track.world_from_object[inside].clone()
     poses[:, :3, 3] -= origin
-    return Track(track.name, track.class_name, track.frames[inside] - frames.start, poses, track.size)
+    body = None
+    if track.body is not None:
+        body = replace(track.body, rotations=track.body.rotations[inside], valid=track.body.valid[inside])
+    return replace(track, frames=track.frames[inside] - frames.start, world_from_object=poses, body=body)
 
 
 def _read_track(key: str, entry: Any, layout: Layout) -> Track:

@@ -28,6 +28,8 @@ class Layout:
     num_frames_on_disk: int
     has_lidar: bool
     """Whether there are sweeps, and they are read."""
+    has_bodies: bool
+    """Whether there are body poses of people, and they are read."""
 
     @property
     def images(self) -> Iterator[tuple[int, int]]:
@@ -73,6 +75,10 @@ class Layout:
     def has_instances(self) -> bool:
         return self.instances.parent.is_dir()
 
+    @property
+    def bodies(self) -> Path:
+        return self.root / "humanpose" / "smpl.pkl"
+
     def mask_folder(self, kind: str) -> Path | None:
         """Folder of the masks of a kind (sky, human, vehicle), or None where the log has none.
 
@@ -102,10 +108,11 @@ def find_layout(
     first_frame: int = 0,
     last_frame: int = -1,
     lidar: bool = True,
+    bodies: bool = True,
 ) -> Layout:
     """Recognize the flavor by its files and choose cameras and frames (last_frame is included; -1: to the end).
 
-    Without ``lidar`` the folder is looked at as if it had none.
+    Without ``lidar`` or ``bodies`` the folder is looked at as if it had none.
 
     Raises LogError where the folder is no such log, ValueError where cameras or frames are asked for that it lacks.
     """
@@ -127,7 +134,8 @@ def find_layout(
     if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(on_disk):
         raise ValueError(f"cameras {list(chosen)} must be different ones of the log's {on_disk}: {root}")
     frames, has_lidar = range(first_frame, last + 1), lidar and (root / "lidar").is_dir()
-    return Layout(root, waymo, frames, chosen, on_disk[0], count, has_lidar)
+    has_bodies = bodies and (root / "humanpose").is_dir()
+    return Layout(root, waymo, frames, chosen, on_disk[0], count, has_lidar, has_bodies)
 
 
 def _no_log(root: Path) -> LogError:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
 from sparsestreet.data.drivestudio.instances import read_instances, window
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
@@ -47,6 +48,8 @@ class DriveStudioReader(LogReader):
     """Pixels; every image is scaled to it at its own aspect, and the intrinsics with it. None: as recorded."""
     lidar: bool = True
     """False: as if the log had none."""
+    bodies: bool = True
+    """False: as if the log had no body poses of people."""
     ignore_distortion: bool = False
     """Take images of a lens with distortion for pinhole images."""
     cache_mb: int = 512
@@ -69,6 +72,7 @@ class DriveStudioReader(LogReader):
         if problems:
             raise LogError(problems)
         origin = world_origin(layout)
+        tracks, people = _read_tracks(layout, origin)
         mounts = [read_mount(layout, index, number, self.width) for index, number in enumerate(layout.cameras)]
         source = Source(layout, mounts, origin, 1_000_000 * self.cache_mb, lambda: self._check(layout, contents=True))
         dataset_from_world = torch.eye(4, dtype=torch.float64)
@@ -77,11 +81,11 @@ class DriveStudioReader(LogReader):
             name=layout.root.resolve().name,
             frames=Frames(source.views, source.frame),
             sweeps=Sweeps(range(len(layout.frames)) if layout.has_lidar else (), source.sweep, source.gray_sweep),
-            tracks=_read_tracks(layout, origin),
+            tracks=tracks,
             num_frames=len(layout.frames),
             num_cameras=len(mounts),
             dataset_from_world=dataset_from_world,
-            notes=_notes(layout),
+            notes=(*_notes(layout), *people),
         )
 
     def _layout(self) -> Layout:
@@ -91,17 +95,20 @@ class DriveStudioReader(LogReader):
             first_frame=self.first_frame,
             last_frame=self.last_frame,
             lidar=self.lidar,
+            bodies=self.bodies,
         )
 
     def _check(self, layout: Layout, *, contents: bool) -> list[Problem]:
         return check_layout(layout, ignore_distortion=self.ignore_distortion, contents=contents)
 
 
-def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[Track, ...]:
+def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Track, ...], tuple[str, ...]]:
+    """The objects in the window, and what has to be said about their body poses."""
     if not layout.has_instances:
-        return ()
-    tracks = [window(track, layout.frames, origin) for track in read_instances(layout)]
-    return tuple(track for track in tracks if track is not None)
+        return (), ()
+    tracks, notes = with_bodies(read_instances(layout), layout)
+    windows = [window(track, layout.frames, origin) for track in tracks]
+    return tuple(track for track in windows if track is not None), notes
 
 
 def _notes(layout: Layout) -> tuple[str, ...]:

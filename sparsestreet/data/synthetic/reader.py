@@ -27,6 +27,8 @@ class StreetReader(LogReader):
     parent: Path | str = "outputs/streets"
     lidar: bool = True
     """False: as if the street had none, though it is traced with its own."""
+    bodies: bool = True
+    """False: as if the street had no body poses of its pedestrians."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
@@ -42,7 +44,7 @@ class StreetReader(LogReader):
 
     def _made(self) -> DriveStudioReader:
         root = make_street(self.settings, self.folder, self._report)
-        return DriveStudioReader(root, lidar=self.lidar, cache_mb=self.cache_mb)
+        return DriveStudioReader(root, lidar=self.lidar, bodies=self.bodies, cache_mb=self.cache_mb)
 
     def _report(self, done: int, total: int) -> None:
         """A line when a quarter more is traced."""

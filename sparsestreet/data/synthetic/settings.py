@@ -35,6 +35,8 @@ class StreetSettings:
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
     num_pedestrians: int = 6
     num_cyclists: int = 2
+    body_pose_noise: float = 3.0
+    """Degrees, root mean square over the joints, by which the body pose of a pedestrian is wrong in each frame."""
     lidar: LidarSensor = WAYMO_TOP
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, meters."""
@@ -53,7 +55,9 @@ class StreetSettings:
         for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
-        not_negative = ("seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists")
+        not_negative = (
+            "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
+        )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")

@@ -16,7 +16,7 @@ from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.world import World, build_world
 from sparsestreet.data.synthetic.write import StreetWriter
 
-GENERATOR = 2
+GENERATOR = 3
 """Raised whenever equal settings would give another street."""
 _WORKERS = 2
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int16
 from PIL import Image
 
+from sparsestreet.data.synthetic.bodies import BodyWriter
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -28,10 +29,14 @@ class StreetWriter:
     root: Path
     settings: StreetSettings
     world: World
+    _bodies: BodyWriter = field(init=False)
     _ids: dict[int, int] = field(default_factory=dict)
     """Id of every actor annotated so far, by its position in the world."""
     _instances: dict[str, dict] = field(default_factory=dict)
     _frames: dict[str, list[int]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._bodies = BodyWriter(self.settings, self.world, MINIMUM_PIXELS)
 
     def write_frame(self, frame: StreetFrame) -> None:
         annotated = self._annotate(frame)
@@ -50,6 +55,7 @@ class StreetWriter:
         """The files about the whole drive."""
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
+        self._bodies.write(self.root / "humanpose" / "smpl.pkl")
         times = np.arange(self.settings.num_frames) / self.settings.frame_rate
         np.savetxt(self.root / "timestamps.txt", times, fmt="%.6f")
 
@@ -73,6 +79,7 @@ class StreetWriter:
         ]
         for index in annotated:
             self._record(index, actors[index], frame.index, frame.actor_poses[index])
+            self._bodies.record(self._ids[index], index, frame)
         self._frames[str(frame.index)] = [self._ids[index] for index in annotated]
         return annotated
 

@@ -2,7 +2,8 @@
 
 ``node`` is what all have in common. Of a whole street: ``background`` stands still, the Gaussians of ``vibrating``
 swing and fade, those of ``field`` are deformed by a ``network``. Of objects: ``rigid`` moves them along their tracks
-(``tracked``) without changing their shape, ``deformable`` with a network that changes it.
+(``tracked``) without changing their shape, ``deformable`` with a network that changes it, ``smpl`` moves people by
+their skeletons.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
@@ -11,6 +12,7 @@ from sparsestreet.scene.nodes.field import Field, FieldSettings
 from sparsestreet.scene.nodes.network import NetworkSettings
 from sparsestreet.scene.nodes.node import Instances, Node, NodeSettings
 from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
+from sparsestreet.scene.nodes.smpl import Smpl, SmplSettings
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
 from sparsestreet.scene.nodes.vibrating import Vibrating, VibratingSettings
 
@@ -27,6 +29,8 @@ __all__ = [
     "NodeSettings",
     "Rigid",
     "RigidSettings",
+    "Smpl",
+    "SmplSettings",
     "Tracked",
     "TrackedSettings",
     "Vibrating",

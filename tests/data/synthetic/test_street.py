@@ -78,7 +78,7 @@ def boxes(street: Path, frame: int) -> dict[int, tuple[np.ndarray, np.ndarray, s
 def test_all_files_are_there(street):
     views = [f"{frame:03d}_{camera}" for frame, camera in VIEWS]
     expected = {"street.json", "timestamps.txt", "instances/instances_info.json", "instances/frame_instances.json"}
-    expected |= {f"intrinsics/{camera}.txt" for camera in range(2)}
+    expected |= {f"intrinsics/{camera}.txt" for camera in range(2)} | {"humanpose/smpl.pkl"}
     for folder, kind in (
         ("images", "jpg"), ("extrinsics", "txt"), ("sky_masks", "png"), ("depth", "npz"),
         *((f"dynamic_masks/{name}", "png") for name in ("all", "human", "vehicle")),

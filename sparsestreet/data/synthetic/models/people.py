@@ -56,35 +56,44 @@ class Pedestrian:
 
     def parts(self, traveled: float) -> list[Part]:
         h, scale = self.height, self.height / 1.75
-        gait = 2 * np.pi * traveled / self.stride
         ground = -h / 2
         hip, shoulder = ground + 0.50 * h, ground + 0.80 * h
-        cloth = Grainy(self.clothes.top, 0.25, 0.08)
+        cloth, skin = Grainy(self.clothes.top, 0.25, 0.08), Plain(self.clothes.skin)
         torso = limb((0.0, 0.0, hip + 0.02 * h), (0.02, 0.0, shoulder - 0.03 * h), 0.135 * scale, cloth)
         parts = [torso, *_head(0.02, ground + 0.915 * h, scale, self.clothes)]
         for side in (-1, 1):
-            swing = float(np.sin(gait)) * side
-            parts += self._leg(side * 0.085 * scale, hip, ground, swing, float(np.cos(gait)) * side)
-            parts += self._arm(side * 0.19 * scale, shoulder, -swing, cloth)
+            parts += _leg(*self.leg(side, traveled), scale, self.clothes)
+            start, elbow, hand = self.arm(side, traveled)
+            parts += [
+                limb(start, elbow, 0.05 * scale, cloth),
+                limb(elbow, hand, 0.042 * scale, cloth),
+                Part(Ellipsoid(np.full(3, 0.05 * scale, np.float32)), skin, at(*hand)),
+            ]
         return parts
 
-    def _leg(self, y: float, hip: float, ground: float, swing: float, lift: float) -> list[Part]:
+    def leg(self, side: int, traveled: float) -> tuple[Point, Point, Point]:
+        """Hip, knee and foot of the left (1) or right (-1) leg after so many meters."""
         h, scale = self.height, self.height / 1.75
+        ground, y = -h / 2, side * 0.085 * scale
+        swing, lift = self._swing(side, traveled)
         raised = max(lift, 0.0) * 0.05 * h
         foot = (swing * 0.17 * h - 0.03, y, ground + 0.058 * scale + raised)
         knee = (swing * 0.10 * h + 0.03 + raised * 0.6, y, ground + 0.27 * h + raised * 0.5)
-        return _leg((0.0, y, hip), knee, foot, scale, self.clothes)
+        return (0.0, y, ground + 0.50 * h), knee, foot
 
-    def _arm(self, y: float, shoulder: float, swing: float, cloth: Grainy) -> list[Part]:
+    def arm(self, side: int, traveled: float) -> tuple[Point, Point, Point]:
+        """Shoulder, elbow and hand of an arm, which swings against its leg."""
         h, scale = self.height, self.height / 1.75
+        shoulder, y = -h / 2 + 0.80 * h, side * 0.19 * scale
+        swing = -self._swing(side, traveled)[0]
         elbow = (swing * 0.08 * h - 0.02, y * 1.12, shoulder - 0.17 * h)
         hand = (swing * 0.17 * h + 0.03, y * 1.08, shoulder - 0.32 * h)
-        skin = Plain(self.clothes.skin)
-        return [
-            limb((0.0, y, shoulder - 0.03 * h), elbow, 0.05 * scale, cloth),
-            limb(elbow, hand, 0.042 * scale, cloth),
-            Part(Ellipsoid(np.full(3, 0.05 * scale, np.float32)), skin, at(*hand)),
-        ]
+        return (0.0, y, shoulder - 0.03 * h), elbow, hand
+
+    def _swing(self, side: int, traveled: float) -> tuple[float, float]:
+        """Of a leg: how far it is ahead and how high it is lifted, both in -1 to 1."""
+        gait = 2 * np.pi * traveled / self.stride
+        return float(np.sin(gait)) * side, float(np.cos(gait)) * side
 
 
 @dataclass(frozen=True)

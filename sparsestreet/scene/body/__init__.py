@@ -1,0 +1,7 @@
+"""Bodies of people: a surface on a skeleton, ours or the user's own."""
+
+from sparsestreet.scene.body.builtin import BuiltinBody
+from sparsestreet.scene.body.smpl_file import SmplFile
+from sparsestreet.scene.body.template import Body, BodyTemplate, surface
+
+__all__ = ["Body", "BodyTemplate", "BuiltinBody", "SmplFile", "surface"]

@@ -1,0 +1,98 @@
+"""The people of a log on a template: how they are shaped, and how they stand and move at training frames."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.skeleton import Bones, posed_bones, skin
+from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.scene.body.template import BodyTemplate
+from sparsestreet.types import BodyPoses, Track
+
+
+@dataclass(frozen=True)
+class People:
+    """Shapes and poses of i people."""
+
+    vertices: Float[Tensor, "i v 3"]
+    """At rest, about the pelvis, meters."""
+    joints: Float[Tensor, "i 24 3"]
+    """At rest; the pelvis is 0."""
+    keyframes: Trajectories
+    """World from body: the pelvis, and how the body is turned about it."""
+    rotations: Float[Tensor, "i k 23 4"]
+    """Of the joints but the pelvis at the keyframes, relative to their parents."""
+
+
+def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozenset[int], num_frames: int) -> People:
+    """Poses of frames that are not held out; between and around frames with a pose it is interpolated, in the box.
+
+    The pelvis is put where the box around the posed body is in the middle of the annotated box. Every track has a valid
+    pose in a training frame.
+    """
+    shaped = [template.shaped(_body(track).shape, float(track.size[2])) for track in tracks]
+    vertices, joints = (torch.stack(parts) for parts in zip(*shaped, strict=True))
+    attached, weights = template.influences()
+    roots, rotations = [], []
+    for i, track in enumerate(tracks):
+        in_box = _filled(track, held_out)
+        bones = posed_bones(joints[i].expand(len(in_box), 24, 3), in_box)
+        centers = torch.stack([_middle(vertices[i], bones, frame, attached, weights) for frame in range(len(in_box))])
+        box_from_body = torch.eye(4, dtype=torch.float64).repeat(len(in_box), 1, 1)
+        box_from_body[:, :3, :3] = quat.to_matrix(in_box[:, 0].double())
+        box_from_body[:, :3, 3] = -centers.double()
+        roots.append(replace(track, world_from_object=track.world_from_object @ box_from_body))
+        trained = torch.tensor([int(frame) not in held_out for frame in track.frames])
+        rotations.append(in_box[trained, 1:])
+    keyframes = Trajectories.from_tracks(roots, held_out, num_frames)
+    padded = torch.zeros(*keyframes.valid.shape, 23, 4)
+    padded[..., 0] = 1
+    padded[keyframes.valid] = torch.cat(rotations)
+    return People(vertices, joints, keyframes, padded)
+
+
+def trained_poses(track: Track, held_out: frozenset[int]) -> Bool[Tensor, " f"]:
+    """Annotated frames with a pose that training may see."""
+    trained = torch.tensor([int(frame) not in held_out for frame in track.frames])
+    return trained & _body(track).valid
+
+
+def _body(track: Track) -> BodyPoses:
+    if track.body is None:
+        raise ValueError(
+            f"track {track.name!r} has no body poses: give it to a node for objects without (posed: false)"
+        )
+    return track.body
+
+
+def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
+    """Joints at all annotated frames, the first one box_from_body, by slerp between the frames with a pose.
+
+    In the box a turn of the heading does not count: a person without a pose turns with the box.
+    """
+    body, usable, frames = _body(track), trained_poses(track, held_out), track.frames
+    world_from_box = quat.from_matrix(track.world_from_object[:, :3, :3]).to(body.rotations.dtype)
+    rotations = body.rotations.clone()
+    rotations[:, 0] = quat.multiply(world_from_box * torch.tensor([1.0, -1.0, -1.0, -1.0]), rotations[:, 0])
+    known, rotations = frames[usable], rotations[usable]
+    upper = torch.searchsorted(known, frames).clamp(max=len(known) - 1)
+    lower = (torch.searchsorted(known, frames, right=True) - 1).clamp(min=0)
+    fraction = ((frames - known[lower]) / (known[upper] - known[lower]).clamp(min=1)).clamp(0, 1)
+    return quat.slerp(rotations[lower], rotations[upper], fraction[:, None].expand(-1, 24))
+
+
+def _middle(
+    vertices: Float[Tensor, "v 3"],
+    bones: Bones,
+    frame: int,
+    attached: Int[Tensor, "v k"],
+    weights: Float[Tensor, "v k"],
+) -> Float[Tensor, "3"]:
+    """Of the box around a posed body, along the axes of its annotated box."""
+    still = torch.zeros(len(vertices), 4)
+    posed, _ = skin(vertices, still, Bones(bones.transforms[frame], bones.quaternions[frame]), attached, weights)
+    return (posed.amax(0) + posed.amin(0)) / 2

@@ -1,0 +1,274 @@
+"""People as bodies on a skeleton (the SMPL nodes of OmniRe, Chen et al. 2024)."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
+from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
+from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.scene.body import Body, BodyTemplate, BuiltinBody, surface
+from sparsestreet.scene.body.people import People, people_of, trained_poses
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.initialize.boxes import lidar_in_boxes
+from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.masks import Mask, MaskScope
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
+from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Track, View
+
+_log = logging.getLogger(__name__)
+
+_APART = 100.0
+"""Meters between people when neighbors are looked for: nobody's neighbor is on somebody else."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmplSettings(TrackedSettings):
+    """Starts with one Gaussian at each vertex of a body, in the mean color of what was measured in the box."""
+
+    posed: bool | None = True
+    initial_opacity: float = 0.99
+    body: Body = field(default_factory=BuiltinBody)
+    """The surface, and which joints move it."""
+    neighbors: int = 3
+    """K: a Gaussian and those next to it on the body should be alike."""
+    neighbor_weight: float = 1.0e-3
+    """Of the mean spread among neighbors, for each of rotations, scales, opacities and harmonics."""
+    scale_weight: float = 0.05
+    """Of the mean squared longest axis, square meters."""
+    smoothness_weight: float = 0.0
+    """Of how far joints, as unit quaternions, are from the middle between the keyframes before and after."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.posed:
+            raise ValueError(f"a node of bodies takes only tracks with body poses, got posed={self.posed}: say true")
+        if self.neighbors < 2:
+            raise ValueError(f"neighbors counts the Gaussian itself, so it must be at least 2, got {self.neighbors}")
+
+    @property
+    def node_class(self) -> "type[Smpl]":
+        return Smpl
+
+    def build(self, data: TrainingData, generator: torch.Generator) -> "Smpl | None":
+        """A person without a pose in a training frame is left out, and the program's log says so."""
+        tracks = [track for track in data.tracks if bool(trained_poses(track, data.held_out).any())]
+        if len(tracks) < len(data.tracks):
+            _log.warning("%d people have no pose in a training frame and are left out", len(data.tracks) - len(tracks))
+        if not tracks:
+            return None
+        template = self.body.load()
+        people = people_of(tracks, template, data.held_out, data.log.num_frames)
+        rows, mask = self._start(data, tracks, template, people, generator)
+        return Smpl(
+            self,
+            rows,
+            people.keyframes,
+            torch.stack([track.size.float() for track in tracks]),
+            anatomy=Anatomy.of(template, people),
+            names=tuple(track.name for track in tracks),
+            max_gap=self.max_gap / max(data.log.num_frames - 1, 1),
+            mask=mask,
+        )
+
+    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Smpl":
+        trajectories = Trajectories(
+            tensors["keyframe_times"],
+            tensors["keyframe_quaternions"],
+            tensors["keyframe_translations"],
+            tensors["keyframe_valid"],
+            tensors["spans"],
+        )
+        anatomy = Anatomy(
+            tensors["vertices"], tensors["attached"], tensors["weights"], tensors["joints"], tensors["joint_keyframes"]
+        )
+        names, max_gap = tuple(header["names"]), header["max_gap"]
+        return Smpl(self, rows, trajectories, tensors["sizes"], anatomy=anatomy, names=names, max_gap=max_gap)
+
+    def _start(
+        self,
+        data: TrainingData,
+        tracks: Sequence[Track],
+        template: BodyTemplate,
+        people: People,
+        generator: torch.Generator,
+    ) -> tuple[Rows, Mask | None]:
+        """Discs along the surface, each as large as the part of it that belongs to its vertex, and half as thick."""
+        count, per_person = people.vertices.shape[:2]
+        surfaces = [surface(vertices, template.faces) for vertices in people.vertices]
+        areas, normals = (torch.cat(parts) for parts in zip(*surfaces, strict=True))
+        radii = (areas / torch.pi).sqrt()
+        low, high = people.vertices.amin(1), people.vertices.amax(1)
+        rows, mask = self.start(
+            data,
+            Points(people.vertices.flatten(0, 1), _colors(tracks, data).repeat_interleave(per_person, 0)),
+            radii,
+            torch.full_like(radii, self.initial_opacity),
+            generator,
+            buffers={
+                "instances": torch.arange(count).repeat_interleave(per_person),
+                "vertex_ids": torch.arange(per_person).repeat(count),
+            },
+            scope=MaskScope(people.keyframes.times, people.keyframes.valid, (low + high) / 2, (high - low) / 2),
+        )
+        with torch.no_grad():
+            rows.log_scales[:, 2] -= np.log(2)
+            rows.quaternions.copy_(_from_third_axis(normals))
+        return rows, mask
+
+
+def _colors(tracks: Sequence[Track], data: TrainingData) -> Float[Tensor, "i 3"]:
+    """Mean color of the returns and of the points from images in each track's box; gray where there are none."""
+    colors = []
+    for track, returns in zip(tracks, lidar_in_boxes(tracks, data.sweeps), strict=True):
+        points = [returns.colors]
+        if data.image_points is not None:
+            points.append(torch.from_numpy(data.image_points.in_boxes[track.name].colors))
+        measured = torch.cat(points)
+        colors.append(measured.mean(0) if len(measured) else torch.full((3,), 0.5))
+    return torch.stack(colors)
+
+
+def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """The shortest turn that takes the z axis to each unit direction."""
+    x, y, z = directions.unbind(1)
+    # Half of the turn lies between the axis and the direction; straight down any axis will do.
+    turn = torch.stack((1 + z, -y, x, torch.zeros_like(z)), 1)
+    down = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    return quat.normalized(torch.where((z < -0.9999)[:, None], down, turn))
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """What moves v vertices of i people, with k keyframes each."""
+
+    vertices: Float[Tensor, "v 3"]
+    """Of the template at rest: who is whose neighbor."""
+    attached: Int[Tensor, "v m"]
+    """The joints that move a vertex."""
+    weights: Float[Tensor, "v m"]
+    joints: Float[Tensor, "i 24 3"]
+    """At rest, about the pelvis, meters."""
+    keyframes: Float[Tensor, "i k 23 4"]
+    """Rotations of the joints but the pelvis relative to their parents."""
+
+    @staticmethod
+    def of(template: BodyTemplate, people: People) -> "Anatomy":
+        return Anatomy(template.vertices, *template.influences(), people.joints, people.rotations)
+
+
+class Smpl(Tracked):
+    """Rows at rest about their person's pelvis; the skeleton moves them, and the pose of the pelvis places them.
+
+    Poses of the pelvis are those of ``Tracked``. The other joints have keyframes at the same times, with learned
+    corrections as rotation vectors, zero at the start.
+    """
+
+    def __init__(
+        self,
+        settings: SmplSettings,
+        rows: Rows,
+        keyframes: Trajectories,
+        sizes: Float[Tensor, "i 3"],
+        *,
+        anatomy: Anatomy,
+        names: Sequence[str] | None = None,
+        max_gap: float = 0.05,
+        mask: Mask | None = None,
+    ) -> None:
+        """As ``Tracked``; rows have the buffer ``vertex_ids`` [n] int64 too: their vertex of the template."""
+        super().__init__(settings, rows, keyframes, sizes, names=names, max_gap=max_gap, mask=mask)
+        self.register_buffer("vertices", anatomy.vertices)
+        self.register_buffer("attached", anatomy.attached)
+        self.register_buffer("weights", anatomy.weights)
+        self.register_buffer("joints", anatomy.joints)
+        self.register_buffer("joint_keyframes", anatomy.keyframes)
+        self.joint_deltas = nn.Parameter(torch.zeros_like(anatomy.keyframes[..., 1:]))
+        self._neighbors: Tensor | None = None
+
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """Every person's Gaussians as the skeleton moves them; opacity exactly 0 where the person is absent."""
+        raw = self.placed(view)
+        bones = posed_bones(self.joints, self.joint_rotations(view.time))
+        all_bones = Bones(bones.transforms.flatten(0, 1), bones.quaternions.flatten(0, 1))
+        attached = self.attached[self.rows.vertex_ids] + NUM_JOINTS * self.rows.instances[:, None]
+        weights = self.weights[self.rows.vertex_ids]
+        means, quaternions = skin(raw.means, raw.quaternions, all_bones, attached, weights)
+        return replace(raw, means=means, quaternions=quaternions)
+
+    def joint_rotations(self, time: float) -> Float[Tensor, "i 24 4"]:
+        """Of every person's joints relative to their parents at a time; the pelvis, which is placed, is at rest."""
+        table = self.keyframes
+        at = keyframe_interval(table.times, table.valid, table.spans, time, self.max_gap)
+        each = torch.arange(len(at.lower), device=at.lower.device)
+        lower, upper = (
+            quat.multiply(self.joint_keyframes[each, place], quat.from_rotation_vector(self.joint_deltas[each, place]))
+            for place in (at.lower, at.upper)
+        )
+        turned = quat.slerp(lower, upper, at.fraction[:, None].expand(lower.shape[:2]))
+        pelvis = torch.zeros_like(turned[:, :1])
+        pelvis[..., 0] = 1
+        return torch.cat((pelvis, turned), 1)
+
+    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """``neighbors``, ``scale`` and ``smoothness``, those that have a weight."""
+        terms, settings = {}, self.settings
+        if len(self.rows) and settings.neighbor_weight > 0:
+            terms["neighbors"] = settings.neighbor_weight * self._spread(raw)
+        if len(self.rows) and settings.scale_weight > 0:
+            terms["scale"] = settings.scale_weight * raw.log_scales.exp().amax(1).square().mean()
+        if settings.smoothness_weight > 0:
+            terms["smoothness"] = settings.smoothness_weight * self._unevenness()
+        return terms
+
+    def pose_bytes(self) -> int:
+        """As ``Tracked``, with 23 quaternions a keyframe, and what moves the rows: joints and weights."""
+        per_keyframe = 4 * (NUM_JOINTS - 1) * int(self.keyframe_valid.sum())
+        body = sum(part.numel() for part in (self.vertices, self.attached, self.weights, self.joints))
+        return super().pose_bytes() + BYTES_PER_NUMBER * (per_keyframe + body)
+
+    def _spread(self, raw: RawGaussians) -> Float[Tensor, ""]:
+        """Sum over the attributes of their mean standard deviation among neighbors."""
+        attributes = (
+            quat.normalized(self.rows.quaternions),
+            raw.log_scales.exp(),
+            torch.sigmoid(raw.opacity_logits)[:, None],
+            raw.sh_dc.flatten(1),
+            raw.sh_rest.flatten(1),
+        )
+        widths = [attribute.shape[1] for attribute in attributes if attribute.shape[1]]
+        spread = torch.cat(attributes, 1)[self._nearest()].std(1)
+        return torch.stack([part.mean() for part in spread.split(widths, 1)]).sum()
+
+    def _unevenness(self) -> Float[Tensor, ""]:
+        """Mean squared distance of joints from what their neighbors in time say of them."""
+        turned = quat.multiply(self.joint_keyframes, quat.from_rotation_vector(self.joint_deltas))
+        before, here, after = (self.keyframe_times[:, start : start - 2 or None] for start in range(3))
+        # Frames that are held out leave gaps: the middle is where time says.
+        fraction = (here - before) / torch.where(after > before, after - before, 1.0)
+        first, middle, last = (turned[:, start : start - 2 or None] for start in range(3))
+        distance = torch.lerp(first, last, fraction[..., None, None]) - middle
+        counts = self.keyframe_valid[:, 2:]
+        return (distance.square().sum((2, 3)) * counts).sum() / ((NUM_JOINTS - 1) * counts.sum()).clamp(min=1)
+
+    def _nearest(self) -> Int[Tensor, "n k"]:
+        """The rows next to each row on the body at rest, itself among them; looked for when the rows have changed."""
+        if self._neighbors is None or len(self._neighbors) != len(self.rows):
+            apart = _APART * self.rows.instances[:, None].float()
+            places = torch.cat((self.vertices[self.rows.vertex_ids], apart), 1).cpu().numpy()
+            distances, found = cKDTree(places).query(places, k=self.settings.neighbors)
+            itself = np.arange(len(places))[:, None]
+            found = np.where(distances < _APART / 2, found, itself)
+            self._neighbors = torch.from_numpy(found).to(self.rows.means.device)
+        return self._neighbors
