@@ -35,6 +35,7 @@ class TrainSchema:
     schedule: Any = MISSING
     assignment: Any = MISSING
     method: Any = MISSING
+    preset: Any = MISSING
     sparsify: Any = MISSING
     node: Any = MISSING
     sky: Any = None
