@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sparsestreet.evaluation.strict_json import RecordError, write_atomically
 
-MASK, PRUNING = "mask", "background pruning"
+MASK, PRUNING = "mask", "pruning"
 """Reasons of the changes that make a scene small: masks fell to their threshold, a rule named what may go."""
 
 

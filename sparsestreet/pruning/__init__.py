@@ -1,20 +1,27 @@
 """Scores of Gaussians over all training views, and the rules that select which to keep.
 
-``importance`` is the paper's score; ``rules`` the paper's rule and ours (leave one out); ``select`` what is kept.
+``rule`` is what every rule is; ``importance`` the paper's score; ``rules`` the paper's rule and ours (leave one out);
+``controls`` keep a given number at random or by opacity; ``select`` and ``floors`` say what is kept in any case.
 """
 
+from sparsestreet.pruning.controls import OpacityRule, RandomRule
+from sparsestreet.pruning.floors import Floors, InstanceAreas
 from sparsestreet.pruning.importance import Importance, measure_importance
-from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule, Look, PruningRule, prunable_floors
+from sparsestreet.pruning.rule import Look, PruningRule
+from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance
 
 __all__ = [
+    "Floors",
     "Importance",
     "ImportanceRule",
+    "InstanceAreas",
     "LeaveOneOutRule",
     "Look",
+    "OpacityRule",
     "PruningRule",
+    "RandomRule",
     "keep_by_cost",
     "keep_by_importance",
     "measure_importance",
-    "prunable_floors",
 ]

@@ -1,49 +1,27 @@
 """What decides which rows of some nodes go, given all training views: by the paper's importance or by removal."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from sparsestreet.data.device import to_device
-from sparsestreet.ops import contribution, leave_one_out
-from sparsestreet.pruning.importance import measure_importance
+from sparsestreet.ops import leave_one_out
+from sparsestreet.pruning.importance import Importance
+from sparsestreet.pruning.rule import Look, PruningRule, contributions, on_device
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, render, sky_image
-from sparsestreet.scene.state import FINISHED, SceneState
-from sparsestreet.types import Contribution, Frame, LeaveOneOut
+from sparsestreet.scene.rendering import render, sky_image
+from sparsestreet.types import Frame, LeaveOneOut
 
 LEAST_ERROR = 1e-12
 """Squared error (images lie in [0, 1]) that stands for none; its inverse fits into float32."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a rule looks at the scene: as training does."""
-
-    state: SceneState = FINISHED
-    options: RenderOptions = DEFAULT_OPTIONS
-
-
-@runtime_checkable
-class PruningRule(Protocol):
-    """Answers which rows of the prunable nodes stay, never fewer than a node's K_min. Without gradients."""
-
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]: ...
-
-
-def prunable_floors(scene: SceneGraph) -> dict[str, int]:
-    """Name of every node that pruning may touch -> its K_min."""
-    return {name: node.settings.min_gaussians for name, node in scene.nodes.items() if node.settings.prunable}
-
-
-@dataclass(frozen=True)
-class ImportanceRule:
+class ImportanceRule(PruningRule):
     """The paper's: rows whose global importance is zero go (see ``Importance``).
 
     The whole scene is rendered for the scores: cars hide the road behind them.
@@ -54,13 +32,16 @@ class ImportanceRule:
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
-        scores = measure_importance(_contributions(scene, frames, how), gate=self.gate)
-        spans = scene.gaussians_at(frames[0], how.state).spans
-        return {name: keep_by_importance(scores[spans[name]], floor) for name, floor in prunable_floors(scene).items()}
+        importance, areas = Importance(self.gate), self.areas(scene)
+        for view, spans in contributions(scene, frames, how):
+            importance.add(view)
+            areas.add(view, spans)
+        scores = importance.scores()
+        return {name: keep_by_importance(scores[spans[name]], floors) for name, floors in areas.floors().items()}
 
 
 @dataclass(frozen=True)
-class LeaveOneOutRule:
+class LeaveOneOutRule(PruningRule):
     """Rows go that the training images miss least, as many as cost ``allowed_db`` of their PSNR.
 
     The cost of a row is the sum over views, pixels and channels of the squared change when it alone is taken away,
@@ -87,15 +68,15 @@ class LeaveOneOutRule:
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
-        errors = sum(_squared_errors(scene, frame, how) for frame in _beside(scene, frames))
+        errors = sum(_squared_errors(scene, frame, how) for frame in on_device(scene, frames))
         spans = scene.gaussians_at(frames[0], how.state).spans
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
-        for frame in _beside(scene, frames):
+        for frame in on_device(scene, frames):
             change = _without_each(scene, frame, errors, how)
             largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         costs = torch.where(largest > self.noticeable, squared, 0.0)
-        floors = prunable_floors(scene)
+        floors = self.floors(scene, frames, how)
         return keep_by_cost({name: costs[spans[name]] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
 
 
@@ -127,14 +108,3 @@ def _squared_errors(scene: SceneGraph, frame: Frame, how: Look) -> Float64[Tenso
     image = render(scene, frame, how.state, how.options).rgb
     squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
     return (_regions(frame).double() * squared).sum((1, 2))
-
-
-def _beside(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
-    """One frame at a time on the scene's device."""
-    return (to_device(frame, scene.device) for frame in frames)
-
-
-def _contributions(scene: SceneGraph, frames: Sequence[Frame], how: Look) -> Iterator[Contribution]:
-    for frame in _beside(scene, frames):
-        gaussians = scene.gaussians_at(frame, how.state).gaussians
-        yield contribution(gaussians, frame.camera, settings=how.options.settings, backend=how.options.backend)

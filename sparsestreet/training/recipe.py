@@ -10,7 +10,7 @@ from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.nodes import NodeSettings
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.sky import SkySettings
-from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining
+from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
 from sparsestreet.training.losses import Loss, MaskSparsity
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
@@ -46,8 +46,12 @@ class Recipe:
                 )
             if present and not masked:
                 found.append(f"{kind.__name__} is among the {part} but no node trains a mask: set sparsify.masks=true")
-        if self._has(BackgroundPruning) and not any(settings.prunable for settings in self.nodes.values()):
-            found.append("BackgroundPruning is among the callbacks but no node is prunable: set node.X.prunable=true")
+        for pruning in (callback for callback in self.callbacks.values() if isinstance(callback, Pruning)):
+            if not any(pruning.rule.touches(name, settings) for name, settings in self.nodes.items()):
+                found.append(
+                    "Pruning is among the callbacks but its rule may touch no node: set node.X.prunable=true, or the "
+                    "rule's nodes to null"
+                )
         if self._has(DensityControl) and all(settings.density is None for settings in self.nodes.values()):
             found.append("DensityControl is among the callbacks but every node's density is null: leave it out")
         return found

@@ -51,7 +51,7 @@ def run(tiny_street, tmp_path_factory) -> Path:
     """Two steps with everything that is our own; the rule comes in at the first."""
     out = tmp_path_factory.mktemp("extending") / "run"
     words = ["method=no_lidar", "loss=[photometric,sky,mean_color]", "sparsify=size", PROBIT]
-    rule = "callback.background_pruning.rule.meters=0.1"
+    rule = "callback.pruning.rule.meters=0.1"
     assert train([*tiny_street, *TINY_RIGID, OUTSIDE, *words, rule, f"out={out}", "trainer.fast_dev_run=2"]) == 0
     return out
 
@@ -91,7 +91,7 @@ def test_a_loss(words):
 
 def test_a_rule():
     cfg = composed("sparsify=size")
-    pruning = recipe_of(cfg).callbacks["background_pruning"]
+    pruning = recipe_of(cfg).callbacks["pruning"]
     assert (pruning.at, pruning.rule, cfg.name) == ((0.6,), SizeRule(meters=1.0), "streetgs+size")
     node = background(20, min_gaussians=19)
     set_rows(node, "log_scales", {3: 1.0, 5: 2.0})
@@ -139,9 +139,9 @@ def test_a_method_goes_with_every_sparsification(sparsify):
 
 def test_they_train_together(run):
     with (run / "records" / "counts.csv").open() as file:
-        pruned = [row for row in csv.DictReader(file) if row["reason"] == "background pruning"]
-    assert [row["node"] for row in pruned] == ["background"]
-    assert int(pruned[0]["after"]) < int(pruned[0]["before"])
+        pruned = [row for row in csv.DictReader(file) if row["reason"] == "pruning"]
+    assert [row["node"] for row in pruned] == ["background", "rigid"]
+    assert all(int(row["after"]) < int(row["before"]) for row in pruned)
     description = read_run(run_path(run))
     assert (description.label, description.steps) == ("no_lidar+size", 2)
     assert description.config["loss.mean_color.weight"] == 0.1

@@ -11,9 +11,9 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.cli.compose import CONF, configuration, override_problem
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.training.callbacks import BackgroundPruning, DensityControl, MaskTraining, PhaseTimes, RowLedger
+from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.triangulation import ImagePointSettings
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
@@ -31,7 +31,7 @@ def composed(*overrides: str):
 
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
-    assert {"none", "masks", "importance", "paper", "removal"} == set(SPARSIFY)
+    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity"} == set(SPARSIFY)
 
 
 @pytest.mark.parametrize(("method", "sparsify"), PAIRS)
@@ -43,13 +43,17 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
     assert list(recipe.losses) == [*plain.losses, *(["mask_sparsity"] if masked else [])]
     rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
-    added = ([MaskTraining] if masked else []) + ([BackgroundPruning] if sparsify in rules else [])
+    rules |= {"random": RandomRule, "opacity": OpacityRule}
+    added = ([MaskTraining] if masked else []) + ([Pruning] if sparsify in rules else [])
     assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:
-        pruning = recipe.callbacks["background_pruning"]
+        pruning = recipe.callbacks["pruning"]
         assert type(pruning.rule) is rules[sparsify]
         # The paper prunes once, at 28,000 of 30,000 steps, whatever the schedule.
-        assert sparsify == "removal" or pruning.at == (0.93334,)
+        assert (pruning.at == (0.93334,)) == (rules[sparsify] is ImportanceRule)
+        # And the background alone.
+        touched = [name for name, settings in recipe.nodes.items() if pruning.rule.touches(name, settings)]
+        assert touched == (["background"] if rules[sparsify] is ImportanceRule else list(recipe.nodes))
     assert cfg.name == method + ("" if sparsify == "none" else f"+{sparsify}")
 
 
@@ -144,7 +148,7 @@ def test_every_option_can_be_set_without_plus_signs(override: str):
         (["sparsify=masks", "~loss.mask_sparsity"], "no MaskSparsity among the losses"),
         (["sparsify=masks", "~callback.mask_training"], "no MaskTraining among the callbacks"),
         (["sparsify=masks", "sparsify.masks=false"], "no node trains a mask"),
-        (["sparsify=importance", "node.background.prunable=false"], "no node is prunable"),
+        (["sparsify=importance", "node.background.prunable=false"], "may touch no node"),
         (["node.background.density=null", "node.rigid.density=null"], "every node's density is null"),
     ],
 )
@@ -180,5 +184,5 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
         reasons = {row["reason"] for row in csv.DictReader(file)}
     assert {"start", "densify"} <= reasons
     assert ("mask" in reasons) == (sparsify in ("masks", "paper", "removal"))
-    assert ("background pruning" in reasons) == (sparsify in ("importance", "paper", "removal"))
+    assert ("pruning" in reasons) == (sparsify not in ("none", "masks"))
     assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["global_step"] == 20

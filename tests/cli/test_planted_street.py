@@ -23,7 +23,7 @@ from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Background
 from sparsestreet.scene.rendering import RenderOptions, sky_image
 from sparsestreet.scene.storage import StoredScene, load_scene
-from sparsestreet.training.callbacks import BackgroundPruning, MaskTraining
+from sparsestreet.training.callbacks import MaskTraining, Pruning
 from sparsestreet.training.losses import InverseDepth, MaskSparsity, Photometric, SkyMask
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.schedule import Interval
@@ -124,7 +124,7 @@ def _prune(stored: StoredScene, data: StreetData, rows: Rows, *, lambda_m: float
         max_epochs=-1,
         callbacks=[
             MaskTraining(Interval(0.0, 0.8, 50)),
-            *([BackgroundPruning([0.8], ImportanceRule())] if gated else []),
+            *([Pruning([0.8], ImportanceRule())] if gated else []),
         ],
         logger=False,
         enable_progress_bar=False,

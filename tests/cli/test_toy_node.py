@@ -40,7 +40,7 @@ def toy_run(tiny_street, tmp_path_factory) -> Path:
 def test_its_gaussians_come_and_go_for_every_reason(toy_run):
     with (toy_run / "records" / "counts.csv").open() as file:
         reasons = {row["reason"] for row in csv.DictReader(file) if row["node"] == "bobbing"}
-    assert {"start", "densify", "mask", "background pruning"} <= reasons
+    assert {"start", "densify", "mask", "pruning"} <= reasons
     # Its learned parts have moved, its network too, which rested for the first quarter.
     node = load_scene(toy_run).scene.nodes["bobbing"]
     assert isinstance(node, Bobbing)

@@ -6,7 +6,7 @@ from sparsestreet.evaluation import history
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.ledger import MASK, PRUNING, CountChange, ledger_path, read_changes, write_changes
 from sparsestreet.evaluation.strict_json import RecordError
-from sparsestreet.training.callbacks import background_pruning, mask_training
+from sparsestreet.training.callbacks import mask_training, pruning
 
 CHANGES = [
     CountChange(0, "background", 0, 100, "seeds"),
@@ -34,12 +34,12 @@ def test_counts_stay_between_changes_and_events_are_marked(tmp_path, drawn):
     steps, counts, events = drawn["counts.png"]
     assert steps == [0, 10, 20, 30]
     assert counts == {"background": [100, 120, 90, 40], "rigid": [20, 20, 15, 15]}
-    assert events == [(20, "mask"), (30, "background pruning")]
+    assert events == [(20, "mask"), (30, "pruning")]
     assert "psnr.png" not in drawn
 
 
 def test_the_callbacks_give_the_reasons_that_are_marked():
-    assert set(history.MARKED) == {mask_training.REASON, background_pruning.REASON}
+    assert set(history.MARKED) == {mask_training.REASON, pruning.REASON}
 
 
 def test_psnr_is_taken_where_it_was_logged(tmp_path, drawn):
@@ -51,7 +51,7 @@ def test_psnr_is_taken_where_it_was_logged(tmp_path, drawn):
     draw_history(tmp_path)
     curves, events = drawn["psnr.png"]
     assert curves == {"training, running mean": ((9, 19), (20.5, 21.5)), "held out": ((9,), (18.25,))}
-    assert events == [(20, "mask"), (30, "background pruning")]
+    assert events == [(20, "mask"), (30, "pruning")]
 
 
 def test_files_that_were_not_written_leave_their_picture_out(tmp_path, drawn):

@@ -8,7 +8,7 @@ import torch
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.ops import splat
-from sparsestreet.pruning import keep_by_importance, measure_importance
+from sparsestreet.pruning import Floors, keep_by_importance, measure_importance
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.types import Camera
 from tests.pruning.planted import NOTICEABLE, Views, activated, contributions_of, joint_change, judge, plant
@@ -90,7 +90,7 @@ def test_zero_importance_removes_what_was_planted_and_nothing_visible(planted_wa
     rows, planted = planted_wall
     visible = Views(activated(rows), cameras(), BACKEND).visible(torch.nonzero(~planted).squeeze(-1))
     scores = measure_importance(contributions_of(rows, cameras(), BACKEND))
-    verdict = judge(keep_by_importance(scores, min_gaussians=0).keep, planted, visible)
+    verdict = judge(keep_by_importance(scores, Floors(0)).keep, planted, visible)
     assert verdict.num_visible == 49  # every tile and the front of the slab
     assert verdict.recall >= RECALL
     assert verdict.visible_lost <= VISIBLE_LOST
@@ -130,7 +130,7 @@ def test_without_the_gate_most_of_them_stay(planted_wall):
     """The test above can fail: touching one pixel faintly is enough to score."""
     rows, planted = planted_wall
     scores = measure_importance(contributions_of(rows, cameras(), BACKEND), gate=False)
-    keep = keep_by_importance(scores, min_gaussians=0).keep
+    keep = keep_by_importance(scores, Floors(0)).keep
     assert float((planted & ~keep).sum()) / 50 < RECALL
 
 

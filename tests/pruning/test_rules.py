@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, Look, PruningRule, prunable_floors
+from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, Look, PruningRule
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -124,7 +124,7 @@ def test_only_prunable_nodes_are_asked_each_with_its_own_floor():
     rows = [scene_of([opacity], [depth]).nodes["background"].rows for opacity, depth in ((0.99, 2.0), (0.3, 3.0))]
     wall, hidden = background(rows[0], prunable=False), background(rows[1])
     scene = SceneGraph({"wall": wall, "hidden": hidden, "kept": background(rows[1], min_gaussians=1)})
-    assert prunable_floors(scene) == {"hidden": 0, "kept": 1}
+    assert ImportanceRule().floors(scene, [], LOOK) == {"hidden": Floors(0), "kept": Floors(1)}
     for rule in (LeaveOneOutRule(0.0), ImportanceRule()):
         selections = rule.select(scene, [frame_of(scene, 5)], LOOK)
         assert {name: each.removed for name, each in selections.items()} == {"hidden": 1, "kept": 0}

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from sparsestreet.pruning import keep_by_cost, keep_by_importance
+from sparsestreet.pruning import Floors, keep_by_cost, keep_by_importance
 from tests.scene.gaussians.oracle import by_hand
 
 # A coarse grid, so that ties are common.
@@ -15,14 +15,14 @@ score_lists = st.lists(st.sampled_from([0.0, 0.005, 0.01, 0.02, 0.5, 0.73, 1.0])
 @settings(max_examples=300, deadline=None)
 @given(score_lists, st.integers(0, 14))
 def test_importance_rule_removes_only_zeros(scores, floor):
-    selection = keep_by_importance(torch.tensor(scores, dtype=torch.float64), floor)
+    selection = keep_by_importance(torch.tensor(scores, dtype=torch.float64), Floors(floor))
     unwanted = [score == 0 for score in scores]
     assert selection.keep.tolist() == by_hand(scores, unwanted, floor)
     assert selection.floor_hit == (selection.removed < sum(unwanted))
 
 
 def test_all_scores_equal():
-    selection = keep_by_importance(torch.zeros(5, dtype=torch.float64), 3)
+    selection = keep_by_importance(torch.zeros(5, dtype=torch.float64), Floors(3))
     assert selection.keep.tolist() == [True, True, True, False, False]
     assert selection.floor_hit
     assert selection.removed == 2
@@ -30,7 +30,7 @@ def test_all_scores_equal():
 
 @pytest.mark.parametrize("floor", [0, 7])
 def test_a_node_without_rows(floor):
-    selection = keep_by_importance(torch.zeros(0), floor)
+    selection = keep_by_importance(torch.zeros(0), Floors(floor))
     assert selection.keep.shape == (0,)
     assert selection.removed == 0
     assert not selection.floor_hit
@@ -39,21 +39,21 @@ def test_a_node_without_rows(floor):
 
 def test_nan_scores_are_refused():
     with pytest.raises(ValueError, match="row 1 of 2 is NaN"):
-        keep_by_importance(torch.tensor([0.5, float("nan")]), 0)
+        keep_by_importance(torch.tensor([0.5, float("nan")]), Floors(0))
 
 
 def test_impossible_inputs_are_refused():
     with pytest.raises(ValueError, match="min_gaussians"):
-        keep_by_importance(torch.zeros(2), -1)
+        keep_by_importance(torch.zeros(2), Floors(-1))
     with pytest.raises(ValueError, match=">= 0"):
-        keep_by_importance(torch.tensor([-0.1, 0.2]), 0)
+        keep_by_importance(torch.tensor([-0.1, 0.2]), Floors(0))
 
 
 @settings(max_examples=200, deadline=None)
 @given(score_lists, score_lists, st.floats(0, 3), st.integers(0, 5))
 def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, second, allowed, floor):
     costs = {name: torch.tensor(values, dtype=torch.float64) for name, values in (("a", first), ("b", second))}
-    chosen = keep_by_cost(costs, allowed, {"a": floor, "b": 0})
+    chosen = keep_by_cost(costs, allowed, {"a": Floors(floor), "b": Floors(0)})
     order = sorted(range(len(first) + len(second)), key=lambda row: ((first + second)[row], -row))
     spent, unwanted = 0.0, [False] * len(order)
     for row in order:
@@ -69,11 +69,11 @@ def test_without_nodes_nothing_is_chosen():
 
 def test_a_budget_may_be_met_exactly():
     costs = {"a": torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64)}
-    assert keep_by_cost(costs, 0.5, {"a": 0})["a"].keep.tolist() == [False, True, False]
-    assert keep_by_cost(costs, 0.49, {"a": 0})["a"].keep.tolist() == [True, True, False]
+    assert keep_by_cost(costs, 0.5, {"a": Floors(0)})["a"].keep.tolist() == [False, True, False]
+    assert keep_by_cost(costs, 0.49, {"a": Floors(0)})["a"].keep.tolist() == [True, True, False]
 
 
 def test_costs_must_be_numbers():
     for bad in (float("nan"), -1.0):
         with pytest.raises(ValueError, match="costs of removal"):
-            keep_by_cost({"a": torch.tensor([1.0, bad])}, 1.0, {"a": 0})
+            keep_by_cost({"a": torch.tensor([1.0, bad])}, 1.0, {"a": Floors(0)})

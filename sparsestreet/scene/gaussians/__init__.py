@@ -2,6 +2,6 @@
 
 from sparsestreet.scene.gaussians.plan import RowPlan
 from sparsestreet.scene.gaussians.rows import Rows, drop_parameter
-from sparsestreet.scene.gaussians.selection import Selection, keep_best
+from sparsestreet.scene.gaussians.selection import InstanceFloors, Selection, keep_best
 
-__all__ = ["RowPlan", "Rows", "Selection", "drop_parameter", "keep_best"]
+__all__ = ["InstanceFloors", "RowPlan", "Rows", "Selection", "drop_parameter", "keep_best"]

@@ -1,9 +1,9 @@
-"""Which rows of a table stay, and the floor that no rule goes below."""
+"""Which rows of a table stay, and the floors that no rule goes below."""
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.scene.gaussians.plan import RowPlan
@@ -15,7 +15,7 @@ class Selection:
 
     keep: Bool[Tensor, " n"]
     floor_hit: bool
-    """True: the rule wanted to remove more, but K_min kept some of its candidates."""
+    """True: the rule wanted to remove more, but K_min or the floor of an instance kept some of its candidates."""
     removed: int
 
     def plan(self) -> RowPlan:
@@ -23,20 +23,49 @@ class Selection:
         return RowPlan.keep(self.keep)
 
 
-def keep_best(scores: Float[Tensor, " n"], unwanted: Bool[Tensor, " n"], min_gaussians: int) -> Selection:
-    """Keep all that is wanted, and of the unwanted (which score lowest) only what the floor calls for.
+@dataclass(frozen=True)
+class InstanceFloors:
+    """How many rows each instance of a node keeps; one that has fewer keeps all."""
 
-    Among rows of equal score at the floor the lower row stays. Raises ValueError for scores that are NaN or a negative
-    floor.
+    ids: Int[Tensor, " n"]
+    """Row -> its instance."""
+    least: Int[Tensor, " i"]
+
+
+def keep_best(
+    scores: Float[Tensor, " n"],
+    unwanted: Bool[Tensor, " n"],
+    min_gaussians: int,
+    instances: InstanceFloors | None = None,
+) -> Selection:
+    """Keep all that is wanted, and of the unwanted only what the floors call for.
+
+    Each instance first fills up to its own floor, then the best of what is left fill up to ``min_gaussians``. The
+    highest scores stay and, among rows of equal score, the lower row. Raises ValueError for scores that are NaN or a
+    negative floor.
     """
     if min_gaussians < 0:
         raise ValueError(f"min_gaussians must be >= 0, got {min_gaussians}")
     if scores.isnan().any():
         row = int(scores.isnan().nonzero()[0])
         raise ValueError(f"scores must be numbers, but row {row} of {scores.shape[0]} is NaN: repair it before pruning")
-    rows, wanted = scores.shape[0], int((~unwanted).sum())
-    kept = max(wanted, min(min_gaussians, rows))
     best_first = torch.sort(scores, descending=True, stable=True).indices
-    keep = torch.zeros_like(unwanted)
-    keep[best_first[:kept]] = True
-    return Selection(keep, floor_hit=kept > wanted, removed=rows - kept)
+    best_first = best_first[torch.sort(unwanted[best_first].byte(), stable=True).indices]
+    keep = ~unwanted
+    wanted = int(keep.sum())
+    if instances is not None:
+        keep[best_first[_within_floors(instances.ids[best_first], instances.least)]] = True
+    missing = max(min_gaussians - int(keep.sum()), 0)
+    keep[best_first[~keep[best_first]][:missing]] = True
+    kept = int(keep.sum())
+    return Selection(keep, floor_hit=kept > wanted, removed=scores.shape[0] - kept)
+
+
+def _within_floors(ids: Int[Tensor, " n"], least: Int[Tensor, " i"]) -> Bool[Tensor, " n"]:
+    """Rows, the best first, of which fewer than the floor of their instance stand before them in it."""
+    by_instance = torch.sort(ids, stable=True)
+    counts = torch.bincount(ids, minlength=len(least))
+    place = torch.arange(len(ids), device=ids.device) - (counts.cumsum(0) - counts)[by_instance.values]
+    within = torch.zeros_like(ids, dtype=torch.bool)
+    within[by_instance.indices] = place < least[by_instance.values]
+    return within

@@ -24,7 +24,7 @@ class StaticMaskSettings:
     visible_only: bool = False
     """True: the loss pushes a row only in views that draw it. Adam forgets the size of a gradient, so that with the
     paper's sum over all rows one that few images see is pushed out between two visits, at any lambda; with this one
-    lambda is weighed against the image error. Rows that no image sees are then left to background pruning."""
+    lambda is weighed against the image error. Rows that no image sees are then left to pruning."""
 
     def __post_init__(self) -> None:
         if not self.sparsity_weight >= 0:

@@ -40,6 +40,9 @@ class NodeSettings(ABC):
     """True: only tracks that come with body poses; False: only those without; None: both."""
     min_gaussians: int
     """K_min of the paper: neither masks nor pruning leave fewer Gaussians in the node class."""
+    min_instance_gaussians: float = 0.0
+    """What pruning leaves of each object: so many Gaussians per 1,000 pixels that it fills in the training view that
+    shows it largest, or all that it has."""
     max_gaussians: int | None
     """Density control stops here; None: no limit."""
     sh_degree: int = 3
@@ -57,6 +60,10 @@ class NodeSettings(ABC):
     def __post_init__(self) -> None:
         if self.min_gaussians < 0:
             raise ValueError(f"min_gaussians must be >= 0, got {self.min_gaussians}")
+        if not self.min_instance_gaussians >= 0:
+            raise ValueError(
+                f"min_instance_gaussians must be >= 0 Gaussians per 1,000 pixels, got {self.min_instance_gaussians}"
+            )
         if self.max_gaussians is not None and self.max_gaussians < max(self.min_gaussians, 1):
             raise ValueError(
                 f"max_gaussians must be at least min_gaussians, got {self.max_gaussians} and {self.min_gaussians}: "

@@ -1,11 +1,10 @@
 """Callbacks know WHEN; what they apply is decided by pure functions in scene/density, scene/masks and pruning.
 
-They act in the order in which they are configured: ``density_control``, ``mask_training``, ``background_pruning``, all
+They act in the order in which they are configured: ``density_control``, ``mask_training``, ``pruning``, all
 through ``resizing``. ``row_ledger``, ``phase_times`` and ``progress`` look on, ``clock`` counts seconds;
 ``checkpoints``, ``run_files`` and ``graceful_stop`` see to what a run leaves, also one that is interrupted.
 """
 
-from sparsestreet.training.callbacks.background_pruning import BackgroundPruning
 from sparsestreet.training.callbacks.checkpoints import Checkpoints, newest_checkpoint
 from sparsestreet.training.callbacks.clock import Clock
 from sparsestreet.training.callbacks.density_control import DensityControl
@@ -13,17 +12,18 @@ from sparsestreet.training.callbacks.graceful_stop import GracefulStop
 from sparsestreet.training.callbacks.mask_training import MaskTraining
 from sparsestreet.training.callbacks.phase_times import PhaseTimes
 from sparsestreet.training.callbacks.progress import TrainingProgress
+from sparsestreet.training.callbacks.pruning import Pruning
 from sparsestreet.training.callbacks.row_ledger import RowLedger
 from sparsestreet.training.callbacks.run_files import RunFiles
 
 __all__ = [
-    "BackgroundPruning",
     "Checkpoints",
     "Clock",
     "DensityControl",
     "GracefulStop",
     "MaskTraining",
     "PhaseTimes",
+    "Pruning",
     "RowLedger",
     "RunFiles",
     "TrainingProgress",

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import torch
 
-from sparsestreet.pruning import Look, prunable_floors
+from sparsestreet.pruning import Look, PruningRule
 from sparsestreet.scene.gaussians import Selection, keep_best
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import Frame
 
 
 @dataclass(frozen=True)
-class SizeRule:
+class SizeRule(PruningRule):
     """Gaussians larger than some meters go, the largest first where K_min holds some of them."""
 
     meters: float
@@ -20,7 +20,7 @@ class SizeRule:
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
         selections = {}
-        for name, min_gaussians in prunable_floors(scene).items():
+        for name, floors in self.floors(scene, frames, how).items():
             sizes = scene.nodes[name].rows.log_scales.amax(1).exp()
-            selections[name] = keep_best(-sizes, sizes > self.meters, min_gaussians)
+            selections[name] = keep_best(-sizes, sizes > self.meters, *floors)
         return selections

@@ -1,12 +1,17 @@
-"""Selections with a floor, one row at a time."""
+"""Selections with floors, one row at a time."""
+
+from collections.abc import Sequence
 
 
-def by_hand(scores: list[float], unwanted: list[bool], floor: int) -> list[bool]:
-    """Remove one row at a time: the lowest, the later of equals, while it is unwanted and the floor allows."""
+def by_hand(
+    scores: list[float], unwanted: list[bool], floor: int, ids: Sequence[int] = (), least: Sequence[int] = ()
+) -> list[bool]:
+    """Remove one row at a time: of the unwanted the lowest, the later of equals, whose removal no floor forbids."""
+    ids = ids or [0] * len(scores)
+    least = least or [0]
     keep = [True] * len(scores)
-    while sum(keep) > floor:
-        row = min((row for row in range(len(scores)) if keep[row]), key=lambda row: (scores[row], -row))
-        if not unwanted[row]:
-            break
-        keep[row] = False
+    for row in sorted(range(len(scores)), key=lambda row: (scores[row], -row)):
+        left = sum(kept for kept, instance in zip(keep, ids, strict=True) if instance == ids[row])
+        if unwanted[row] and sum(keep) > floor and left > least[ids[row]]:
+            keep[row] = False
     return keep

@@ -11,15 +11,15 @@ from sparsestreet.training.schedule import milestone
 
 log = logging.getLogger(__name__)
 
-REASON = "background pruning"
+REASON = "pruning"
 
 
-class BackgroundPruning(Callback):
+class Pruning(Callback):
     """At given moments of the run: let a rule look at all training views, and remove the rows it names.
 
     Args:
         at: fractions of the run (the paper: once, at 28,000 of 30,000 steps).
-        rule: which rows go; it touches the nodes that are ``prunable``, down to their K_min.
+        rule: which rows go of which ``prunable`` nodes, down to the floors of nodes and instances.
     """
 
     def __init__(self, at: Sequence[float], rule: PruningRule) -> None:
@@ -35,9 +35,9 @@ class BackgroundPruning(Callback):
         look = Look(pl_module.state(), pl_module.options)
         for name, selection in self.rule.select(pl_module.scene, frames, look).items():
             log.info(
-                "step %d: background pruning takes %d of %d Gaussians of %r%s",
+                "step %d: pruning takes %d of %d Gaussians of %r%s",
                 trainer.global_step, selection.removed, len(selection.keep), name,
-                " (K_min holds)" if selection.floor_hit else "",
+                " (a floor holds)" if selection.floor_hit else "",
             )  # fmt: skip
             if selection.removed:
                 resize_rows(trainer, pl_module, name, selection.plan(), REASON)

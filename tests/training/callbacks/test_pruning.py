@@ -8,17 +8,17 @@ import torch
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
-from sparsestreet.pruning import ImportanceRule, Look
+from sparsestreet.pruning import ImportanceRule, Look, PruningRule
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import SceneState
-from sparsestreet.training.callbacks import BackgroundPruning
+from sparsestreet.training.callbacks import Pruning
 from sparsestreet.types import Frame
 from tests.training.stubs import Listener, StubTrainer, background, frame_at, labels, make_system, rigid, set_rows
 
 
-class AskedRule:
+class AskedRule(PruningRule):
     """Writes down what it is asked, and answers what it was told to."""
 
     def __init__(self, answer: dict[str, Selection] | None = None) -> None:
@@ -40,7 +40,7 @@ def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_t
     rule, data = AskedRule(), street_data()
     options = RenderOptions(SplatSettings(near_plane=0.3), "reference")
     system = make_system({"background": background()}, options=options, sh_interval=0.3)
-    trainer = StubTrainer(system, [BackgroundPruning([0.2, 0.55, 1.0], rule)], max_steps=20)
+    trainer = StubTrainer(system, [Pruning([0.2, 0.55, 1.0], rule)], max_steps=20)
     trainer.datamodule = data
     steps = []
     for step in range(1, 21):
@@ -62,7 +62,7 @@ def test_the_rows_that_the_rule_names_go_with_their_moments(caplog):
     answer = {"background": Selection(keep, floor_hit=True, removed=2), "rigid": Selection(kept, False, 0)}
     nodes = {"background": background(5), "rigid": rigid(4), "rest": background(3)}
     listener = Listener()
-    trainer = StubTrainer(make_system(nodes), [BackgroundPruning([0.03], AskedRule(answer)), listener])
+    trainer = StubTrainer(make_system(nodes), [Pruning([0.03], AskedRule(answer)), listener])
     trainer.train(2, frame_at())
     moments = trainer.optimizers[0].state[nodes["background"].rows.means]["exp_avg"].clone()
     means = nodes["rigid"].rows.means
@@ -71,10 +71,10 @@ def test_the_rows_that_the_rule_names_go_with_their_moments(caplog):
     assert labels(nodes["background"]) == [0, 2, 3]
     assert torch.equal(trainer.optimizers[0].state[nodes["background"].rows.means]["exp_avg"], moments[[0, 2, 3]])
     assert nodes["rigid"].rows.means is means
-    assert listener.reasons == [(3, "background", "background pruning")]
+    assert listener.reasons == [(3, "background", "pruning")]
     assert caplog.messages == [
-        "step 3: background pruning takes 2 of 5 Gaussians of 'background' (K_min holds)",
-        "step 3: background pruning takes 0 of 4 Gaussians of 'rigid'",
+        "step 3: pruning takes 2 of 5 Gaussians of 'background' (a floor holds)",
+        "step 3: pruning takes 0 of 4 Gaussians of 'rigid'",
     ]
 
 
@@ -85,7 +85,7 @@ def test_with_the_papers_rule_what_no_training_view_draws_goes():
         set_rows(node, "opacity_logits", dict.fromkeys(range(len(node.rows)), 2.0))
         with torch.no_grad():
             node.rows.means[3, 2] = -5.0
-    trainer = StubTrainer(make_system(nodes), [BackgroundPruning([0.01], ImportanceRule(gate=False))])
+    trainer = StubTrainer(make_system(nodes), [Pruning([0.01], ImportanceRule(gate=False))])
     trainer.datamodule = street_data()
     trainer.walk(1)
     assert labels(nodes["background"]) == [0, 1, 2, 4, 5]

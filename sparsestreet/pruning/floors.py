@@ -1,0 +1,68 @@
+"""What pruning must leave: K_min of a node, and for each of its instances a number that follows from its area."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sparsestreet.scene.gaussians import InstanceFloors
+from sparsestreet.scene.nodes import Node
+from sparsestreet.types import Contribution
+
+
+class Floors(NamedTuple):
+    """What must stay of a node, as ``keep_best`` takes it."""
+
+    min_gaussians: int
+    instances: InstanceFloors | None = None
+
+
+class InstanceAreas:
+    """Accumulates, view by view, the largest area that each instance of some nodes fills, and answers their floors.
+
+    The area is the sum of the blend weights of the instance's rows over the pixels: what is drawn of it, in pixels, in
+    front of what stands behind it. An object that is hidden, far or transparent in all views fills little and keeps
+    little; one that fills anything keeps at least one row.
+    """
+
+    def __init__(self, nodes: Mapping[str, Node]) -> None:
+        self._nodes = dict(nodes)
+        objects = {name: node.instances() for name, node in nodes.items() if node.settings.min_instance_gaussians > 0}
+        self._instances = {name: instances for name, instances in objects.items() if instances is not None}
+        self._pixels: dict[str, Tensor] = {
+            name: torch.zeros(len(each.names), dtype=torch.float64, device=each.ids.device)
+            for name, each in self._instances.items()
+        }
+
+    @property
+    def needed(self) -> bool:
+        """Whether any instance has a floor of its own."""
+        return bool(self._instances)
+
+    def add(self, view: Contribution, spans: Mapping[str, slice]) -> None:
+        """Count one view of the whole scene in; ``spans``: name of a node -> its rows."""
+        for name, instances in self._instances.items():
+            largest = self._pixels[name]
+            filled = torch.zeros_like(largest).index_add(0, instances.ids, view.weight[spans[name]].to(largest))
+            self._pixels[name] = torch.maximum(largest, filled)
+
+    def floors(self) -> dict[str, Floors]:
+        """Name of every node -> its floors. Raises ValueError for an area that is no number."""
+        return {
+            name: Floors(node.settings.min_gaussians, self._of_instances(name)) for name, node in self._nodes.items()
+        }
+
+    def _of_instances(self, name: str) -> InstanceFloors | None:
+        instances = self._instances.get(name)
+        if instances is None:
+            return None
+        pixels = self._pixels[name]
+        if not pixels.isfinite().all():
+            index = int((~pixels.isfinite()).nonzero()[0])
+            raise ValueError(
+                f"an instance fills a finite number of pixels, but {instances.names[index]!r} of node {name!r} fills "
+                f"{float(pixels[index])}: look for NaN in its Gaussians before pruning"
+            )
+        least = (self._nodes[name].settings.min_instance_gaussians * pixels / 1000).ceil().long()
+        return InstanceFloors(instances.ids, torch.minimum(least, instances.counts()))
