@@ -59,7 +59,7 @@ class SceneGraph(nn.Module):
         return {
             f"{name}/{term}": value
             for name, node in self.nodes.items()
-            for term, value in node.regularizers(parts[name], state).items()
+            for term, value in node.all_regularizers(parts[name], state).items()
         }
 
     def learning_rates(self) -> dict[str, LearningRate]:

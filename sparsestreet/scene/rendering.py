@@ -17,6 +17,17 @@ from sparsestreet.types import Camera, Rendering, View
 
 
 @dataclass(frozen=True)
+class RenderOptions:
+    """How a scene is rendered; training, pruning and evaluation take the same."""
+
+    settings: SplatSettings = field(default_factory=SplatSettings)
+    backend: str = "auto"
+
+
+DEFAULT_OPTIONS = RenderOptions()
+
+
+@dataclass(frozen=True)
 class SceneRendering:
     """An image of the scene and what losses, density control and pruning need to know about it."""
 
@@ -32,17 +43,9 @@ class SceneRendering:
     """Name of a node -> its rows in ``splats``."""
     parts: dict[str, RawGaussians]
     """Name of a node -> what it answered for the view, before activation."""
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """How a scene is rendered; training, pruning and evaluation take the same."""
-
-    settings: SplatSettings = field(default_factory=SplatSettings)
-    backend: str = "auto"
-
-
-DEFAULT_OPTIONS = RenderOptions()
+    state: SceneState = FINISHED
+    options: RenderOptions = DEFAULT_OPTIONS
+    """How it was rendered."""
 
 
 def render(
@@ -56,7 +59,7 @@ def render(
             splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
         with phase("sky"):
             rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options)
-        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts)
+        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts, state, options)
 
 
 def sky_image(scene: SceneGraph, camera: Camera) -> Float[Tensor, "h w 3"] | None:

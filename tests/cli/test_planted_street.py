@@ -24,7 +24,7 @@ from sparsestreet.scene.nodes import Background
 from sparsestreet.scene.rendering import RenderOptions, sky_image
 from sparsestreet.scene.storage import StoredScene, load_scene
 from sparsestreet.training.callbacks import MaskTraining, Pruning
-from sparsestreet.training.losses import InverseDepth, MaskSparsity, Photometric, SkyMask
+from sparsestreet.training.losses import Depth, MaskSparsity, Photometric, SkyMask
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
@@ -115,7 +115,7 @@ def _prune(stored: StoredScene, data: StreetData, rows: Rows, *, lambda_m: float
     columns = dict(rows.named_parameters()) | logits
     node = Background(settings, Rows(columns, {"numbers": torch.arange(len(rows))}, transient=logits), mask)
     scene.nodes["background"] = node
-    terms = (Photometric(), SkyMask(), InverseDepth(), MaskSparsity(lambda_m))
+    terms = (Photometric(), SkyMask(), Depth(), MaskSparsity(lambda_m))
     losses = {type(term).__name__: term for term in terms}
     system = StreetSystem(scene, losses, OptimizerSettings(), radius=data.driving_log.radius, options=stored.options)
     trainer = Trainer(

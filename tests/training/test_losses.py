@@ -13,7 +13,7 @@ from sparsestreet.ops.ssim import ssim
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.rendering import SceneRendering
-from sparsestreet.training.losses import InverseDepth, Loss, MaskSparsity, Photometric, SkyMask
+from sparsestreet.training.losses import Depth, Loss, MaskSparsity, Photometric, SkyMask
 from sparsestreet.types import Frame, Rendering
 from tests.training.stubs import background, frame_at, rigid, set_rows
 
@@ -178,7 +178,7 @@ def test_depth_compares_only_measured_pixels():
     measured = torch.zeros(HEIGHT, WIDTH)
     measured[2, 3], measured[5, 5], measured[7, 7] = 4.0, 200.0, 0.1
     depth = torch.full((HEIGHT, WIDTH), 2.0, requires_grad=True)
-    loss = InverseDepth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
+    loss = Depth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
     assert loss.item() == pytest.approx(0.5 * abs(1 / 2 - 1 / 4))
     loss.backward()
     assert torch.nonzero(depth.grad).tolist() == [[2, 3]]
@@ -191,7 +191,7 @@ def test_depth_leaves_out_measured_pixels_in_which_nothing_is_rendered():
     depth = torch.full((HEIGHT, WIDTH), 2.0)
     depth[6, 8] = 0.0
     depth.requires_grad_()
-    loss = InverseDepth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
+    loss = Depth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
     assert loss.item() == pytest.approx(0.5 * (1 / 2 - 1 / 4))  # the mean of one pixel, not of two
     loss.backward()
     assert bool(depth.grad.isfinite().all())
@@ -210,7 +210,7 @@ def test_depth_limits_by_numpy(generator):
         for rendered, lidar in zip(depth.flatten().tolist(), measured.flatten().tolist(), strict=True)
         if 2.0 < lidar < 9.0 and rendered > 2.0
     ]
-    loss = InverseDepth(weight=0.25, nearest=2.0, farthest=9.0)(rendering(depth=depth), seen, SCENE)
+    loss = Depth(weight=0.25, nearest=2.0, farthest=9.0)(rendering(depth=depth), seen, SCENE)
     assert loss.item() == pytest.approx(0.25 * sum(terms) / len(terms), rel=1e-6)  # lidar is float32
 
 
@@ -218,13 +218,13 @@ def test_depth_gradient_equals_finite_differences(generator):
     depth = 2 + 10 * torch.rand(HEIGHT, WIDTH, generator=generator)
     measured = torch.rand(HEIGHT, WIDTH, generator=generator) * 12
     check_gradient(
-        lambda values: InverseDepth(weight=0.7)(rendering(depth=values), frame(depth=measured), SCENE), depth, generator
+        lambda values: Depth(weight=0.7)(rendering(depth=values), frame(depth=measured), SCENE), depth, generator
     )
 
 
 def test_depth_of_an_image_without_returns_is_zero():
     depth = torch.ones(HEIGHT, WIDTH, requires_grad=True)
-    loss = InverseDepth()(rendering(depth=depth), frame(depth=torch.zeros(HEIGHT, WIDTH)), SCENE)
+    loss = Depth()(rendering(depth=depth), frame(depth=torch.zeros(HEIGHT, WIDTH)), SCENE)
     loss.backward()
     assert loss.item() == 0.0
     assert bool((depth.grad == 0).all())
@@ -234,7 +234,7 @@ def test_depth_of_an_image_without_returns_is_zero():
     ("loss", "without", "known"),
     [
         (SkyMask(), False, {"sky": torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)}),
-        (InverseDepth(), False, {"depth": torch.zeros(HEIGHT, WIDTH)}),
+        (Depth(), False, {"depth": torch.zeros(HEIGHT, WIDTH)}),
         (Photometric(), True, {}),
         (MaskSparsity(), True, {}),
     ],

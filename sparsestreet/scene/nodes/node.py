@@ -18,6 +18,7 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import Mask, MaskScope, MaskSettings
+from sparsestreet.scene.nodes.regularizers import sharp_shape
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Gaussians, Track, View
 
@@ -54,6 +55,10 @@ class NodeSettings(ABC):
     """None: the node keeps the Gaussians it starts with."""
     prunable: bool
     """Whether pruning rules may take Gaussians of this node."""
+    sharp_shape: float = 0.0
+    """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: it is not computed."""
+    max_axis_ratio: float = 10.0
+    """Ratio of a Gaussian's longest to its shortest axis from which that term counts."""
     learning_rates: Mapping[str, LearningRate]
     """Column, parameter or module of the node -> its rate; the longest name that matches wins."""
 
@@ -63,6 +68,11 @@ class NodeSettings(ABC):
         if not self.min_instance_gaussians >= 0:
             raise ValueError(
                 f"min_instance_gaussians must be >= 0 Gaussians per 1,000 pixels, got {self.min_instance_gaussians}"
+            )
+        if not (self.sharp_shape >= 0 and self.max_axis_ratio >= 1):
+            raise ValueError(
+                f"sharp_shape is a weight >= 0 and max_axis_ratio a ratio >= 1, got {self.sharp_shape} and "
+                f"{self.max_axis_ratio}"
             )
         if self.max_gaussians is not None and self.max_gaussians < max(self.min_gaussians, 1):
             raise ValueError(
@@ -176,6 +186,15 @@ class Node(nn.Module, ABC):
         ``raw`` is what the node answered for the view of this step, so that nothing need be computed twice.
         """
         return {}
+
+    def all_regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """``regularizers``, and the terms that every node has whose settings give them a weight."""
+        settings = self.settings
+        shape = {}
+        if settings.sharp_shape > 0:
+            # The mask is applied at activation: what it hides has its shape here.
+            shape["sharp_shape"] = settings.sharp_shape * sharp_shape(self.rows.log_scales, settings.max_axis_ratio)
+        return shape | self.regularizers(raw, state)
 
     def outside(self) -> Bool[Tensor, " n"] | None:
         """Rows that left the bounds of their instance; None for a node without bounds."""

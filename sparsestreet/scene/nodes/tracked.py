@@ -19,6 +19,8 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
+from sparsestreet.scene.nodes.regularizers import temporal_smoothness
+from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Track, View
 
 
@@ -33,6 +35,14 @@ class TrackedSettings(NodeSettings):
     initial_opacity: float = 0.1
     max_gap: int = 2
     """Frames; an object is present within its span up to this far from a training annotation."""
+    temporal_smooth: float = 0.0
+    """Weight of the term that keeps the learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: it is not
+    computed."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.temporal_smooth >= 0:
+            raise ValueError(f"temporal_smooth is a weight >= 0, got {self.temporal_smooth}")
 
     @property
     @abstractmethod
@@ -164,6 +174,13 @@ class Tracked(Node):
     def pose_at(self, time: float) -> Poses:
         """Pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
+
+    def all_regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        terms, weight = super().all_regularizers(raw, state), self.settings.temporal_smooth
+        if weight > 0:
+            learned = self.keyframe_translations + self.translation_deltas
+            terms["temporal_smooth"] = weight * temporal_smoothness(self.keyframe_times, learned, self.keyframe_valid)
+        return terms
 
     @property
     def keyframes(self) -> Trajectories:

@@ -1,4 +1,4 @@
-"""Rendered depth against lidar: L1 of the inverse depth over the pixels with a return."""
+"""Rendered depth against lidar: L1 over the pixels with a return."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,12 @@ from sparsestreet.types import Frame
 
 
 @dataclass(frozen=True)
-class InverseDepth:
-    """Inverse depth bounds the pull of far and wrong returns (DriveStudio's legacy presets)."""
+class Depth:
+    """The inverse depth bounds the pull of far and wrong returns (DriveStudio's legacy presets)."""
 
     weight: float = 0.1
+    inverse: bool = True
+    """False: the depth itself, in meters (its current presets, with weight 0.01)."""
     nearest: float = 0.5
     farthest: float = 80.0
     """Returns outside [nearest, farthest] meters are left out."""
@@ -27,5 +29,6 @@ class InverseDepth:
         measured, rendered = frame.depth, rendering.depth
         valid = (measured > self.nearest) & (measured < self.farthest) & (rendered > self.nearest)
         # Over all pixels, because picking the valid ones would wait for a device; 1 m stands where none is.
-        error = (1 / torch.where(valid, rendered, 1.0) - 1 / torch.where(valid, measured, 1.0)).abs()
-        return self.weight * (error.sum() / valid.sum().clamp(min=1))
+        rendered, measured = torch.where(valid, rendered, 1.0), torch.where(valid, measured, 1.0)
+        error = 1 / rendered - 1 / measured if self.inverse else rendered - measured
+        return self.weight * (error.abs().sum() / valid.sum().clamp(min=1))

@@ -1,0 +1,180 @@
+"""Terms that keep Gaussians and tracks in shape: by hand, by loops, by finite differences."""
+
+import math
+
+import pytest
+import torch
+
+from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes.regularizers import sharp_shape, temporal_smoothness
+from sparsestreet.scene.state import SceneState
+from tests.scene.street import background, random_rows, rigid, rigid_settings, static_mask, view_at
+
+
+def test_sharp_shape_by_hand():
+    scales = torch.tensor([[1.0, 0.01, 0.1], [0.2, 0.2, 0.2], [0.5, 0.06, 0.4], [2.0, 0.1, 1.0]], dtype=torch.float64)
+    # Ratios 100, 1, 8.3 and 20.
+    expected = (math.log(100 / 10) + math.log(20 / 10)) / 4
+    assert sharp_shape(scales.log(), 10.0).item() == pytest.approx(expected)
+
+
+def test_gradient_of_sharp_shape_in_float64():
+    log_scales = torch.randn(12, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2
+    log_scales[0] = 0.0  # a ball: all axes are longest and shortest
+    assert torch.autograd.gradcheck(lambda values: sharp_shape(values, 3.0), log_scales.requires_grad_())
+
+
+@pytest.mark.parametrize("log_scale", [-200.0, 200.0])
+def test_needles_and_flat_gaussians_have_a_finite_term(log_scale):
+    """exp of these is 0 or infinite in float32."""
+    log_scales = torch.tensor([[0.0, 1.0, log_scale]], requires_grad=True)
+    sharp_shape(log_scales, 10.0).backward()
+    assert bool(log_scales.grad.isfinite().all())
+    assert float(log_scales.grad.abs().sum()) == 2
+
+
+def test_no_gaussians_no_term():
+    assert sharp_shape(torch.zeros(0, 3), 10.0).item() == 0
+
+
+def by_loops(times, translations, valid) -> float:
+    bends = []
+    for track, at, known in zip(translations, times, valid, strict=True):
+        for middle in range(len(track)):
+            for distance in range(1, 6):
+                before, after = middle - distance, middle + distance
+                if before < 0 or after >= len(track) or not (known[before] and known[middle] and known[after]):
+                    continue
+                share = (at[middle] - at[before]) / (at[after] - at[before])
+                line = (1 - share) * track[before] + share * track[after]
+                bends += (2 * (track[middle] - line)).abs().tolist()
+    return sum(bends) / max(len(bends), 1)
+
+
+def tracks(count: int = 9, *, known: tuple[int, ...] = (9, 4, 1, 0)) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Unevenly spaced keyframes of four objects, of which the later have fewer."""
+    generator = torch.Generator().manual_seed(0)
+    times = torch.rand(len(known), count, generator=generator, dtype=torch.float64).cumsum(1)
+    valid = torch.arange(count) < torch.tensor(known)[:, None]
+    translations = torch.randn(len(known), count, 3, generator=generator, dtype=torch.float64)
+    return torch.where(valid, times, 0.0), translations, valid
+
+
+def test_smoothness_of_tracks_is_the_mean_over_all_neighbors():
+    times, translations, valid = tracks()
+    assert temporal_smoothness(times, translations, valid).item() == pytest.approx(by_loops(times, translations, valid))
+
+
+def test_evenly_spaced_it_is_the_second_difference():
+    times = torch.tensor([[0.0, 0.5, 1.0]])
+    translations = torch.tensor([[[0.0, 0.0, 1.0], [2.0, 0.0, 1.0], [1.0, 3.0, 1.0]]])
+    # |0 + 1 - 2 * 2| and |0 + 3 - 0|, over three coordinates.
+    assert temporal_smoothness(times, translations, torch.ones(1, 3, dtype=torch.bool)).item() == pytest.approx(6 / 3)
+
+
+def test_constant_velocity_costs_nothing_where_frames_are_held_out():
+    times = torch.tensor([[0.0, 0.1, 0.3, 0.4, 0.9]])
+    translations = 5 * times[..., None] * torch.tensor([1.0, -2.0, 0.5]) + 7
+    bend = temporal_smoothness(times, translations, torch.ones(1, 5, dtype=torch.bool))
+    assert bend.item() == pytest.approx(0, abs=1e-5)  # of meters around 10 in float32
+
+
+def test_only_the_keyframe_in_the_middle_moves():
+    times, valid = torch.tensor([[0.0, 0.5, 1.0]]), torch.ones(1, 3, dtype=torch.bool)
+    translations = torch.tensor([[[0.0] * 3, [2.0] * 3, [1.0] * 3]], requires_grad=True)
+    temporal_smoothness(times, translations, valid).backward()
+    assert translations.grad[0, :, 0].tolist() == pytest.approx([0.0, 2 / 3, 0.0])
+
+
+def test_gradient_of_smoothness_in_float64():
+    times, translations, valid = tracks()
+    fixed = translations.clone()
+    translations.requires_grad_()
+    (gradient,) = torch.autograd.grad(temporal_smoothness(times, translations, valid), translations)
+
+    def bend(moved: torch.Tensor, middle: int) -> float:
+        """Only the terms that have this keyframe in the middle: its neighbors stand still in them."""
+        rest = fixed.clone()
+        rest[:, middle] = moved[:, middle]
+        return sum(each.item() for each in of_middle(times, rest, valid, middle))
+
+    def of_middle(times, translations, valid, middle):
+        for distance in range(1, 6):
+            before, after = middle - distance, middle + distance
+            if before >= 0 and after < times.shape[1]:
+                known = valid[:, before] & valid[:, middle] & valid[:, after]
+                share = ((times[:, middle] - times[:, before]) / (times[:, after] - times[:, before]))[known, None]
+                line = (1 - share) * translations[known, before] + share * translations[known, after]
+                yield (2 * (translations[known, middle] - line)).abs().sum() / 3
+
+    triples = sum(
+        bool(valid[i, m]) and m - d >= 0 and m + d < 9 and bool(valid[i, m + d])
+        for i in range(4)
+        for m in range(9)
+        for d in range(1, 6)
+    )
+    for middle in range(9):
+        step = torch.zeros_like(fixed)
+        step[:, middle] = torch.randn(4, 3, generator=torch.Generator().manual_seed(middle), dtype=torch.float64)
+        slope = (bend(fixed + 1e-7 * step, middle) - bend(fixed - 1e-7 * step, middle)) / 2e-7 / triples
+        assert (gradient * step).sum().item() == pytest.approx(slope, abs=1e-8)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_tracks_too_short_for_three_keyframes(count):
+    times, valid = torch.zeros(2, count), torch.ones(2, count, dtype=torch.bool)
+    assert temporal_smoothness(times, torch.zeros(2, count, 3), valid).item() == 0
+
+
+def curved() -> Trajectories:
+    times = torch.tensor([[0.0, 0.5, 1.0]])
+    translations = torch.tensor([[[0.0, 0.0, 0.0], [2.0, 1.0, 0.0], [3.0, 0.0, 0.0]]])
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(1, 3, 4).clone()
+    return Trajectories(times, identity, translations, torch.ones(1, 3, dtype=torch.bool), torch.tensor([[0.0, 1.0]]))
+
+
+def test_nodes_have_the_terms_that_their_settings_weigh():
+    instances = torch.zeros(6, dtype=torch.long)
+    road = background(random_rows(8, 0), sharp_shape=0.5, max_axis_ratio=2.0)
+    cars = rigid(random_rows(6, 1, instances=instances), curved(), temporal_smooth=0.01, names=["car"])
+    plain = rigid(random_rows(6, 1, instances=instances), curved(), names=["car"])
+    scene, state = SceneGraph({"road": road, "cars": cars, "plain": plain}), SceneState()
+    parts = {name: node.raw_at(view_at(0.5), state) for name, node in scene.nodes.items()}
+    terms = scene.regularizers(parts, state)
+    assert set(terms) == {"road/sharp_shape", "cars/temporal_smooth"}
+    assert terms["road/sharp_shape"].item() == pytest.approx(0.5 * sharp_shape(road.rows.log_scales, 2.0).item())
+    # |0 + 3 - 4| and |0 + 0 - 2| over three coordinates.
+    assert terms["cars/temporal_smooth"].item() == pytest.approx(0.01 * 3 / 3)
+    sum(terms.values()).backward()
+    assert float(road.rows.log_scales.grad.abs().sum()) > 0
+    # Learned corrections, not annotations, are pulled straight.
+    assert cars.translation_deltas.grad[0, :, :2].tolist() == [
+        [0, 0],
+        pytest.approx([0.01 * 2 / 3, 0.01 * 2 / 3]),
+        [0, 0],
+    ]
+
+
+def test_a_masked_gaussian_keeps_its_shape_in_the_term():
+    mask = static_mask()
+    rows = random_rows(4, 0, mask=mask)
+    node = background(rows, mask, sharp_shape=1.0, max_axis_ratio=1.5)
+    state = SceneState()
+    before = node.all_regularizers(node.raw_at(view_at(0.0), state), state)["sharp_shape"].item()
+    with torch.no_grad():
+        rows.mask_logits.fill_(-20.0)
+    term = node.all_regularizers(node.raw_at(view_at(0.0), state), state)["sharp_shape"]
+    term.backward()
+    assert term.item() == before > 0
+    assert bool(rows.log_scales.grad.isfinite().all())
+
+
+def test_impossible_weights_are_refused():
+    rows = random_rows(2, 0)
+    with pytest.raises(ValueError, match=r"got -1\.0 and 10\.0"):
+        background(rows, sharp_shape=-1.0)
+    with pytest.raises(ValueError, match=r"ratio >= 1, got 0\.0 and 0\.5"):
+        background(rows, max_axis_ratio=0.5)
+    with pytest.raises(ValueError, match="temporal_smooth is a weight"):
+        rigid_settings(temporal_smooth=-0.1)
