@@ -19,7 +19,7 @@ from sparsestreet.types import Frame
 class CountRule(PruningRule):
     """A given number of rows stays of each node, those of the highest score; more where a floor asks for more."""
 
-    keep: float | Mapping[str, float]
+    keep: int | float | Mapping[str, int | float]
     """Of each node alike, or by its name (a node without number keeps all): up to 1 a fraction of the rows that it has
     before the pass, above 1 their number."""
 
@@ -43,7 +43,7 @@ class CountRule(PruningRule):
             selections[name] = keep_best(scores, unwanted, *floors)
         return selections
 
-    def _numbers(self) -> Sequence[float]:
+    def _numbers(self) -> Sequence[int | float]:
         return tuple(self.keep.values()) if isinstance(self.keep, Mapping) else (self.keep,)
 
     def _count(self, name: str, rows: int) -> int:

@@ -186,3 +186,38 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
     assert ("mask" in reasons) == (sparsify in ("masks", "paper", "removal"))
     assert ("pruning" in reasons) == (sparsify not in ("none", "masks"))
     assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["global_step"] == 20
+
+
+BASELINE_TERMS = [
+    "loss=[photometric,sky,depth,opacity_entropy,inverse_depth_smoothness,dynamic_region]",
+    "loss.depth.inverse=false",
+    "loss.depth.weight=0.01",
+    "node.background.sharp_shape=0.1",
+    "node.rigid.sharp_shape=0.1",
+    "node.rigid.temporal_smooth=0.01",
+]
+
+
+def test_the_terms_of_the_baselines_are_options():
+    losses = recipe_of(composed(*BASELINE_TERMS)).losses
+    dynamic = losses.pop("dynamic_region")
+    assert (dynamic.weight, dynamic.threshold, dynamic.from_progress) == (1.0, 0.2, 0.6666)
+    assert {name: loss.weight for name, loss in losses.items()} == {
+        "photometric": 1.0,
+        "sky": 0.05,
+        "depth": 0.01,
+        "opacity_entropy": 0.05,
+        "inverse_depth_smoothness": 0.001,
+    }
+    assert not losses["depth"].inverse
+
+
+def test_the_terms_of_the_baselines_train_and_a_control_prunes_every_node(run_train, tmp_path):
+    """All terms in one run, the dynamic region in its last third, and pruning to given numbers."""
+    counts = "callback.pruning.rule.keep={background: 500, rigid: 0.5}"
+    out = run_train(tmp_path, *BASELINE_TERMS, "sparsify=random", counts, "trainer.fast_dev_run=6")
+    with (out / "records" / "counts.csv").open() as file:
+        pruned = {row["node"]: row for row in csv.DictReader(file) if row["reason"] == "pruning"}
+    assert pruned["background"]["after"] == "500"
+    # Objects have floors of their own.
+    assert 0.5 * int(pruned["rigid"]["before"]) <= int(pruned["rigid"]["after"]) < int(pruned["rigid"]["before"])

@@ -30,9 +30,6 @@ def street() -> SceneGraph:
     ],
 )
 def test_so_many_stay(make, keep, kept):
-    keep = float(keep) if isinstance(keep, int) else keep
-    if isinstance(keep, dict):
-        keep = {name: float(value) for name, value in keep.items()}
     selections = make(keep=keep).select(street(), [], Look())
     assert {name: int(each.keep.sum()) for name, each in selections.items()} == kept
     assert not any(each.floor_hit for each in selections.values())
