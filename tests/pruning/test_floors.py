@@ -59,15 +59,15 @@ def frame(width: int = 48, offset: float = 0.0) -> Frame:
 
 
 def test_the_area_is_the_most_pixels_that_an_instance_fills():
-    areas = InstanceAreas({"cars": objects(2)})
+    areas = InstanceAreas({"cars": objects(2, density=60.0)})
     assert areas.needed
     spans = {"road": slice(0, 1), "cars": slice(1, 7)}
     for weights in ([9.0, 10.0, 5.0, 0.0, 1.5, 0.0, 0.0], [9.0, 1.0, 4.0, 2.0, 20.0, 0.0, 0.0]):
         weight = torch.tensor(weights, dtype=torch.float64)
         areas.add(Contribution(weight, torch.ones(7, dtype=torch.long), torch.ones(7, dtype=torch.long)), spans)
     floors = areas.floors()["cars"].instances
-    # 15 and 5 pixels, 1.5 and 22, none; 100 Gaussians per 1,000.
-    assert floors.least.tolist() == [2, 2, 0]
+    # 15 and 5 pixels, 1.5 and 22, none; 60 Gaussians per 1,000.
+    assert floors.least.tolist() == [1, 2, 0]
 
 
 def test_no_more_than_an_instance_has():
