@@ -28,6 +28,8 @@ def toy_run(tiny_street, tmp_path_factory) -> Path:
             f"hydra.searchpath=[file://{CONF}]",
             "node=[background,bobbing]",
             "sparsify=paper",
+            # The paper's rule takes from the background alone.
+            "callback.pruning.rule.nodes=null",
             "schedule.mask_learning_rate=0.25",
             "schedule.lambda_m=30.0",
             f"out={out}",
