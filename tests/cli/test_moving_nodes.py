@@ -15,13 +15,9 @@ pytestmark = pytest.mark.xdist_group("tiny street")
 
 def trained(tiny_street: list[str], out: Path, *overrides: str) -> tuple[SceneGraph, list[dict[str, str]]]:
     """The scene of a run, and its curves."""
-    assert train([*tiny_street, "method=3dgs", "trainer.log_every_n_steps=1", f"out={out}", *overrides]) == 0
+    assert train([*tiny_street, "trainer.log_every_n_steps=1", f"out={out}", *overrides]) == 0
     with (out / "curves" / "metrics.csv").open() as file:
         return load_scene(out).scene, list(csv.DictReader(file))
-
-
-def in_place_of_background(tiny_street: list[str], name: str) -> list[str]:
-    return [*(word.replace("node.background", f"node.{name}") for word in tiny_street), f"node=[{name}]"]
 
 
 def of_steps(curves: list[dict[str, str]], name: str) -> list[float]:
@@ -30,12 +26,12 @@ def of_steps(curves: list[dict[str, str]], name: str) -> list[float]:
 
 def test_a_vibrating_street(tiny_street, tmp_path):
     """Its loss falls, its times and velocities are learned, and it grows where and when images ask for it."""
-    thresholds = ["node.vibrating.density.grad_threshold=1e9", "node.vibrating.density.peak_threshold=1e-4"]
-    scene, curves = trained(in_place_of_background(tiny_street, "vibrating"), tmp_path / "run", *thresholds)
-    node = scene.nodes["vibrating"]
+    thresholds = ["node.background.density.grad_threshold=1e9", "node.background.density.peak_threshold=1e-4"]
+    scene, curves = trained(tiny_street, tmp_path / "run", "method=pvg", *thresholds)
+    node = scene.nodes["background"]
     losses = of_steps(curves, "train/photometric")
     assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
-    assert of_steps(curves, "train/vibrating/velocity")[-1] > 0
+    assert of_steps(curves, "train/background/velocity")[-1] > 0
     assert node.rows.velocities.any()
     assert len(node.rows.log_life_spans.unique()) > 100
     with (tmp_path / "run" / "records" / "counts.csv").open() as file:
@@ -46,9 +42,8 @@ def test_a_vibrating_street(tiny_street, tmp_path):
 
 def test_a_street_deformed_by_a_network(tiny_street, tmp_path):
     """Its loss falls, and what moves is learned from the time on at which it begins."""
-    street = in_place_of_background(tiny_street, "field")
-    scene, curves = trained(street, tmp_path / "run", "node.field.deform_from=0.5")
-    node = scene.nodes["field"]
+    scene, curves = trained(tiny_street, tmp_path / "run", "method=deformgs", "node.background.deform_from=0.5")
+    node = scene.nodes["background"]
     losses = of_steps(curves, "train/photometric")
     assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
     assert node.network.last.weight.any()
@@ -60,6 +55,7 @@ def test_objects_deformed_by_a_network(tiny_street, tmp_path):
     scene, curves = trained(
         tiny_street,
         tmp_path / "run",
+        "method=3dgs",
         "node=[background,deformable]",
         "sparsify=masks",
         "node.deformable.posed=null",

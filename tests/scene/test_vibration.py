@@ -35,17 +35,22 @@ def test_who_lives_long_goes_nowhere():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_faded_logit_gives_the_product(dtype: torch.dtype):
-    """sigmoid(l) g from numpy's longdouble; float32 loses no more than it loses to the logit itself."""
+    """sigmoid(l) g, and what it lacks of 1, from numpy's longdouble: neither loses digits to the other."""
     logits = torch.tensor([-15.0, -4.0, 0.0, 3.0, 12.0, 15.0], dtype=dtype)[:, None]
     factors = torch.tensor([0.05, 0.3, 0.999, 1 - 1e-6, 1.0], dtype=dtype)
-    made = torch.sigmoid(faded_logits(logits.expand(6, 5).flatten(), factors.log().expand(6, 5).flatten()))
-    product = factors.numpy().astype(np.longdouble) / (1 + np.exp(-logits.numpy().astype(np.longdouble)))
-    epsilon = torch.finfo(dtype).eps
-    np.testing.assert_allclose(made.double().numpy(), product.astype(np.float64).ravel(), rtol=30 * epsilon, atol=0)
+    made = faded_logits(logits.expand(6, 5).flatten(), factors.log().expand(6, 5).flatten()).double()
+    opacity = 1 / (1 + np.exp(-logits.numpy().astype(np.longdouble)))
+    lacking = 1 - opacity + opacity * (1 - factors.numpy().astype(np.longdouble))
+    bound = 60 * torch.finfo(dtype).eps  # a logit is up to 18, and rounded once in each of three steps
+    product = (opacity * factors.numpy()).ravel().astype(np.float64)
+    np.testing.assert_allclose(torch.sigmoid(made).numpy(), product, rtol=bound, atol=0)
+    # Torch's log1p of a double of 3e-7 is right to 2e-13.
+    lacked = lacking.ravel().astype(np.float64)
+    np.testing.assert_allclose(torch.sigmoid(-made).numpy(), lacked, rtol=max(bound, 1e-12), atol=0)
 
 
 def test_gradients_of_a_faded_logit_are_finite_at_the_ends_and_those_of_finite_differences():
-    logits = torch.tensor([-100.0, -15.0, 15.0, 100.0, 0.3], requires_grad=True)
+    logits = torch.tensor([-1e4, -15.0, 15.0, 1e4, 0.3], requires_grad=True)
     logs = torch.tensor([0.0, -3.0, 0.0, -1e-7, -0.5], requires_grad=True)
     faded_logits(logits, logs).sum().backward()
     assert logits.grad.isfinite().all()

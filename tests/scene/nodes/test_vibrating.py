@@ -91,6 +91,7 @@ def test_the_swing_repeats_with_the_cycle_and_a_finished_scene_is_not_smoothed()
     node = vibrating(smoothing_probability=1.0)
     first, again, between = (node.gaussians_at(view_at(time), FINISHED).means for time in (0.1, 0.1 + 1 / 3, 0.2))
     torch.testing.assert_close(first, again, rtol=0, atol=1e-5)
+    torch.testing.assert_close(first.double(), by_hand(node, 0.1)[0], rtol=0, atol=1e-5)
     assert not torch.allclose(first, between, atol=0.1)
 
 
