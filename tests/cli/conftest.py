@@ -1,5 +1,6 @@
 """A street small enough that a training takes seconds."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -41,15 +42,31 @@ TINY_RIGID = [
 ]
 
 
+TINY_PEOPLE = [
+    "node.smpl.body.num_vertices=500",
+    "node.smpl.min_gaussians=50",
+    "node.deformable.points_per_instance=100",
+    "node.deformable.min_gaussians=50",
+]
+TINY_NODES = {"streetgs": TINY_RIGID, "omnire": [*TINY_RIGID, *TINY_PEOPLE]}
+"""Method -> what makes its nodes of objects small."""
+
+
+def method_of(overrides: Sequence[str]) -> str:
+    """That of a command: StreetGS unless another is named."""
+    named = [word.partition("=")[2] for word in overrides if word.startswith("method=")]
+    return named[0] if named else "streetgs"
+
+
 @pytest.fixture
 def run_train(tiny_street):
     """Train on the tiny street into a folder; what has no options is named: ``method=3dgs``, ``image_points=none``."""
 
     def run(out: Path, *overrides: str) -> Path:
-        rigid = [] if "method=3dgs" in overrides else TINY_RIGID
+        objects = TINY_NODES.get(method_of(overrides), [])
         without_points = "image_points=none" in overrides
         street = [word for word in tiny_street if not (without_points and word.startswith("image_points."))]
-        assert train([*street, *rigid, f"out={out}", *overrides]) == 0
+        assert train([*street, *objects, f"out={out}", *overrides]) == 0
         return out
 
     return run
