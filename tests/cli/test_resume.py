@@ -66,6 +66,21 @@ def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, tiny_street, tmp
     assert (part / "records" / "counts.csv").read_text() == (whole / "records" / "counts.csv").read_text()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["pvg", "deformgs"])
+def test_what_a_moving_street_draws_in_a_step_is_drawn_again(method, tiny_street, tmp_path):
+    """Temporal smoothing and noise of time; stopped between two refinements, so that statistics go on too."""
+    parts = tmp_path / "whole", tmp_path / "part"
+    assert train([*tiny_street, f"method={method}", f"out={parts[0]}"]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RowLedger, "on_train_batch_start", _raises_at(17), raising=False)
+        patch.setenv("HYDRA_FULL_ERROR", "1")
+        with pytest.raises(RuntimeError, match="stopped by the test"):
+            train([*tiny_street, f"method={method}", f"out={parts[1]}"])
+    assert train([f"resume={parts[1]}"]) == 0
+    assert_equal(*parts)
+
+
 def curve(run: Path) -> list[dict[str, str]]:
     """The rows of metrics.csv, without what is blank in them."""
     with (run / "curves" / "metrics.csv").open(newline="") as file:
