@@ -70,3 +70,30 @@ def test_objects_deformed_by_a_network(tiny_street, tmp_path):
     assert node.translation_deltas.any()
     assert max(of_steps(curves, "train/deformable/out_of_box")) > 0
     assert len(node.instances().names) > 0
+
+
+def test_people_on_skeletons(tiny_street, tmp_path):
+    """Its loss falls, poses and joints are learned, a mask over time takes rows, and the file brings all of it back."""
+    scene, curves = trained(
+        tiny_street,
+        tmp_path / "run",
+        "node=[background,smpl]",
+        "sparsify=masks",
+        "node.smpl.body.num_vertices=500",
+        "node.smpl.smoothness_weight=0.1",
+        "node.smpl.min_gaussians=60",
+        "schedule.mask_learning_rate=0.25",
+        "schedule.lambda_m=3e5",
+    )
+    node = scene.nodes["smpl"]
+    losses = of_steps(curves, "train/photometric")
+    assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
+    for corrections in (node.rotation_deltas, node.translation_deltas, node.joint_deltas):
+        assert corrections.any()
+        assert torch.isfinite(corrections).all()
+    for term in ("neighbors", "scale", "smoothness"):
+        assert of_steps(curves, f"train/smpl/{term}")[-1] > 0
+    with (tmp_path / "run" / "records" / "counts.csv").open() as file:
+        changes = [row for row in csv.DictReader(file) if row["node"] == "smpl"]
+    assert {row["reason"] for row in changes} == {"start", "mask"}
+    assert 60 <= len(node.rows) < int(changes[0]["after"])
