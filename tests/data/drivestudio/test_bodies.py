@@ -24,7 +24,7 @@ FLAVORS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 
 
 def person(frames: int = FRAMES) -> dict:
-    """As DriveStudio writes it: valid at frames 1 and 2, there seen by camera 1."""
+    """As DriveStudio writes it: valid at frames 1, 2 and 3, at 1 and 2 seen by camera 1, at 3 by none."""
     rotations = Rotation.random(frames * 24, random_state=0).as_matrix().reshape(frames, 24, 3, 3)
     valid = np.isin(np.arange(frames), [1, 2])
     return {
@@ -36,7 +36,7 @@ def person(frames: int = FRAMES) -> dict:
         "selected_cam_idx": torch.tensor(np.where(valid, 1, -1)),
         "matched_mask": torch.tensor(valid),
         "must_appear_mask": torch.tensor(valid),
-        "valid_mask": torch.tensor(valid),
+        "valid_mask": torch.tensor(np.isin(np.arange(frames), [1, 2, 3])),
     }
 
 

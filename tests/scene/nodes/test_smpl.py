@@ -105,7 +105,8 @@ def test_frames_without_a_pose_are_between_those_that_have_one():
 
 
 def test_nothing_of_held_out_frames_is_used():
-    track = walker()
+    # Frame 3 has no pose of its own: it is between 1 and 4, not between 2 and 4.
+    track = walker(valid=(True, True, True, False, True))
     changed = replace(track, body=replace(track.body, rotations=track.body.rotations.flip(2)))
     mixed = torch.where(torch.arange(NUM_FRAMES)[:, None, None] == 2, changed.body.rotations, track.body.rotations)
     other = replace(track, body=replace(track.body, rotations=mixed))
