@@ -1,0 +1,153 @@
+"""Logs at the edge of what a drive can be: every method works on them, or says in one sentence why it does not."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra import compose
+
+from sparsestreet.cli.assemble import recipe_of
+from sparsestreet.cli.compose import configuration
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.scene.rendering import render
+from sparsestreet.scene.state import SceneState
+from sparsestreet.training.system import StreetSystem
+from sparsestreet.types import BodyPoses, Track
+from tests.scene.street import NUM_FRAMES, pose, street_log, track
+
+METHODS = ("3dgs", "deformgs", "pvg", "streetgs", "omnire")
+SMALL = (
+    "image_points=none",
+    "sky.resolution=4",
+    "node.background.num_points=60",
+    "node.background.min_gaussians=10",
+)
+OBJECTS = ("node.rigid.points_per_instance=20", "node.rigid.box_points=20", "node.rigid.min_gaussians=5")
+PEOPLE = (
+    "node.smpl.body.num_vertices=500",
+    "node.deformable.points_per_instance=20",
+    "node.deformable.min_gaussians=5",
+)
+SIZES = {"streetgs": OBJECTS, "omnire": (*OBJECTS, *PEOPLE)}
+
+
+def system_on(log: DrivingLog, method: str = "omnire", stride: int = 4, offset: int = 2) -> StreetSystem:
+    """With masks, as a run would start it."""
+    overrides = ["folder=.", f"method={method}", "sparsify=masks", *SMALL, *SIZES.get(method, ())]
+    with configuration():
+        cfg = compose("train", overrides)
+    data = StreetData(log, stride=stride, offset=offset)
+    return recipe_of(cfg).build(data)
+
+
+def trains(system: StreetSystem, log: DrivingLog) -> dict[str, int]:
+    """Every view has a finite image, and every learned number a finite gradient; rows of each node."""
+    state = SceneState(0.5, 1, training=True)
+    for frame in log.frames:
+        rendering = render(system.scene, frame, state)
+        assert rendering.rgb.isfinite().all()
+        terms = [loss(rendering, frame, system.scene) for loss in system.losses.values() if loss.applies(frame)]
+        terms += system.scene.regularizers(rendering.parts, state).values()
+        torch.stack(terms).sum().backward()
+    for name, parameter in system.scene.named_parameters():
+        assert parameter.grad is None or parameter.grad.isfinite().all(), name
+    for node in system.scene.nodes.values():
+        node.rows.resize(node.mask.keep(node.rows).plan())
+        node.finish_mask()
+    assert all(render(system.scene, frame).rgb.isfinite().all() for frame in log.frames)
+    return system.scene.counts()
+
+
+def with_tracks(*tracks: Track) -> DrivingLog:
+    return replace(street_log(), tracks=tracks)
+
+
+def car(frames: Sequence[int], yaw: Callable[[int], float] = lambda frame: 0.0) -> Track:
+    """It drives 2 m a frame, ahead of the camera."""
+    return track("car", list(frames), [pose(yaw(frame), (8.0 + 2.0 * frame, 1.0, 0.75)) for frame in frames],
+                 class_name="Vehicle")  # fmt: skip
+
+
+def person(name: str = "person", valid: Sequence[bool] = (True,) * NUM_FRAMES, place: float = 0.0) -> Track:
+    """Upright and facing along x, with a pose in the frames that are valid."""
+    frames = list(range(NUM_FRAMES))
+    poses = [pose(0.0, (6.0 + 0.5 * frame + place, 0.5, 0.9)) for frame in frames]
+    walking = track(name, frames, poses, (0.6, 0.6, 1.8), "Pedestrian")
+    rotations = torch.zeros(NUM_FRAMES, 24, 4)
+    rotations[..., 0] = 1
+    # The body's y is the world's z, its z the world's x.
+    rotations[:, 0] = torch.tensor([0.5, 0.5, 0.5, 0.5])
+    return replace(walking, body=BodyPoses(rotations, torch.tensor(valid), torch.zeros(10)))
+
+
+LOGS: dict[str, tuple[DrivingLog, set[str]]] = {
+    "no boxes": (with_tracks(), {"background"}),
+    "no people": (with_tracks(car(range(NUM_FRAMES))), {"background", "rigid"}),
+    "a person and a car": (with_tracks(car(range(NUM_FRAMES)), person()), {"background", "rigid", "smpl"}),
+    "no lidar": (replace(with_tracks(car(range(NUM_FRAMES)), person()), sweeps=()), {"background", "rigid", "smpl"}),
+    "a track of a single frame": (with_tracks(car([1])), {"background"}),
+    "a turn by 180 degrees": (
+        with_tracks(car(range(NUM_FRAMES), lambda frame: math.pi * (frame % 2))),
+        {"background", "rigid"},
+    ),
+    "a track that leaves and comes back": (with_tracks(car([0, 1, 4])), {"background", "rigid"}),
+    "a person without pose in some frames": (
+        with_tracks(person(valid=(False, True, False, False, True))),
+        {"background", "smpl"},
+    ),
+    "a person with a pose in a held-out frame only": (
+        with_tracks(person(valid=(False, False, True, False, False))),
+        {"background"},
+    ),
+    "two people in one box": (with_tracks(person("one"), person("two")), {"background", "smpl"}),
+}
+
+
+@pytest.mark.parametrize("case", LOGS)
+def test_a_scene_of_all_nodes_trains_on_it(case: str):
+    log, expected = LOGS[case]
+    counts = trains(system_on(log), log)
+    assert counts.keys() == expected
+    assert all(counts.values())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_frame_of_one_camera(method: str):
+    log = with_tracks(car(range(NUM_FRAMES)), person())
+    still = replace(log, frames=(log.frames[0],), sweeps=(log.sweeps[0],), tracks=tuple(
+        replace(each, frames=each.frames[:1], world_from_object=each.world_from_object[:1],
+                body=None if each.body is None else replace(
+                    each.body, rotations=each.body.rotations[:1], valid=each.body.valid[:1]))
+        for each in log.tracks), num_frames=1)  # fmt: skip
+    counts = trains(system_on(still, method, stride=0), still)
+    # What is seen once has not moved: it is part of the background.
+    assert counts.keys() == {"background"}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nothing_to_start_from_is_an_error_of_one_sentence(method: str):
+    log = replace(with_tracks(), sweeps=())
+    overrides = ["folder=.", f"method={method}", *SMALL, "node.background.num_points=0"]
+    with configuration():
+        recipe = recipe_of(compose("train", overrides))
+    with pytest.raises(ValueError, match="has nothing to start from: none of num_points=0"):
+        recipe.build(StreetData(log, stride=4, offset=2))
+
+
+def test_two_people_in_one_box_keep_their_own_rows():
+    scene = system_on(LOGS["two people in one box"][0]).scene
+    people = scene.nodes["smpl"].instances()
+    assert people.names == ("one", "two")
+    assert len(set(people.counts().tolist())) == 1
+
+
+def test_a_turn_by_180_degrees_is_no_jump_of_the_center():
+    """Between two frames that face each other's back a car is where it would be without the turn."""
+    log = LOGS["a turn by 180 degrees"][0]
+    poses = system_on(log, "streetgs").scene.nodes["rigid"].pose_at(0.125)
+    torch.testing.assert_close(poses.translations[0], torch.tensor([9.0, 1.0, 0.75]))
+    assert poses.quaternions.isfinite().all()
+    assert bool(poses.present)
