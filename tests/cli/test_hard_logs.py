@@ -31,10 +31,6 @@ PEOPLE = (
     "node.deformable.points_per_instance=20",
     "node.deformable.min_gaussians=5",
 )
-    "node.smpl.body.num_vertices=500",
-    "node.deformable.points_per_instance=20",
-    "node.deformable.min_gaussians=5",
-)
 SIZES = {"streetgs": OBJECTS, "omnire": (*OBJECTS, *PEOPLE)}
 
 
