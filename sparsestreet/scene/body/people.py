@@ -31,8 +31,9 @@ class People:
 def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozenset[int], num_frames: int) -> People:
     """Poses of frames that are not held out; between and around frames with a pose it is interpolated, in the box.
 
-    The pelvis is put where the box around the posed body is in the middle of the annotated box. Every track has a valid
-    pose in a training frame.
+    The pelvis stays at one place in a person's box: where the boxes around the posed body are in its middle on average.
+    (DriveStudio puts each frame's in the middle, so that a body rocks to and fro as its limbs reach out.) Every track
+    has a valid pose in a training frame.
     """
     shaped = [template.shaped(_body(track).shape, float(track.size[2])) for track in tracks]
     vertices, joints = (torch.stack(parts) for parts in zip(*shaped, strict=True))
@@ -41,10 +42,10 @@ def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozens
     for i, track in enumerate(tracks):
         in_box = _filled(track, held_out)
         bones = posed_bones(joints[i].expand(len(in_box), 24, 3), in_box)
-        centers = torch.stack([_middle(vertices[i], bones, frame, attached, weights) for frame in range(len(in_box))])
+        middles = [_middle(vertices[i], bones, frame, attached, weights) for frame in range(len(in_box))]
         box_from_body = torch.eye(4, dtype=torch.float64).repeat(len(in_box), 1, 1)
         box_from_body[:, :3, :3] = quat.to_matrix(in_box[:, 0].double())
-        box_from_body[:, :3, 3] = -centers.double()
+        box_from_body[:, :3, 3] = -torch.stack(middles).double().mean(0)
         roots.append(replace(track, world_from_object=track.world_from_object @ box_from_body))
         trained = torch.tensor([int(frame) not in held_out for frame in track.frames])
         rotations.append(in_box[trained, 1:])
