@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.ops.activate import RawGaussians, activate
@@ -54,12 +54,17 @@ class SceneGraph(nn.Module):
         """Number of rows of every node, absent instances included."""
         return {name: len(node.rows) for name, node in self.nodes.items()}
 
-    def regularizers(self, parts: Mapping[str, RawGaussians], state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        """The weighted terms of all nodes, named node/term; ``parts`` is what they answered for the view."""
+    def regularizers(
+        self, parts: Mapping[str, RawGaussians], drawn: Mapping[str, Bool[Tensor, " _"]], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The weighted terms of all nodes, named node/term.
+
+        ``parts`` is what they answered for the view, ``drawn`` which of their rows it shows.
+        """
         return {
             f"{name}/{term}": value
             for name, node in self.nodes.items()
-            for term, value in node.all_regularizers(parts[name], state).items()
+            for term, value in node.all_regularizers(parts[name], drawn[name], state).items()
         }
 
     def learning_rates(self) -> dict[str, LearningRate]:

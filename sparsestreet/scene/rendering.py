@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
@@ -43,6 +43,13 @@ class SceneRendering:
     """Name of a node -> its rows in ``splats``."""
     parts: dict[str, RawGaussians]
     """Name of a node -> what it answered for the view, before activation."""
+
+    @property
+    def drawn(self) -> dict[str, Bool[Tensor, " _"]]:
+        """Name of a node -> which of its rows the view shows."""
+        visible = self.splats.visible
+        return {name: visible[rows] for name, rows in self.spans.items()}
+
     state: SceneState = FINISHED
     options: RenderOptions = DEFAULT_OPTIONS
     """How it was rendered."""

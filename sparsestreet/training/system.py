@@ -80,7 +80,7 @@ class StreetSystem(LightningModule):
                 with phase(f"loss {name}"):
                     terms[name] = loss(self.rendering, frame, self.scene)
             with phase("regularizers"):
-                terms |= self.scene.regularizers(self.rendering.parts, state)
+                terms |= self.scene.regularizers(self.rendering.parts, self.rendering.drawn, state)
         if self._logs():
             with phase("logging"):
                 self._log_training(terms, frame)

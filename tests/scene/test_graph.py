@@ -1,5 +1,7 @@
 import pytest
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from sparsestreet.ops.activate import RawGaussians
 from sparsestreet.scene.graph import SceneGraph
@@ -82,7 +84,7 @@ def test_masks_are_those_of_masked_nodes_only():
 class Heavy(Background):
     """A node with two terms of its own."""
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, torch.Tensor]:
+    def regularizers(self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState) -> dict[str, torch.Tensor]:
         return {"weight": self.rows.means.sum(), "age": torch.tensor(state.progress)}
 
 
@@ -91,15 +93,15 @@ def test_regularizers_are_named_by_node_and_term():
     scene = SceneGraph({"road": background(random_rows(4, 0)), "heavy": heavy, "cars": cars(3)})
     state = SceneState(progress=0.25, training=True)
     parts = scene.gaussians_at(VIEW, state).parts
-    terms = scene.regularizers(parts, state)
+    drawn = {name: torch.ones(len(part), dtype=torch.bool) for name, part in parts.items()}
+    terms = scene.regularizers(parts, drawn, state)
     assert list(terms) == ["heavy/weight", "heavy/age"]
     assert terms["heavy/age"].item() == 0.25
     assert torch.equal(terms["heavy/weight"], heavy.rows.means.sum())
     sum(terms.values()).backward()
     assert torch.equal(heavy.rows.means.grad, torch.ones(3, 3))
-    assert (
-        SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]}).regularizers(parts, SceneState()) == {}
-    )
+    plain = SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]})
+    assert plain.regularizers(parts, drawn, SceneState()) == {}
 
 
 def test_bytes_of_every_part():

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from jaxtyping import Bool
 from lightning import Callback, Trainer
 from torch import Tensor
 
@@ -76,7 +77,7 @@ class Watched(Background):
         self.asked.append(state)
         return super().raw_at(view, state)
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Tensor]:
+    def regularizers(self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState) -> dict[str, Tensor]:
         self.asked.append(state)
         return {"size": 0.25 * self.rows.log_scales.sum(), "nothing": torch.zeros(())}
 

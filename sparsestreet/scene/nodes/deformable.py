@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.geometry.quaternions import normalized
@@ -78,7 +78,9 @@ class Deformable(Tracked):
             log_scales=scales,
         )
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
         """``out_of_box`` in place of a cull: arms and legs may leave a box for a moment."""
         beyond = torch.relu(raw.means.abs() - self.sizes.index_select(0, self.rows.instances) / 2)
         return {"out_of_box": self.settings.outside_weight * beyond.sum() / max(beyond.numel(), 1)}

@@ -180,21 +180,27 @@ class Node(nn.Module, ABC):
         """The node's Gaussians in the world, activated, with the mask applied."""
         return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
         """Terms of the loss that concern the node alone, by name, each with its weight.
 
-        ``raw`` is what the node answered for the view of this step, so that nothing need be computed twice.
+        ``raw`` is what the node answered for the view of this step, so that nothing need be computed twice. ``drawn``:
+        rows that the view shows. A term that always pulls, at all rows, wins over the image at those that few views
+        show: Adam steps by its learning rate however small a lone gradient is.
         """
         return {}
 
-    def all_regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def all_regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
         """``regularizers``, and the terms that every node has whose settings give them a weight."""
         settings = self.settings
         shape = {}
         if settings.sharp_shape > 0:
             # The mask is applied at activation: what it hides has its shape here.
             shape["sharp_shape"] = settings.sharp_shape * sharp_shape(self.rows.log_scales, settings.max_axis_ratio)
-        return shape | self.regularizers(raw, state)
+        return shape | self.regularizers(raw, drawn, state)
 
     def outside(self) -> Bool[Tensor, " n"] | None:
         """Rows that left the bounds of their instance; None for a node without bounds."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
@@ -221,13 +221,15 @@ class Smpl(Tracked):
         pelvis[..., 0] = 1
         return torch.cat((pelvis, turned), 1)
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
         """``neighbors``, ``scale`` and ``smoothness``, those that have a weight."""
         terms, settings = {}, self.settings
         if len(self.rows) and settings.neighbor_weight > 0:
-            terms["neighbors"] = settings.neighbor_weight * self._spread(raw)
+            terms["neighbors"] = settings.neighbor_weight * self._spread(raw, drawn)
         if len(self.rows) and settings.scale_weight > 0:
-            terms["scale"] = settings.scale_weight * raw.log_scales.exp().amax(1).square().mean()
+            terms["scale"] = settings.scale_weight * _mean_of(raw.log_scales.exp().amax(1).square(), drawn)
         if settings.smoothness_weight > 0:
             terms["smoothness"] = settings.smoothness_weight * self._unevenness()
         return terms
@@ -238,8 +240,8 @@ class Smpl(Tracked):
         body = sum(part.numel() for part in (self.vertices, self.attached, self.weights, self.joints))
         return super().pose_bytes() + BYTES_PER_NUMBER * (per_keyframe + body)
 
-    def _spread(self, raw: RawGaussians) -> Float[Tensor, ""]:
-        """Sum over the attributes of their mean standard deviation among neighbors."""
+    def _spread(self, raw: RawGaussians, drawn: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+        """Sum over the attributes of their mean standard deviation among neighbors of rows that are drawn."""
         attributes = (
             quat.normalized(self.rows.quaternions),
             raw.log_scales.exp(),
@@ -252,7 +254,7 @@ class Smpl(Tracked):
         # Written out: torch's std and norm take ten times as long on the CPU. Equal neighbors have a slope, of 0.
         variance = (near - near.mean(1, keepdim=True)).square().sum(1) / (near.shape[1] - 1)
         spread = (variance + 1e-12).sqrt()
-        return torch.stack([part.mean() for part in spread.split(widths, 1)]).sum()
+        return torch.stack([_mean_of(part.mean(1), drawn) for part in spread.split(widths, 1)]).sum()
 
     def _unevenness(self) -> Float[Tensor, ""]:
         """Mean squared distance of joints from what their neighbors in time say of them."""
@@ -275,3 +277,7 @@ class Smpl(Tracked):
             found = np.where(distances < _APART / 2, found, itself)
             self._neighbors = torch.from_numpy(found).to(self.rows.means.device)
         return self._neighbors
+
+
+def _mean_of(values: Float[Tensor, " n"], drawn: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+    return (values * drawn).sum() / drawn.sum().clamp(min=1)

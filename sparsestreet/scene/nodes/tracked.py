@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.geometry.trajectories import Trajectories
@@ -175,8 +175,10 @@ class Tracked(Node):
         """Pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
-    def all_regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        terms, weight = super().all_regularizers(raw, state), self.settings.temporal_smooth
+    def all_regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
+        terms, weight = super().all_regularizers(raw, drawn, state), self.settings.temporal_smooth
         if weight > 0:
             learned = self.keyframe_translations + self.translation_deltas
             terms["temporal_smooth"] = weight * temporal_smoothness(self.keyframe_times, learned, self.keyframe_valid)

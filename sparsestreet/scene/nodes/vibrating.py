@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.ops.activate import RawGaussians
@@ -105,10 +105,12 @@ class Vibrating(Node):
         """By which a row moves on average, meters per unit of the node's time."""
         return mean_velocities(self.rows.velocities, self.rows.log_life_spans, self.settings.cycle)
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
         """``velocity`` holds still what need not move."""
-        lengths = self.mean_velocities().norm(dim=1)
-        return {"velocity": self.settings.velocity_weight * lengths.sum() / max(len(lengths), 1)}
+        lengths = self.mean_velocities().norm(dim=1) * drawn
+        return {"velocity": self.settings.velocity_weight * lengths.sum() / drawn.sum().clamp(min=1)}
 
     def header(self) -> dict[str, Any]:
         return {"num_frames": self.num_frames, "seed": self.seed}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.ops.activate import RawGaussians
@@ -65,7 +65,9 @@ class Bobbing(Node):
         height = torch.tanh(self.lift(torch.tensor([view.time], device=local.means.device)))
         return replace(local, means=local.means + torch.cat((torch.zeros_like(height).expand(2), height)))
 
-    def regularizers(self, raw: RawGaussians, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+    def regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, Float[Tensor, ""]]:
         return {"stillness": self.settings.stillness * self.lift[2].weight.square().sum()}
 
     def instances(self) -> Instances:

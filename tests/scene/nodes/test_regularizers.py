@@ -141,7 +141,8 @@ def test_nodes_have_the_terms_that_their_settings_weigh():
     plain = rigid(random_rows(6, 1, instances=instances), curved(), names=["car"])
     scene, state = SceneGraph({"road": road, "cars": cars, "plain": plain}), SceneState()
     parts = {name: node.raw_at(view_at(0.5), state) for name, node in scene.nodes.items()}
-    terms = scene.regularizers(parts, state)
+    drawn = {name: torch.ones(len(part), dtype=torch.bool) for name, part in parts.items()}
+    terms = scene.regularizers(parts, drawn, state)
     assert set(terms) == {"road/sharp_shape", "cars/temporal_smooth"}
     assert terms["road/sharp_shape"].item() == pytest.approx(0.5 * sharp_shape(road.rows.log_scales, 2.0).item())
     # |0 + 3 - 4| and |0 + 0 - 2| over three coordinates.
@@ -160,11 +161,11 @@ def test_a_masked_gaussian_keeps_its_shape_in_the_term():
     mask = static_mask()
     rows = random_rows(4, 0, mask=mask)
     node = background(rows, mask, sharp_shape=1.0, max_axis_ratio=1.5)
-    state = SceneState()
-    before = node.all_regularizers(node.raw_at(view_at(0.0), state), state)["sharp_shape"].item()
+    state, drawn = SceneState(), torch.ones(4, dtype=torch.bool)
+    before = node.all_regularizers(node.raw_at(view_at(0.0), state), drawn, state)["sharp_shape"].item()
     with torch.no_grad():
         rows.mask_logits.fill_(-20.0)
-    term = node.all_regularizers(node.raw_at(view_at(0.0), state), state)["sharp_shape"]
+    term = node.all_regularizers(node.raw_at(view_at(0.0), state), drawn, state)["sharp_shape"]
     term.backward()
     assert term.item() == before > 0
     assert bool(rows.log_scales.grad.isfinite().all())

@@ -32,8 +32,23 @@ def in_box(track: Track, frame: int, means: torch.Tensor) -> torch.Tensor:
     return (means.double() - center) @ rotation
 
 
-def terms(node: Smpl, time: float = 0.5) -> dict[str, torch.Tensor]:
-    return node.regularizers(node.raw_at(view_at(time), FINISHED), FINISHED)
+def terms(node: Smpl, time: float = 0.5, drawn: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """As if all rows were drawn, unless said."""
+    drawn = torch.ones(len(node.rows), dtype=torch.bool) if drawn is None else drawn
+    return node.regularizers(node.raw_at(view_at(time), FINISHED), drawn, FINISHED)
+
+
+def test_terms_are_of_rows_that_are_drawn():
+    """Somebody out of view is left alone: Adam would follow the terms alone, at its full rate."""
+    node = smpl(walker(), walker("other", y=2.0))
+    drawn = node.rows.instances == 1
+    sum(terms(node, drawn=drawn).values()).backward()
+    assert not node.rows.log_scales.grad[~drawn].any()
+    assert node.rows.log_scales.grad[drawn].any()
+    alone = {name: term.item() for name, term in terms(smpl(walker("other", y=2.0))).items()}
+    assert {name: term.item() for name, term in terms(node, drawn=drawn).items()} == pytest.approx(alone, rel=1e-4)
+    nobody = terms(node, drawn=torch.zeros_like(drawn))
+    assert all(term.item() == 0 for term in nobody.values())
 
 
 def test_one_flat_gaussian_lies_on_each_vertex():
