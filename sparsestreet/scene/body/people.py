@@ -26,6 +26,8 @@ class People:
     """World from body: the pelvis, and how the body is turned about it."""
     rotations: Float[Tensor, "i k 23 4"]
     """Of the joints but the pelvis at the keyframes, relative to their parents."""
+    places: Float[Tensor, "i v 3"]
+    """Where the vertices are in the box on average over the frames, meters: near what was measured of them."""
 
 
 def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozenset[int], num_frames: int) -> People:
@@ -38,14 +40,16 @@ def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozens
     shaped = [template.shaped(_body(track).shape, float(track.size[2])) for track in tracks]
     vertices, joints = (torch.stack(parts) for parts in zip(*shaped, strict=True))
     attached, weights = template.influences()
-    roots, rotations = [], []
+    roots, rotations, places = [], [], []
     for i, track in enumerate(tracks):
         in_box = _filled(track, held_out)
         bones = posed_bones(joints[i].expand(len(in_box), 24, 3), in_box)
-        middles = [_middle(vertices[i], bones, frame, attached, weights) for frame in range(len(in_box))]
+        bodies = torch.stack([_posed(vertices[i], bones, frame, attached, weights) for frame in range(len(in_box))])
+        middle = ((bodies.amax(1) + bodies.amin(1)) / 2).mean(0)
+        places.append(bodies.mean(0) - middle)
         box_from_body = torch.eye(4, dtype=torch.float64).repeat(len(in_box), 1, 1)
         box_from_body[:, :3, :3] = quat.to_matrix(in_box[:, 0].double())
-        box_from_body[:, :3, 3] = -torch.stack(middles).double().mean(0)
+        box_from_body[:, :3, 3] = -middle.double()
         roots.append(replace(track, world_from_object=track.world_from_object @ box_from_body))
         trained = torch.tensor([int(frame) not in held_out for frame in track.frames])
         rotations.append(in_box[trained, 1:])
@@ -53,7 +57,7 @@ def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozens
     padded = torch.zeros(*keyframes.valid.shape, 23, 4)
     padded[..., 0] = 1
     padded[keyframes.valid] = torch.cat(rotations)
-    return People(vertices, joints, keyframes, padded)
+    return People(vertices, joints, keyframes, padded, torch.stack(places))
 
 
 def trained_poses(track: Track, held_out: frozenset[int]) -> Bool[Tensor, " f"]:
@@ -86,14 +90,13 @@ def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
     return quat.slerp(rotations[lower], rotations[upper], fraction[:, None].expand(-1, 24))
 
 
-def _middle(
+def _posed(
     vertices: Float[Tensor, "v 3"],
     bones: Bones,
     frame: int,
     attached: Int[Tensor, "v k"],
     weights: Float[Tensor, "v k"],
-) -> Float[Tensor, "3"]:
-    """Of the box around a posed body, along the axes of its annotated box."""
+) -> Float[Tensor, "v 3"]:
+    """The body about its pelvis, along the axes of its annotated box."""
     still = torch.zeros(len(vertices), 4)
-    posed, _ = skin(vertices, still, Bones(bones.transforms[frame], bones.quaternions[frame]), attached, weights)
-    return (posed.amax(0) + posed.amin(0)) / 2
+    return skin(vertices, still, Bones(bones.transforms[frame], bones.quaternions[frame]), attached, weights)[0]

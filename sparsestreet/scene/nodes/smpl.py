@@ -25,9 +25,13 @@ from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
 from sparsestreet.scene.state import SceneState
+from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Track, View
 
 _log = logging.getLogger(__name__)
+
+_COLORED_BY = 4
+"""Measured points that give a vertex its first color."""
 
 _APART = 100.0
 """Meters between people when neighbors are looked for: nobody's neighbor is on somebody else."""
@@ -35,7 +39,7 @@ _APART = 100.0
 
 @dataclass(frozen=True, kw_only=True)
 class SmplSettings(TrackedSettings):
-    """Starts with one Gaussian at each vertex of a body, in the mean color of what was measured in the box."""
+    """Starts with one Gaussian at each vertex of a body, in the color of what was measured near it in the box."""
 
     posed: bool | None = True
     initial_opacity: float = 0.99
@@ -112,7 +116,7 @@ class SmplSettings(TrackedSettings):
         low, high = people.vertices.amin(1), people.vertices.amax(1)
         rows, mask = self.start(
             data,
-            Points(people.vertices.flatten(0, 1), _colors(tracks, data).repeat_interleave(per_person, 0)),
+            Points(people.vertices.flatten(0, 1), _colors(tracks, data, people.places)),
             radii,
             torch.full_like(radii, self.initial_opacity),
             generator,
@@ -128,16 +132,27 @@ class SmplSettings(TrackedSettings):
         return rows, mask
 
 
-def _colors(tracks: Sequence[Track], data: TrainingData) -> Float[Tensor, "i 3"]:
-    """Mean color of the returns and of the points from images in each track's box; gray where there are none."""
+def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "i v 3"]) -> Float[Tensor, "n 3"]:
+    """Of each vertex the mean color of the measured points of its box that are nearest to it; gray without any.
+
+    Measured are returns and points from images, pooled over all frames: limbs swing about where they are on average.
+    """
     colors = []
-    for track, returns in zip(tracks, lidar_in_boxes(tracks, data.sweeps), strict=True):
-        points = [returns.colors]
-        if data.image_points is not None:
-            points.append(torch.from_numpy(data.image_points.in_boxes[track.name].colors))
-        measured = torch.cat(points)
-        colors.append(measured.mean(0) if len(measured) else torch.full((3,), 0.5))
-    return torch.stack(colors)
+    for track, returns, vertices in zip(tracks, lidar_in_boxes(tracks, data.sweeps), places, strict=True):
+        found = None if data.image_points is None else data.image_points.in_boxes[track.name]
+        points = [returns, *([] if found is None else [_measured(found)])]
+        measured = Points.concatenate(points)
+        if len(measured) == 0:
+            colors.append(torch.full_like(vertices, 0.5))
+            continue
+        tree = cKDTree(measured.positions.numpy())
+        _, nearest = tree.query(vertices.numpy(), k=list(range(1, min(_COLORED_BY, len(measured)) + 1)))
+        colors.append(measured.colors[torch.from_numpy(nearest)].mean(1))
+    return torch.cat(colors)
+
+
+def _measured(found: TriangulatedPoints) -> Points:
+    return Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors))
 
 
 def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
