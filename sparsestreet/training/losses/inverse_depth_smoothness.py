@@ -19,7 +19,7 @@ class InverseDepthSmoothness:
     """mean(|dx d| exp(-|dx I|)) + mean(|dy d| exp(-|dy I|)) of the inverse depth d; |I| is the mean of the channels.
 
     Steps between neighbors of which one shows nothing (depth 0) count as none: an inverse depth of 10^5 would stand
-    there. ``kornia.losses.inverse_depth_smoothness_loss`` is the same elsewhere, at ten times the cost.
+    there. ``kornia.losses.inverse_depth_smoothness_loss``, the oracle of the tests, is the same elsewhere.
     """
 
     weight: float = 0.001
