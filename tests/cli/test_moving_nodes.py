@@ -81,9 +81,11 @@ def test_people_on_skeletons(tiny_street, tmp_path):
         "sparsify=masks",
         "node.smpl.body.num_vertices=500",
         "node.smpl.smoothness_weight=0.1",
+        "node.smpl.neighbor_weight=1e-3",
+        "node.smpl.scale_weight=0.05",
         "node.smpl.min_gaussians=60",
-        "schedule.mask_learning_rate=0.25",
-        "schedule.lambda_m=3e5",
+        "schedule.mask_feature_rate=0.25",
+        "schedule.lambda_m=3e6",
     )
     node = scene.nodes["smpl"]
     losses = of_steps(curves, "train/photometric")
@@ -92,7 +94,8 @@ def test_people_on_skeletons(tiny_street, tmp_path):
         assert corrections.any()
         assert torch.isfinite(corrections).all()
     for term in ("neighbors", "scale", "smoothness"):
-        assert of_steps(curves, f"train/smpl/{term}")[-1] > 0
+        # 0 in a step whose view shows nobody.
+        assert max(of_steps(curves, f"train/smpl/{term}")) > 0
     with (tmp_path / "run" / "records" / "counts.csv").open() as file:
         changes = [row for row in csv.DictReader(file) if row["node"] == "smpl"]
     assert {row["reason"] for row in changes} == {"start", "mask"}
