@@ -17,6 +17,9 @@ FEATURES = "mask_features"
 _GOLDEN = (math.sqrt(5) - 1) / 2
 """Multiples of it, modulo 1, fill the unit interval evenly: the frames of successive steps."""
 
+_ALWAYS = -1.0
+"""Every score exceeds it."""
+
 _TIMES_AT_ONCE = 8
 """Scores of all training frames are computed for so many frames at a time, to bound the memory."""
 
@@ -80,7 +83,7 @@ class TemporalMask(Mask):
         nn.init.constant_(self.last.bias, settings.initial_logit)
         for name in ("times", "valid", "centers", "half_sizes"):
             self.register_buffer(name, getattr(scope, name))
-        # Lowered by ``keep`` where K_min needs it, so that what it keeps shows too.
+        # What a score must exceed now; ``keep`` lowers it where K_min holds.
         self.register_buffer("limit", torch.tensor(settings.threshold))
         self.register_buffer("draws", torch.zeros((), dtype=torch.float64))
 
@@ -110,14 +113,13 @@ class TemporalMask(Mask):
 
     @torch.no_grad()
     def keep(self, rows: Rows) -> Selection:
-        """Rows that are open in any training frame of their instance; K_min by the best of its scores."""
+        """Rows that are open in any training frame of their instance. Where that were fewer than K_min the best of
+        the others stay, and the whole node shows at all times until scores have recovered."""
         best = self._at_training_frames(rows).masked_fill(~self.valid[_instances(rows)], -1.0).amax(1)
         selection = keep_best(best, best <= self.settings.threshold, self.min_gaussians)
         self.floor_firings += selection.floor_hit
-        lowest = torch.where(selection.keep, best, 1.0).amin() if len(best) else best.new_ones(())
-        # One step below the lowest score that must pass, since the comparison is strict.
-        below = torch.nextafter(lowest, torch.full_like(lowest, -1.0))
-        self.limit.copy_(below.clamp(max=self.settings.threshold))
+        # At the floor nothing is masked: what it keeps would else show at the best of its times alone.
+        self.limit.fill_(_ALWAYS if selection.floor_hit else self.settings.threshold)
         return selection
 
     @torch.no_grad()

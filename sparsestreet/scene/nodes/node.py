@@ -53,6 +53,8 @@ class NodeSettings(ABC):
     """Whether the mask is trained in this run."""
     density: DensityStrategy | None
     """None: the node keeps the Gaussians it starts with."""
+    densify_until: float | None = None
+    """Fraction of the run after which none are added any more; None: the schedule says."""
     prunable: bool
     """Whether pruning rules may take Gaussians of this node."""
     sharp_shape: float = 0.0
@@ -74,6 +76,8 @@ class NodeSettings(ABC):
                 f"sharp_shape is a weight >= 0 and max_axis_ratio a ratio >= 1, got {self.sharp_shape} and "
                 f"{self.max_axis_ratio}"
             )
+        if self.densify_until is not None and not 0 <= self.densify_until <= 1:
+            raise ValueError(f"densify_until is a fraction of the run in [0, 1], got {self.densify_until}")
         if self.max_gaussians is not None and self.max_gaussians < max(self.min_gaussians, 1):
             raise ValueError(
                 f"max_gaussians must be at least min_gaussians, got {self.max_gaussians} and {self.min_gaussians}: "

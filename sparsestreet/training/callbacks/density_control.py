@@ -17,7 +17,7 @@ class DensityControl(Callback, RowListener):
 
     Args:
         refine_in: when rows that are of no use are culled and, up to ``densify_until``, others split and cloned before.
-        densify_until: fraction of the run after which no rows are added any more.
+        densify_until: fraction of the run after which no rows are added any more, unless a node's settings say another.
         reset_in: when opacities are pulled down, so that what is not needed can be culled.
         pause_after_reset: steps after a reset without refinement: opacities must recover first.
         seed: of the positions of split children.
@@ -97,7 +97,8 @@ class DensityControl(Callback, RowListener):
         node, statistics = system.scene.nodes[name], self.statistics[name]
         strategy = node.settings.density
         when = {"radius": system.radius, "progress": step / steps}
-        if step <= last_step(self.densify_until, steps):
+        own = node.settings.densify_until
+        if step <= last_step(self.densify_until if own is None else own, steps):
             limit = node.settings.max_gaussians
             plan = strategy.densify(node.rows, statistics, max_gaussians=limit, generator=self.generator, **when)
             resize_rows(trainer, system, name, plan, "densify")

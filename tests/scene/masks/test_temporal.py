@@ -156,7 +156,12 @@ def test_at_the_floor_the_best_rows_stay_and_show():
     assert mask.floor_firings == 1
     assert best[selection.keep].min() >= best[~selection.keep].max()
     node.rows.resize(selection.plan())
-    assert torch.stack([shown(node, time) for time in TIMES]).any(0).all()
+    # At the floor nothing is hidden, at no time.
+    assert torch.stack([shown(node, time) for time in TIMES]).all()
+    with torch.no_grad():
+        node.mask.last.bias += 20
+    assert not node.mask.keep(node.rows).floor_hit
+    assert node.mask.limit.item() == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("min_gaussians", [0, 38])

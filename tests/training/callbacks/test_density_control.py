@@ -54,6 +54,22 @@ def test_densify_until_its_fraction_and_cull_to_the_end_of_the_interval():
     assert [given["what"] for given in strategy.asked[:4]] == ["densify", "cull", "densify", "cull"]
 
 
+def test_a_node_may_grow_for_another_time_than_the_others():
+    early, late, others = AskedStrategy(), AskedStrategy(), AskedStrategy()
+    trainer, _, _ = started(
+        every_ten(densify_until=0.5),
+        early=background(density=early, densify_until=0.2),
+        late=background(density=late, densify_until=0.7),
+        others=background(density=others),
+    )
+    trainer.walk(100)
+    lasts = [asked_at(strategy, "densify")[-1] for strategy in (early, late, others)]
+    assert lasts == [20, 70, 50]
+    assert asked_at(early, "cull")[-1] == 90
+    with pytest.raises(ValueError, match=r"densify_until is a fraction of the run in \[0, 1\], got 2"):
+        background(density=early, densify_until=2.0)
+
+
 def test_a_reset_is_followed_by_a_pause():
     """Resets at 30 and 60, after the refinement that is due as well; none up to 20 steps later."""
     listener, strategy = Listener(), AskedStrategy()
