@@ -43,6 +43,10 @@ class TemporalMaskSettings:
     """Of the sines and cosines that encode time and position."""
     visible_only: bool = False
     """True: the loss pushes a row only in views that draw it (see ``StaticMaskSettings``)."""
+    image_closes: bool = True
+    """False: the image's gradient may only raise scores, so that nothing but the sparsity loss closes masks. What an
+    image asks of all rows alike (thinner limbs, say) otherwise runs away with the network, which is one for all: a
+    mask that is 0 or 1 cannot answer it, and closes people at most of their times."""
 
     def __post_init__(self) -> None:
         if not self.sparsity_weight >= 0:
@@ -102,7 +106,10 @@ class TemporalMask(Mask):
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
         scores = self.scores(rows, self.times.new_full((1, 1), time)).squeeze(1)
-        return straight_through(scores, self.limit)
+        multipliers = straight_through(scores, self.limit)
+        if not self.settings.image_closes and multipliers.requires_grad:
+            multipliers.register_hook(lambda gradient: gradient.clamp(max=0))
+        return multipliers
 
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
         """Means over the current time and T training frames of the row's own instance, summed over the rows."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,6 +105,21 @@ def test_the_multipliers_gradient_is_that_of_the_scores():
     rows.mask_features.grad = None
     (mask.scores(rows, torch.tensor([[0.4]]))[:, 0] * cotangent).sum().backward()
     assert torch.equal(found, rows.mask_features.grad)
+
+
+def test_the_image_may_be_kept_from_closing_masks():
+    settings = replace(SETTINGS, image_closes=False)
+    mask = settings.build(0, scope())
+    rows = random_rows(20, 1, mask=mask)
+    cotangent = torch.randn(20, generator=torch.Generator().manual_seed(3))
+    (mask.multipliers(rows, 0.4) * cotangent).sum().backward()
+    found = rows.mask_features.grad.clone()
+    rows.mask_features.grad = None
+    (mask.scores(rows, torch.tensor([[0.4]]))[:, 0] * cotangent.clamp(max=0)).sum().backward()
+    torch.testing.assert_close(found, rows.mask_features.grad)
+    assert torch.equal(found.abs().sum(1) > 0, cotangent < 0)
+    with torch.no_grad():
+        assert (mask.multipliers(rows, 0.4) == 1).all()
 
 
 def test_the_loss_looks_at_now_and_at_frames_of_the_rows_own_instance():
