@@ -19,8 +19,8 @@ from sparsestreet.triangulation import ImagePointSettings
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
 PAIRS = list(itertools.product(METHODS, SPARSIFY))
-DAILY = [("streetgs", "paper"), ("3dgs", "removal"), ("omnire", "removal")]
-"""The pairs that a daily run trains: every stage. (``test_moving_nodes`` trains the nodes of the other methods.)"""
+DAILY = [("streetgs", "paper"), ("3dgs", "removal"), ("omnire", "removal"), ("pvg", "masks"), ("deformgs", "none")]
+"""The pairs that a daily run trains: every method, every stage."""
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 

@@ -24,6 +24,7 @@ def of_steps(curves: list[dict[str, str]], name: str) -> list[float]:
     return [float(row[name]) for row in curves if row.get(name)]
 
 
+@pytest.mark.slow
 def test_a_vibrating_street(tiny_street, tmp_path):
     """Its loss falls, its times and velocities are learned, and it grows where and when images ask for it."""
     thresholds = ["node.background.density.grad_threshold=1e9", "node.background.density.peak_threshold=1e-4"]
@@ -40,6 +41,7 @@ def test_a_vibrating_street(tiny_street, tmp_path):
     assert torch.isfinite(node.rows.life_peaks).all()
 
 
+@pytest.mark.slow
 def test_a_street_deformed_by_a_network(tiny_street, tmp_path):
     """Its loss falls, and what moves is learned from the time on at which it begins."""
     scene, curves = trained(tiny_street, tmp_path / "run", "method=deformgs", "node.background.deform_from=0.5")
