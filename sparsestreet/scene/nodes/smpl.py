@@ -23,7 +23,7 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
-from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
+from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, stored_keyframes
 from sparsestreet.scene.state import SceneState
 from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Track, View
@@ -87,13 +87,7 @@ class SmplSettings(TrackedSettings):
         )
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Smpl":
-        trajectories = Trajectories(
-            tensors["keyframe_times"],
-            tensors["keyframe_quaternions"],
-            tensors["keyframe_translations"],
-            tensors["keyframe_valid"],
-            tensors["spans"],
-        )
+        trajectories = stored_keyframes(tensors)
         anatomy = Anatomy(
             tensors["vertices"], tensors["attached"], tensors["weights"], tensors["joints"], tensors["joint_keyframes"]
         )

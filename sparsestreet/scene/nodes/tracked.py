@@ -83,13 +83,7 @@ class TrackedSettings(NodeSettings):
         )
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Tracked":
-        trajectories = Trajectories(
-            tensors["keyframe_times"],
-            tensors["keyframe_quaternions"],
-            tensors["keyframe_translations"],
-            tensors["keyframe_valid"],
-            tensors["spans"],
-        )
+        trajectories = stored_keyframes(tensors)
         names = tuple(header["names"])
         return self.node_class(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
 
@@ -102,6 +96,17 @@ class TrackedSettings(NodeSettings):
         color = points.colors.mean(0) if len(points) else torch.full((3,), 0.5)
         surface = box_surface_points(missing, track.size.float(), generator)
         return Points.concatenate([points, Points(surface, color.expand(missing, 3))])
+
+
+def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
+    """The annotated poses of a scene file."""
+    return Trajectories(
+        tensors["keyframe_times"],
+        tensors["keyframe_quaternions"],
+        tensors["keyframe_translations"],
+        tensors["keyframe_valid"],
+        tensors["spans"],
+    )
 
 
 def _from_images(track: Track, data: TrainingData) -> Points:
