@@ -156,10 +156,13 @@ def test_what_any_training_frame_shows_stays():
 
 def test_frames_without_the_instance_do_not_count():
     where = scope([TIMES, [0.25]])
-    mask = mask_of(where=where)
+    mask = mask_of(where=where, seed=1)
     rows = random_rows(40, 1, mask=mask, instances=torch.tensor([1]).expand(40))
     scores = mask.scores(rows, torch.tensor([[0.25]]))[:, 0]
     assert torch.equal(mask.keep(rows).keep, scores > 0.01)
+    # Those that the padding of the table would have kept.
+    padding = mask.scores(rows, torch.tensor([[9.0]]))[:, 0]
+    assert ((padding > 0.01) & (scores <= 0.01)).any()
 
 
 def test_at_the_floor_the_best_rows_stay_and_show():
@@ -200,7 +203,9 @@ def test_between_two_frames_a_row_shows_that_shows_at_either():
     at = {time: shown(node, time) for time in TIMES}
     assert torch.equal(shown(node, 0.3), at[0.25] | at[0.5])
     assert torch.equal(shown(node, 0.25 + 1e-6), at[0.25])
-    assert not torch.equal(at[0.25], at[0.25] | at[0.5])
+    assert torch.equal(shown(node, 0.7), at[0.5] | at[1.0])
+    assert (at[0.5] & ~at[1.0]).any()
+    assert (at[0.5] & ~at[0.25]).any()
 
 
 def test_bits_of_many_frames_and_of_none():
@@ -212,6 +217,8 @@ def test_bits_of_many_frames_and_of_none():
     assert node.rows.mask_bits.shape == (40, 2)
     bits = np.unpackbits(node.rows.mask_bits.numpy(), axis=1, bitorder="little")[:, :11]
     assert np.array_equal(bits.astype(bool), (scores > 0.01).numpy())
+    for frame in range(11):
+        assert torch.equal(shown(node, frame / 10), scores[:, frame] > 0.01)
     empty = node_of(mask_of(), count=0)
     assert empty.mask.keep(empty.rows).removed == 0
     empty.finish_mask()
