@@ -121,6 +121,18 @@ def test_gradient_and_mask_may_be_views(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_a_graph_of_older_values_refuses_its_backward_pass(backend):
+    start, (gradient, *_) = inputs((6, 3), torch.float32, device_of(backend))
+    parameter = start.clone().requires_grad_()
+    loss = (parameter * parameter).sum()
+    moments = torch.zeros_like(start), torch.zeros_like(start)
+    visible = torch.ones(6, dtype=torch.bool, device=start.device)
+    adam_step_(parameter, gradient, *moments, visible, AdamStep(1, LR), backend=backend)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_moments_of_another_shape_are_an_error(backend):
     fields = [torch.zeros(4, width, device=device_of(backend)) for width in (3, 3, 2, 3)]
     mask = torch.ones(4, dtype=torch.bool, device=fields[0].device)

@@ -4,6 +4,7 @@ from functools import partial
 
 import triton.language as tl
 from torch import Tensor, uint8
+from torch.autograd.graph import increment_version
 
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
@@ -35,6 +36,8 @@ def step_rows_(
         1 - betas[0], betas[1], 1 - betas[1], root, eps, size,
         ROW=numbers // len(parameter), options=OPTIONS,
     )  # fmt: skip
+    # What a kernel writes autograd does not see: a graph that holds old values must refuse its backward pass.
+    increment_version((parameter, exp_avg, exp_avg_sq))
 
 
 @partial(jit, do_not_specialize=["numbers"])

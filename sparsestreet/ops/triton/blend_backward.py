@@ -132,7 +132,8 @@ def blend_tiles_backward(
         passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
     else:
         last = tl.load(lasts + at, inside, begin)
-    latest = tl.max(last)
+    # Of a split tile no pair is this program's: its ``lasts`` are those of the parts put together.
+    latest = tl.minimum(tl.max(last), end)
     zero_slots(slots, pair_slots, latest, end, SLOT)
     for i in range(latest - begin):
         k = latest - 1 - i

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
-from sparsestreet.ops.triton import parts, rasterizer
+from sparsestreet.ops.triton import blend_backward, parts, pixels, rasterizer
 from sparsestreet.ops.triton.parts import split_tiles
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -75,6 +75,28 @@ def test_against_the_reference(name, short_parts):
     assert relative_error(result.images["depth"], truth.images["depth"]) <= 1e-6
     for field, gradient in truth.gradients.items():
         assert relative_error(result.gradients[field], gradient) <= 1e-5, field
+
+
+def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatch):
+    """The launch over whole tiles leaves the pairs of split tiles to the launch over parts."""
+    started, written = pixels.launch, {}
+
+    def launch(kernel, items, block, *arguments, **options):
+        if kernel is blend_backward.blend_tiles_backward:
+            slots = [a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (12,)][-1]
+            slots.fill_(torch.nan)
+            started(kernel, items, block, *arguments, **options)
+            written[options["PARTS"]] = slots.isfinite().all(1)
+        else:
+            started(kernel, items, block, *arguments, **options)
+
+    monkeypatch.setattr(pixels, "launch", launch)
+    gaussians = cast(stack(13), torch.float32, requires_grad=True)
+    # Wider than VIEW: one tile is not split.
+    splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
+    assert written[True].any()
+    assert written[False].any()
+    assert torch.equal(written[False], ~written[True])
 
 
 @pytest.mark.parametrize("length", [1, pytest.param(4, marks=pytest.mark.slow_if_interpreted)])
