@@ -1,16 +1,15 @@
 """Forward: each tile's splats, nearest first, into its 256 pixels.
 
-One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers and walks the splats one by
-one; every number of a splat is one load for all lanes. A lane's pixels lie in one line, so that everything that only y
-changes is computed once. They are one axis of 256: of two axes each version of the compiler would choose the lanes'
-pixels for itself, and some choose columns. Registers and instructions are bounded in
-tests/ops/triton/test_machine_code.py.
+One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers, two of each quarter of the
+tile (quarters.py), and walks the splats one by one; every number of a splat is one load for all lanes. Of the next pair
+the row is fetched ahead. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
 """
 
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.quarters import centers, load_splat, of_lines, quarter_pixels, row_of, touches
 from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
@@ -28,10 +27,8 @@ def registers(lasts: bool, exclusive: bool) -> int:
 
 @jit
 def pixels_of(tile, width, height, tiles_x):
-    """Columns and lines of a tile's pixels, and which of them lie in the image; all [256].
-
-    Of 32 neighbors each lane gets one: its 8 pixels lie in one line, two columns apart.
-    """
+    """Columns and lines of a tile's pixels, and which of them lie in the image; all [256]. For kernels that take all of
+    a tile's pixels at once: they are one axis, so that each version of the compiler gives a lane pixels of one line."""
     p = tl.arange(0, PIXELS)
     x = (tile % tiles_x) * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
     y = (tile // tiles_x) * TILE + p % TILE
@@ -43,6 +40,17 @@ def part_pixels(part):
     """Places of a part's pixels in the layers of all parts [256]: line by line, as in the image."""
     p = tl.arange(0, PIXELS)
     return part * PIXELS + p % TILE * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
+
+
+@jit
+def quarter_places(tile, width, height, tiles_x, QUARTER: tl.constexpr, PARTS: tl.constexpr):
+    """Where a quarter's pixels are written, in the image or in the layers of parts, and which of them; [64]."""
+    x, y = quarter_pixels(tile, tiles_x, QUARTER)
+    at, inside = y * width + x, (x < width) & (y < height)
+    if PARTS:
+        # Pixels outside have a place too, and are written, for they are read.
+        at, inside = tl.program_id(0) * PIXELS + y % TILE * TILE + x % TILE, inside | True
+    return at, inside
 
 
 @jit
@@ -63,15 +71,14 @@ def whitened(s, px, py):
 
 
 @jit
-def blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
+def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
     """Blend weight of a splat, the light that gets past it, and which pixels were open to it.
 
     A pixel is finished for good where ``passed`` is at most ``transmittance_min``. The exclusive stop drops the splat
     that would cross that limit and marks the pixel by the sign: the light itself stays above.
     """
-    _, _, _, _, exponent = whitened(s, px, py)
     alpha = tl.minimum(tl.exp2(exponent), alpha_max)
-    drawn = exponent >= tl.load(s + record.CUTOFF)
+    drawn = exponent >= cutoff
     if EXCLUSIVE:
         weight = tl.where(drawn, alpha, 0.0) * passed
         rest = passed - weight
@@ -86,55 +93,55 @@ def blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE: tl.con
 
 
 @jit
-def open_before(products, firsts, part, inside, PARTS: tl.constexpr):
-    """What reaches a tile, or gets past the parts of the tile before this one; pixels outside are finished at once."""
-    passed = tl.where(inside, 1.0, 0.0)
+def open_quarter(tile, products, firsts, first_pair, width, height, tiles_x, QUARTER: tl.constexpr, PARTS: tl.constexpr):
+    """A quarter before its first splat: the light that reaches its pixels (none of those outside the image), no color,
+    no depth, and the index after the last pair that each pixel was open to."""
+    x, y = quarter_pixels(tile, tiles_x, QUARTER)
+    passed = tl.where((x < width) & (y < height), 1.0, 0.0)
     if PARTS:
+        part = tl.program_id(0)
         for before in range(tl.load(firsts + part), part):
-            passed *= tl.load(products + part_pixels(before))
-    return passed
+            passed *= tl.load(products + before * PIXELS + y % TILE * TILE + x % TILE)
+    nothing = tl.zeros_like(passed)
+    return passed, nothing, nothing, nothing, nothing, nothing.to(tl.int32) + first_pair
 
 
 @jit
-def blend_tiles(
-    records, pair_rows, begins, ends, order, firsts, products, rgb, transmittance, depth_sum, lasts,
-    width, height, tiles_x, alpha_max, transmittance_min,
-    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
+def blend_quarter(
+    touched, quarter, x, line, splat, k, alpha_max, transmittance_min,
+    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
 ):  # fmt: skip
-    """Writes every pixel of one tile; with PARTS of one part of a tile, into the layers of parts (parts.py).
+    """A quarter behind a splat, which it may touch."""
+    passed, red, green, blue, depth, last = quarter
+    if touched:
+        geometry, ends, light = splat
+        _, shear, _, base = line
+        a = geometry[2] * (x - geometry[0]) + shear
+        weight, passed, still = blend_one(base - a * a, ends[1], passed, alpha_max, transmittance_min, EXCLUSIVE)
+        red += weight * light[0]
+        green += weight * light[1]
+        blue += weight * light[2]
+        if DEPTH:
+            depth += weight * light[3]
+        if LASTS:
+            last = tl.where(still, k + 1, last)
+    return passed, red, green, blue, depth, last
 
-    ``lasts`` (if LASTS): the index after the last pair that a pixel was open to, where backward begins.
-    """
-    tl.static_assert(BLOCK == 1)
-    tile = tl.load(order + tl.program_id(0))
-    x, y, inside = pixels_of(tile, width, height, tiles_x)
-    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    k, end = pairs_of(tile, begins, ends, PARTS)
-    passed = open_before(products, firsts, tl.program_id(0), inside, PARTS)
-    red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
-    depth, last = tl.zeros_like(passed), tl.zeros_like(passed).to(tl.int32) + k
-    unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    while unfinished:
-        stop = tl.minimum(k + LOOK, end)
-        for i in range(k, stop):
-            s = record.record_of(records, tl.load(pair_rows + i))
-            weight, passed, still = blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE)
-            red += weight * tl.load(s + record.COLOR)
-            green += weight * tl.load(s + record.COLOR + 1)
-            blue += weight * tl.load(s + record.COLOR + 2)
-            if DEPTH:
-                depth += weight * tl.load(s + record.DEPTH)
-            if LASTS:
-                last = tl.where(still, i + 1, last)
-        k = stop
-        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    # Volatile: the compiler must compute places anew instead of holding registers for them through the loop.
-    tile = tl.load(order + tl.program_id(0), volatile=True)
-    x, y, inside = pixels_of(tile, width, height, tiles_x)
-    at = y * width + x
-    if PARTS:
-        # Pixels outside have a place too, and are written, for they are read.
-        at, inside = part_pixels(tl.program_id(0)), inside | True
+
+@jit
+def any_open(upper_left, upper_right, lower_left, lower_right, transmittance_min):
+    """Whether a pixel of the tile still takes light."""
+    upper, lower = tl.maximum(upper_left[0], upper_right[0]), tl.maximum(lower_left[0], lower_right[0])
+    return tl.max(tl.maximum(upper, lower)) > transmittance_min
+
+
+@jit
+def store_quarter(
+    quarter, tile, rgb, transmittance, depth_sum, lasts, width, height, tiles_x,
+    QUARTER: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr,
+):  # fmt: skip
+    passed, red, green, blue, depth, last = quarter
+    at, inside = quarter_places(tile, width, height, tiles_x, QUARTER, PARTS)
     tl.store(rgb + 3 * at, red, inside)
     tl.store(rgb + 3 * at + 1, green, inside)
     tl.store(rgb + 3 * at + 2, blue, inside)
@@ -143,3 +150,50 @@ def blend_tiles(
         tl.store(depth_sum + at, depth, inside)
     if LASTS:
         tl.store(lasts + at, last, inside)
+
+
+@jit
+def blend_tiles(
+    records, pair_rows, begins, ends, order, firsts, products, rgb, transmittance, depth_sum, lasts,
+    width, height, tiles_x, alpha_max, transmittance_min,
+    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes every pixel of one tile; with PARTS of one part of a tile, into the layers of parts (parts.py), and
+    nothing of a part that is not needed.
+
+    ``lasts`` (if LASTS): an index after the last pair that a pixel took light from, where backward begins.
+    """
+    tl.static_assert(BLOCK == 1)
+    tile = tl.load(order + tl.program_id(0))
+    k, end = pairs_of(tile, begins, ends, PARTS)
+    written = (k < end) | (not PARTS)
+    limit = transmittance_min
+    q0 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 0, PARTS)
+    q1 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 1, PARTS)
+    q2 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 2, PARTS)
+    q3 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 3, PARTS)
+    xs, ys = centers(tile, tiles_x)
+    unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
+    pair = tl.load(pair_rows + k, unfinished, 0)
+    while unfinished:
+        stop = tl.minimum(k + LOOK, end)
+        for i in range(k, stop):
+            splat = load_splat(records, row_of(pair))
+            touched = pair
+            pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
+            line = of_lines(splat[0], splat[1][0], ys[0])
+            q0 = blend_quarter(touches(touched, 0), q0, xs[0], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
+            q1 = blend_quarter(touches(touched, 1), q1, xs[1], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
+            line = of_lines(splat[0], splat[1][0], ys[1])
+            q2 = blend_quarter(touches(touched, 2), q2, xs[0], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
+            q3 = blend_quarter(touches(touched, 3), q3, xs[1], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
+        k = stop
+        unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
+    if written:
+        # Volatile: the compiler must compute places anew instead of holding registers for them through the loop.
+        tile = tl.load(order + tl.program_id(0), volatile=True)
+        to, size = (rgb, transmittance, depth_sum, lasts), (width, height, tiles_x)
+        store_quarter(q0, tile, *to, *size, 0, DEPTH, LASTS, PARTS)
+        store_quarter(q1, tile, *to, *size, 1, DEPTH, LASTS, PARTS)
+        store_quarter(q2, tile, *to, *size, 2, DEPTH, LASTS, PARTS)
+        store_quarter(q3, tile, *to, *size, 3, DEPTH, LASTS, PARTS)

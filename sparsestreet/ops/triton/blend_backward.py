@@ -10,9 +10,19 @@ s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + 
 
 import triton.language as tl
 
-from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import PIXELS, WARP, pairs_of, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.blend import pairs_of, quarter_places
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.quarters import (
+    WARP,
+    centers,
+    lane_sum,
+    load_splat,
+    of_lane,
+    of_lines,
+    row_of,
+    touches,
+)
+from sparsestreet.ops.triton.view import TILE
 
 SLOT_LENGTH = 12
 SLOT = constant(SLOT_LENGTH)
@@ -25,45 +35,27 @@ def registers(depth: bool) -> int:
 
 
 @jit
-def in_lane(values):
-    """Sums over the pixels of each lane [32]."""
-    return tl.sum(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+def halved(low, high, lane, BIT: tl.constexpr):
+    """Lanes without BIT keep ``low`` and those with it ``high``, each with the same of its partner added."""
+    upper = (lane & BIT) != 0
+    return tl.where(upper, high, low) + tl.gather(tl.where(upper, low, high), lane ^ BIT, 0)
 
 
 @jit
-def of_lane(values):
-    """What the pixels of each lane share [32]."""
-    return tl.max(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
-
-
-@jit
-def store_sums(
-    o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr
-):
-    """Sums over the tile: first within a lane, whose pixels share y, then over what y alone changes."""
-    ga = g * a
-    lane_g, lane_ga, lane_b, lane_dy = in_lane(g), in_lane(ga), of_lane(b), of_lane(dy)
-    sums = (
-        tl.sum(lane_g), tl.sum(lane_ga), tl.sum(lane_g * lane_b),
-        tl.sum(in_lane(ga * dx)), tl.sum(lane_ga * lane_dy), tl.sum(lane_g * lane_b * lane_dy),
-    )  # fmt: skip
-    absolute_x, absolute_y, depth = 0.0, 0.0, 0.0
-    if ABSOLUTE:
-        absolute_x = tl.sum(in_lane(tl.abs(ga)))
-        l21, l22 = tl.load(s + record.L21), tl.load(s + record.L22)
-        absolute_y = tl.sum(in_lane(tl.abs(l21 * ga + l22 * (g * b))))
-    if DEPTH:
-        depth = tl.sum(in_lane(weight * v_depth))
-    sums += (
-        absolute_x, absolute_y,
-        tl.sum(in_lane(weight * v_red)), tl.sum(in_lane(weight * v_green)), tl.sum(in_lane(weight * v_blue)), depth,
-    )  # fmt: skip
-    # One store for all: as many as there are sums would each take an address of its own.
-    field = tl.arange(0, 16)
-    values = tl.where(field == 0, sums[0], 0.0)
-    for i in tl.static_range(1, SLOT):
-        values = tl.where(field == i, sums[i], values)
-    tl.store(o + field, values, field < SLOT)
+def store_sums(to, s):
+    """Sums over the warp of each lane's twelve numbers, in a fixed order. Every exchange between lanes halves how many
+    numbers a lane still holds: 13 exchanges, where a sum of each number alone would take 60."""
+    lane = tl.arange(0, WARP)
+    s0, s1, s2 = halved(s[0], s[6], lane, 16), halved(s[1], s[7], lane, 16), halved(s[2], s[8], lane, 16)
+    s3, s4, s5 = halved(s[3], s[9], lane, 16), halved(s[4], s[10], lane, 16), halved(s[5], s[11], lane, 16)
+    s0, s1, s2 = halved(s0, s3, lane, 8), halved(s1, s4, lane, 8), halved(s2, s5, lane, 8)
+    s0 = halved(s0, s1, lane, 4)
+    s2 += tl.gather(s2, lane ^ 4, 0)
+    s0 = halved(s0, s2, lane, 2)
+    s0 += tl.gather(s0, lane ^ 1, 0)
+    third = (lane & 2) != 0
+    field = 6 * (lane // 16) + 3 * (lane // 8 % 2) + tl.where(third, 2, lane // 4 % 2)
+    tl.store(to + field, s0, ((lane & 1) == 0) & ((lane & 6) != 6))
 
 
 @jit
@@ -77,10 +69,10 @@ def zero_slots(slots, pair_slots, begin, end, COUNT: tl.constexpr):
 
 
 @jit
-def alpha_behind(s, exponent, k, last, alpha_max):
+def alpha_behind(exponent, cutoff, k, last, alpha_max):
     """Alpha, 0 where the splat was not drawn or the pixel had finished, and 1 / (1 - alpha)."""
     raw = tl.exp2(exponent)
-    drawn = (exponent >= tl.load(s + record.CUTOFF)) & (k < last)
+    drawn = (exponent >= cutoff) & (k < last)
     alpha = tl.where(drawn, tl.minimum(raw, alpha_max), 0.0)
     # The device's reciprocal root is good to 2^-22.9; one Newton step, so that no drift builds up over a stack.
     rest = 1.0 - alpha
@@ -90,16 +82,79 @@ def alpha_behind(s, exponent, k, last, alpha_max):
 
 
 @jit
-def from_behind(colors, depths, v_red, v_green, v_blue, v_depth, nexts, part, DEPTH: tl.constexpr):
-    """Light of the parts of the tile behind this one, against the cotangents."""
-    behind = tl.zeros_like(v_red)
+def light_behind(part_rgb, part_depth, nexts, v, at, DEPTH: tl.constexpr):
+    """Light of the parts of the tile behind this one, against the cotangents; ``at``: places in this part's layer."""
+    part = tl.program_id(0)
+    light = tl.zeros_like(v[0])
     for after in range(part + 1, tl.load(nexts + part)):
-        at = part_pixels(after)
-        behind += tl.load(colors + 3 * at) * v_red + tl.load(colors + 3 * at + 1) * v_green
-        behind += tl.load(colors + 3 * at + 2) * v_blue
+        to = at + (after - part) * TILE * TILE
+        light += tl.load(part_rgb + 3 * to) * v[0] + tl.load(part_rgb + 3 * to + 1) * v[1]
+        light += tl.load(part_rgb + 3 * to + 2) * v[2]
         if DEPTH:
-            behind += tl.load(depths + at) * v_depth
-    return behind
+            light += tl.load(part_depth + to) * v[3]
+    return light
+
+
+@jit
+def last_quarter(
+    tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin,
+    nexts, part_rgb, part_depth, part_transmittance, part_lasts, width, height, tiles_x,
+    QUARTER: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr,
+):  # fmt: skip
+    """A quarter behind its last splat: the light that is left and the light behind against the cotangents; then what
+    stays the same, the cotangents of color and depth and the index after the last pair of each pixel."""
+    at, inside = quarter_places(tile, width, height, tiles_x, QUARTER, False)
+    red = tl.load(v_rgb + 3 * at, inside, 0.0)
+    green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
+    blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
+    v = (red, green, blue, tl.load(v_depth_sum + at, inside, 0.0) if DEPTH else red)
+    passed = tl.load(transmittance + at, inside, 0.0)
+    behind = passed * tl.load(v_transmittance + at, inside, 0.0)
+    if PARTS:
+        at, inside = quarter_places(tile, width, height, tiles_x, QUARTER, True)
+        behind += light_behind(part_rgb, part_depth, nexts, v, at, DEPTH)
+        passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
+    else:
+        last = tl.load(lasts + at, inside, begin)
+    return (passed, behind), v, last
+
+
+@jit
+def differentiate_quarter(
+    touched, quarter, v, last, sums, x, line, splat, k, alpha_max, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr
+):
+    """The quarter before a splat, and the splat's sums with those over this quarter: within a lane, whose pixels share
+    y, all that x changes."""
+    passed, behind = quarter
+    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = sums
+    if touched:
+        geometry, ends, light = splat
+        dy, shear, b, base = line
+        dx = x - geometry[0]
+        a = geometry[2] * dx + shear
+        raw, alpha, inverse = alpha_behind(base - a * a, ends[1], k, last, alpha_max)
+        passed *= inverse
+        weight = alpha * passed
+        shown = light[0] * v[0] + light[1] * v[1] + light[2] * v[2]
+        if DEPTH:
+            shown += light[3] * v[3]
+        blended = weight * shown
+        # A clamped alpha has no derivative.
+        g = tl.where(raw <= alpha_max, blended - alpha * inverse * behind, 0.0)
+        behind += blended
+        ga = g * a
+        lane_g, lane_ga, lane_dy = lane_sum(g), lane_sum(ga), of_lane(dy)
+        lane_gb = lane_g * of_lane(b)
+        s0, s1, s2 = s0 + lane_g, s1 + lane_ga, s2 + lane_gb
+        s3, s4, s5 = s3 + lane_sum(ga * dx), s4 + lane_ga * lane_dy, s5 + lane_gb * lane_dy
+        if ABSOLUTE:
+            s6 += lane_sum(tl.abs(ga))
+            s7 += lane_sum(tl.abs(geometry[3] * ga + geometry[4] * (g * b)))
+        s8, s9 = s8 + lane_sum(weight * v[0]), s9 + lane_sum(weight * v[1])
+        s10 += lane_sum(weight * v[2])
+        if DEPTH:
+            s11 += lane_sum(weight * v[3])
+    return (passed, behind), (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11)
 
 
 @jit
@@ -115,40 +170,41 @@ def blend_tiles_backward(
     """
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
-    x, y, inside = pixels_of(tile, width, height, tiles_x)
-    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    at = y * width + x
-    v_red = tl.load(v_rgb + 3 * at, inside, 0.0)
-    v_green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
-    v_blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
-    v_depth = tl.load(v_depth_sum + at, inside, 0.0) if DEPTH else v_red
-    passed = tl.load(transmittance + at, inside, 0.0)
-    behind = passed * tl.load(v_transmittance + at, inside, 0.0)
     begin, end = pairs_of(tile, begins, ends, PARTS)
-    if PARTS:
-        part = tl.program_id(0)
-        behind += from_behind(part_rgb, part_depth, v_red, v_green, v_blue, v_depth, nexts, part, DEPTH)
-        at = part_pixels(part)
-        passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
-    else:
-        last = tl.load(lasts + at, inside, begin)
-    # Of a split tile no pair is this program's: its ``lasts`` are those of the parts put together.
-    latest = tl.minimum(tl.max(last), end)
+    given = (tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin)
+    part = (nexts, part_rgb, part_depth, part_transmittance, part_lasts)
+    size = (width, height, tiles_x)
+    q0, v0, last0 = last_quarter(*given, *part, *size, 0, DEPTH, PARTS)
+    q1, v1, last1 = last_quarter(*given, *part, *size, 1, DEPTH, PARTS)
+    q2, v2, last2 = last_quarter(*given, *part, *size, 2, DEPTH, PARTS)
+    q3, v3, last3 = last_quarter(*given, *part, *size, 3, DEPTH, PARTS)
+    xs, ys = centers(tile, tiles_x)
+    latest = tl.max(tl.maximum(tl.maximum(last0, last1), tl.maximum(last2, last3)))
+    # Of a split tile no pair is this program's: its ``lasts`` are those of the parts put together. Of a part that is
+    # not needed nothing was written.
+    latest = tl.maximum(tl.minimum(latest, end), begin)
     zero_slots(slots, pair_slots, latest, end, SLOT)
+    pair, slot = tl.load(pair_rows + latest - 1, latest > begin, 0), tl.load(pair_slots + latest - 1, latest > begin, 0)
     for i in range(latest - begin):
         k = latest - 1 - i
-        s = record.record_of(records, tl.load(pair_rows + k))
-        dx, dy, a, b, exponent = whitened(s, px, py)
-        raw, alpha, inverse = alpha_behind(s, exponent, k, last, alpha_max)
-        passed *= inverse
-        weight = alpha * passed
-        light = tl.load(s + record.COLOR) * v_red + tl.load(s + record.COLOR + 1) * v_green
-        light += tl.load(s + record.COLOR + 2) * v_blue
-        if DEPTH:
-            light += tl.load(s + record.DEPTH) * v_depth
-        blended = weight * light
-        # A clamped alpha has no derivative.
-        g = tl.where(raw <= alpha_max, blended - alpha * inverse * behind, 0.0)
-        behind += blended
-        o = slots + tl.load(pair_slots + k) * SLOT
-        store_sums(o, s, g, dx, dy, a, b, weight, v_red, v_green, v_blue, v_depth, DEPTH, ABSOLUTE)
+        splat = load_splat(records, row_of(pair))
+        touched, to = pair, slots + slot * SLOT
+        pair, slot = tl.load(pair_rows + k - 1, k > begin, 0), tl.load(pair_slots + k - 1, k > begin, 0)
+        nothing = tl.zeros((WARP,), tl.float32)
+        s = (nothing, nothing, nothing, nothing, nothing, nothing)
+        s = s + s
+        line = of_lines(splat[0], splat[1][0], ys[0])
+        q0, s = differentiate_quarter(
+            touches(touched, 0), q0, v0, last0, s, xs[0], line, splat, k, alpha_max, DEPTH, ABSOLUTE
+        )
+        q1, s = differentiate_quarter(
+            touches(touched, 1), q1, v1, last1, s, xs[1], line, splat, k, alpha_max, DEPTH, ABSOLUTE
+        )
+        line = of_lines(splat[0], splat[1][0], ys[1])
+        q2, s = differentiate_quarter(
+            touches(touched, 2), q2, v2, last2, s, xs[0], line, splat, k, alpha_max, DEPTH, ABSOLUTE
+        )
+        q3, s = differentiate_quarter(
+            touches(touched, 3), q3, v3, last3, s, xs[1], line, splat, k, alpha_max, DEPTH, ABSOLUTE
+        )
+        store_sums(to, s)

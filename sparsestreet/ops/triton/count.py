@@ -4,9 +4,10 @@ does not pay for it; slots instead of atomics, as in backward."""
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, blend_one, pixels_of
+from sparsestreet.ops.triton.blend import LOOK, blend_one, pixels_of, whitened
 from sparsestreet.ops.triton.blend_backward import zero_slots
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.quarters import row_of
 
 COUNTER_COUNT = 3
 COUNTERS = constant(COUNTER_COUNT)
@@ -30,8 +31,10 @@ def count_tiles_pixels(
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
-            s = record.record_of(records, tl.load(pair_rows + i))
-            weight, passed, _ = blend_one(s, px, py, passed, alpha_max, transmittance_min, EXCLUSIVE)
+            s = record.record_of(records, row_of(tl.load(pair_rows + i)))
+            _, _, _, _, exponent = whitened(s, px, py)
+            cutoff = tl.load(s + record.CUTOFF)
+            weight, passed, _ = blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE)
             # Strictly more: of equal weights the nearer splat keeps the pixel.
             more = weight > best
             best, best_pair = tl.where(more, weight, best), tl.where(more, i, best_pair)

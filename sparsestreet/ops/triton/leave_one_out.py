@@ -8,6 +8,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import pixels_of, whitened
 from sparsestreet.ops.triton.blend_backward import alpha_behind, zero_slots
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.quarters import row_of
 
 CHANGE_COUNT = 2
 CHANGES = constant(CHANGE_COUNT)
@@ -51,9 +52,9 @@ def remove_from_tiles(
     zero_slots(slots, pair_slots, latest, tl.load(ends + tile), CHANGES)
     for i in range(latest - begin):
         k = latest - 1 - i
-        s = record.record_of(records, tl.load(pair_rows + k))
+        s = record.record_of(records, row_of(tl.load(pair_rows + k)))
         _, _, _, _, exponent = whitened(s, px, py)
-        _, alpha, inverse = alpha_behind(s, exponent, k, last, alpha_max)
+        _, alpha, inverse = alpha_behind(exponent, tl.load(s + record.CUTOFF), k, last, alpha_max)
         passed *= inverse
         weight, through = alpha * passed, alpha * inverse
         of_red, red = change_of(red, weight * tl.load(s + record.COLOR), through)

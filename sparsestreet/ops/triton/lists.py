@@ -18,6 +18,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.parts import Parts, split_tiles
+from sparsestreet.ops.triton.quarters import MOST_ROWS, QUARTER_SHIFT, touched_quarters
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
 from sparsestreet.ops.triton.view import View
 
@@ -36,7 +37,7 @@ class Lists:
     first_pairs: Int[Tensor, " v"]
     tile_counts: Int[Tensor, " v"]
     pair_rows: Int[Tensor, " p"]
-    """Rows of the pairs tile by tile, nearest first."""
+    """Rows of the pairs tile by tile, nearest first, and the quarters of the tile that each touches (quarters.py)."""
     slots: Int[Tensor, " p"]
     """Number of each of those pairs before it was sorted by tile."""
     begins: Int[Tensor, " t"]
@@ -45,6 +46,16 @@ class Lists:
     """Tiles, those with most pairs first: the longest must not start last."""
     parts: Parts | None
     """Room for the parts of long tiles, empty where there are none; None where no tile can be long."""
+
+    @property
+    def rows_of_pairs(self) -> Int[Tensor, " p"]:
+        """``pair_rows`` without the quarters."""
+        return self.pair_rows & (MOST_ROWS - 1)
+
+    @property
+    def quarters_of_pairs(self) -> Int[Tensor, " p"]:
+        """A bit for each quarter of the tile."""
+        return self.pair_rows >> QUARTER_SHIFT & 15
 
 
 @partial(jit, do_not_specialize=["row_count"])
@@ -65,7 +76,8 @@ def list_pairs(
     records, ranks, rows, first_pairs, keys, pair_rows, pairs, width, height, tiles_x,
     BOUNDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tile of each pair: pair i of a row lies in the i-th tile of its splat, counted row of tiles by row."""
+    """The tile of each pair, and its row with the quarters it touches (quarters.py): pair i of a row lies in the i-th
+    tile of its splat, counted row of tiles by row."""
     pair = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = pair < pairs
     rank = tl.load(ranks + pair, given, 0)
@@ -78,15 +90,16 @@ def list_pairs(
     reach = tl.load(s + record.LOG2_OPACITY, given, 0.0) - tl.load(s + record.CUTOFF, given, 0.0)
     reach = tl.maximum(reach, 0.0)
     first, last = tile_rows(y, l22, reach, height, BOUNDED)
-    tile = tl.zeros_like(pair)
+    column, line = tl.zeros_like(pair), tl.zeros_like(pair)
     for i in range(tl.max(tl.where(given, last - first + 1, 0), 0)):
         left, right = tile_columns(x, y, l11, l21, l22, reach, first + i, width, BOUNDED)
         here = (rest >= 0) & (rest <= right - left) & (first + i <= last)
-        tile = tl.where(here, (first + i) * tiles_x + left + rest, tile)
+        column, line = tl.where(here, left + rest, column), tl.where(here, first + i, line)
         rest -= right - left + 1
     # Each lane writes its own pair, so nothing is left unwritten or written outside.
-    tl.store(keys + pair, tile, given)
-    tl.store(pair_rows + pair, row, given)
+    tl.store(keys + pair, line * tiles_x + column, given)
+    quarters = touched_quarters((x, y, l11, l21, l22), reach, column, line, BOUNDED)
+    tl.store(pair_rows + pair, row | quarters, given)
 
 
 def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: View) -> Lists:

@@ -19,6 +19,7 @@ from torch import Tensor
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
 from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.quarters import row_of
 
 PART_LENGTH = 256
 """Least pairs of a part; none has more than one and a half times as many."""
@@ -96,24 +97,25 @@ def thin_parts(
     records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each part, or something below the limit where it falls there."""
+    """Writes the product of 1 - alpha over each part that is needed, or something below the limit where it falls there."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
     x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
     passed = tl.where(inside, 1.0, 0.0)
     k, end = tl.load(begins + part), tl.load(ends + part)
-    unfinished = k < end
+    needed = k < end
+    unfinished = needed
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
-            s = record.record_of(records, tl.load(pair_rows + i))
+            s = record.record_of(records, row_of(tl.load(pair_rows + i)))
             _, _, _, _, exponent = whitened(s, px, py)
             alpha = tl.minimum(tl.exp2(exponent), alpha_max)
             passed -= tl.where(exponent >= tl.load(s + record.CUTOFF), alpha, 0.0) * passed
         k = stop
         unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    tl.store(products + part_pixels(part), passed)
+    tl.store(products + part_pixels(part), passed, needed)
 
 
 @jit

@@ -24,6 +24,7 @@ from sparsestreet.ops.triton.pixels import (
     differentiate_view,
     pixel_arguments,
 )
+from sparsestreet.ops.triton.quarters import MOST_ROWS
 from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import View
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
@@ -85,7 +86,7 @@ def leave_one_out(
     _sum_slots(changes, lists, totals, 2, tl.float64)
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
-    largest.scatter_reduce_(0, lists.pair_rows.long(), changes[lists.slots, 0].double(), "amax")
+    largest.scatter_reduce_(0, lists.rows_of_pairs.long(), changes[lists.slots, 0].double(), "amax")
     return LeaveOneOut(largest, totals[:, 1])
 
 
@@ -139,6 +140,8 @@ def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl
 
 def _check(gaussians: Gaussians) -> None:
     means = gaussians.means
+    if len(means) > MOST_ROWS:
+        raise ValueError(f"backend 'triton' takes at most 2^28 rows, got {len(means)}: render a part of them")
     if means.dtype != torch.float32:
         raise ValueError(
             f"backend 'triton' computes in float32, got {means.dtype}: convert the Gaussians with dataclasses.replace "

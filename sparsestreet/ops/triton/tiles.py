@@ -49,23 +49,31 @@ def half_chord(dy, half_width, half_y):
 
 
 @jit
+def lines_span(x, y, l11, l21, l22, reach, line, LINES: tl.constexpr):
+    """The least and the largest x of the ellipse x(dy) = slope dy -+ half_chord(dy) within LINES lines of pixels from
+    ``line`` on, and whether it comes near them at all; margins included."""
+    root = tl.sqrt(reach)
+    slope, half_width, half_y = -l21 / l11, root / l11, root / l22
+    half_x = root * tl.sqrt(l21 * l21 + l22 * l22) / (l11 * l22)
+    # The right-most point lies at dy = peak, the left-most at -peak.
+    peak = tl.where(half_x > 0, slope * half_y * half_y / half_x, 0.0)
+    margin_x, margin_y = BOX_MARGIN + RELATIVE_MARGIN * half_x, BOX_MARGIN + RELATIVE_MARGIN * half_y
+    top = line.to(tl.float32) + 0.5 - y
+    first, last = top - margin_y, top + (LINES - 1.0) + margin_y
+    low, high = limited(first, -half_y, half_y), limited(last, -half_y, half_y)
+    at_right, at_left = limited(peak, low, high), limited(-peak, low, high)
+    low_x = x + (slope * at_left - half_chord(at_left, half_width, half_y) - margin_x)
+    high_x = x + (slope * at_right + half_chord(at_right, half_width, half_y) + margin_x)
+    return low_x, high_x, (first <= half_y) & (last >= -half_y)
+
+
+@jit
 def tile_columns(x, y, l11, l21, l22, reach, row, width, BOUNDED: tl.constexpr):
-    """First and last tile of row ``row`` that the ellipse x(dy) = slope dy -+ half_chord(dy) passes through."""
+    """First and last tile of row ``row`` that the ellipse passes through."""
     low_x = tl.zeros_like(x)
     high_x = low_x + width
     if BOUNDED:
-        root = tl.sqrt(reach)
-        slope, half_width, half_y = -l21 / l11, root / l11, root / l22
-        half_x = root * tl.sqrt(l21 * l21 + l22 * l22) / (l11 * l22)
-        # The right-most point lies at dy = peak, the left-most at -peak.
-        peak = tl.where(half_x > 0, slope * half_y * half_y / half_x, 0.0)
-        margin_x, margin_y = BOX_MARGIN + RELATIVE_MARGIN * half_x, BOX_MARGIN + RELATIVE_MARGIN * half_y
-        top = (row * TILE).to(tl.float32) + 0.5 - y
-        low = limited(top - margin_y, -half_y, half_y)
-        high = limited(top + (TILE - 1.0) + margin_y, -half_y, half_y)
-        at_right, at_left = limited(peak, low, high), limited(-peak, low, high)
-        low_x = x + (slope * at_left - half_chord(at_left, half_width, half_y) - margin_x)
-        high_x = x + (slope * at_right + half_chord(at_right, half_width, half_y) + margin_x)
+        low_x, high_x, _ = lines_span(x, y, l11, l21, l22, reach, row * TILE, TILE)
     return tile_span(low_x, high_x, width)
 
 

@@ -5,8 +5,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.triton.blend import LOOK_LENGTH, PIXEL_COUNT
+from sparsestreet.ops.triton.blend import LOOK_LENGTH
 from sparsestreet.ops.triton.pixels import blend_view
+from sparsestreet.ops.triton.quarters import QUARTER_PIXELS
 from sparsestreet.ops.triton.screen import project
 from sparsestreet.ops.triton.view import TILE_SIZE, View
 from sparsestreet.types import Camera, Gaussians
@@ -16,8 +17,9 @@ from sparsestreet.types import Camera, Gaussians
 def count_work(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> tuple[int, int]:
     """(splat, tile) pairs of one view and (splat, pixel) samples that its forward pass computes.
 
-    The walk over a tile ends with the 32 pairs in which its last pixel is finished. Long tiles are counted as if they
-    were in one piece: that the light through their parts is computed twice is not in the number.
+    The walk over a tile is counted up to the 32 pairs in which its last pixel is open to a splat, and of each pair the
+    quarters that it touches. Long tiles are counted as if they were in one piece: that the light through their parts is
+    computed twice is not in the number.
     """
     view = View(camera, settings)
     screen = project(gaussians, view)
@@ -25,7 +27,10 @@ def count_work(gaussians: Gaussians, camera: Camera, settings: SplatSettings) ->
     counts, seen = lists.ends - lists.begins, _last_of_tiles(blend_view(screen, view, lasts=True).ends.lasts, view)
     seen = torch.where(counts > 0, seen - lists.begins, 0)
     walked = torch.minimum(-(-seen // LOOK_LENGTH) * LOOK_LENGTH, counts)
-    return len(lists.slots), int(walked.sum()) * PIXEL_COUNT
+    touched = (lists.quarters_of_pairs[:, None] >> torch.arange(4, device=counts.device) & 1).sum(1)
+    before = torch.nn.functional.pad(touched.cumsum(0), (1, 0))
+    quarters = before[(lists.begins + walked).long()] - before[lists.begins.long()]
+    return len(lists.slots), int(quarters.sum()) * QUARTER_PIXELS
 
 
 def _last_of_tiles(lasts: Tensor, view: View) -> Tensor:

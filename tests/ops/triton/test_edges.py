@@ -8,7 +8,7 @@ import torch
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import lists, rasterizer
 from sparsestreet.types import Gaussians, Shutter
-from tests.ops.scenes import FIELDS, camera, cast, device_of, front_camera, one_gaussian, random_gaussians, render
+from tests.ops.scenes import FIELDS, camera, cast, device_of, front_camera, one_gaussian, random_gaussians, relative_error, render
 
 DEVICE = device_of("triton")
 VIEW = camera(9, 7)
@@ -97,10 +97,16 @@ def test_an_overflowing_row_is_culled():
     assert together.radii[-1] == 0
 
 
-def test_no_motion_is_no_shutter_bit_for_bit():
+def test_no_motion_is_no_shutter():
+    """The same bits, but for gradients on a device: of two kernels the compiler contracts not the same products."""
     gaussians = random_gaussians(6, VIEW)
     still = dataclasses.replace(VIEW, shutter=Shutter(torch.zeros(3), torch.zeros(3)))
-    assert_same_bits(*(render(gaussians, view, "triton", torch.float32) for view in (VIEW, still)))
+    plain, rolled = (render(gaussians, view, "triton", torch.float32) for view in (VIEW, still))
+    for name, image in plain.images.items():
+        assert torch.equal(image, rolled.images[name]), name
+    for name, gradient in plain.gradients.items():
+        bar = 0.0 if DEVICE.type == "cpu" else 1e-6
+        assert relative_error(rolled.gradients[name], gradient) <= bar, name
 
 
 def test_behind_the_fold_of_the_lens():

@@ -22,20 +22,20 @@ def listed(screen: Screen) -> set[tuple[int, int]]:
     """(row, tile) of every pair, as the pixel kernels walk them."""
     lists, pairs = screen.lists, set()
     for tile in range(len(lists.begins)):
-        rows = lists.pair_rows[int(lists.begins[tile]) : int(lists.ends[tile])].tolist()
+        rows = lists.rows_of_pairs[int(lists.begins[tile]) : int(lists.ends[tile])].tolist()
         pairs |= {(row, tile) for row in rows}
     assert len(pairs) == len(lists.pair_rows)
     return pairs
 
 
-def touched(screen: Screen, view: Camera, rows: int, margin: float = 0.0) -> set[tuple[int, int]]:
-    """Pairs with a pixel center in the ellipse, which is widened by ``margin`` pixels; from the records, in float64."""
+def touched(screen: Screen, rows: int, margin: float = 0.0, side: int = TILE) -> set[tuple[int, int, int]]:
+    """Row, column and line of the squares of ``side`` pixels with a pixel center in the row's ellipse, which is widened
+    by ``margin`` pixels; from the records, in float64, and over whole tiles."""
     y, x = torch.meshgrid(
-        torch.arange(view.height, dtype=torch.float64) + 0.5,
-        torch.arange(view.width, dtype=torch.float64) + 0.5,
+        torch.arange(ROWS * TILE, dtype=torch.float64) + 0.5,
+        torch.arange(COLUMNS * TILE, dtype=torch.float64) + 0.5,
         indexing="ij",
     )
-    tiles = (y / TILE).floor().long() * math.ceil(view.width / TILE) + (x / TILE).floor().long()
     found = set()
     for row in range(rows):
         if screen.tile_counts[row] == 0:
@@ -46,7 +46,8 @@ def touched(screen: Screen, view: Camera, rows: int, margin: float = 0.0) -> set
         # A pixel is at most so many units of L d.
         most = float(torch.linalg.matrix_norm(torch.tensor([[l11, l21], [0, l22]]), 2))
         inside = distance <= math.sqrt(max(log2_opacity - cutoff, 0)) + margin * most
-        found |= {(row, tile) for tile in tiles[inside].unique().tolist()}
+        squares = torch.stack((x[inside], y[inside])).div(side).floor().long().unique(dim=1)
+        found |= {(row, column, line) for column, line in squares.T.tolist()}
     return found
 
 
@@ -77,11 +78,37 @@ def projected() -> tuple[Screen, Camera]:
 
 def test_no_touched_tile_is_missing_and_hardly_one_is_listed_in_vain(projected):
     screen, view = projected
-    needed = touched(screen, view, 24)
-    assert len(needed) > 150
-    assert needed <= listed(screen)
+
+    def needed(margin: float) -> set[tuple[int, int]]:
+        return {
+            (row, line * COLUMNS + column)
+            for row, column, line in touched(screen, 24, margin)
+            if column * TILE < view.width and line * TILE < view.height
+        }
+
+    assert len(needed(0.0)) > 150
+    assert needed(0.0) <= listed(screen)
     # The margin against rounding is a hundredth of a pixel and 1e-5 of the ellipse.
-    assert listed(screen) <= touched(screen, view, 24, margin=0.05)
+    assert listed(screen) <= needed(0.05)
+
+
+def test_no_touched_quarter_is_missing_and_hardly_one_is_listed_in_vain(projected):
+    screen, _ = projected
+    lists, marked, tiles = screen.lists, set(), set()
+    for tile in range(COLUMNS * ROWS):
+        pairs = slice(int(lists.begins[tile]), int(lists.ends[tile]))
+        line, column = divmod(tile, COLUMNS)
+        for row, bits in zip(
+            lists.rows_of_pairs[pairs].tolist(), lists.quarters_of_pairs[pairs].tolist(), strict=True
+        ):
+            tiles.add((row, column, line))
+            marked |= {(row, 2 * column + k % 2, 2 * line + k // 2) for k in range(4) if bits >> k & 1}
+
+    def within(squares: set[tuple[int, int, int]]) -> set[tuple[int, int, int]]:
+        return {square for square in squares if (square[0], square[1] // 2, square[2] // 2) in tiles}
+
+    assert within(touched(screen, 24, side=8)) <= marked <= touched(screen, 24, margin=0.05, side=8)
+    assert len(marked) < 3 * len(tiles)
 
 
 def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
@@ -89,7 +116,7 @@ def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
     screen = project(cast(random_gaussians(40, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
     lists, depths = screen.lists, screen.records[:, DEPTH]
     for begin, end in zip(lists.begins.tolist(), lists.ends.tolist(), strict=True):
-        order = depths[lists.pair_rows[begin:end].long()]
+        order = depths[lists.rows_of_pairs[begin:end].long()]
         assert (order[1:] >= order[:-1]).all()
     lengths = (lists.ends - lists.begins)[lists.order.long()]
     assert lengths[0] > lengths[-1]

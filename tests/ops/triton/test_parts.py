@@ -91,7 +91,7 @@ def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatc
             started(kernel, items, block, *arguments, **options)
 
     monkeypatch.setattr(pixels, "launch", launch)
-    gaussians = cast(stack(13), torch.float32, requires_grad=True)
+    gaussians = cast(stack(13), torch.float32, requires_grad=True, device=DEVICE)
     # Wider than VIEW: one tile is not split.
     splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
     assert written[True].any()

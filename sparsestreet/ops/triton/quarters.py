@@ -1,0 +1,108 @@
+"""A tile's four quarters of 8x8 pixels: top left, top right, bottom left, bottom right.
+
+Splats are smaller than tiles more often than not, so each pair says which quarters of its tile the splat can touch, and
+pixel kernels pass over the others. A warp holds two pixels of each quarter in a lane, both in one line, so that what
+only y changes is computed once.
+"""
+
+import triton.language as tl
+
+from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.tiles import lines_span
+from sparsestreet.ops.triton.view import TILE
+
+SIDE = constant(8)
+QUARTER_PIXELS = 64
+PIXELS = constant(QUARTER_PIXELS)
+WARP = constant(32)
+QUARTER_SHIFT = 28
+MOST_ROWS = 1 << QUARTER_SHIFT
+"""Rows that a pair has room for beside its quarters, in 32 bits."""
+ROW = constant(MOST_ROWS - 1)
+SHIFT = constant(QUARTER_SHIFT)
+ALL = constant(15)
+
+
+@jit
+def row_of(pair):
+    """The row of a pair."""
+    return pair & ROW
+
+
+@jit
+def touches(pair, QUARTER: tl.constexpr):
+    """Whether the pair's splat can touch a quarter."""
+    return ((pair >> (SHIFT + QUARTER)) & 1) != 0
+
+
+@jit
+def touched_quarters(splat, reach, tile_x, tile_y, BOUNDED: tl.constexpr):
+    """Bits of the quarters of a tile that hold a pixel center of the ellipse (tiles.py), as a pair carries them."""
+    x, y, l11, l21, l22 = splat
+    bits = tl.zeros_like(tile_x) + ALL
+    if BOUNDED:
+        bits = tl.zeros_like(tile_x)
+        middle = (tile_x * TILE + SIDE).to(tl.float32)
+        for half in tl.static_range(2):
+            line = tile_y * TILE + half * SIDE
+            low, high, reached = lines_span(x, y, l11, l21, l22, reach, line, SIDE)
+            left = reached & (low <= middle - 0.5) & (high >= middle - (SIDE - 0.5))
+            right = reached & (high >= middle + 0.5) & (low <= middle + (SIDE - 0.5))
+            bits = bits | (left.to(tl.int32) << (2 * half)) | (right.to(tl.int32) << (2 * half + 1))
+    return bits << SHIFT
+
+
+@jit
+def quarter_pixels(tile, tiles_x, QUARTER: tl.constexpr):
+    """Columns and lines of a quarter's pixels [64]. Of 32 neighbors each lane gets one: its two are four apart."""
+    p = tl.arange(0, PIXELS)
+    x = (tile % tiles_x) * TILE + QUARTER % 2 * SIDE + p // WARP * 4 + p % WARP // SIDE
+    y = (tile // tiles_x) * TILE + QUARTER // 2 * SIDE + p % SIDE
+    return x, y
+
+
+@jit
+def centers(tile, tiles_x):
+    """Centers of the tile's pixels: x of the left and of the right quarters, y of the upper and of the lower."""
+    left, upper = quarter_pixels(tile, tiles_x, 0)
+    right, lower = quarter_pixels(tile, tiles_x, 3)
+    return (
+        (left.to(tl.float32) + 0.5, right.to(tl.float32) + 0.5),
+        (upper.to(tl.float32) + 0.5, lower.to(tl.float32) + 0.5),
+    )
+
+
+@jit
+def lane_sum(values):
+    """Sums over the two pixels of each lane [32]."""
+    return tl.sum(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+
+
+@jit
+def of_lane(values):
+    """What the two pixels of each lane share [32]."""
+    return tl.max(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+
+
+@jit
+def load_splat(records, row):
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth."""
+    s = record.record_of(records, row)
+    geometry = (
+        tl.load(s + record.X), tl.load(s + record.Y),
+        tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
+    )  # fmt: skip
+    ends = tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF)
+    return geometry, ends, (
+        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
+        tl.load(s + record.DEPTH),
+    )  # fmt: skip
+
+
+@jit
+def of_lines(geometry, log2_opacity, y):
+    """What a line of pixels shares: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1."""
+    dy = y - geometry[1]
+    b = geometry[4] * dy
+    return dy, geometry[3] * dy, b, log2_opacity - b * b
