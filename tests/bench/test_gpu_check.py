@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -9,9 +10,12 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.evaluation.records import write_summary
+from sparsestreet.ops.cpu import library
 from tests.evaluation.frames import make_summary
+from tests.ops import scenes
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / "scripts"
 
 
 @pytest.mark.lengthy
@@ -50,3 +54,11 @@ def test_the_line_about_the_training_is_of_todays_records(tmp_path):
     (program,) = re.findall(r"SUMMARIZE='\n(.*?)'\n", (SCRIPTS / "gpu_check.sh").read_text(), flags=re.S)
     said = subprocess.run([sys.executable, "-c", program, tmp_path / "train.json"], capture_output=True, text=True)
     assert said.stdout == "100.0 s of training, held-out PSNR 25.00 dB\n", said.stderr
+
+
+def test_without_the_library_its_backend_is_left_out(monkeypatch):
+    monkeypatch.setattr(library, "find_library", lambda: None)
+    found = runpy.run_path(str(ROOT / "tests" / "ops" / "scenes.py"))
+    assert "cpu" not in found["BACKENDS"]
+    assert found["BACKENDS"][0] == "reference"
+    assert "cpu" in scenes.BACKENDS
