@@ -1,10 +1,14 @@
-"""What the check of a GPU leaves out where packages of the tests are missing, and what it says of its training."""
+"""The check of a GPU: what it needs and leaves out, and a dry run in an environment made for it."""
 
+import importlib.metadata
 import os
-import re
 import runpy
+import shutil
 import subprocess
 import sys
+import sysconfig
+import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -16,6 +20,70 @@ from tests.ops import scenes
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
+TAG = "py3-none-any"
+
+
+def check(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """The script in an environment without this process's paths."""
+    kept = {name: os.environ[name] for name in ("PATH", "HOME", "TMPDIR") if name in os.environ}
+    return subprocess.run(
+        [str(SCRIPTS / "gpu_check.sh"), *arguments], env=kept | environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture
+def bare(tmp_path) -> Path:
+    """The interpreter of a virtual environment without any package."""
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "bare"], check=True)
+    return tmp_path / "bare" / "bin" / "python"
+
+
+def write_wheel(folder: Path, name: str, files: dict[str, bytes], tag: str = TAG) -> None:
+    folder.mkdir(exist_ok=True)
+    with zipfile.ZipFile(folder / f"{name}-1.0-{tag}.whl", "w") as wheel:
+        for file, content in files.items():
+            wheel.writestr(file, content)
+
+
+def test_what_is_missing_is_said_at_once_with_its_remedy(tmp_path, bare):
+    began = time.monotonic()
+    said = check(PYTHON=str(bare), OUT=str(tmp_path / "out"))
+    assert said.returncode == 2
+    assert time.monotonic() - began < 5  # a tenth of a second where nothing else runs
+    lines = [line for line in said.stdout.splitlines() if line.startswith("needs    missing ")]
+    for package, distribution in (("torch", "torch"), ("hydra", "hydra-core"), ("xdist", "pytest-xdist")):
+        (line,) = [line for line in lines if f"  no {package} (" in line]
+        assert line.endswith(f": pip install {distribution}, or its wheel into SPARSESTREET_WHEELS")
+
+
+def test_what_triton_calls_is_looked_for(monkeypatch):
+    tools = runpy.run_path(str(SCRIPTS / "gpu_needs.py"))["missing_tools"]
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setattr(sysconfig, "get_path", lambda name: "/nowhere")
+    monkeypatch.setattr(Path, "is_file", lambda path: False)
+    assert [line.split(" (")[0] for line in tools()] == ["no C compiler", "no /nowhere/Python.h", "no nvcc", "no ninja"]
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
+    monkeypatch.setattr(Path, "is_file", lambda path: True)
+    assert tools() == []
+
+
+def test_wheels_are_unpacked_before_packages_are_looked_for(tmp_path):
+    write_wheel(tmp_path / "wheels", "gsplat", {"gsplat/__init__.py": b""})
+    write_wheel(tmp_path / "wheels", "other", {"other.py": b""}, "cp27-cp27m-win32")
+    site = tmp_path / "site"
+    site.mkdir()
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    said = subprocess.run(
+        [sys.executable, SCRIPTS / "gpu_needs.py", site, tmp_path / "wheels"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert "no gsplat" not in said
+    assert "other-1.0-cp27-cp27m-win32.whl is for another Python" in said
+    assert [path.name for path in site.iterdir()] == ["gsplat"]
 
 
 @pytest.mark.lengthy
@@ -49,11 +117,10 @@ def test_files_without_their_packages_are_left_out_and_named(tmp_path):
         assert (f"{broken} errors" in lines[-1], run.returncode) == (broken > 0, int(broken > 0))
 
 
-def test_the_line_about_the_training_is_of_todays_records(tmp_path):
+def test_the_line_about_the_training_is_of_todays_records(tmp_path, capsys):
     write_summary(tmp_path / "train.json", make_summary())
-    (program,) = re.findall(r"SUMMARIZE='\n(.*?)'\n", (SCRIPTS / "gpu_check.sh").read_text(), flags=re.S)
-    said = subprocess.run([sys.executable, "-c", program, tmp_path / "train.json"], capture_output=True, text=True)
-    assert said.stdout == "100.0 s of training, held-out PSNR 25.00 dB\n", said.stderr
+    runpy.run_path(str(SCRIPTS / "gpu_says.py"))["training"](tmp_path / "train.json")
+    assert capsys.readouterr().out == "100.0 s of training, held-out PSNR 25.00 dB\n"
 
 
 def test_without_the_library_its_backend_is_left_out(monkeypatch):
@@ -62,3 +129,44 @@ def test_without_the_library_its_backend_is_left_out(monkeypatch):
     assert "cpu" not in found["BACKENDS"]
     assert found["BACKENDS"][0] == "reference"
     assert "cpu" in scenes.BACKENDS
+
+
+BY_WHEEL = ("hydra-core", "omegaconf", "antlr4-python3-runtime", "beartype")
+"""What a machine for training networks lacks; it has the other packages."""
+
+
+def give_packages(python: Path, without: tuple[str, ...]) -> None:
+    """Links to all packages of this environment but some and the project's own."""
+    site = next((python.parent.parent / "lib").iterdir()) / "site-packages"
+    left_out = {name for distribution in without for name in top_level(distribution)}
+    for package in Path(sysconfig.get_path("purelib")).iterdir():
+        if package.name not in left_out and "sparsestreet" not in package.name and package.suffix != ".pth":
+            (site / package.name).symlink_to(package)
+
+
+def top_level(distribution: str) -> set[str]:
+    return {file.parts[0] for file in importlib.metadata.files(distribution) or () if file.parts[0] != ".."}
+
+
+@pytest.mark.slow
+def test_a_dry_run_where_only_wheels_bring_the_rest(tmp_path, bare):
+    for distribution in BY_WHEEL:
+        files = [file for file in importlib.metadata.files(distribution) or () if file.parts[0] != ".."]
+        contents = {str(file): Path(file.locate()).read_bytes() for file in files if file.suffix != ".pyc"}
+        write_wheel(tmp_path / "wheels", distribution.replace("-", "_"), contents)
+    give_packages(bare, without=(*BY_WHEEL, "hypothesis"))
+    said = check(
+        "--dry-run",
+        PYTHON=str(bare),
+        OUT=str(tmp_path / "out"),
+        SPARSESTREET_WHEELS=str(tmp_path / "wheels"),
+        SPARSESTREET_SPLAT_LIBRARY=str(library.find_library()),
+    )
+    table = (tmp_path / "out" / "table.txt").read_text(encoding="utf-8").splitlines()
+    states = {line.split()[0]: line.split()[1] for line in table if " s  " in line and "needs" not in line}
+    assert states == dict.fromkeys(("parity", "bench", "train", "kernels"), "ok") | dict.fromkeys(
+        ("build", "gsplat"), "skipped"
+    ), said.stdout + said.stderr
+    assert said.returncode == 0
+    assert any("no hypothesis (test files left out)" in line for line in table)
+    assert any(line.startswith("sparsestreet cpu") for line in table)
