@@ -86,6 +86,105 @@ def test_wheels_are_unpacked_before_packages_are_looked_for(tmp_path):
     assert [path.name for path in site.iterdir()] == ["gsplat"]
 
 
+PRETENDS = """
+import os, sys, time
+from pathlib import Path
+
+given, folder = " ".join(sys.argv[1:]), Path(__file__).parent
+trained = folder / "trained"
+
+
+def call(name):
+    with (folder / "calls").open("a") as file:
+        file.write(f"{name}: {given}\\n")
+
+
+if "gpu_says.py machine" in given:
+    print("a device", "9.0", "/a/library.so", sep="\\n")
+elif "gsplat.cuda._backend" in given:
+    while MODE == "slow" and not trained.exists():
+        time.sleep(0.02)
+    print("error: of nvcc\\nmore" if MODE == "failing" else "compiled: True")
+elif "test_parity.py" in given and "--ignore=" not in given:
+    call("parity")
+    time.sleep(0.5)  # the compiler has ended, where it is not slow
+    print("FAILED tests/ops/test_it.py::test_this - it is so\\n1 failed, 2 passed in 3 s")
+    sys.exit(1)
+elif "-m pytest" in given:
+    call("kernels")
+    print("left out: tests/ops/test_that.py (no hypothesis)\\n7 passed, 1 skipped in 3 s")
+elif "gpu_says.py training" in given:
+    print("trained")
+elif " train " in given:
+    call("train")
+    (out,) = (item.removeprefix("out=") for item in sys.argv if item.startswith("out="))
+    Path(out, "records").mkdir(parents=True)
+    Path(out, "records", "summary.json").write_text("{}")
+    trained.touch()
+    time.sleep(0.5)
+elif " bench gpu" in given:
+    call("bench")
+    stubs = [Path(path, "gsplat.py") for path in os.environ["PYTHONPATH"].split(os.pathsep)]
+    print("sparsestreet triton", "alone" if any(stub.is_file() for stub in stubs) else "beside gsplat")
+"""
+TIMEOUT = """#!/bin/sh
+printf 'timeout: %s\\n' "$*" >>"$(dirname "$0")/calls"
+while case "$1" in --*) true ;; *) false ;; esac; do shift; done
+shift
+exec "$@"
+"""
+
+
+def run_on_a_pretended_device(folder: Path, mode: str) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+    """The script with a Python and a timeout that note what they are called with; the calls."""
+    pretended = f"#!{sys.executable} -S\nMODE = {mode!r}\n{PRETENDS}"
+    for name, text in (("python", pretended), ("timeout", TIMEOUT)):
+        (folder / name).write_text(text, encoding="utf-8")
+        (folder / name).chmod(0o755)
+    path = os.pathsep.join([str(folder), os.environ["PATH"]])
+    said = check(PATH=path, PYTHON=str(folder / "python"), OUT=str(folder / "out"))
+    return said, (folder / "calls").read_text(encoding="utf-8").splitlines()
+
+
+@pytest.mark.parametrize(
+    ("gsplat", "order", "beside"),
+    [
+        ("compiled", ["parity", "bench", "train", "kernels"], "beside gsplat"),
+        ("slow", ["parity", "train", "bench", "kernels"], "beside gsplat"),
+        ("failing", ["parity", "bench", "train", "kernels"], "alone"),
+    ],
+)
+def test_the_order_of_the_parts_and_their_table(tmp_path, gsplat, order, beside):
+    said, calls = run_on_a_pretended_device(tmp_path, gsplat)
+    assert [call.split(":")[0] for call in calls if not call.startswith("timeout")] == order
+    table = (tmp_path / "out" / "table.txt").read_text(encoding="utf-8").splitlines()
+    states = {line[:8].strip(): line[9:17].strip() for line in table if line[25:26] == "s"}
+    failed = ["parity"] + ["gsplat"] * (gsplat == "failing")
+    expected = dict.fromkeys((*order, "gsplat"), "ok") | {"build": "skipped"} | dict.fromkeys(failed, "failed")
+    assert states == expected, said.stdout + said.stderr
+    assert said.returncode == 1
+    assert any("FAILED tests/ops/test_it.py::test_this - it is so" in line for line in table)
+    assert any("tests/ops/test_that.py (no hypothesis)" in line for line in table)
+    assert any(line.strip() == "trained" for line in table)
+    assert any("error: of nvcc" in line for line in table) == (gsplat == "failing")
+    assert table[-1] == f"sparsestreet triton {beside}"
+
+
+def test_parts_end_as_by_ctrl_c_and_tests_keep_going_at_warnings(tmp_path):
+    _, calls = run_on_a_pretended_device(tmp_path, "compiled")
+    parts = [call for call in calls if call.startswith("timeout") and "gsplat.cuda" not in call]
+    assert len(parts) == 4
+    assert all(call.startswith("timeout: --signal=INT --kill-after=10 ") for call in parts)
+    for call in calls:
+        if call.startswith(("parity", "kernels")):
+            assert "-rfE" in call
+            assert "-o filterwarnings=default" in call
+            assert "--dist loadgroup" in call
+            named = [ROOT / word for word in call.split() if word.startswith("tests/")]
+            assert named
+            assert all(path.exists() for path in named)
+
+
 @pytest.mark.lengthy
 def test_files_without_their_packages_are_left_out_and_named(tmp_path):
     files = {
@@ -163,7 +262,8 @@ def test_a_dry_run_where_only_wheels_bring_the_rest(tmp_path, bare):
         SPARSESTREET_SPLAT_LIBRARY=str(library.find_library()),
     )
     table = (tmp_path / "out" / "table.txt").read_text(encoding="utf-8").splitlines()
-    states = {line.split()[0]: line.split()[1] for line in table if " s  " in line and "needs" not in line}
+    states = {line[:8].strip(): line[9:17].strip() for line in table if line[25:26] == "s"}
+    assert states.pop("needs") == "missing"
     assert states == dict.fromkeys(("parity", "bench", "train", "kernels"), "ok") | dict.fromkeys(
         ("build", "gsplat"), "skipped"
     ), said.stdout + said.stderr
