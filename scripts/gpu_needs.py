@@ -37,6 +37,8 @@ DISTRIBUTIONS = {
 
 def unpack_wheels(folder: Path, site: Path) -> list[str]:
     """Unpack what fits this Python into ``site``; the other wheels, by name."""
+    if not folder.is_dir():
+        return [f"no folder {folder}: SPARSESTREET_WHEELS names none"]
     if importlib.util.find_spec("packaging") is None:
         return ["no packaging (no wheel is unpacked): pip install packaging"]
     from packaging.tags import sys_tags

@@ -84,6 +84,8 @@ def test_wheels_are_unpacked_before_packages_are_looked_for(tmp_path):
     assert "no gsplat" not in said
     assert "other-1.0-cp27-cp27m-win32.whl is for another Python" in said
     assert [path.name for path in site.iterdir()] == ["gsplat"]
+    unpack = runpy.run_path(str(SCRIPTS / "gpu_needs.py"))["unpack_wheels"]
+    assert unpack(tmp_path / "nowhere", site) == [f"no folder {tmp_path / 'nowhere'}: SPARSESTREET_WHEELS names none"]
 
 
 PRETENDS = """
