@@ -9,14 +9,15 @@ from torch.profiler import DeviceType, ProfilerActivity, profile
 from sparsestreet.bench.timing import Spread, spread
 
 STAGES = {
-    "blend_backward": r"(blend|raster).*backward",
-    "project_backward": r"project.*backward|slots",
-    "project": r"project",
+    "blend_backward": r"(blend|raster).*(backward|bwd)",
+    "project_backward": r"(project|spherical|quat_scale).*(backward|bwd)|slots",
+    "project": r"project|spherical|quat_scale",
     "blend": r"blend|raster|_parts",
-    "sort": r"sort|radix",
-    "bin": r"list_|tile|pairs|isect|scan",
+    "sort": r"(?<!search)sort|radix",
+    "bin": r"list_|tile|pairs|isect|intersect|scan|search",
 }
-"""Stage -> pattern of its kernels' names; the first that fits gets the time, the rest is ``other``."""
+"""Stage -> pattern of its kernels' names, ours and gsplat 1.5.3's; the first that fits gets the time, the rest is
+``other``."""
 
 
 def stage_of(kernel: str) -> str:

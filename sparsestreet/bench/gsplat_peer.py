@@ -18,6 +18,8 @@ from sparsestreet.types import Camera, Gaussians
 
 SETTINGS = SplatSettings.preset("gsplat15")
 """What we render with beside it: its clamp, stop rule and near plane."""
+MODES = ("packed", "unpacked")
+"""The first keeps rows in view only, which takes less memory; which is faster depends on the view."""
 LEAST_PSNR = 60.0
 """dB. Fast-math exponentials move a sample over the cut-off 1/255 in some pixels; if every thousandth pixel changed by
 1/255 that would be 78 dB."""

@@ -1,6 +1,7 @@
 """The plumbing of device timings and of gsplat beside them, with a fake gsplat: no device needed."""
 
 import dataclasses
+import time
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -99,22 +100,67 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
     module = fake_gsplat()
     monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
     file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
-    assert gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20)], CPU, ONCE, file, said.append)
+    assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append)
     records = read_records(file.path)
     assert [record["renderer"] for record in records] == [
         "sparsestreet cpu",
         "gsplat 1.5.3 packed",
         "gsplat 1.5.3 unpacked",
-    ] * 2
+    ]
     for record in records:
         assert record["failed"] is None
         assert record["forward"]["median"] > 0
         assert record["inference"]["repeats"] == 1
         assert record["stages"] is None  # no device, no kernels
-    assert [record["agrees"] for record in records] == [True, True, True] * 2
-    assert [record["pairs"] is None for record in records] == [False, True, True] * 2
+    assert [record["agrees"] for record in records] == [True] * 3
+    assert [record["pairs"] is None for record in records] == [False, True, True]
     assert records[0]["samples"] > records[0]["pairs"] >= 60
     assert any("agrees: equal" in line for line in said)
+
+
+@pytest.mark.parametrize("slower", ["packed", "unpacked"])
+def test_gsplats_faster_mode_is_used_after_the_first_size(tmp_path, monkeypatch, slower):
+    module = fake_gsplat()
+
+    def slow_in_one_mode(**given):
+        if given["packed"] == (slower == "packed"):
+            time.sleep(0.2)  # the image takes a few milliseconds
+        return fake_gsplat().rasterization(**given)
+
+    module.rasterization = slow_in_one_mode
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
+    gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20), Size(32, 32, 30)], CPU, ONCE, file, lambda text: None)
+    theirs = [record["renderer"] for record in read_records(file.path) if record["renderer"].startswith("gsplat")]
+    faster = "unpacked" if slower == "packed" else "packed"
+    assert theirs == [f"gsplat 1.5.3 {mode}" for mode in ("packed", "unpacked", faster, faster)]
+
+
+def test_a_record_is_on_disk_before_the_next_is_measured(tmp_path, monkeypatch):
+    module = fake_gsplat()
+    file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
+
+    def cut_off(**given):
+        raise KeyboardInterrupt
+
+    module.rasterization = cut_off
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
+    with pytest.raises(KeyboardInterrupt):
+        gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, lambda text: None)
+    assert [record["renderer"] for record in read_records(file.path)] == ["sparsestreet cpu"]
+
+
+def test_many_splats_are_not_compared(tmp_path, monkeypatch):
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: fake_gsplat(brightness=0.5))
+    monkeypatch.setattr(gpu, "TRUTH_ROWS", 59)
+    file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
+    assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, lambda text: None)
+    assert [(record["parity"], record["agrees"]) for record in read_records(file.path)] == [(None, None)] * 3
+
+
+def test_the_headline_comes_first():
+    assert (gpu.IMAGES[0], gpu.ROWS[0]) == ((1920, 1280), 1_500_000)
+    assert gpu.ROWS[0] <= gpu.TRUTH_ROWS
 
 
 def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
@@ -151,7 +197,19 @@ def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
         ("blend_tiles_backward", "blend_backward"),
         ("list_pairs", "bin"),
         ("void at_cuda_detail::cub::DeviceRadixSortOnesweepKernel<...>", "sort"),
+        ("void at::native::(anonymous namespace)::searchsorted_cuda_kernel<long, int>(...)", "bin"),
+        ("merge_parts", "blend"),
         ("Memset (Device)", "other"),
+        # gsplat 1.5.3
+        ("void gsplat::projection_ewa_3dgs_fused_fwd_kernel<float>(...)", "project"),
+        ("void gsplat::projection_ewa_3dgs_packed_bwd_kernel<float>(...)", "project_backward"),
+        ("void gsplat::spherical_harmonics_fwd_kernel<float>(...)", "project"),
+        ("void gsplat::spherical_harmonics_bwd_kernel<float>(...)", "project_backward"),
+        ("void gsplat::quat_scale_to_covar_preci_bwd_kernel<float>(...)", "project_backward"),
+        ("void gsplat::intersect_tile_kernel<float>(...)", "bin"),
+        ("void gsplat::intersect_offset_kernel(...)", "bin"),
+        ("void gsplat::rasterize_to_pixels_3dgs_fwd_kernel<3u, float>(...)", "blend"),
+        ("void gsplat::rasterize_to_pixels_3dgs_bwd_kernel<3u, float>(...)", "blend_backward"),
     ],
 )
 def test_kernels_belong_to_stages(kernel, stage):

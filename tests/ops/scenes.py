@@ -10,16 +10,18 @@ from torch import Tensor
 
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.backend import has_triton
+from sparsestreet.ops.cpu.library import find_library
 from sparsestreet.types import Camera, Gaussians
 
 Answer = TypeVar("Answer")
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 DEFAULT = SplatSettings()
 CPU = torch.device("cpu")
-BACKENDS = ("reference", "cpu", *["triton"] * has_triton())
-"""Every implementation of the op. What is tested for all of them takes its list from here, so that a new case runs on
-each. Triton's kernels run by its interpreter where there is no GPU; what is too much for that in ``make test`` has the
-marker ``slow_if_interpreted`` and waits for ``make test-all``."""
+BACKENDS = ("reference", *["cpu"] * (find_library() is not None), *["triton"] * has_triton())
+"""Every implementation of the op that is here; ``test_cpu_library.py`` fails without the C++ library. What is tested
+for all takes its list from here, so that a new case runs on each. Triton's kernels run by its interpreter where
+there is no GPU; what is too much for that in ``make test`` has the marker ``slow_if_interpreted`` and waits for
+``make test-all``."""
 SINGLE_PRECISION = ("triton",)
 """Those that compute in float32 only; tests whose oracle needs float64 leave them out."""
 

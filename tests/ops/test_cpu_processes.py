@@ -1,5 +1,6 @@
 """The C++ backend in other processes: forked and spawned workers, and loaded before torch."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -59,8 +60,10 @@ assert (torch.full((1 << 22,), 1e-40) * 0.5 > 0).all()
 def run(script: Path, text: str, *arguments: str) -> None:
     script.write_text(text)
     command = [sys.executable, str(script), *arguments]
+    # Packages, too, may be found by PYTHONPATH.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     answer = subprocess.run(
-        command, cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=180, check=False
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=180, check=False
     )
     assert answer.returncode == 0, answer.stderr
 
