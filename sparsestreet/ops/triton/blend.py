@@ -9,7 +9,7 @@ import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import centers, load_splat, of_lines, quarter_pixels, row_of, touches
+from sparsestreet.ops.triton.quarters import centers, load_ahead, load_splat, of_lines, quarter_pixels, row_of, touches
 from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
@@ -174,13 +174,14 @@ def blend_tiles(
     q3 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 3, PARTS)
     xs, ys = centers(tile, tiles_x)
     unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
-    pair = tl.load(pair_rows + k, unfinished, 0)
+    pair, after = tl.load(pair_rows + k, k < end, 0), tl.load(pair_rows + k + 1, k + 1 < end, 0)
+    ahead = load_ahead(records, row_of(pair))
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
-            splat = load_splat(records, row_of(pair))
-            touched = pair
-            pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
+            splat, touched = load_splat(records, row_of(pair), ahead), pair
+            pair, ahead = after, load_ahead(records, row_of(after))
+            after = tl.load(pair_rows + i + 2, i + 2 < end, 0)
             line = of_lines(splat[0], splat[1][0], ys[0])
             q0 = blend_quarter(touches(touched, 0), q0, xs[0], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             q1 = blend_quarter(touches(touched, 1), q1, xs[1], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)

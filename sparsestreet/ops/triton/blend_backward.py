@@ -16,6 +16,7 @@ from sparsestreet.ops.triton.quarters import (
     WARP,
     centers,
     lane_sum,
+    load_ahead,
     load_splat,
     of_lane,
     of_lines,
@@ -29,9 +30,8 @@ SLOT = constant(SLOT_LENGTH)
 ZEROED = constant(32)
 
 
-def registers(depth: bool) -> int:
-    """Registers of a lane: the fewest without spills, so that many tiles run at once."""
-    return 112 if depth else 104
+REGISTERS = 128
+"""Of a lane: with any number from 97 to 128 a multiprocessor runs 16 warps."""
 
 
 @jit
@@ -184,12 +184,14 @@ def blend_tiles_backward(
     # not needed nothing was written.
     latest = tl.maximum(tl.minimum(latest, end), begin)
     zero_slots(slots, pair_slots, latest, end, SLOT)
-    pair, slot = tl.load(pair_rows + latest - 1, latest > begin, 0), tl.load(pair_slots + latest - 1, latest > begin, 0)
+    pair, after = tl.load(pair_rows + latest - 1, latest > begin, 0), tl.load(pair_rows + latest - 2, latest - 1 > begin, 0)
+    ahead = load_ahead(records, row_of(pair))
     for i in range(latest - begin):
         k = latest - 1 - i
-        splat = load_splat(records, row_of(pair))
-        touched, to = pair, slots + slot * SLOT
-        pair, slot = tl.load(pair_rows + k - 1, k > begin, 0), tl.load(pair_slots + k - 1, k > begin, 0)
+        splat, touched = load_splat(records, row_of(pair), ahead), pair
+        pair, ahead = after, load_ahead(records, row_of(after))
+        after = tl.load(pair_rows + k - 2, k - 1 > begin, 0)
+        to = slots + tl.load(pair_slots + k) * SLOT
         nothing = tl.zeros((WARP,), tl.float32)
         s = (nothing, nothing, nothing, nothing, nothing, nothing)
         s = s + s

@@ -90,7 +90,7 @@ def differentiate_view(screen: Screen, view: View, ends: Ends, v: Cotangents, ab
             screen.records, lists.pair_rows, lists.slots, begins, stops, tiles, passed, ends.lasts, *part,
             v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, *pixel_arguments(view),
             DEPTH=depth, ABSOLUTE=absolute, PARTS=split,
-            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth)},
+            options=ONE_WARP | {"maxnreg": blend_backward.REGISTERS},
         )  # fmt: skip
 
     parts, part = lists.parts, ends.parts

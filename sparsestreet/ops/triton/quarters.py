@@ -86,17 +86,23 @@ def of_lane(values):
 
 
 @jit
-def load_splat(records, row):
-    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth."""
+def load_ahead(records, row):
+    """The first number and the last but one of the record of the next splat: with them its 48 bytes come near."""
+    s = record.record_of(records, row)
+    return tl.load(s + record.X), tl.load(s + record.DEPTH)
+
+
+@jit
+def load_splat(records, row, ahead):
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth. ``ahead``: load_ahead."""
     s = record.record_of(records, row)
     geometry = (
-        tl.load(s + record.X), tl.load(s + record.Y),
+        ahead[0], tl.load(s + record.Y),
         tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
     )  # fmt: skip
     ends = tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF)
     return geometry, ends, (
-        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
-        tl.load(s + record.DEPTH),
+        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2), ahead[1],
     )  # fmt: skip
 
 
