@@ -11,9 +11,13 @@ T = TypeVar("T")
 
 
 def to_device(value: T, device: torch.device) -> T:
-    """A copy of a frozen dataclass with all tensors, nested ones too, on the device; those of a camera stay."""
+    """A copy of a frozen dataclass with all tensors, nested ones too, on the device; those of a camera stay.
+
+    The host does not wait for the copies to a GPU: they go through pinned memory.
+    """
     if isinstance(value, torch.Tensor):
-        return value.to(device)
+        pinned = value.pin_memory() if device.type == "cuda" and value.device.type == "cpu" else value
+        return pinned.to(device, non_blocking=True)
     if isinstance(value, Camera) or not is_dataclass(value):
         return value
     moved: dict[str, Any] = {field.name: to_device(getattr(value, field.name), device) for field in fields(value)}

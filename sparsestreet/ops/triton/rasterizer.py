@@ -134,7 +134,7 @@ def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl
     launch(
         slots.sum_slots, len(lists.rows), slots.ROWS,
         values, lists.rows, lists.first_pairs, lists.tile_counts, sums, len(lists.rows),
-        COUNT=values.shape[1], PADDED=padded, SUM=kind,
+        COUNT=values.shape[1], PADDED=padded, SUM=kind, options=slots.OPTIONS,
     )  # fmt: skip
 
 

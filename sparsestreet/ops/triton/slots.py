@@ -4,10 +4,13 @@ from functools import partial
 
 import triton.language as tl
 
-from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.language import constant, jit
 
-ROWS = 8
-"""Rows of a program."""
+ROWS = 16
+"""Rows of a program. Four neighboring lanes take a row's numbers, four at a time."""
+OPTIONS = {"num_warps": 2}
+STEP = constant(4)
+"""Slots of a row that are fetched together."""
 
 
 @partial(jit, do_not_specialize=["visible"])
@@ -20,12 +23,14 @@ def sum_slots(
     given = rank < visible
     first, count = tl.load(first_pairs + rank, given, 0).to(tl.int64), tl.load(tile_counts + rank, given, 0)
     field = tl.arange(0, PADDED)
-    step = tl.arange(0, 8)
+    slot = slots + first[:, None] * COUNT + field[None, :]
     total = tl.zeros((BLOCK, PADDED), SUM)
-    for k in range(0, tl.max(count, 0), 8):
-        slot = first[:, None] + (k + step)[None, :]
-        mask = ((k + step)[None, :] < count[:, None])[:, :, None] & (field < COUNT)[None, None, :]
-        values = tl.load(slots + slot[:, :, None] * COUNT + field[None, None, :], mask, 0.0)
-        total += tl.sum(values.to(SUM), 1)
+    for k in range(0, tl.max(count, 0), STEP):
+        values = ()
+        for i in tl.static_range(STEP):
+            mask = (k + i < count)[:, None] & (field < COUNT)[None, :]
+            values += (tl.load(slot + (k + i) * COUNT, mask, 0.0),)
+        for i in tl.static_range(STEP):
+            total += values[i].to(SUM)
     row = tl.load(rows + rank, given, 0).to(tl.int64)
     tl.store(sums + row[:, None] * COUNT + field[None, :], total, given[:, None] & (field < COUNT)[None, :])
