@@ -13,6 +13,7 @@ from sparsestreet.ops.triton.quaternions import unit_quaternion
 from sparsestreet.ops.triton.shape import (
     DETERMINANT_MIN,
     LARGEST,
+    LEAST_OPACITY,
     LOG2_SCALE,
     blurred,
     camera_axes,
@@ -132,7 +133,7 @@ def project_rows(
     variance_x, variance_y, determinant = blurred(view, shape[2], shape[3], shape[5])
     seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST)
     effective = opacity * compensation(shape[5], determinant, ANTIALIAS)
-    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective > 0)
+    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective >= LEAST_OPACITY)
 
     x, y = shape[0], shape[1]
     half_x, half_y = half_box(view, effective, variance_x, variance_y, BOUNDED)
