@@ -40,7 +40,7 @@ class Guards:
     overflowed: int = 0
     """Determinant on the screen beyond the dtype. An alarm."""
     faint: int = 0
-    """Peak alpha below ``alpha_min``."""
+    """Peak alpha below ``alpha_min``, or below what float32 holds (2^-126)."""
     outside: int = 0
     """The box holds no pixel center of the image."""
 

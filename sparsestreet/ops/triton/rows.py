@@ -70,10 +70,8 @@ def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: 
 
 
 @jit
-def checked_row(
-    means, quaternions, scales, opacities, displacements, row, given, DISPLACED: tl.constexpr
-):
-    """Opacity, mean, quaternion, scales and displacement; which rows are to be drawn, and which of those are bad.
+def checked_row(means, quaternions, scales, opacities, displacements, row, given, DISPLACED: tl.constexpr):
+    """Opacity, mean, quaternion, scales and displacement; which rows may be drawn, and which of those are bad.
 
     A row of opacity 0 is not read beyond its opacity.
     """
@@ -97,15 +95,17 @@ def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
 
 
 @jit
-def drawn_color(raw, HALF_COLORS: tl.constexpr):
-    """Channels as torch.where(color > 0, color, 0) has them."""
-    color = ()
+def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, HALF_COLORS: tl.constexpr):
+    """Colors of the rows that are seen, and which of them have finite coefficients; no others are read."""
+    coefficients, color = load_columns(sh, row, seen, 3 * TERMS), ()
+    raw = raw_color(basis(direction, TERMS), coefficients, TERMS)
     for i in tl.static_range(3):
+        # As in torch.where(color > 0, color, 0).
         channel = tl.where(raw[i] > 0, raw[i], 0.0)
         if HALF_COLORS:
             channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
         color += (channel,)
-    return color
+    return color, all_finite(coefficients, 3 * TERMS)
 
 
 @partial(jit, do_not_specialize=["rows"])
@@ -116,7 +116,7 @@ def project_rows(
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    Comparisons are written so that NaN culls.
+    ``bad``: whether a program met a bad value. Comparisons are written so that NaN culls.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = row < rows
@@ -150,12 +150,8 @@ def project_rows(
     tiles = count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED)
     tl.store(tile_counts + row, tiles, given)
 
-    coefficients = load_columns(sh, row, seen, 3 * TERMS)
-    wrong = wrong | (all_finite(coefficients, 3 * TERMS) == 0)
-    tl.store(bad + tl.program_id(0), tl.max(wrong.to(tl.int32), 0))
-    direction, _ = direction_of(rotation, mean)
-    color = raw_color(basis(direction, TERMS), coefficients, TERMS)
-    color = drawn_color(color, HALF_COLORS)
+    color, good = seen_color(sh, row, seen, direction_of(rotation, mean)[0], TERMS, HALF_COLORS)
     # In the order of records.py.
     values = (x, y, l11, l21, l22, log2_opacity, cutoff, color[0], color[1], color[2], mean[2], 0 * x)
     store_columns(records, row, values, seen & (tiles > 0), record.RECORD)
+    tl.store(bad + tl.program_id(0), tl.max((wrong | (good == 0)).to(tl.int32), 0))

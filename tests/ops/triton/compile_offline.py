@@ -80,7 +80,7 @@ def _machine_code(cubin: bytes) -> tuple[dict, list[tuple[int, str]]]:
 
 
 def _tiles(ttgir: str) -> list[dict]:
-    """Loads and stores of tiles [rows, columns] in blocked layouts: numbers that a lane holds, lanes along both axes."""
+    """Loads and stores of tiles [rows, columns] in blocked layouts: numbers that a lane holds, lanes on both axes."""
     lists = r"sizePerThread = \[(.*?)\], threadsPerWarp = \[(.*?)\], warpsPerCTA = \[.*?\], order = \[1, 0\]"
     layouts = {name: found for name, *found in re.findall(rf"^(#\w+) = #ttg.blocked<{{{lists}}}>", ttgir, re.MULTILINE)}
     tiles = []

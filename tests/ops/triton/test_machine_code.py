@@ -235,7 +235,7 @@ def _sectors(tile: dict, count: int, first: int) -> int:
 
 
 def test_sectors_by_hand():
-    # 32 lanes with a row of 192 bytes each, number by number: 32 sectors an instruction. Eight rows of 64 bytes: two each.
+    # 32 lanes with a row of 192 bytes each, number by number: 32 sectors an instruction. Of 64 bytes together: two.
     alone = {"shape": [32, 16], "held": [1, 1], "lanes": [32, 1]}
     together = {"shape": [32, 16], "held": [1, 4], "lanes": [8, 4]}
     assert _sectors(alone, 48, 16) == 16 * 32
