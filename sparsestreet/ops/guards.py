@@ -40,7 +40,7 @@ class Guards:
     overflowed: int = 0
     """Determinant on the screen beyond the dtype. An alarm."""
     faint: int = 0
-    """Peak alpha below ``alpha_min``."""
+    """Peak alpha below ``alpha_min``, or below what float32 holds (2^-126)."""
     outside: int = 0
     """The box holds no pixel center of the image."""
 
@@ -85,10 +85,11 @@ def guards(
     check_structure(gaussians, camera, None)
     check_dtype(gaussians, "guards")
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        check_values(gaussians)
         reasons = row_reasons(gaussians, camera, settings)
+        drawn = reasons == Reason.DRAWN
+        check_values(gaussians, drawn)
         counts = torch.bincount(reasons, minlength=len(Reason)).tolist()
-        acting = _acting(gaussians, (reasons == Reason.DRAWN).nonzero().squeeze(-1), camera, settings)
+        acting = _acting(gaussians, drawn.nonzero().squeeze(-1), camera, settings)
         acted = {name: int(rows.sum()) for name, rows in acting.items()}
     return Guards(**{reason.name.lower(): counts[reason] for reason in Reason}, **acted)
 

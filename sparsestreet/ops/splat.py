@@ -11,7 +11,7 @@ from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu import rasterizer as cpu
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_pixel_weights, check_structure, check_values
+from sparsestreet.ops.validate import check_pixel_weights, check_structure
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
@@ -43,7 +43,8 @@ def splat(
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is no rigid motion, whose size or lens is
             out of range; a value that is not finite, an opacity outside [0, 1] or a negative scale (named with field
-            and row). Nothing but the opacity is looked at in a row whose opacity is 0.
+            and row). Nothing but the opacity is looked at in a row whose opacity is 0, and the harmonics only of rows
+            that are drawn (``Rendering.visible``): those of others may hold anything.
         RuntimeError: the backend asked for is not built.
         PairLimitError: the splats cover more tiles than can be held.
     """
@@ -51,11 +52,7 @@ def splat(
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.autocast(gaussians.means.device.type, enabled=False):
         offsets = _screen_offsets(gaussians)
-        if chosen == "reference":
-            check_values(gaussians)
-            raster = reference.rasterize(gaussians, offsets, camera, settings)
-        else:
-            raster = _fast(chosen).rasterize(gaussians, offsets, camera, settings)
+        raster = _module(chosen).rasterize(gaussians, offsets, camera, settings)
         return _compose(raster, offsets, background)
 
 
@@ -73,10 +70,7 @@ def contribution(
     check_structure(gaussians, camera, None)
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
-        if chosen == "reference":
-            check_values(gaussians)
-            return reference.contribution(gaussians, camera, settings)
-        return _fast(chosen).contribution(gaussians, camera, settings)
+        return _module(chosen).contribution(gaussians, camera, settings)
 
 
 def leave_one_out(
@@ -104,16 +98,13 @@ def leave_one_out(
         if pixel_weights is not None:
             check_pixel_weights(pixel_weights, camera, gaussians.means)
         behind = None if background is None else background.expand(camera.height, camera.width, 3)
-        if chosen == "reference":
-            check_values(gaussians)
-            return reference.leave_one_out(gaussians, behind, pixel_weights, camera, settings)
-        return _fast(chosen).leave_one_out(gaussians, behind, pixel_weights, camera, settings)
+        return _module(chosen).leave_one_out(gaussians, behind, pixel_weights, camera, settings)
 
 
-def _fast(backend: str) -> ModuleType:
-    """The module of a backend that checks values itself. Triton is imported only here, when it is first used."""
-    if backend == "cpu":
-        return cpu
+def _module(backend: str) -> ModuleType:
+    """Each checks values itself. Triton is imported only here, when it is first used."""
+    if backend != "triton":
+        return reference if backend == "reference" else cpu
     from sparsestreet.ops.triton import rasterizer
 
     return rasterizer

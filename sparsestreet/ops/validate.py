@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from sparsestreet.types import Camera, Gaussians
@@ -67,16 +68,19 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
     _raise_in_image("pixel_weights", weights, (weights >= 0) & (weights < math.inf), "must be finite and >= 0")
 
 
-def check_values(gaussians: Gaussians) -> None:
+def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) -> None:
     """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value.
 
-    Rows of opacity 0 are not looked at: they are culled before anything else of them is read.
+    Rows of opacity 0 are not looked at: they are culled before anything else of them is read. ``drawn``: the rows whose
+    harmonics are read; None, where one of them is known to be bad: any bad one is named.
     """
     opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
     masked = opacities == 0
     for name in (*_SHAPES, *(() if gaussians.displacements is None else ("displacements",))):
-        field = getattr(gaussians, name).detach()
-        _raise_at(name, field, torch.isfinite(field), masked, "must be finite", "find the step that made it")
+        field, unread = getattr(gaussians, name).detach(), masked
+        if name == "sh" and drawn is not None:
+            unread = ~drawn
+        _raise_at(name, field, torch.isfinite(field), unread, "must be finite", "find the step that made it")
     inside = (opacities >= 0) & (opacities <= 1)
     _raise_at("opacities", opacities, inside, masked, "must lie in [0, 1]", "apply the sigmoid")
     _raise_at("scales", scales, scales >= 0, masked, "must be >= 0 meters", "apply the exponential")

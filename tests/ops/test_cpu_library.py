@@ -1,7 +1,9 @@
 """Which library is loaded."""
 
 import pytest
+import torch
 
+from sparsestreet.ops.cpu import workspace
 from sparsestreet.ops.cpu.library import LIBRARY_VARIABLE, find_library, load_library, tile_size
 
 find = find_library.__wrapped__  # without its cache
@@ -23,3 +25,12 @@ def test_a_variable_that_names_no_file(monkeypatch, tmp_path):
 def test_the_library_reports_its_tiles():
     assert tile_size() == load_library().splat_tile_size()
     assert tile_size() in (8, 16, 32)
+
+
+def test_a_workspace_that_is_gone_is_not_lent_again():
+    # The garbage collector may take a workspace before its lease.
+    lease = workspace.Lease(torch.float64, workspace.FASTEST_VARIANT)
+    gone = lease.workspace
+    gone.__del__()
+    del lease
+    assert gone not in workspace.idle_workspaces()

@@ -5,7 +5,16 @@ import dataclasses
 import pytest
 import torch
 
-from sparsestreet.ops import PairLimitError, SplatSettings, backend, contribution, leave_one_out, resolve_backend, splat
+from sparsestreet.ops import (
+    PairLimitError,
+    SplatSettings,
+    backend,
+    contribution,
+    guards,
+    leave_one_out,
+    resolve_backend,
+    splat,
+)
 from sparsestreet.ops.cpu import library
 from sparsestreet.ops.validate import check_structure
 from sparsestreet.types import Camera, Shutter
@@ -40,9 +49,10 @@ def unchecked(value, **changes):
 @pytest.mark.parametrize("field", FIELDS)
 def test_value_that_is_not_finite(field, poison, dtype, name):
     gaussians = cast(random_gaussians(20, VIEW, terms=16), dtype)
-    getattr(gaussians, field)[13].view(-1)[-1] = poison
+    assert splat(gaussians, VIEW, backend="reference").radii[12] > 0
+    getattr(gaussians, field)[12].view(-1)[-1] = poison
     for call in (splat, contribution):
-        with pytest.raises(ValueError, match=f"{field} must be finite, but row 13 has {poison}"):
+        with pytest.raises(ValueError, match=f"{field} must be finite, but row 12 has {poison}"):
             call(gaussians, VIEW, backend=name)
 
 
@@ -66,6 +76,50 @@ def test_rows_of_opacity_0_may_hold_anything(backend, dtype):
     cut = cast(gaussians, dtype, device=device_of(backend))
     assert torch.isfinite(contribution(cut, VIEW, backend=backend).weight).all()
     assert torch.isfinite(leave_one_out(cut, VIEW, backend=backend).squared_change).all()
+
+
+@every_precision
+def test_harmonics_are_read_only_of_rows_that_are_drawn(backend, dtype):
+    gaussians = random_gaussians(12, VIEW, terms=16)
+    # Too faint, beside the image, behind the camera.
+    gaussians.opacities[3] = 0.001
+    gaussians.means[5, 1] += 500
+    gaussians.means[7] -= 100 * VIEW.camera_from_world[2, :3]
+    expected = render(gaussians, VIEW, backend, dtype)
+    hidden = expected.radii == 0
+    assert hidden.nonzero().flatten().tolist() == [3, 5, 7]
+    gaussians.sh[hidden] = torch.tensor([float("nan"), float("inf"), -float("inf")], dtype=torch.float64)
+    result = render(gaussians, VIEW, backend, dtype)
+    for part in ("images", "gradients"):
+        for name, value in getattr(expected, part).items():
+            assert torch.equal(getattr(result, part)[name], value), name
+    cut = cast(gaussians, dtype, device=device_of(backend))
+    assert torch.isfinite(contribution(cut, VIEW, backend=backend).weight).all()
+    assert torch.isfinite(leave_one_out(cut, VIEW, backend=backend).squared_change).all()
+    assert guards(cut, VIEW).drawn == int((~hidden).sum())
+
+
+@every_precision
+@pytest.mark.parametrize("terms", [1, 4, 9, 16])
+def test_any_coefficient_of_a_row_that_is_drawn(backend, dtype, terms):
+    # The first and the last row of a block, and coefficients at the ends of what is read together.
+    for row, place in ((0, 0), (0, 3 * terms - 1), (1, 15), (1, 16), (1, 3 * terms - 2)):
+        gaussians = one_gaussian(sh=[[[0.1] * 3] * terms])
+        both = cast(type(gaussians).concatenate([gaussians] * 2), dtype, device=device_of(backend))
+        place = min(place, 3 * terms - 1)
+        both.sh[row].view(-1)[place] = float("nan")
+        for call in (splat, contribution, leave_one_out):
+            with pytest.raises(ValueError, match=f"sh must be finite, but row {row} has nan"):
+                call(both, front_camera(3, 3, 5.0), backend=backend)
+
+
+@every_precision
+def test_finite_harmonics_whose_sum_overflows_are_no_error(backend, dtype):
+    # The color is infinite, which shows; no value is bad.
+    largest = float(torch.finfo(dtype).max)
+    bright = cast(one_gaussian(sh=[[[largest] * 3] * 4], means=[[-1.0, -1.0, 1.0]]), dtype, device=device_of(backend))
+    view = front_camera(9, 9, 2.0)
+    assert torch.isinf(splat(bright, view, backend=backend).rgb).any()
 
 
 @pytest.mark.parametrize("name", BACKENDS)

@@ -199,6 +199,22 @@ def test_14_a_masked_row_leaves_no_trace(backend, dtype, preset):
 
 
 @every_precision
+@pytest.mark.parametrize("preset", ["exact", "fine"])
+def test_11_an_opacity_below_the_normal_numbers_is_culled(backend, dtype, preset):
+    # Without a cut-off the gradient of an opacity o is a sum over o exp(..) divided by o: 0 times infinity.
+    view, settings, least = front_camera(9, 9, 20.0), SplatSettings.preset(preset), 2.0**-126
+    for opacity in (1e-45, 1e-40, least * (1 - 2.0**-23)):
+        faint = one_gaussian(opacities=[opacity])
+        result = render(faint, view, backend, dtype, settings)
+        assert result.radii.tolist() == [0.0]
+        assert not any(value.any() for value in (*result.images.values(), *result.gradients.values())), opacity
+        assert guards(cast(faint, dtype), view, settings=settings).faint == 1
+    result = render(one_gaussian(opacities=[least]), view, backend, dtype, settings)
+    assert result.radii[0] > 0
+    assert result.is_finite()
+
+
+@every_precision
 def test_25_negative_colors_are_black_without_gradient(backend, dtype):
     sh = [[[-1.5 / Y0, 0.5 / Y0, -1.5 / Y0]]]
     view = front_camera(5, 5, 40.0)

@@ -48,6 +48,7 @@ class Workspace:
     def __del__(self) -> None:
         if getattr(self, "handle", None):
             self._library.splat_destroy(self.handle)
+            self.handle = None
 
 
 class Lease:
@@ -62,7 +63,8 @@ class Lease:
 
     def __del__(self) -> None:
         workspace = getattr(self, "workspace", None)
-        if workspace is None:
+        # Where both are garbage of one cycle (an error's traceback), the workspace may have gone first.
+        if workspace is None or not workspace.handle:
             return
         workspace.last_use = next(_uses)
         idle = _idle[workspace.key]

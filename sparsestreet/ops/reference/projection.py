@@ -18,12 +18,15 @@ from sparsestreet.ops.reference.reasons import Reason, first_reason
 from sparsestreet.ops.reference.shutter import read_out, screen_motion
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.spherical_harmonics import view_colors
+from sparsestreet.ops.validate import check_values
 from sparsestreet.types import Camera, Gaussians
 
 BOX_MARGIN = 0.01
 """Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""
 COMPENSATION_FLOOR = 0.005
 """Least antialias compensation (gsplat 1.6): below it the ratio of determinants has no correct digits."""
+LEAST_OPACITY = 2.0**-126
+"""Smallest normal float32: the fast backends keep log2 of the opacity, of which less is left below."""
 DETERMINANT_MIN = 1e-12
 """px^4. Reached only without blur, by splats so thin that they touch no pixel center; their conic would overflow."""
 
@@ -58,7 +61,7 @@ def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -
     size = torch.tensor([camera.width, camera.height], dtype=depths.dtype, device=depths.device)
     box = splats.half_boxes + BOX_MARGIN
     inside = ((splats.means + box >= 0.5) & (splats.means - box <= size - 0.5)).all(-1)
-    faint = ~(splats.opacities >= settings.alpha_min)
+    faint = ~(splats.opacities >= max(settings.alpha_min, LEAST_OPACITY))
     reasons[rows] = first_reason(splats.refusals | {Reason.FAINT: faint, Reason.OUTSIDE: ~inside})
     return reasons
 
@@ -68,9 +71,11 @@ def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
     """Rows whose box holds a pixel center, nearest first, ties in row order.
 
     Found before anything is differentiated: a culled row takes no part in the graph, so no infinity of its
-    intermediates can meet a zero cotangent.
+    intermediates can meet a zero cotangent. Raises ValueError for bad values.
     """
-    rows = (row_reasons(gaussians, camera, settings) == Reason.DRAWN).nonzero().squeeze(-1)
+    drawn = row_reasons(gaussians, camera, settings) == Reason.DRAWN
+    check_values(gaussians, drawn)
+    rows = drawn.nonzero().squeeze(-1)
     depths = to_camera(gaussians.means, camera)[:, 2]
     return rows[torch.sort(_sort_keys(depths[rows], settings.depth_bits), stable=True).indices]
 

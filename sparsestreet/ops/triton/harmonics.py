@@ -78,35 +78,27 @@ def direction_of(rotation, mean):
 
 
 @jit
-def raw_color(values, sh, mask, TERMS: tl.constexpr):
-    """0.5 + sum_i basis_i sh_i, before the clamp at 0; ``sh`` points at the lanes' first coefficients."""
+def raw_color(values, sh, TERMS: tl.constexpr):
+    """0.5 + sum_i basis_i sh_i, before the clamp at 0."""
     red, green, blue = 0 * values[0] + 0.5, 0 * values[0] + 0.5, 0 * values[0] + 0.5
     for i in tl.static_range(TERMS):
-        red += values[i] * tl.load(sh + 3 * i, mask, 0.0)
-        green += values[i] * tl.load(sh + 3 * i + 1, mask, 0.0)
-        blue += values[i] * tl.load(sh + 3 * i + 2, mask, 0.0)
+        red += values[i] * sh[3 * i]
+        green += values[i] * sh[3 * i + 1]
+        blue += values[i] * sh[3 * i + 2]
     return red, green, blue
 
 
 @jit
-def color_backward(rotation, mean, v, sh, v_sh, seen, mask, TERMS: tl.constexpr):
-    """Writes the coefficients' gradient (0 where not ``seen``); answers that of ``mean`` through the direction."""
+def color_backward(rotation, mean, v, sh, TERMS: tl.constexpr):
+    """Gradients of the coefficients, and of ``mean`` through the direction."""
     direction, distance = direction_of(rotation, mean)
     values = basis(direction, TERMS)
-    raw = raw_color(values, sh, seen, TERMS)
-    red, green, blue = (
-        tl.where(raw[0] > 0, v[0], 0.0),
-        tl.where(raw[1] > 0, v[1], 0.0),
-        tl.where(raw[2] > 0, v[2], 0.0),
-    )
-    v_values = ()
+    raw = raw_color(values, sh, TERMS)
+    v = (tl.where(raw[0] > 0, v[0], 0.0), tl.where(raw[1] > 0, v[1], 0.0), tl.where(raw[2] > 0, v[2], 0.0))
+    v_sh, v_values = (), ()
     for i in tl.static_range(TERMS):
-        tl.store(v_sh + 3 * i, tl.where(seen, values[i] * red, 0.0), mask)
-        tl.store(v_sh + 3 * i + 1, tl.where(seen, values[i] * green, 0.0), mask)
-        tl.store(v_sh + 3 * i + 2, tl.where(seen, values[i] * blue, 0.0), mask)
-        at = sh + 3 * i
-        term = tl.load(at, seen, 0.0) * red + tl.load(at + 1, seen, 0.0) * green + tl.load(at + 2, seen, 0.0) * blue
-        v_values += (term,)
+        v_sh += scaled(values[i], v)
+        v_values += (dot((sh[3 * i], sh[3 * i + 1], sh[3 * i + 2]), v),)
     v_direction = basis_backward(direction, v_values, TERMS)
     across = plus(v_direction, scaled(-dot(v_direction, direction), direction))
-    return times(rotation, scaled(1.0 / distance, across))
+    return v_sh, times(rotation, scaled(1.0 / distance, across))

@@ -5,6 +5,7 @@ from functools import partial
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.columns import load_columns, store_columns
 from sparsestreet.ops.triton.harmonics import basis, direction_of, raw_color
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.lens import pinhole
@@ -12,6 +13,7 @@ from sparsestreet.ops.triton.quaternions import unit_quaternion
 from sparsestreet.ops.triton.shape import (
     DETERMINANT_MIN,
     LARGEST,
+    LEAST_OPACITY,
     LOG2_SCALE,
     blurred,
     camera_axes,
@@ -51,14 +53,6 @@ def all_finite(values, COUNT: tl.constexpr):
 
 
 @jit
-def finite_terms(sh, mask, COUNT: tl.constexpr):
-    finite = mask
-    for i in tl.static_range(COUNT):
-        finite = finite & (tl.abs(tl.load(sh + i, mask, 0.0)) <= LARGEST)
-    return finite
-
-
-@jit
 def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: tl.constexpr):
     """Shape on the screen (lens.py) of rows in front of the camera, and whether the lens and the shutter see them."""
     rotation = load_matrix(view + ROTATION)
@@ -76,11 +70,8 @@ def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: 
 
 
 @jit
-def checked_row(
-    means, quaternions, scales, opacities, coefficients, displacements, row, given,
-    TERMS: tl.constexpr, DISPLACED: tl.constexpr,
-):  # fmt: skip
-    """Opacity, mean, quaternion, scales and displacement; which rows are to be drawn, and which of those are bad.
+def checked_row(means, quaternions, scales, opacities, displacements, row, given, DISPLACED: tl.constexpr):
+    """Opacity, mean, quaternion, scales and displacement; which rows may be drawn, and which of those are bad.
 
     A row of opacity 0 is not read beyond its opacity.
     """
@@ -90,7 +81,6 @@ def checked_row(
     size, moved = load_row(scales, row, alive, 3), load_row(displacements, row, alive & DISPLACED, 3)
     good = all_finite(mean, 3) & all_finite(q, 4) & all_finite(size, 3) & all_finite(moved, 3)
     good = good & (size[0] >= 0) & (size[1] >= 0) & (size[2] >= 0) & (opacity >= 0) & (opacity <= 1)
-    good = good & finite_terms(coefficients, alive, 3 * TERMS)
     return opacity, mean, q, size, moved, alive, alive & (good == 0)
 
 
@@ -105,21 +95,17 @@ def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
 
 
 @jit
-def store_record(to, x, y, factor, log2_opacity, cutoff, color, depth, mask, HALF_COLORS: tl.constexpr):
-    tl.store(to + record.X, x, mask)
-    tl.store(to + record.Y, y, mask)
-    tl.store(to + record.L11, factor[0], mask)
-    tl.store(to + record.L21, factor[1], mask)
-    tl.store(to + record.L22, factor[2], mask)
-    tl.store(to + record.LOG2_OPACITY, log2_opacity, mask)
-    tl.store(to + record.CUTOFF, cutoff, mask)
+def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, HALF_COLORS: tl.constexpr):
+    """Colors of the rows that are seen, and which of them have finite coefficients; no others are read."""
+    coefficients, color = load_columns(sh, row, seen, 3 * TERMS), ()
+    raw = raw_color(basis(direction, TERMS), coefficients, TERMS)
     for i in tl.static_range(3):
         # As in torch.where(color > 0, color, 0).
-        channel = tl.where(color[i] > 0, color[i], 0.0)
+        channel = tl.where(raw[i] > 0, raw[i], 0.0)
         if HALF_COLORS:
             channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
-        tl.store(to + record.COLOR + i, channel, mask)
-    tl.store(to + record.DEPTH, depth, mask)
+        color += (channel,)
+    return color, all_finite(coefficients, 3 * TERMS)
 
 
 @partial(jit, do_not_specialize=["rows"])
@@ -130,15 +116,13 @@ def project_rows(
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    Comparisons are written so that NaN culls.
+    ``bad``: whether a program met a bad value. Comparisons are written so that NaN culls.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    given, coefficients = row < rows, sh + row * (3 * TERMS)
+    given = row < rows
     opacity, mean, q, size, moved, alive, wrong = checked_row(
-        means, quaternions, scales, opacities, coefficients, displacements, row, given, TERMS, DISPLACED
+        means, quaternions, scales, opacities, displacements, row, given, DISPLACED
     )
-    tl.store(bad + tl.program_id(0), tl.max(wrong.to(tl.int32), 0))
-
     rotation = load_matrix(view + ROTATION)
     mean = in_camera(view, rotation, mean)
     seen = alive & (mean[2] > tl.load(view + NEAR))
@@ -149,7 +133,7 @@ def project_rows(
     variance_x, variance_y, determinant = blurred(view, shape[2], shape[3], shape[5])
     seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST)
     effective = opacity * compensation(shape[5], determinant, ANTIALIAS)
-    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective > 0)
+    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective >= LEAST_OPACITY)
 
     x, y = shape[0], shape[1]
     half_x, half_y = half_box(view, effective, variance_x, variance_y, BOUNDED)
@@ -166,8 +150,8 @@ def project_rows(
     tiles = count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED)
     tl.store(tile_counts + row, tiles, given)
 
-    seen = seen & (tiles > 0)
-    direction, _ = direction_of(rotation, mean)
-    color = raw_color(basis(direction, TERMS), coefficients, seen, TERMS)
-    to = record.record_of(records, row)
-    store_record(to, x, y, (l11, l21, l22), log2_opacity, cutoff, color, mean[2], seen, HALF_COLORS)
+    color, good = seen_color(sh, row, seen, direction_of(rotation, mean)[0], TERMS, HALF_COLORS)
+    # In the order of records.py.
+    values = (x, y, l11, l21, l22, log2_opacity, cutoff, color[0], color[1], color[2], mean[2], 0 * x)
+    store_columns(records, row, values, seen & (tiles > 0), record.RECORD)
+    tl.store(bad + tl.program_id(0), tl.max((wrong | (good == 0)).to(tl.int32), 0))

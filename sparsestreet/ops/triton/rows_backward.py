@@ -5,6 +5,7 @@ from functools import partial
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.columns import load_columns, store_columns
 from sparsestreet.ops.triton.harmonics import color_backward
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.lens import pinhole, pinhole_backward
@@ -68,8 +69,14 @@ def project_rows_backward(
     mean = in_camera(view, rotation, load_row(means, row, seen, 3))
     # Lanes that were not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
+    s = load_columns(sums, row, seen, record.RECORD)
+    coefficients = load_columns(sh, row, seen, 3 * TERMS)
+    # Before all else, so that nothing else takes registers meanwhile.
+    v_coefficients, v_mean = color_backward(rotation, mean, (s[8], s[9], s[10]), coefficients, TERMS)
+    store_columns(v_sh, row, v_coefficients, given, 3 * TERMS)
+
     size = load_row(scales, row, seen, 3)
-    unit, inverse_length = unit_quaternion(load_row(quaternions, row, seen, 4))
+    unit, inverse_length = unit_quaternion(load_columns(quaternions, row, seen, 4))
     axes = camera_axes(rotation, unit, size)
     lens = lens_shape(view, mean, axes, DISTORTED)
     shape = lens
@@ -78,7 +85,6 @@ def project_rows_backward(
         speed = velocity(view, mean, moved, DISTORTED)
         shape, _ = roll(view, lens, speed)
 
-    s = load_row(sums, row, seen, 12)
     to = record.record_of(records, row)
     v_screen_mean, v_absolute, v_l, v_effective = screen_gradient(s, to, seen)
     opacity = tl.load(opacities + row, seen, 0.0)
@@ -86,9 +92,6 @@ def project_rows_backward(
     v_opacity = v_effective * compensation(shape[5], determinant, ANTIALIAS)
     v_xx, v_yy, v_xy, v_bare = conic_backward(view, shape, v_l, v_effective, opacity, ANTIALIAS)
     v_shape = (v_screen_mean[0], v_screen_mean[1], v_xx, v_yy, v_xy, v_bare)
-    v_mean = color_backward(
-        rotation, mean, (s[8], s[9], s[10]), sh + row * (3 * TERMS), v_sh + row * (3 * TERMS), seen, given, TERMS
-    )
     if ROLLING:
         v_shape, v_speed = roll_backward(view, lens, speed, v_shape)
         v_mean = plus(v_mean, velocity_backward(view, mean, moved, v_speed, DISTORTED))
@@ -97,7 +100,7 @@ def project_rows_backward(
     v_mean = plus(plus(v_mean, through_lens), (0.0, 0.0, s[11]))
     v_mean = transposed_times(rotation, v_mean)
     store_row(v_means, row, masked(v_mean, seen, 3), given, 3)
-    store_row(v_quaternions, row, masked(v_quaternion, seen, 4), given, 4)
+    store_columns(v_quaternions, row, masked(v_quaternion, seen, 4), given, 4)
     store_row(v_scales, row, masked(v_size, seen, 3), given, 3)
     store_row(v_screen, row, masked(v_absolute, seen, 2), given, 2)
     tl.store(v_opacities + row, tl.where(seen, v_opacity, 0.0), given)

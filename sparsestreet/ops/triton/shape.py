@@ -13,8 +13,9 @@ from sparsestreet.ops.triton.view import ALPHA_MIN, BLUR, BOX_REACH, LOG2_ALPHA_
 LOG2_SCALE = constant(math.sqrt(math.log2(math.e) / 2))
 TWO_LN2 = constant(2 * math.log(2))
 HALF_LOG2_E = constant(math.log2(math.e) / 2)
-# Of ops/reference: COMPENSATION_FLOOR squared, and DETERMINANT_MIN.
+# Of ops/reference: COMPENSATION_FLOOR squared, LEAST_OPACITY and DETERMINANT_MIN.
 RATIO_FLOOR = constant(2.5e-5)
+LEAST_OPACITY = constant(2.0**-126)
 DETERMINANT_MIN = constant(1e-12)
 LARGEST = constant(3.4028234663852886e38)
 

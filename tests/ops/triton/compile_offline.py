@@ -56,6 +56,9 @@ def _compile(kernel: KernelInterface, launch: dict, arch: int) -> dict:
         + compiled.asm["ptx"].count("tf32"),
         "atomics": sum(text.split()[0].startswith(("ATOM", "RED.", "REDG.")) for _, text in instructions),
         "sample": _per_sample(instructions),
+        "loads": sum(text.startswith("LDG") for _, text in instructions),
+        "stores": sum(text.startswith("STG") for _, text in instructions),
+        "tiles": _tiles(compiled.asm["ttgir"]),
         "code": hashlib.sha256(repr(instructions).encode()).hexdigest(),
     }
 
@@ -74,6 +77,19 @@ def _machine_code(cubin: bytes) -> tuple[dict, list[tuple[int, str]]]:
     found = re.findall(r"^\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\d+\s+)?(.*?);", listing, re.MULTILINE)
     resources = {"registers": int(used[1]), "spilled": int(used[2])}
     return resources, [(int(address, 16), text.strip()) for address, text in found]
+
+
+def _tiles(ttgir: str) -> list[dict]:
+    """Loads and stores of tiles [rows, columns] in blocked layouts: numbers that a lane holds, lanes on both axes."""
+    lists = r"sizePerThread = \[(.*?)\], threadsPerWarp = \[(.*?)\], warpsPerCTA = \[.*?\], order = \[1, 0\]"
+    layouts = {name: found for name, *found in re.findall(rf"^(#\w+) = #ttg.blocked<{{{lists}}}>", ttgir, re.MULTILINE)}
+    tiles = []
+    for kind, rows, columns, layout in re.findall(
+        r"tt\.(load|store) .*tensor<(\d+)x(\d+)x!tt\.ptr<f32>, (#blocked\w*)>", ttgir
+    ):
+        held, lanes = ([int(number) for number in text.split(",")] for text in layouts[layout])
+        tiles.append({"kind": kind, "shape": [int(rows), int(columns)], "held": held, "lanes": lanes})
+    return tiles
 
 
 def _per_sample(instructions: list[tuple[int, str]]) -> float | None:

@@ -174,6 +174,79 @@ def test_effects_that_are_off_are_not_in_the_row_kernels(compiled, name):
     assert without == whole
 
 
+# Loads, stores and registers of a lane's row: 16 warps of a multiprocessor then run at once.
+ROW_BUDGETS = {"project_rows": (54, 7, 128), "project_rows_backward": (50, 22, 128)}
+
+
+@pytest.mark.parametrize("name", ROW_BUDGETS)
+def test_budget_of_the_row_kernels(compiled, name):
+    found = [found for launch, found in compiled if launch.name == name and _is_still(launch, terms=16)]
+    assert found
+    for each in found:
+        assert each["loads"] <= ROW_BUDGETS[name][0]
+        assert each["stores"] <= ROW_BUDGETS[name][1]
+        assert each["registers"] <= ROW_BUDGETS[name][2]
+
+
+# Numbers in a row of the tables that are read and written as tiles, in the order of the kernels; None: harmonics.
+TABLES = {
+    "project_rows": {"load": (None,), "store": (12,)},
+    "project_rows_backward": {"load": (12, None, 4), "store": (None, 4)},
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_lanes_side_by_side_take_numbers_side_by_side(compiled, name):
+    """Of tiles no more than 1.5 times the sectors of 32 bytes are asked for that their rows fill."""
+    checked = 0
+    for launch, found in compiled:
+        if launch.name != name or not _is_still(launch):
+            continue
+        for kind, counts in TABLES[name].items():
+            tiles = iter([tile for tile in found["tiles"] if tile["kind"] == kind])
+            for count in (number or 3 * launch.constants["TERMS"] for number in counts):
+                asked, first = 0, 0
+                while first < count:
+                    tile = next(tiles)
+                    asked += _sectors(tile, count, first)
+                    first += tile["shape"][1]
+                assert asked <= 1.5 * tile["shape"][0] * count * 4 / 32, (launch, kind, count)
+                checked += 1
+            assert not list(tiles)
+    assert checked
+
+
+def _sectors(tile: dict, count: int, first: int) -> int:
+    """Sectors that the instructions of a tile ask for: columns from ``first`` on of rows of ``count`` numbers."""
+    (rows, columns), (one, held), lanes = tile["shape"], tile["held"], tile["lanes"]
+    assert one == 1
+    asked = 0
+    # One instruction of a warp: a number of rows, and of columns.
+    for top in range(0, rows, lanes[0]):
+        for left in range(0, columns, held * lanes[1]):
+            places = {
+                row * count + first + column
+                for row in range(top, top + lanes[0])
+                for column in range(left, min(left + held * lanes[1], columns))
+                if first + column < count
+            }
+            asked += len({4 * place // 32 for place in places})
+    return asked
+
+
+def test_sectors_by_hand():
+    # 32 lanes with a row of 192 bytes each, number by number: 32 sectors an instruction. Of 64 bytes together: two.
+    alone = {"shape": [32, 16], "held": [1, 1], "lanes": [32, 1]}
+    together = {"shape": [32, 16], "held": [1, 4], "lanes": [8, 4]}
+    assert _sectors(alone, 48, 16) == 16 * 32
+    assert _sectors(together, 48, 16) == 4 * 8 * 2
+
+
+def _is_still(launch: Launch, terms: int | None = None) -> bool:
+    constants = launch.constants
+    return not (constants["DISTORTED"] or constants["ROLLING"]) and terms in (None, constants["TERMS"])
+
+
 def _is_plain(launch: Launch) -> bool:
     return launch.constants["TERMS"] == 1 and not (launch.constants["DISTORTED"] or launch.constants["ROLLING"])
 

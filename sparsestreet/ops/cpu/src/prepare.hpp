@@ -34,13 +34,14 @@ inline bool finite(const T* values, int64_t count) {
   return most < infinity;
 }
 
+// Of everything but the harmonics, which only rows that are drawn are asked for.
 template <class T>
 inline bool sound_rows(const Inputs<T>& in, int64_t first, int64_t count) {
   bool inside = true;
   for (int64_t i = first; i < first + count; ++i) inside &= in.opacities[i] >= 0 && in.opacities[i] <= 1;
   for (int64_t i = 3 * first; i < 3 * (first + count); ++i) inside &= in.scales[i] >= 0;
   return inside && finite(in.means + 3 * first, 3 * count) && finite(in.quaternions + 4 * first, 4 * count) &&
-         finite(in.scales + 3 * first, 3 * count) && finite(in.sh + 3 * in.terms * first, 3 * in.terms * count) &&
+         finite(in.scales + 3 * first, 3 * count) &&
          (!in.displacements || finite(in.displacements + 3 * first, 3 * count));
 }
 
@@ -81,9 +82,10 @@ inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, 
     for (auto& channel : s.color) channel = rounded_to_half<T>(channel);
 }
 
-// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii, counts pairs per tile.
+// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii, counts pairs per tile;
+// false if a row that is drawn has a bad coefficient.
 template <class E, class T>
-void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
+bool project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
                    int count, T* radii, int64_t* counts) {
   // The lanes of a last, partial block repeat its last row.
   const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
@@ -96,7 +98,7 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
     for (int r = 0; r < count; ++r) radii[first + r] = radius[r];
   if (!any<T>(seen)) {
     for (int r = 0; r < count; ++r) ws.tiles[first + r].count = 0, ws.tiles[first + r].mask = 0;
-    return;
+    return true;
   }
   color_rows(camera, in, row, p.placement.mean, s);
   Splat<T>* splats = &ws.splats[first];
@@ -106,6 +108,9 @@ void project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
     ws.tiles[first + r].depth_key = depth_key(splats[r].depth, camera.depth_bits);
     for_each_tile(ws.tiles[first + r], splats[r], grid, [&](int64_t tile) { ++counts[tile]; });
   }
+  bool sound = true;
+  for (int r = 0; r < count; ++r) sound &= !seen[r] || finite(in.sh + 3 * in.terms * (first + r), 3 * in.terms);
+  return sound;
 }
 
 // Fills ws.splats, ws.tiles, `radii` and each thread's counts of pairs per tile; false if a row holds a bad value.
@@ -124,7 +129,7 @@ bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* ra
     for (int64_t first = range.begin; first < range.end; first += LANES<T>) {
       const int count = int(range.end - first < LANES<T> ? range.end - first : LANES<T>);
       bad |= !valid_rows(in, first, count);
-      project_block<E>(ws, camera, grid, in, first, count, radii, counts);
+      bad |= !project_block<E>(ws, camera, grid, in, first, count, radii, counts);
     }
   }
   return !bad;

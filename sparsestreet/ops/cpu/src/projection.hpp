@@ -9,6 +9,7 @@ namespace SPLAT_VARIANT {
 
 constexpr double BOX_MARGIN = 0.01;               // pixels; rounding must never cull a touched pixel
 constexpr double COMPENSATION_FLOOR = 2.5e-5;     // least det / det_blurred of the antialias compensation
+constexpr double LEAST_OPACITY = 0x1p-126;        // below it log2 and its power of two are no inverses in float
 constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: thinner splats touch no pixel center
 constexpr double LOG2_SCALE = 0.84932180028801907;  // sqrt(log2(e) / 2)
 constexpr double TWO_LN2 = 1.3862943611198906;
@@ -137,7 +138,7 @@ inline Index<V> project(const Camera<T>& camera, const RowValues<V>& row, const 
   s.l11 = scale * root(c.yy / c.determinant);
   s.l21 = -scale * c.xy / (deviation_y * root(c.determinant));
   s.l22 = scale / deviation_y;
-  return p.seen && row.opacity > T(0) && c.determinant >= T(DETERMINANT_MIN) &&
+  return p.seen && opacity >= T(LEAST_OPACITY) && c.determinant >= T(DETERMINANT_MIN) &&
          c.determinant <= std::numeric_limits<T>::max() && opacity >= camera.alpha_min && s.x + box_x >= T(0.5) &&
          s.x - box_x <= camera.width - T(0.5) && s.y + box_y >= T(0.5) && s.y - box_y <= camera.height - T(0.5);
 }
