@@ -164,7 +164,8 @@ def test_parts_cover_long_tiles_once(counts, length, limit):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(parts, "PART_LENGTH", length)
         patch.setattr(parts, "PART_LIMIT", limit)
-        found = split_tiles(begins, ends, pairs)
+        lengths, order = torch.sort(ends - begins, descending=True, stable=True)
+        found = split_tiles(*(part.to(DEVICE) for part in (begins, ends, order.int(), lengths)), pairs)
     share = max(length, -(-pairs // limit))
     long = [tile for tile, count in enumerate(counts) if count >= 2 * share]
     if found is None:
