@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
 from triton.runtime import driver
 
 _PROPERTIES = {"max_shared_mem": 232448, "max_num_regs": 65536, "multiprocessor_count": 132, "warpSize": 32}
@@ -17,20 +18,60 @@ _PROPERTIES = {"max_shared_mem": 232448, "max_num_regs": 65536, "multiprocessor_
 
 
 @dataclass
+class Binary:
+    """A kernel as it was specialized, and its machine code."""
+
+    name: str
+    source: ASTSource
+    shared: int
+    """Bytes of shared memory."""
+    cubin: bytes = b""
+
+    def specialized(self) -> dict[str, str]:
+        """What is known of each argument that is no constant: "1" (its value), "16" (what divides it) or ""."""
+        known = {}
+        for i, name in enumerate(self.source.fn.arg_names):
+            if not self.source.fn.params[i].is_constexpr:
+                divisible = ["tt.divisibility", 16] in self.source.attrs.get((i,), [])
+                known[name] = "1" if (i,) in self.source.constants else "16" if divisible else ""
+        return known
+
+
+@dataclass
 class FakeDevice:
-    """What was launched on it, and what stands in for kernels whose outputs somebody reads."""
+    """A device of compute capability ``arch`` that compiles what is launched and runs nothing."""
 
     arch: int = 90
     stand_ins: dict[str, Callable[..., None]] = field(default_factory=dict)
-    """By a kernel's name: called with the kernel's arguments in place of the kernel."""
-    launches: list[tuple[str, int, Any]] = field(default_factory=list)
-    """Name, programs and the compiled source of each launch; its attributes tell what was specialized."""
-    recording: bool = True
+    """By a kernel's name: called with the kernel's arguments in its place, where somebody reads its outputs."""
+    binaries: list[Binary] = field(default_factory=list)
+    """What was compiled."""
+    launches: list[Binary] = field(default_factory=list)
+    """Which of them was launched, time after time."""
 
 
-class _Utils:
-    def load_binary(self, name: str, kernel: bytes, shared: int, device: int) -> tuple[int, int, int, int, int]:
+class _Driver:
+    """What Triton asks of a driver; it is its own ``utils``."""
+
+    def __init__(self, device: FakeDevice):
+        self._device, self.utils = device, self
+
+    def launcher_cls(self, source: ASTSource, metadata: Any) -> Callable[..., None]:
+        """What starts a kernel: made just before its machine code is loaded."""
+        binary, device = Binary(metadata.name, source, metadata.shared), self._device
+        device.binaries.append(binary)
+
+        # The grid, stream, function and what hooks get; then the kernel's arguments.
+        def start(*arguments: Any) -> None:
+            device.launches.append(binary)
+            if binary.name in device.stand_ins:
+                device.stand_ins[binary.name](*arguments[9:])
+
+        return start
+
+    def load_binary(self, name: str, cubin: bytes, shared: int, device: int) -> tuple[int, int, int, int, int]:
         """Module, function, registers, spills, most threads of a program."""
+        self._device.binaries[-1].cubin = cubin
         return 1, 1, 0, 0, 1024
 
     def unload_module(self, module: int) -> None:
@@ -38,22 +79,6 @@ class _Utils:
 
     def get_device_properties(self, device: int) -> dict[str, int]:
         return _PROPERTIES
-
-
-class _Driver:
-    def __init__(self, device: FakeDevice):
-        self._device, self.utils = device, _Utils()
-
-    def launcher_cls(self, source: Any, metadata: Any) -> Callable[..., None]:
-        name, device = metadata.name, self._device
-
-        def start(x: int, y: int, z: int, stream: int, function: int, packed: Any, lazy: Any, enter, leave, *arguments):
-            if device.recording:
-                device.launches.append((name, x, source))
-            if name in device.stand_ins:
-                device.stand_ins[name](*arguments)
-
-        return start
 
     def get_current_device(self) -> int:
         return 0
@@ -69,9 +94,6 @@ class _Driver:
 
     def get_active_torch_device(self) -> torch.device:
         return torch.device("cpu")
-
-    def map_python_to_cpp_type(self, kind: str) -> str:
-        return "int"
 
 
 def install(device: FakeDevice) -> None:
