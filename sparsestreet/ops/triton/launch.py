@@ -34,41 +34,36 @@ def launch(
 ) -> None:
     """Run ``kernel`` over ``items`` in programs of ``block``, given to it as BLOCK; nothing runs for no items.
 
-    The first of ``arguments`` must be a tensor, and all of them come before the constants in the kernel's signature.
-    ``options`` are the compiler's (num_warps, maxnreg, enable_fp_fusion).
+    The first of ``arguments`` must be a tensor. ``constants`` are all others that the kernel takes, ``options`` the
+    compiler's (num_warps, maxnreg, enable_fp_fusion). Raises TypeError for arguments that are no tensors, ints or
+    floats.
     """
     if not items:
         return
-    grid, options = (-(-items // block), 1, 1), options or {}
+    grid, options, constants = (-(-items // block), 1, 1), options or {}, constants | {"BLOCK": block}
+    device = arguments[0].get_device()
+    key = (kernel.fn, device, tuple([_kind(value) for value in arguments]), *constants.items(), *options.items())
     if is_interpreted(kernel):
         # NumPy, which the interpreter computes in, would warn of infinities in lanes that are masked off.
         with np.errstate(all="ignore"):
-            kernel[grid](*arguments, **constants, BLOCK=block, **options)
+            kernel[grid](*arguments, **constants, **options)
         return
-    device = arguments[0].get_device()
     if device < 0 or device == torch.cuda.current_device():
-        _launch_here(device, kernel, grid, block, arguments, options, constants)
+        _launch_here(key, kernel, grid, arguments, constants, options)
         return
     with torch.cuda.device(device):
-        _launch_here(device, kernel, grid, block, arguments, options, constants)
+        _launch_here(key, kernel, grid, arguments, constants, options)
 
 
 def _launch_here(
-    device: int,
-    kernel: KernelInterface,
-    grid: tuple[int, int, int],
-    block: int,
-    arguments: tuple,
-    options: dict[str, Any],
-    constants: dict[str, Any],
+    key: tuple, kernel: KernelInterface, grid: tuple[int, int, int], arguments: tuple, constants: dict, options: dict
 ) -> None:
-    kinds = tuple([_kind(argument) for argument in arguments])
-    key = (kernel.fn, device, block, kinds, *constants.items(), *options.items())
     compiled = _COMPILED.get(key)
     if compiled is not None:
-        compiled[grid](*arguments, *constants.values(), block)
+        # Constants fill their places in the signature; the machine code has them already.
+        compiled[grid](*arguments, *constants.values())
         return
-    compiled = kernel[grid](*arguments, **constants, BLOCK=block, **options)
+    compiled = kernel[grid](*arguments, **constants, **options)
     # A hook of Triton's may have kept it from compiling.
     if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
         _COMPILED[key] = compiled

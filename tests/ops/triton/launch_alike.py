@@ -39,12 +39,15 @@ KINDS = {
     "float": (TO, VALUES, 7.0, 50, True),
     "count of one": (TO, VALUES, 7, 1, True),
     "other constant": (TO, VALUES, 7, 50, False),
+    "other block": (TO, VALUES, 7, 50, True),
+    "other options": (TO, VALUES, 7, 50, True),
 }
 
 
 def start(name: str) -> None:
     *arguments, exact = KINDS[name]
-    launch(scale, arguments[3], 16, *arguments, EXACT=exact, options={"num_warps": 1})
+    options = {"num_warps": 2 if name == "other options" else 1}
+    launch(scale, arguments[3], 32 if name == "other block" else 16, *arguments, EXACT=exact, options=options)
 
 
 def measure(device: FakeDevice, names: list[str]) -> list[dict]:

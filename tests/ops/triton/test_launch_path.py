@@ -73,7 +73,7 @@ def alike() -> dict[str, list[dict]]:
     """By kind: what its first and its second launch got."""
     names = [
         "plain", "another plain", "unaligned target", "unaligned source", "doubles", "one", "sixteens", "zero", "long",
-        "least int", "long sixteens", "float", "count of one", "other constant",
+        "least int", "long sixteens", "float", "count of one", "other constant", "other block", "other options",
     ]  # fmt: skip
     found = run_compiler("launch_alike", {"names": names * 2})
     return {name: [found[i], found[i + len(names)]] for i, name in enumerate(names)}
@@ -99,7 +99,6 @@ TYPES = ["*fp32", "*fp32", "i32", "i32"]
         ("long sixteens", {"factor": "16"}, {2: "i64"}),
         ("float", {}, {2: "fp32"}),
         ("count of one", {}, {}),
-        ("other constant", {}, {}),
     ],
 )
 def test_a_launch_gets_the_kernel_of_its_arguments(alike, name, known, types):
@@ -116,7 +115,10 @@ def test_only_the_first_of_launches_alike_is_bound(alike):
 
 
 def test_what_is_no_argument_is_part_of_the_kernel_too(alike):
-    assert alike["other constant"][0]["code"] != alike["plain"][0]["code"]
+    codes = {
+        alike[name][i]["code"] for name in ("plain", "other constant", "other block", "other options") for i in (0, 1)
+    }
+    assert len(codes) == 4
     # A count is not specialized, so what it is compiles nothing.
     assert alike["count of one"][0]["code"] == alike["plain"][0]["code"]
 
