@@ -124,6 +124,12 @@ def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
     assert sorted(lists.order.tolist()) == list(range(COLUMNS * ROWS))
 
 
+def test_more_pairs_than_tiles():
+    scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, 2 + 0.01 * k]]) for k in range(300)])
+    screen = project(cast(scene, torch.float32, device=DEVICE), View(front_camera(9, 5, 20.0), SplatSettings()))
+    assert screen.lists.pair_rows.tolist() == list(range(300))
+
+
 @pytest.mark.parametrize(("edge", "distance"), [("left", 9), ("right", 8), ("top", 9), ("bottom", 8)])
 def test_a_splat_that_ends_on_a_pixel_center_is_listed(edge, distance):
     # The mean is on the pixel center (24.5, 24.5) of 3 x 3 tiles; the next tiles' nearest centers lie 9 and 8 px away.

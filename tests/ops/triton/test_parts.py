@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
@@ -158,6 +158,9 @@ def test_parts_longer_than_a_look(monkeypatch):
 
 @settings(deadline=None, max_examples=100)
 @given(st.lists(st.integers(0, 40), min_size=1, max_size=9), st.integers(1, 7), st.integers(2, 12))
+# More parts, and more tiles, than a program has lanes.
+@example([300], 1, 400)
+@example([5] + [0] * 299, 2, 12)
 def test_parts_cover_long_tiles_once(counts, length, limit):
     ends = torch.tensor(counts).cumsum(0).int()
     begins, pairs = ends - torch.tensor(counts, dtype=torch.int32), sum(counts)
