@@ -112,9 +112,10 @@ def list_parts(
     pairs = tl.load(lengths + rank, rank < split_count, 0)
     used = pairs >= 2 * length
     tile, count = tl.load(order + rank, used, 0), tl.where(used, pairs // length, 1)
-    next_part = tl.where(used, tl.load(split_nexts + rank, used, 0), number)
-    first = tl.where(used, next_part - count, number)
+    first = tl.where(used, tl.load(split_nexts + rank, used, 0) - count, number)
     share = tl.cdiv(pairs, count)
+    # Rounded up, the shares may leave nothing for the last parts: these are not needed, and nobody reads them.
+    next_part = tl.where(used, first + tl.cdiv(pairs, tl.maximum(share, 1)), number)
     end = tl.load(ends + tile, used, 0)
     begin = tl.minimum(tl.load(begins + tile, used, 0) + (number - first) * share, end)
     given = number < part_count

@@ -98,9 +98,7 @@ def test_no_touched_quarter_is_missing_and_hardly_one_is_listed_in_vain(projecte
     for tile in range(COLUMNS * ROWS):
         pairs = slice(int(lists.begins[tile]), int(lists.ends[tile]))
         line, column = divmod(tile, COLUMNS)
-        for row, bits in zip(
-            lists.rows_of_pairs[pairs].tolist(), lists.quarters_of_pairs[pairs].tolist(), strict=True
-        ):
+        for row, bits in zip(lists.rows_of_pairs[pairs].tolist(), lists.quarters_of_pairs[pairs].tolist(), strict=True):
             tiles.add((row, column, line))
             marked |= {(row, 2 * column + k % 2, 2 * line + k // 2) for k in range(4) if bits >> k & 1}
 
