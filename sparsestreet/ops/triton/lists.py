@@ -19,6 +19,7 @@ from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.parts import Parts, split_tiles
 from sparsestreet.ops.triton.quarters import MOST_ROWS, QUARTER_SHIFT, touched_quarters
+from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
 from sparsestreet.ops.triton.view import View
 
@@ -71,6 +72,17 @@ def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: 
     tl.store(rows + place, row, seen)
 
 
+@partial(jit, do_not_specialize=["visible"])
+def list_counts(tile_counts, unsorted_rows, order, rows, counts, first_pairs, visible, BLOCK: tl.constexpr):
+    """Rows in the ``order`` of their depths, and how many pairs each has; 0 as the first of ``first_pairs``."""
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    given = rank < visible
+    row = tl.load(unsorted_rows + tl.load(order + rank, given, 0), given, 0)
+    tl.store(rows + rank, row, given)
+    tl.store(counts + rank, tl.load(tile_counts + row, given, 0), given)
+    tl.store(first_pairs + rank, 0, rank == 0)
+
+
 @partial(jit, do_not_specialize=["pairs"])
 def list_pairs(
     records, ranks, rows, first_pairs, keys, pair_rows, pairs, width, height, tiles_x,
@@ -102,39 +114,71 @@ def list_pairs(
     tl.store(pair_rows + pair, row | quarters, given)
 
 
+@partial(jit, do_not_specialize=["pairs", "tiles", "steps"])
+def bound_tiles(
+    keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, pairs, tiles, steps, BLOCK: tl.constexpr
+):  # fmt: skip
+    """Rows of the sorted pairs, and where each tile's pairs begin and end: a program does its share of both."""
+    start = tl.program_id(0) * BLOCK
+    pair = start + tl.arange(0, BLOCK)
+    row = tl.load(unsorted_rows + tl.load(slots + pair, pair < pairs, 0), pair < pairs, 0)
+    tl.store(pair_rows + pair, row, pair < pairs)
+    if start < tiles:
+        # Both searches at once: each step of one waits for its load.
+        end = tl.arange(0, 2)[:, None]
+        tile = start + tl.arange(0, BLOCK)[None, :] + 0 * end
+        bound = first_at_least(keys, tile + end, pairs, steps)
+        given = tile < tiles
+        tl.store(begins + tile, bound, given & (end == 0))
+        tl.store(ends + tile, bound, given & (end == 1))
+        tile = start + tl.arange(0, BLOCK)
+        tl.store(lengths + tile, tl.sum(tl.where(end == 1, bound, -bound), 0), tile < tiles)
+
+
 def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: View) -> Lists:
-    """Sort rows and pairs; ``visible`` and ``pairs`` are the numbers of both, already checked."""
-    rows = _rows_by_depth(records, tile_counts, places, visible, view)
-    counts = tile_counts[rows.long()]
-    first_pairs = (counts.cumsum(0) - counts).int()
+    """Sort rows and pairs; ``visible`` and ``pairs`` are the numbers of both, already checked.
+
+    The device has nothing else to do meanwhile: every call between two kernels of ours is a gap.
+    """
+    rows, counts, first_pairs = _rows_by_depth(records, tile_counts, places, visible, view)
     columns, lines = view.tiles
     keys = tile_counts.new_empty(pairs, dtype=torch.int16 if columns * lines <= _SHORT_KEYS else torch.int32)
     unsorted_rows = tile_counts.new_empty(pairs)
-    ranks = torch.repeat_interleave(
-        torch.arange(visible, dtype=torch.int32, device=rows.device), counts, output_size=pairs
-    )
     launch(
         list_pairs, pairs, _BLOCK,
-        records, ranks, rows, first_pairs, keys, unsorted_rows, pairs,
+        records, torch.repeat_interleave(counts, output_size=pairs), rows, first_pairs, keys, unsorted_rows, pairs,
         float(view.camera.width), float(view.camera.height), columns,
         BOUNDED=view.bounded, options={"enable_fp_fusion": False},
     )  # fmt: skip
     keys, slots = torch.sort(keys, stable=True)
-    begins = torch.searchsorted(keys, torch.arange(columns * lines, device=keys.device).to(keys.dtype), out_int32=True)
-    ends = torch.cat((begins[1:], begins.new_full((1,), pairs)))
-    order = torch.argsort(ends - begins, descending=True).int()
-    parts = split_tiles(begins, ends, pairs)
-    return Lists(rows, first_pairs, counts, unsorted_rows[slots], slots, begins, ends, order, parts)
+    pair_rows = torch.empty_like(unsorted_rows)
+    begins, ends, lengths = (tile_counts.new_empty(columns * lines) for _ in range(3))
+    launch(
+        bound_tiles, max(pairs, len(lengths)), _BLOCK,
+        keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, pairs, len(lengths), pairs.bit_length(),
+    )  # fmt: skip
+    lengths, order = torch.sort(lengths, descending=True, stable=True)
+    order = order.int()
+    parts = split_tiles(begins, ends, order, lengths, pairs)
+    return Lists(rows, first_pairs, counts, pair_rows, slots, begins, ends, order, parts)
 
 
-def _rows_by_depth(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: View) -> Tensor:
-    keys, rows = tile_counts.new_empty(visible), tile_counts.new_empty(visible)
+def _rows_by_depth(
+    records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: View
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Visible rows, nearest first, the number of pairs of each, and its first pair."""
+    keys, unsorted, rows, counts = (tile_counts.new_empty(visible) for _ in range(4))
+    # One more, so that the sums can be written beside the first row's 0.
+    first_pairs = tile_counts.new_empty(visible + 1)
     mask = -1 << (32 - view.settings.depth_bits)
     launch(
         list_visible, len(tile_counts), _BLOCK,
-        records, tile_counts, places, keys, rows, len(tile_counts), KEY_MASK=mask,
+        records, tile_counts, places, keys, unsorted, len(tile_counts), KEY_MASK=mask,
     )  # fmt: skip
-    return rows[torch.sort(keys, stable=True).indices]
+    order = torch.sort(keys, stable=True).indices
+    launch(list_counts, visible, _BLOCK, tile_counts, unsorted, order, rows, counts, first_pairs, visible)
+    torch.cumsum(counts, 0, dtype=torch.int32, out=first_pairs[1:])
+    return rows, counts, first_pairs[:-1]
 
 
 def check_pairs(pairs: int, tile_counts: Tensor) -> None:

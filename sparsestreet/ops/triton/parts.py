@@ -10,6 +10,7 @@ twice, which pays only where others would wait.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import triton.language as tl
@@ -19,13 +20,16 @@ from torch import Tensor
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
 from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.quarters import row_of
+from sparsestreet.ops.triton.search import first_at_least
 
 PART_LENGTH = 256
 """Least pairs of a part; none has more than one and a half times as many."""
 PART_LIMIT = 8192
 """Most parts of a view: about twice the warps that a large GPU runs at once (21 to 28 on each of its 108 to 132
 multiprocessors), so that no part takes longer than the device's share of the whole view. 7 kB each."""
+_BLOCK = 128
 
 
 @dataclass(frozen=True)
@@ -67,29 +71,59 @@ class PartLayers:
         return PartLayers(pixels[0], rgb, pixels[1], pixels[2], lasts)
 
 
-def split_tiles(begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], pairs: int) -> Parts | None:
+def split_tiles(
+    begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], order: Int[Tensor, " t"], lengths: Int[Tensor, " t"], pairs: int
+) -> Parts | None:
     """Parts of all tiles that are long enough for two; None if the pairs are too few for one.
 
-    Does not wait for the device: there is room for the most parts that so many pairs could need.
+    ``order`` holds the tiles, those with most pairs first, and ``lengths`` their numbers of pairs in that order. Does
+    not wait for the device: there is room for the most parts that so many pairs could need.
     """
     length = max(PART_LENGTH, -(-pairs // PART_LIMIT))
     most = pairs // length
     if most < 2:
         return None
-    counts = ends - begins
-    parts = torch.where(counts >= 2 * length, counts // length, 0)
-    nexts = parts.cumsum(0, dtype=torch.int32)
-    number = torch.arange(most, dtype=torch.int32, device=begins.device)
-    tiles = torch.searchsorted(nexts, number, right=True, out_int32=True)
-    used = tiles < len(begins)
-    tiles = torch.where(used, tiles, 0)
-    firsts = torch.where(used, nexts[tiles] - parts[tiles], number)
-    share = -(-counts[tiles] // parts[tiles].clamp(min=1))
-    first_pairs = begins[tiles] + (number - firsts) * share
-    first_pairs = torch.where(used, torch.minimum(first_pairs, ends[tiles]), 0)
-    last_pairs = torch.where(used, torch.minimum(first_pairs + share, ends[tiles]), 0)
-    whole_ends = torch.where(parts > 0, begins, ends)
-    return Parts(tiles, first_pairs, last_pairs, firsts, torch.where(used, nexts[tiles], number), whole_ends)
+    # No more tiles can have two parts. Those too short for two come last, so they move no part of the others.
+    nexts = (lengths[: most // 2] // length).cumsum(0, dtype=torch.int32)
+    parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends))
+    launch(
+        list_parts, max(most, len(order)), _BLOCK,
+        begins, ends, order, lengths, nexts,
+        parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.whole_ends,
+        len(order), len(nexts), len(nexts).bit_length(), most, length,
+    )  # fmt: skip
+    return parts
+
+
+@partial(jit, do_not_specialize=["tile_count", "split_count", "steps", "part_count", "length"])
+def list_parts(
+    begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends,
+    tile_count, split_count, steps, part_count, length, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One lane a part and a tile. ``split_nexts``: the part after the last one of each of the first tiles in order."""
+    number = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    given = number < tile_count
+    tile = tl.load(order + number, given, 0)
+    begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
+    tl.store(whole_ends + tile, tl.where(end - begin < 2 * length, end, begin), given)
+
+    # The first tile whose parts end behind this one.
+    rank = first_at_least(split_nexts, number + 1, split_count, steps)
+    pairs = tl.load(lengths + rank, rank < split_count, 0)
+    used = pairs >= 2 * length
+    tile, count = tl.load(order + rank, used, 0), tl.where(used, pairs // length, 1)
+    first = tl.where(used, tl.load(split_nexts + rank, used, 0) - count, number)
+    share = tl.cdiv(pairs, count)
+    # Rounded up, the shares may leave nothing for the last parts: these are not needed, and nobody reads them.
+    next_part = tl.where(used, first + tl.cdiv(pairs, tl.maximum(share, 1)), number)
+    end = tl.load(ends + tile, used, 0)
+    begin = tl.minimum(tl.load(begins + tile, used, 0) + (number - first) * share, end)
+    given = number < part_count
+    tl.store(tiles + number, tile, given)
+    tl.store(part_begins + number, begin, given)
+    tl.store(part_ends + number, tl.minimum(begin + share, end), given)
+    tl.store(firsts + number, first, given)
+    tl.store(nexts + number, next_part, given)
 
 
 @jit

@@ -45,11 +45,16 @@ def project(gaussians: Gaussians, view: View) -> Screen:
     )  # fmt: skip
     places = (tile_counts > 0).cumsum(0, dtype=torch.int32)
     numbers = torch.stack((tile_counts.sum(dtype=torch.int64), places[-1:].sum(), bad.sum()))
-    pairs, visible, bad_blocks = numbers.tolist()
+    pairs, visible, bad_blocks = wait_for(numbers)
     if bad_blocks:
         check_values(gaussians)
     check_pairs(pairs, tile_counts)
     return Screen(table, splats, tile_counts, radii, list_tiles(splats, tile_counts, places, visible, pairs, view))
+
+
+def wait_for(numbers: Int[Tensor, " numbers"]) -> list[int]:
+    """The numbers on the host: the only place where the op waits for the device."""
+    return numbers.tolist()
 
 
 def fields_of(gaussians: Gaussians) -> tuple[Tensor, ...]:

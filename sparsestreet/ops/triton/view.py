@@ -101,7 +101,7 @@ class View:
             motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
         numbers = (
             *(value for row in pose[:3] for value in row[:3]),
-            *position,
+            *position.tolist(),
             *(K[0][0], K[1][1], K[0][2], K[1][2]),
             *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
             *(camera.width, camera.height, s.eps2d, s.near_plane),
@@ -111,9 +111,9 @@ class View:
             math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
             *motion,
             # What float32 cannot hold of the position.
-            *(position - position.float().double()),
+            *(position - position.float().double()).tolist(),
         )
-        return [float(number) for number in numbers]
+        return list(map(float, numbers))
 
 
 def _slope_limits(focal: float, center: float, size: int) -> tuple[float, float]:

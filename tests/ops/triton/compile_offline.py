@@ -49,7 +49,8 @@ def _compile(kernel: KernelInterface, launch: dict, arch: int) -> dict:
     compiled = triton.compile(
         ASTSource(kernel, signature, constants, attributes), GPUTarget("cuda", arch, 32), options=launch["options"]
     )
-    resources, instructions = _machine_code(compiled.asm["cubin"])
+    cubin = compiled.asm["cubin"]
+    resources, instructions = resources_of(cubin), _instructions_of(cubin)
     return {
         **resources,
         "tensor_core": sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
@@ -67,16 +68,24 @@ def _constant(value: object) -> object:
     return tl.dtype(value["dtype"]) if isinstance(value, dict) else value
 
 
-def _machine_code(cubin: bytes) -> tuple[dict, list[tuple[int, str]]]:
-    """Registers and bytes of stack (where spilled registers go), and the instructions with their addresses."""
+def resources_of(cubin: bytes) -> dict[str, int]:
+    """Registers, and bytes of stack, where spilled registers go."""
+    used = re.search(r"REG:(\d+) STACK:(\d+)", _listed(cubin, "-res-usage"))
+    return {"registers": int(used[1]), "spilled": int(used[2])}
+
+
+def _instructions_of(cubin: bytes) -> list[tuple[int, str]]:
+    """Instructions with their addresses."""
+    pattern = r"^\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\d+\s+)?(.*?);"
+    found = re.findall(pattern, _listed(cubin, "-sass"), re.MULTILINE)
+    return [(int(address, 16), text.strip()) for address, text in found]
+
+
+def _listed(cubin: bytes, what: str) -> str:
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         Path(file.name).write_bytes(cubin)
-        command = [_TOOLS / "cuobjdump", "-res-usage", "-sass", file.name]
-        listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    used = re.search(r"REG:(\d+) STACK:(\d+)", listing)
-    found = re.findall(r"^\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\d+\s+)?(.*?);", listing, re.MULTILINE)
-    resources = {"registers": int(used[1]), "spilled": int(used[2])}
-    return resources, [(int(address, 16), text.strip()) for address, text in found]
+        command = [_TOOLS / "cuobjdump", what, file.name]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
 def _tiles(ttgir: str) -> list[dict]:

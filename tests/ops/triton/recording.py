@@ -15,7 +15,7 @@ import torch
 import triton.language as tl
 
 from sparsestreet.ops.triton import launch as package
-from sparsestreet.ops.triton import lists, pixels, rasterizer, screen
+from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
 
 _POINTERS = {
     torch.float32: "*fp32",
@@ -41,7 +41,7 @@ class Launch:
 
 
 def record_launches(
-    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (rasterizer, screen, lists, pixels)
+    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (rasterizer, screen, lists, parts, pixels)
 ) -> list[Launch]:
     """A list that every launch of the modules is appended to from now on."""
     launches: list[Launch] = []
@@ -61,16 +61,20 @@ def record_launches(
 
 def compile_launches(launches: list[Launch], arch: int) -> list[tuple[Launch, dict]]:
     """What compile_offline.py finds of each launch, compiled for sm_``arch``."""
-    # The interpreter replaces the compiler in this process.
+    given = {"arch": arch, "launches": [dataclasses.asdict(item) for item in launches]}
+    return list(zip(launches, run_compiler("compile_offline", given), strict=True))
+
+
+def run_compiler(script: str, given: Any) -> Any:
+    """What a script of this folder answers, in a process that has the compiler: the interpreter replaces it in this."""
     environment = {"TRITON_CACHE_DIR": str(Path.cwd() / ".cache" / "triton")} | dict(os.environ)
     environment.pop("TRITON_INTERPRET", None)
-    given = {"arch": arch, "launches": [dataclasses.asdict(item) for item in launches]}
-    command = [sys.executable, "-m", "tests.ops.triton.compile_offline"]
+    command = [sys.executable, "-m", f"tests.ops.triton.{script}"]
     ended = subprocess.run(
         command, input=json.dumps(given), env=environment, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 0, ended.stderr[-3000:]
-    return list(zip(launches, json.loads(ended.stdout), strict=True))
+    return json.loads(ended.stdout)
 
 
 def _type_of(value: Any) -> str:

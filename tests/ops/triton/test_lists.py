@@ -98,9 +98,7 @@ def test_no_touched_quarter_is_missing_and_hardly_one_is_listed_in_vain(projecte
     for tile in range(COLUMNS * ROWS):
         pairs = slice(int(lists.begins[tile]), int(lists.ends[tile]))
         line, column = divmod(tile, COLUMNS)
-        for row, bits in zip(
-            lists.rows_of_pairs[pairs].tolist(), lists.quarters_of_pairs[pairs].tolist(), strict=True
-        ):
+        for row, bits in zip(lists.rows_of_pairs[pairs].tolist(), lists.quarters_of_pairs[pairs].tolist(), strict=True):
             tiles.add((row, column, line))
             marked |= {(row, 2 * column + k % 2, 2 * line + k // 2) for k in range(4) if bits >> k & 1}
 
@@ -122,6 +120,12 @@ def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
     assert lengths[0] > lengths[-1]
     assert (lengths[1:] <= lengths[:-1]).all()
     assert sorted(lists.order.tolist()) == list(range(COLUMNS * ROWS))
+
+
+def test_more_pairs_than_tiles():
+    scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, 2 + 0.01 * k]]) for k in range(300)])
+    screen = project(cast(scene, torch.float32, device=DEVICE), View(front_camera(9, 5, 20.0), SplatSettings()))
+    assert screen.lists.pair_rows.tolist() == list(range(300))
 
 
 @pytest.mark.parametrize(("edge", "distance"), [("left", 9), ("right", 8), ("top", 9), ("bottom", 8)])

@@ -109,8 +109,9 @@ def compiled(request) -> list[tuple[Launch, dict]]:
 
 def test_every_kernel_is_compiled(compiled):
     assert {launch.name for launch, _ in compiled} == {
-        "project_rows", "list_visible", "list_pairs", "blend_tiles", "count_tiles_pixels", "blend_tiles_backward",
-        "sum_slots", "project_rows_backward", "remove_from_tiles", "thin_parts", "merge_parts",
+        "project_rows", "list_visible", "list_counts", "list_pairs", "bound_tiles", "list_parts", "blend_tiles",
+        "count_tiles_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward", "remove_from_tiles",
+        "thin_parts", "merge_parts",
     }  # fmt: skip
 
 

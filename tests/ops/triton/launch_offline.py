@@ -1,0 +1,120 @@
+"""Renders and differentiates as on a device, up to the launches, and says what was launched and how.
+
+Run as a script, without TRITON_INTERPRET: cases come in as JSON on standard input, what was found goes out as JSON.
+"""
+
+import json
+import statistics
+import sys
+import time
+from contextlib import nullcontext
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sparsestreet.ops import splat
+from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
+from sparsestreet.ops.triton.launch import launch
+from tests.ops.scenes import camera, cast, random_gaussians
+from tests.ops.triton.compile_offline import resources_of
+from tests.ops.triton.fake_driver import Binary, FakeDevice, install
+
+MODULES: tuple[ModuleType, ...] = (screen, lists, parts, pixels, rasterizer)
+ROWS, VISIBLE = 40, 30
+_ALLOCATIONS = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
+
+
+class Dispatches(TorchDispatchMode):
+    """Names of torch's operations from the wait on, those that start something on a device: no views (something that
+    is returned shares memory with an argument that is not written) and no bare allocations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        returned = [result.alias_info for result in func._schema.returns]
+        view = any(alias is not None and not alias.is_write for alias in returned)
+        name = func._schema.name.removeprefix("aten::")
+        if not view and name not in _ALLOCATIONS:
+            self.names.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+class Case:
+    """One scene and view; the numbers that the host waits for are planted."""
+
+    def __init__(self, device: FakeDevice, case: dict):
+        self.view = camera(case["width"], case["height"])
+        scene = random_gaussians(ROWS, self.view, terms=case["terms"])
+        self.gaussians = cast(scene, torch.float32, requires_grad=True)
+        self.background = torch.zeros(3) if case["background"] else None
+        self.numbers, self.dispatches = [case["pairs"], VISIBLE, 0], Dispatches()
+        device.stand_ins = {"list_counts": self.write_counts}
+        screen.wait_for = self.wait_for
+
+    def wait_for(self, numbers: torch.Tensor) -> list[int]:
+        self.dispatches.names.clear()
+        return self.numbers
+
+    def write_counts(self, tile_counts, unsorted, order, rows, counts, first_pairs, visible, block) -> None:
+        """In place of list_counts, for torch's repeat_interleave reads them."""
+        # NumPy writes: nothing that is counted.
+        counts.numpy()[:] = [self.numbers[0]] + [0] * (VISIBLE - 1)
+
+    def run(self, backward: bool = True, counted: bool = False) -> list[str]:
+        """Torch's operations after the wait, forward."""
+        with self.dispatches if counted else nullcontext():
+            drawn = splat(self.gaussians, self.view, background=self.background, backend="triton")
+        if backward:
+            (drawn.rgb.sum() + drawn.depth.sum()).backward()
+        return list(self.dispatches.names)
+
+
+def found_in(binary: Binary) -> dict:
+    resources = resources_of(binary.cubin)
+    types = dict(binary.source.signature)
+    return {"name": binary.name, "types": types, "known": binary.specialized(), "shared": binary.shared, **resources}
+
+
+def launch_time(case: Case, repeats: int) -> float:
+    """Microseconds that a forward and a backward pass spend in their launches, median."""
+    spent = [0.0]
+
+    def timed(*arguments: Any, **options: Any) -> None:
+        start = time.perf_counter()
+        launch(*arguments, **options)
+        spent[-1] += time.perf_counter() - start
+
+    for module in MODULES:
+        module.launch = timed
+    for _ in range(repeats):
+        case.run()
+        spent.append(0.0)
+    for module in MODULES:
+        module.launch = launch
+    return statistics.median(spent[:-1]) * 1e6
+
+
+def measure(device: FakeDevice, given: dict) -> dict:
+    """All that is asked of a case."""
+    before = len(device.binaries)
+    case = Case(device, given)
+    case.run()
+    answer = {"compiled": [found_in(binary) for binary in device.binaries[before:]]}
+    device.launches.clear()
+    answer["dispatches"] = case.run(backward=False, counted=True)
+    answer["forward"] = [binary.name for binary in device.launches]
+    if given["repeats"]:
+        answer["microseconds"] = launch_time(case, given["repeats"])
+    return answer
+
+
+if __name__ == "__main__":
+    fake = FakeDevice()
+    install(fake)
+    # The only other thing that a device's tensors have and these have not.
+    rasterizer.is_interpreted = lambda kernel: True
+    json.dump([measure(fake, given) for given in json.load(sys.stdin)], sys.stdout)

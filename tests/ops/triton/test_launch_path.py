@@ -1,0 +1,169 @@
+"""The way from a call of the op to its launches, as on a device: Triton's own, with a driver that runs nothing."""
+
+from collections import Counter
+from types import SimpleNamespace
+
+import pytest
+from triton.runtime.jit import KernelInterface
+
+from sparsestreet.ops.triton import launch
+from tests.ops.triton.recording import run_compiler
+
+# One process compiles for all tests.
+pytestmark = [pytest.mark.xdist_group("machine code"), pytest.mark.lengthy]
+
+FORWARD = [
+    "project_rows", "list_visible", "list_counts", "list_pairs", "bound_tiles", "list_parts", "blend_tiles",
+    "thin_parts", "blend_tiles", "merge_parts",
+]  # fmt: skip
+BACKWARD = ["blend_tiles_backward", "blend_tiles_backward", "sum_slots", "project_rows_backward"]
+CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
+DAILY = CASE | {"width": 1920, "height": 1280}
+SLOW = [
+    CASE | {"width": 1600, "height": 900, "terms": 16},
+    CASE | {"width": 16, "height": 16, "pairs": 1},
+    CASE | {"width": 1, "height": 1, "terms": 4, "background": False},
+    # More tiles than 16 bits count.
+    CASE | {"width": 5001, "height": 3003, "pairs": 1 << 20},
+]
+
+
+def expected(width: int, height: int) -> dict[str, str]:
+    """What is known of the sizes that kernels get; of all other numbers, which change from view to view, nothing."""
+    sizes = {"width": width, "height": height, "tiles_x": -(-width // 16)}
+    return {name: "1" if size == 1 else "16" if size % 16 == 0 else "" for name, size in sizes.items()}
+
+
+def check(case: dict, found: dict) -> None:
+    split = case["pairs"] > 1
+    names = [*FORWARD, *BACKWARD] if split else [n for n in [*FORWARD, *BACKWARD] if "parts" not in n]
+    assert {kernel["name"] for kernel in found["compiled"]} <= set(names)
+    sizes = expected(case["width"], case["height"])
+    for kernel in found["compiled"]:
+        assert kernel["spilled"] == 0, kernel
+        assert kernel["shared"] <= 48 << 10, kernel
+        for name, known in kernel["known"].items():
+            kind = kernel["types"][name]
+            wanted = "16" if kind.startswith("*") else "" if kind.startswith("fp") else sizes.get(name, "")
+            assert known == wanted, (kernel["name"], name)
+
+
+def test_every_kernel_compiles_as_it_is_launched():
+    (found,) = run_compiler("launch_offline", [DAILY])
+    check(DAILY, found)
+    assert found["forward"] == FORWARD
+    assert [kernel["name"] for kernel in found["compiled"]] == [*FORWARD, *BACKWARD]
+    # What torch starts on the device after the wait, but for views and bare allocations: 5 of it put the background
+    # behind the layers (ops/splat.py).
+    assert Counter(found["dispatches"]) == Counter(
+        ["sort"] * 3 + ["cumsum"] * 2 + ["repeat_interleave", "floor_divide", "_to_copy"]
+        + ["rsub", "mul", "add", "clamp", "div"]
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_every_kernel_compiles_for_other_sizes():
+    for case, found in zip(SLOW, run_compiler("launch_offline", SLOW), strict=True):
+        check(case, found)
+        assert len(found["dispatches"]) <= 13
+
+
+@pytest.fixture(scope="module")
+def alike() -> dict[str, list[dict]]:
+    """By kind: what its first and its second launch got."""
+    names = [
+        "plain", "another plain", "unaligned target", "unaligned source", "doubles", "one", "sixteens", "zero", "long",
+        "least int", "long sixteens", "float", "count of one", "other constant", "other block", "other options",
+    ]  # fmt: skip
+    found = run_compiler("launch_alike", {"names": names * 2})
+    return {name: [found[i], found[i + len(names)]] for i, name in enumerate(names)}
+
+
+KNOWN = {"to": "16", "values": "16", "factor": "", "count": ""}
+TYPES = ["*fp32", "*fp32", "i32", "i32"]
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "types"),
+    [
+        ("plain", {}, {}),
+        ("another plain", {}, {}),
+        ("unaligned target", {"to": ""}, {}),
+        ("unaligned source", {"values": ""}, {}),
+        ("doubles", {}, {1: "*fp64"}),
+        ("one", {"factor": "1"}, {2: "constexpr"}),
+        ("sixteens", {"factor": "16"}, {}),
+        ("zero", {"factor": "16"}, {}),
+        ("long", {}, {2: "i64"}),
+        ("least int", {"factor": "16"}, {}),
+        ("long sixteens", {"factor": "16"}, {2: "i64"}),
+        ("float", {}, {2: "fp32"}),
+        ("count of one", {}, {}),
+    ],
+)
+def test_a_launch_gets_the_kernel_of_its_arguments(alike, name, known, types):
+    wanted = [types.get(i, kind) for i, kind in enumerate(TYPES)]
+    for found in alike[name]:
+        assert found["known"] == KNOWN | known
+        assert found["types"] == [kind for kind in wanted if kind != "constexpr"]
+
+
+def test_only_the_first_of_launches_alike_is_bound(alike):
+    assert alike["plain"][0]["bound"]
+    assert not alike["another plain"][0]["bound"]
+    assert not any(second["bound"] for _, second in alike.values())
+
+
+def test_what_is_no_argument_is_part_of_the_kernel_too(alike):
+    codes = {
+        alike[name][i]["code"] for name in ("plain", "other constant", "other block", "other options") for i in (0, 1)
+    }
+    assert len(codes) == 4
+    # A count is not specialized, so what it is compiles nothing.
+    assert alike["count of one"][0]["code"] == alike["plain"][0]["code"]
+
+
+def test_an_unknown_triton_binds_every_launch():
+    found = run_compiler("launch_alike", {"names": ["plain", "plain"], "version": "3.12.0"})
+    assert [launched["bound"] for launched in found] == [True, True]
+
+
+def test_an_unknown_triton_is_named():
+    with pytest.warns(UserWarning, match=r"Triton 3\.70\.0 is not among .*3\.6\.x, 3\.7\.x"):
+        assert not launch._is_known("3.70.0")
+    assert launch._is_known("3.6.0")
+    assert launch._is_known("3.7.1")
+
+
+def test_other_arguments_are_refused():
+    with pytest.raises(TypeError, match="must be tensors, ints or floats, got None"):
+        launch._kind(None)
+
+
+@pytest.mark.parametrize(("current", "entered"), [(1, []), (0, [1])])
+def test_a_kernel_runs_on_the_device_of_its_tensors(monkeypatch, current, entered):
+    devices, started = [], []
+
+    class Kernel(KernelInterface):
+        fn = object()
+
+        def __getitem__(self, grid):
+            return lambda *arguments, **options: started.append((grid, arguments, options))
+
+    class Entered:
+        def __init__(self, device):
+            devices.append(device)
+
+        def __enter__(self):
+            assert not started
+
+        def __exit__(self, *_):
+            assert started
+
+    monkeypatch.setattr(launch.torch.cuda, "device", Entered)
+    monkeypatch.setattr(launch.torch.cuda, "current_device", lambda: current)
+    tensor = SimpleNamespace(get_device=lambda: 1)
+    monkeypatch.setattr(launch, "_kind", lambda value: None)
+    launch.launch(Kernel(), 33, 16, tensor, 5, options={"num_warps": 1}, DEPTH=True)
+    assert devices == entered
+    assert started == [((3, 1, 1), (tensor, 5), {"DEPTH": True, "BLOCK": 16, "num_warps": 1})]
