@@ -93,7 +93,9 @@ def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE:
 
 
 @jit
-def open_quarter(tile, products, firsts, first_pair, width, height, tiles_x, QUARTER: tl.constexpr, PARTS: tl.constexpr):
+def open_quarter(
+    tile, products, firsts, first_pair, width, height, tiles_x, QUARTER: tl.constexpr, PARTS: tl.constexpr
+):
     """A quarter before its first splat: the light that reaches its pixels (none of those outside the image), no color,
     no depth, and the index after the last pair that each pixel was open to."""
     x, y = quarter_pixels(tile, tiles_x, QUARTER)
@@ -182,12 +184,13 @@ def blend_tiles(
             splat, touched = load_splat(records, row_of(pair), ahead), pair
             pair, ahead = after, load_ahead(records, row_of(after))
             after = tl.load(pair_rows + i + 2, i + 2 < end, 0)
+            more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(splat[0], splat[1][0], ys[0])
-            q0 = blend_quarter(touches(touched, 0), q0, xs[0], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
-            q1 = blend_quarter(touches(touched, 1), q1, xs[1], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
+            q0 = blend_quarter(touches(touched, 0), q0, xs[0], line, *more)
+            q1 = blend_quarter(touches(touched, 1), q1, xs[1], line, *more)
             line = of_lines(splat[0], splat[1][0], ys[1])
-            q2 = blend_quarter(touches(touched, 2), q2, xs[0], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
-            q3 = blend_quarter(touches(touched, 3), q3, xs[1], line, splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
+            q2 = blend_quarter(touches(touched, 2), q2, xs[0], line, *more)
+            q3 = blend_quarter(touches(touched, 3), q3, xs[1], line, *more)
         k = stop
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     if written:

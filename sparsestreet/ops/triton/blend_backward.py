@@ -184,7 +184,10 @@ def blend_tiles_backward(
     # not needed nothing was written.
     latest = tl.maximum(tl.minimum(latest, end), begin)
     zero_slots(slots, pair_slots, latest, end, SLOT)
-    pair, after = tl.load(pair_rows + latest - 1, latest > begin, 0), tl.load(pair_rows + latest - 2, latest - 1 > begin, 0)
+    pair, after = (
+        tl.load(pair_rows + latest - 1, latest > begin, 0),
+        tl.load(pair_rows + latest - 2, latest - 1 > begin, 0),
+    )
     ahead = load_ahead(records, row_of(pair))
     for i in range(latest - begin):
         k = latest - 1 - i
@@ -195,18 +198,11 @@ def blend_tiles_backward(
         nothing = tl.zeros((WARP,), tl.float32)
         s = (nothing, nothing, nothing, nothing, nothing, nothing)
         s = s + s
+        more = (splat, k, alpha_max, DEPTH, ABSOLUTE)
         line = of_lines(splat[0], splat[1][0], ys[0])
-        q0, s = differentiate_quarter(
-            touches(touched, 0), q0, v0, last0, s, xs[0], line, splat, k, alpha_max, DEPTH, ABSOLUTE
-        )
-        q1, s = differentiate_quarter(
-            touches(touched, 1), q1, v1, last1, s, xs[1], line, splat, k, alpha_max, DEPTH, ABSOLUTE
-        )
+        q0, s = differentiate_quarter(touches(touched, 0), q0, v0, last0, s, xs[0], line, *more)
+        q1, s = differentiate_quarter(touches(touched, 1), q1, v1, last1, s, xs[1], line, *more)
         line = of_lines(splat[0], splat[1][0], ys[1])
-        q2, s = differentiate_quarter(
-            touches(touched, 2), q2, v2, last2, s, xs[0], line, splat, k, alpha_max, DEPTH, ABSOLUTE
-        )
-        q3, s = differentiate_quarter(
-            touches(touched, 3), q3, v3, last3, s, xs[1], line, splat, k, alpha_max, DEPTH, ABSOLUTE
-        )
+        q2, s = differentiate_quarter(touches(touched, 2), q2, v2, last2, s, xs[0], line, *more)
+        q3, s = differentiate_quarter(touches(touched, 3), q3, v3, last3, s, xs[1], line, *more)
         store_sums(to, s)

@@ -131,7 +131,7 @@ def thin_parts(
     records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each part that is needed, or something below the limit where it falls there."""
+    """Writes the product of 1 - alpha over each needed part, or something below the limit where it falls there."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
     x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)

@@ -94,7 +94,7 @@ def load_ahead(records, row):
 
 @jit
 def load_splat(records, row, ahead):
-    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth. ``ahead``: load_ahead."""
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth. ``ahead``: of it."""
     s = record.record_of(records, row)
     geometry = (
         ahead[0], tl.load(s + record.Y),

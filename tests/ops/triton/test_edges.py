@@ -8,7 +8,17 @@ import torch
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import lists, rasterizer
 from sparsestreet.types import Gaussians, Shutter
-from tests.ops.scenes import FIELDS, camera, cast, device_of, front_camera, one_gaussian, random_gaussians, relative_error, render
+from tests.ops.scenes import (
+    FIELDS,
+    camera,
+    cast,
+    device_of,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    relative_error,
+    render,
+)
 
 DEVICE = device_of("triton")
 VIEW = camera(9, 7)

@@ -100,6 +100,7 @@ def compiled(request) -> list[tuple[Launch, dict]]:
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
     forward, backward = first["blend_tiles"], first["blend_tiles_backward"]
     launches += [bare(forward, 72, LASTS=False), bare(forward, 80), bare(backward, 128, ABSOLUTE=False)]
+    launches.append(bare(backward, 128, ABSOLUTE=False, DEPTH=True))
     plain = [launch for launch in launches if launch.name in EFFECTS and _is_plain(launch)]
     launches += [dataclasses.replace(launch, without=EFFECTS[launch.name]) for launch in plain]
     return compile_launches(launches, arch)
