@@ -125,7 +125,7 @@ def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
 def test_more_pairs_than_tiles():
     scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, 2 + 0.01 * k]]) for k in range(300)])
     screen = project(cast(scene, torch.float32, device=DEVICE), View(front_camera(9, 5, 20.0), SplatSettings()))
-    assert screen.lists.pair_rows.tolist() == list(range(300))
+    assert screen.lists.rows_of_pairs.tolist() == list(range(300))
 
 
 @pytest.mark.parametrize(("edge", "distance"), [("left", 9), ("right", 8), ("top", 9), ("bottom", 8)])
