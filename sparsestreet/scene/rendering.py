@@ -63,7 +63,13 @@ def render(
         with phase("scene"):
             placed = scene.gaussians_at(view, state)
         with phase("splat"):
-            splats = splat(placed.gaussians, view.camera, settings=options.settings, backend=options.backend)
+            splats = splat(
+                placed.gaussians,
+                view.camera,
+                settings=options.settings,
+                backend=options.backend,
+                screen_gradients=state.screen_gradients,
+            )
         with phase("sky"):
             rgb = splats.rgb if scene.sky is None else _over_sky(splats, scene.sky, view.camera, options)
         return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts, state, options)

@@ -13,6 +13,8 @@ class SceneState:
     """Highest degree of spherical harmonics in use; a node that stores fewer uses what it has."""
     training: bool = False
     """True inside a training step: noise and sampling of a node are on."""
+    screen_gradients: bool = False
+    """Whether somebody will ask how far the image wants Gaussians to move on screen: density control, while it runs."""
 
 
 FINISHED = SceneState()

@@ -61,13 +61,17 @@ class StreetSystem(LightningModule):
         self.options = options
         self.sh_interval = sh_interval
         self.rendering: SceneRendering | None = None
+        self.screen_gradients = False
+        """Density control says for each step whether it needs them."""
         self.train_psnr = RunningMean(window=10)
 
     def state(self, *, training: bool = False) -> SceneState:
         """Where training stands, for whoever renders the scene now."""
         progress = self.global_step / max(self.trainer.max_steps, 1)
         # 0.6 / 0.2 is 2.9999999999999996.
-        return SceneState(progress, int(progress / self.sh_interval + 1e-6), training)
+        return SceneState(
+            progress, int(progress / self.sh_interval + 1e-6), training, training and self.screen_gradients
+        )
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
         state = self.state(training=True)

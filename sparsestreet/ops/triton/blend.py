@@ -177,12 +177,12 @@ def blend_tiles(
     xs, ys = centers(tile, tiles_x)
     unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     pair, after = tl.load(pair_rows + k, k < end, 0), tl.load(pair_rows + k + 1, k + 1 < end, 0)
-    ahead = load_ahead(records, row_of(pair))
+    ahead = load_ahead(records, row_of(pair), k < end)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
             splat, touched = load_splat(records, row_of(pair), ahead), pair
-            pair, ahead = after, load_ahead(records, row_of(after))
+            pair, ahead = after, load_ahead(records, row_of(after), True)
             after = tl.load(pair_rows + i + 2, i + 2 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(splat[0], splat[1][0], ys[0])

@@ -188,11 +188,11 @@ def blend_tiles_backward(
         tl.load(pair_rows + latest - 1, latest > begin, 0),
         tl.load(pair_rows + latest - 2, latest - 1 > begin, 0),
     )
-    ahead = load_ahead(records, row_of(pair))
+    ahead = load_ahead(records, row_of(pair), latest > begin)
     for i in range(latest - begin):
         k = latest - 1 - i
         splat, touched = load_splat(records, row_of(pair), ahead), pair
-        pair, ahead = after, load_ahead(records, row_of(after))
+        pair, ahead = after, load_ahead(records, row_of(after), True)
         after = tl.load(pair_rows + k - 2, k - 1 > begin, 0)
         to = slots + tl.load(pair_slots + k) * SLOT
         nothing = tl.zeros((WARP,), tl.float32)

@@ -86,10 +86,10 @@ def of_lane(values):
 
 
 @jit
-def load_ahead(records, row):
+def load_ahead(records, row, given):
     """The first number and the last but one of the record of the next splat: with them its 48 bytes come near."""
     s = record.record_of(records, row)
-    return tl.load(s + record.X), tl.load(s + record.DEPTH)
+    return tl.load(s + record.X, given, 0.0), tl.load(s + record.DEPTH, given, 0.0)
 
 
 @jit

@@ -59,7 +59,7 @@ class DensityControl(Callback, RowListener):
             self.statistics[change.node].resize(plan)
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step >= self.refine_in.last(trainer.max_steps):
+        if not pl_module.screen_gradients:
             return
         splats = pl_module.rendering.splats
         height, width = splats.alpha.shape
@@ -79,6 +79,9 @@ class DensityControl(Callback, RowListener):
                 self._refine(trainer, pl_module, name)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        pl_module.screen_gradients = bool(self.statistics) and trainer.global_step < self.refine_in.last(
+            trainer.max_steps
+        )
         # Before the next step rather than behind the last one: a look at held-out views that falls between the two
         # would see a scene that has just lost its opacities.
         step = trainer.global_step

@@ -54,6 +54,15 @@ def test_densify_until_its_fraction_and_cull_to_the_end_of_the_interval():
     assert [given["what"] for given in strategy.asked[:4]] == ["densify", "cull", "densify", "cull"]
 
 
+def test_screen_gradients_are_gathered_while_rows_are_refined_and_no_longer():
+    trainer, system, _ = started(every_ten(), background=background(density=AskedStrategy()))
+    wanted = []
+    for step in range(100):
+        trainer.walk(step + 1)
+        wanted.append(system.screen_gradients)
+    assert wanted == [True] * 90 + [False] * 10
+
+
 def test_a_node_may_grow_for_another_time_than_the_others():
     early, late, others = AskedStrategy(), AskedStrategy(), AskedStrategy()
     trainer, _, _ = started(

@@ -23,6 +23,7 @@ def seen(system: StreetSystem, gradient: Tensor, radii: Tensor, width: int, heig
     offsets = torch.zeros_like(gradient, requires_grad=True)
     offsets.grad = gradient
     image, plane = torch.zeros(height, width, 3), torch.zeros(height, width)
+    system.screen_gradients = True
     spans, start = {}, 0
     for name, count in system.scene.counts().items():
         spans[name] = slice(start, start + count)
