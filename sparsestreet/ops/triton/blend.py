@@ -9,7 +9,7 @@ import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import centers, load_ahead, load_splat, of_lines, quarter_pixels, row_of, touches
+from sparsestreet.ops.triton.quarters import across, centers, load_splat, of_lines, quarter_pixels, row_of, touches
 from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
@@ -20,9 +20,9 @@ LOOK_LENGTH = 32
 LOOK = constant(LOOK_LENGTH)
 
 
-def registers(lasts: bool, exclusive: bool) -> int:
-    """Registers of a lane: the fewest without spills, so that many tiles run at once."""
-    return 88 if lasts or exclusive else 80
+def registers(exclusive: bool) -> int:
+    """Of a lane: the fewest without spills. A multiprocessor runs 24 warps with up to 80 registers, 20 with up to 96."""
+    return 88 if exclusive else 80
 
 
 @jit
@@ -110,16 +110,15 @@ def open_quarter(
 
 @jit
 def blend_quarter(
-    touched, quarter, x, line, splat, k, alpha_max, transmittance_min,
+    touched, quarter, x, line, RIGHT: tl.constexpr, splat, k, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
 ):  # fmt: skip
     """A quarter behind a splat, which it may touch."""
     passed, red, green, blue, depth, last = quarter
     if touched:
         geometry, ends, light = splat
-        _, shear, _, base = line
-        a = geometry[2] * (x - geometry[0]) + shear
-        weight, passed, still = blend_one(base - a * a, ends[1], passed, alpha_max, transmittance_min, EXCLUSIVE)
+        _, a = across(x, geometry, line, RIGHT)
+        weight, passed, still = blend_one(line[3] - a * a, ends[1], passed, alpha_max, transmittance_min, EXCLUSIVE)
         red += weight * light[0]
         green += weight * light[1]
         blue += weight * light[2]
@@ -174,23 +173,21 @@ def blend_tiles(
     q1 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 1, PARTS)
     q2 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 2, PARTS)
     q3 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 3, PARTS)
-    xs, ys = centers(tile, tiles_x)
+    x, y = centers(tile, tiles_x)
     unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
-    pair, after = tl.load(pair_rows + k, k < end, 0), tl.load(pair_rows + k + 1, k + 1 < end, 0)
-    ahead = load_ahead(records, row_of(pair), k < end)
+    pair = tl.load(pair_rows + k, k < end, 0)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
-            splat, touched = load_splat(records, row_of(pair), ahead), pair
-            pair, ahead = after, load_ahead(records, row_of(after), True)
-            after = tl.load(pair_rows + i + 2, i + 2 < end, 0)
+            splat, touched = load_splat(records, row_of(pair)), pair
+            pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
-            line = of_lines(splat[0], splat[1][0], ys[0])
-            q0 = blend_quarter(touches(touched, 0), q0, xs[0], line, *more)
-            q1 = blend_quarter(touches(touched, 1), q1, xs[1], line, *more)
-            line = of_lines(splat[0], splat[1][0], ys[1])
-            q2 = blend_quarter(touches(touched, 2), q2, xs[0], line, *more)
-            q3 = blend_quarter(touches(touched, 3), q3, xs[1], line, *more)
+            line = of_lines(y, splat[0], splat[1][0], 0)
+            q0 = blend_quarter(touches(touched, 0), q0, x, line, 0, *more)
+            q1 = blend_quarter(touches(touched, 1), q1, x, line, 1, *more)
+            line = of_lines(y, splat[0], splat[1][0], 1)
+            q2 = blend_quarter(touches(touched, 2), q2, x, line, 0, *more)
+            q3 = blend_quarter(touches(touched, 3), q3, x, line, 1, *more)
         k = stop
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     if written:

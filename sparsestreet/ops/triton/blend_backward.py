@@ -14,9 +14,9 @@ from sparsestreet.ops.triton.blend import pairs_of, quarter_places
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.quarters import (
     WARP,
+    across,
     centers,
     lane_sum,
-    load_ahead,
     load_splat,
     of_lane,
     of_lines,
@@ -30,8 +30,9 @@ SLOT = constant(SLOT_LENGTH)
 ZEROED = constant(32)
 
 
-REGISTERS = 128
-"""Of a lane: with any number from 97 to 128 a multiprocessor runs 16 warps."""
+def registers(depth: bool) -> int:
+    """Of a lane: the fewest without spills. A multiprocessor runs 20 warps with up to 96 registers, 16 with to 128."""
+    return 104 if depth else 96
 
 
 @jit
@@ -121,17 +122,17 @@ def last_quarter(
 
 @jit
 def differentiate_quarter(
-    touched, quarter, v, last, sums, x, line, splat, k, alpha_max, DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr
-):
+    touched, quarter, v, last, sums, x, line, RIGHT: tl.constexpr, splat, k, alpha_max,
+    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr,
+):  # fmt: skip
     """The quarter before a splat, and the splat's sums with those over this quarter: within a lane, whose pixels share
     y, all that x changes."""
     passed, behind = quarter
     s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = sums
     if touched:
         geometry, ends, light = splat
-        dy, shear, b, base = line
-        dx = x - geometry[0]
-        a = geometry[2] * dx + shear
+        dy, _, b, base = line
+        dx, a = across(x, geometry, line, RIGHT)
         raw, alpha, inverse = alpha_behind(base - a * a, ends[1], k, last, alpha_max)
         passed *= inverse
         weight = alpha * passed
@@ -178,31 +179,26 @@ def blend_tiles_backward(
     q1, v1, last1 = last_quarter(*given, *part, *size, 1, DEPTH, PARTS)
     q2, v2, last2 = last_quarter(*given, *part, *size, 2, DEPTH, PARTS)
     q3, v3, last3 = last_quarter(*given, *part, *size, 3, DEPTH, PARTS)
-    xs, ys = centers(tile, tiles_x)
+    x, y = centers(tile, tiles_x)
     latest = tl.max(tl.maximum(tl.maximum(last0, last1), tl.maximum(last2, last3)))
     # Of a split tile no pair is this program's: its ``lasts`` are those of the parts put together. Of a part that is
     # not needed nothing was written.
     latest = tl.maximum(tl.minimum(latest, end), begin)
     zero_slots(slots, pair_slots, latest, end, SLOT)
-    pair, after = (
-        tl.load(pair_rows + latest - 1, latest > begin, 0),
-        tl.load(pair_rows + latest - 2, latest - 1 > begin, 0),
-    )
-    ahead = load_ahead(records, row_of(pair), latest > begin)
-    for i in range(latest - begin):
-        k = latest - 1 - i
-        splat, touched = load_splat(records, row_of(pair), ahead), pair
-        pair, ahead = after, load_ahead(records, row_of(after), True)
-        after = tl.load(pair_rows + k - 2, k - 1 > begin, 0)
-        to = slots + tl.load(pair_slots + k) * SLOT
+    pair = tl.load(pair_rows + latest - 1, latest > begin, 0)
+    k = latest - 1
+    while k >= begin:
+        splat, touched = load_splat(records, row_of(pair)), pair
+        pair = tl.load(pair_rows + k - 1, k > begin, 0)
         nothing = tl.zeros((WARP,), tl.float32)
         s = (nothing, nothing, nothing, nothing, nothing, nothing)
         s = s + s
         more = (splat, k, alpha_max, DEPTH, ABSOLUTE)
-        line = of_lines(splat[0], splat[1][0], ys[0])
-        q0, s = differentiate_quarter(touches(touched, 0), q0, v0, last0, s, xs[0], line, *more)
-        q1, s = differentiate_quarter(touches(touched, 1), q1, v1, last1, s, xs[1], line, *more)
-        line = of_lines(splat[0], splat[1][0], ys[1])
-        q2, s = differentiate_quarter(touches(touched, 2), q2, v2, last2, s, xs[0], line, *more)
-        q3, s = differentiate_quarter(touches(touched, 3), q3, v3, last3, s, xs[1], line, *more)
-        store_sums(to, s)
+        line = of_lines(y, splat[0], splat[1][0], 0)
+        q0, s = differentiate_quarter(touches(touched, 0), q0, v0, last0, s, x, line, 0, *more)
+        q1, s = differentiate_quarter(touches(touched, 1), q1, v1, last1, s, x, line, 1, *more)
+        line = of_lines(y, splat[0], splat[1][0], 1)
+        q2, s = differentiate_quarter(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more)
+        q3, s = differentiate_quarter(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more)
+        store_sums(slots + tl.load(pair_slots + k) * SLOT, s)
+        k -= 1

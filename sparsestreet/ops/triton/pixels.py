@@ -55,7 +55,7 @@ def blend_view(screen: Screen, view: View, lasts: bool) -> Layers:
             blend.blend_tiles, len(arguments[0]), 1,
             screen.records, lists.pair_rows, *arguments, *pixel_arguments(view), limit,
             EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, PARTS=split,
-            options=ONE_WARP | {"maxnreg": blend.registers(lasts, view.exclusive)},
+            options=ONE_WARP | {"maxnreg": blend.registers(view.exclusive)},
         )  # fmt: skip
 
     parts = lists.parts
@@ -90,7 +90,7 @@ def differentiate_view(screen: Screen, view: View, ends: Ends, v: Cotangents, ab
             screen.records, lists.pair_rows, lists.slots, begins, stops, tiles, passed, ends.lasts, *part,
             v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, *pixel_arguments(view),
             DEPTH=depth, ABSOLUTE=absolute, PARTS=split,
-            options=ONE_WARP | {"maxnreg": blend_backward.REGISTERS},
+            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth)},
         )  # fmt: skip
 
     parts, part = lists.parts, ends.parts

@@ -64,13 +64,9 @@ def quarter_pixels(tile, tiles_x, QUARTER: tl.constexpr):
 
 @jit
 def centers(tile, tiles_x):
-    """Centers of the tile's pixels: x of the left and of the right quarters, y of the upper and of the lower."""
-    left, upper = quarter_pixels(tile, tiles_x, 0)
-    right, lower = quarter_pixels(tile, tiles_x, 3)
-    return (
-        (left.to(tl.float32) + 0.5, right.to(tl.float32) + 0.5),
-        (upper.to(tl.float32) + 0.5, lower.to(tl.float32) + 0.5),
-    )
+    """Centers of the pixels of the upper left quarter. Those of the others lie SIDE farther: kernels move the splat."""
+    x, y = quarter_pixels(tile, tiles_x, 0)
+    return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
 
 
 @jit
@@ -86,29 +82,33 @@ def of_lane(values):
 
 
 @jit
-def load_ahead(records, row, given):
-    """The first number and the last but one of the record of the next splat: with them its 48 bytes come near."""
-    s = record.record_of(records, row)
-    return tl.load(s + record.X, given, 0.0), tl.load(s + record.DEPTH, given, 0.0)
-
-
-@jit
-def load_splat(records, row, ahead):
-    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth. ``ahead``: of it."""
+def load_splat(records, row):
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth."""
     s = record.record_of(records, row)
     geometry = (
-        ahead[0], tl.load(s + record.Y),
+        tl.load(s + record.X), tl.load(s + record.Y),
         tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
     )  # fmt: skip
     ends = tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF)
     return geometry, ends, (
-        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2), ahead[1],
+        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
+        tl.load(s + record.DEPTH),
     )  # fmt: skip
 
 
 @jit
-def of_lines(geometry, log2_opacity, y):
-    """What a line of pixels shares: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1."""
-    dy = y - geometry[1]
+def of_lines(y, geometry, log2_opacity, LOWER: tl.constexpr):
+    """What a line of pixels shares: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1.
+
+    LOWER: of the lower quarters.
+    """
+    dy = y - (geometry[1] - LOWER * SIDE)
     b = geometry[4] * dy
     return dy, geometry[3] * dy, b, log2_opacity - b * b
+
+
+@jit
+def across(x, geometry, line, RIGHT: tl.constexpr):
+    """dx and (L d)_1 of a quarter's pixels; RIGHT: of a right one."""
+    dx = x - (geometry[0] - RIGHT * SIDE)
+    return dx, geometry[2] * dx + line[1]

@@ -99,8 +99,8 @@ def compiled(request) -> list[tuple[Launch, dict]]:
         launches = launches_of(monkeypatch, cases, stops)
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
     forward, backward = first["blend_tiles"], first["blend_tiles_backward"]
-    launches += [bare(forward, 72, LASTS=False), bare(forward, 80), bare(backward, 128, ABSOLUTE=False)]
-    launches.append(bare(backward, 128, ABSOLUTE=False, DEPTH=True))
+    launches += [bare(forward, 72, LASTS=False), bare(forward, 80), bare(backward, 96, ABSOLUTE=False)]
+    launches.append(bare(backward, 104, ABSOLUTE=False, DEPTH=True))
     plain = [launch for launch in launches if launch.name in EFFECTS and _is_plain(launch)]
     launches += [dataclasses.replace(launch, without=EFFECTS[launch.name]) for launch in plain]
     return compile_launches(launches, arch)
@@ -127,18 +127,18 @@ def test_no_tensor_cores_and_no_atomics(compiled):
 FORWARD = {
     "": (72, 21.0),
     "LASTS": (80, 22.0),
-    "DEPTH": (80, 22.5),
-    "DEPTH LASTS": (88, 24.0),
-    "DEPTH LASTS PARTS": (88, 24.0),
+    "DEPTH": (80, 22.0),
+    "DEPTH LASTS": (80, 23.5),
+    "DEPTH LASTS PARTS": (80, 23.5),
     "DEPTH EXCLUSIVE LASTS": (88, 26.0),
     "DEPTH EXCLUSIVE LASTS PARTS": (88, 26.0),
 }
 BACKWARD = {
-    "": (128, 52.0),
-    "DEPTH": (128, 55.0),
-    "ABSOLUTE": (128, 57.5),
-    "ABSOLUTE DEPTH": (128, 60.0),
-    "ABSOLUTE DEPTH PARTS": (128, 60.0),
+    "": (96, 53.0),
+    "DEPTH": (104, 56.0),
+    "ABSOLUTE": (96, 58.5),
+    "ABSOLUTE DEPTH": (104, 61.0),
+    "ABSOLUTE DEPTH PARTS": (104, 61.0),
 }
 BUDGETS = {"blend_tiles": FORWARD, "blend_tiles_backward": BACKWARD}
 
