@@ -13,8 +13,9 @@ from sparsestreet.bench import gsplat_peer
 from sparsestreet.bench.accuracy import Errors, answer, errors
 from sparsestreet.bench.device_profile import kernel_milliseconds, peak_megabytes
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.bench.gpu_step import Render, our_render, step_time, their_render
 from sparsestreet.bench.records import RecordFile
-from sparsestreet.bench.scenes import Size
+from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.timing import (
     Cotangent,
     Draw,
@@ -33,7 +34,8 @@ from sparsestreet.ops.splat import splat
 from sparsestreet.phases import clock_of
 from sparsestreet.types import Camera, Gaussians
 
-ROWS = (1_500_000, 500_000, 5_000_000, 100_000)
+ROWS = (1_500_000, 500_000, 5_000_000, 100_000, 1_000)
+"""The last is next to nothing for a device: what it takes is the host's time."""
 IMAGES = ((1920, 1280), (960, 640))
 """The first of both is the headline: what a time limit cuts off is something else."""
 TRUTH_ROWS = 1_500_000
@@ -48,6 +50,7 @@ class GpuRecord:
 
     renderer: str
     device: str
+    scene: str
     rows: int
     width: int
     height: int
@@ -60,6 +63,8 @@ class GpuRecord:
     """Forward without gradients."""
     forward: Spread | None = None
     backward: Spread | None = None
+    step: Spread | None = None
+    """A whole step of training (gpu_step.py)."""
     stages: dict[str, Spread] | None = None
     """Device time of the kernels of one forward and backward by stage; None without a CUDA device."""
     memory_before: float | None = None
@@ -78,8 +83,20 @@ class GpuRecord:
 class Workload:
     """What is rendered at one size."""
 
+    scene: str
     rows: Gaussians
     camera: Camera
+
+    @staticmethod
+    def random(size: Size, device: torch.device) -> "Workload":
+        """Splats of 2 pixels in a frustum twice as wide as the view."""
+        camera = frustum_camera(size.width, size.height)
+        gaussians = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
+        return Workload("random frustum", leaves(gaussians, torch.float32, device), camera)
+
+    @staticmethod
+    def of(scene: BenchScene, device: torch.device) -> "Workload":
+        return Workload(scene.source, leaves(scene.gaussians, torch.float32, device), scene.camera)
 
     @property
     def device(self) -> torch.device:
@@ -92,8 +109,10 @@ def run_gpu(
     budget: TimingBudget,
     file: RecordFile,
     say: Callable[[str], None] = print,
+    street: BenchScene | None = None,
 ) -> bool:
-    """Measure every size; False if a renderer failed or gsplat disagrees, which ends none of the others.
+    """Measure every size, and a trained street after the first; False if a renderer failed or gsplat disagrees, which
+    ends none of the others.
 
     gsplat runs in both of its modes at the first size, then in the one that was faster there. Each record is on disk as
     soon as it is measured.
@@ -106,8 +125,8 @@ def run_gpu(
         return False
     records: list[GpuRecord] = []
     modes = gsplat_peer.MODES if isinstance(peer, ModuleType) else ()
-    for size in sizes:
-        for record in _measure_size(size, device, name, backend, peer, modes, budget):
+    for workload in _workloads(sizes, street, device):
+        for record in _measure_all(workload, name, backend, peer, modes, budget):
             file.write("gpu", record)
             say(line(record))
             records.append(record)
@@ -118,28 +137,36 @@ def run_gpu(
     return good == len(records)
 
 
-def _measure_size(
-    size: Size,
-    device: torch.device,
+def _workloads(sizes: Sequence[Size], street: BenchScene | None, device: torch.device) -> Iterator[Workload]:
+    for size in sizes[:1]:
+        yield Workload.random(size, device)
+    if street is not None:
+        yield Workload.of(street, device)
+    for size in sizes[1:]:
+        yield Workload.random(size, device)
+
+
+def _measure_all(
+    workload: Workload,
     name: str,
     backend: str,
     peer: ModuleType | str,
     modes: Sequence[str],
     budget: TimingBudget,
 ) -> Iterator[GpuRecord]:
-    camera = frustum_camera(size.width, size.height)
-    gaussians = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
-    workload = Workload(leaves(gaussians, torch.float32, device), camera)
-    blank = GpuRecord("", name, size.rows, size.width, size.height)
+    rows, camera = workload.rows, workload.camera
+    blank = GpuRecord("", name, workload.scene, len(rows), camera.width, camera.height)
     record = replace(blank, renderer=f"sparsestreet {backend}")
     record = _counted(measure(record, _ours(workload, backend), workload, budget), workload, backend)
-    is_compared = size.rows <= TRUTH_ROWS
+    record = stepped(record, our_render(camera, backend), workload, budget)
+    is_compared = len(rows) <= TRUTH_ROWS
     if is_compared and find_library() is not None:
         record = compared(record, partial(_against_truth, workload, backend))
     yield record
     for mode in modes:
         record = replace(blank, renderer=f"gsplat {gsplat_peer.version(peer)} {mode}")
         record = measure(record, _theirs(workload, peer, mode), workload, budget)
+        record = stepped(record, their_render(peer, camera, workload.device, mode), workload, budget)
         if is_compared:
             record = compared(record, partial(gsplat_peer.parity, peer, workload.rows, workload.camera, backend))
         yield record
@@ -192,6 +219,15 @@ def measure(record: GpuRecord, draw: Draw, workload: Workload, budget: TimingBud
     return record
 
 
+def stepped(record: GpuRecord, render: Render, workload: Workload, budget: TimingBudget) -> GpuRecord:
+    """The record with the time of a step of training, or with the reason why there is none."""
+    try:
+        step = step_time(workload.rows, workload.camera, render, budget)
+    except Exception as error:  # a peer may raise anything
+        return replace(record, failed=record.failed or _reason(error))
+    return replace(record, step=step)
+
+
 def compared(record: GpuRecord, compare: Callable[[], Errors]) -> GpuRecord:
     """The record with its differences, or with the reason why there are none."""
     try:
@@ -237,11 +273,13 @@ def _reason(error: Exception) -> str:
 
 def line(record: GpuRecord) -> str:
     """One row of the table: medians, and how far apart the quartiles are."""
-    start = f"{record.renderer:<24}{record.rows:>9} {record.width}x{record.height:<6}"
+    start = f"{record.renderer:<24}{record.scene:<16}{record.rows:>9} {record.width}x{record.height:<6}"
     if record.forward is None or record.backward is None:
         return f"{start} FAILED: {record.failed}"
     inference = _short(record.inference) if record.inference else "-"
     text = f"{start} forward {_short(record.forward)}  backward {_short(record.backward)}  no grad {inference} ms"
+    if record.step is not None:
+        text += f"  step {_short(record.step)}"
     if record.samples is not None:
         text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
     if record.memory_peak is not None:

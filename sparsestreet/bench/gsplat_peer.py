@@ -6,6 +6,7 @@ intersection, the clamp at 0.99 and the kernel work of 2026. A comparison with 1
 
 import importlib
 from types import ModuleType
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -45,12 +46,35 @@ def version(module: ModuleType) -> str:
 def draw(
     module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"], int]:
-    """Color (premultiplied), alpha and the number of (splat, tile) pairs.
+    """Color (premultiplied), alpha and the number of (splat, tile) pairs; ``packed`` trades time for memory."""
+    colors, alphas, meta = _rasterization(module, gaussians, camera, packed)
+    return colors[0], alphas[0, ..., 0], int(meta["flatten_ids"].shape[0])
 
-    ``absgrad`` is on, as our op always sums absolute screen gradients; ``packed`` trades time for memory.
-    """
+
+def draw_for_training(
+    module: ModuleType, gaussians: Gaussians, camera: Camera, mode: str
+) -> tuple[Float[Tensor, "h w 3"], dict[str, Any]]:
+    """Color, and what ``seen`` reads after the backward pass."""
+    colors, _, meta = _rasterization(module, gaussians, camera, mode == "packed")
+    return colors[0], meta
+
+
+def seen(meta: dict[str, Any], rows: int) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+    """Absolute screen gradients and radii of all rows; packed, of those in view, the others are 0."""
+    gradients, radii = meta["means2d"].absgrad, meta["radii"].amax(-1).float()
+    if gradients.dim() == 3:
+        return gradients[0], radii[0]
+    ids = meta["gaussian_ids"]
+    whole, largest = gradients.new_zeros(rows, 2), gradients.new_zeros(rows)
+    return whole.index_copy_(0, ids, gradients), largest.index_copy_(0, ids, radii)
+
+
+def _rasterization(
+    module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """``absgrad`` is on, as our op sums absolute screen gradients by default."""
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.sh.shape[1]]
-    colors, alphas, meta = module.rasterization(
+    return module.rasterization(
         means=gaussians.means,
         quats=gaussians.quaternions,
         scales=gaussians.scales,
@@ -67,7 +91,6 @@ def draw(
         absgrad=True,
         rasterize_mode="antialiased" if SETTINGS.antialias else "classic",
     )
-    return colors[0], alphas[0, ..., 0], int(meta["flatten_ids"].shape[0])
 
 
 def parity(module: ModuleType, rows: Gaussians, camera: Camera, backend: str) -> Errors:

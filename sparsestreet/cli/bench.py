@@ -58,7 +58,9 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("mode", nargs="?", default="knobs", choices=modes, help="what to measure (default: knobs)")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
-    parser.add_argument("--street", type=Path, metavar="RUN", help="knobs: the trained street of this run's folder")
+    parser.add_argument(
+        "--street", type=Path, metavar="RUN", help="knobs, gpu: the trained street of this run's folder"
+    )
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
     return parser
@@ -141,9 +143,10 @@ def _gpu(options: argparse.Namespace) -> bool:
     if device.type == "cpu" and not options.quick:
         raise SystemExit("sparsestreet bench gpu: no CUDA device is available; --quick runs it on the CPU, tiny")
     sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
+    street = None if options.street is None else trained_street(options.street)
     if options.quick:
         return gpu.run_gpu([Size(64, 48, 500)], device, TimingBudget(repeats=2, least=1), _file(options))
-    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options))
+    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), street=street)
 
 
 def trained_street(run: Path) -> BenchScene:

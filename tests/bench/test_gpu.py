@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.profiler import DeviceType
 
-from sparsestreet.bench import device_profile, gpu, gsplat_peer
+from sparsestreet.bench import device_profile, gpu, gpu_step, gsplat_peer
 from sparsestreet.bench.accuracy import Errors, GradientError, ImageError
 from sparsestreet.bench.device_profile import stage_of
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
@@ -40,7 +40,12 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
         fields = ("means", "quats", "scales", "opacities", "colors")
         camera = Camera(given["viewmats"][0], given["Ks"][0], given["width"], given["height"])
         rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=gsplat_peer.SETTINGS)
-        meta = {"flatten_ids": torch.zeros(7, dtype=torch.int32)}
+
+        class Means:
+            absgrad = property(lambda self: rendering.screen_offsets.grad[None])
+
+        radii = rendering.radii[None, :, None].expand(-1, -1, 2)
+        meta = {"flatten_ids": torch.zeros(7, dtype=torch.int32), "means2d": Means(), "radii": radii}
         return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
 
     module = ModuleType("gsplat")
@@ -255,7 +260,7 @@ def test_device_time_of_the_stages_and_its_spread(monkeypatch):
 
 def test_a_line_has_medians_and_spreads():
     value, single = Spread(1.25, 1.0, 0.125, 20), Spread(3.0, 3.0, None, 1)
-    record = GpuRecord("sparsestreet triton", "a device", 7, 8, 9, forward=value, backward=single)
+    record = GpuRecord("sparsestreet triton", "a device", "random frustum", 7, 8, 9, forward=value, backward=single)
     record = dataclasses.replace(record, inference=value, stages={"sort": value, "other": single})
     text = gpu.line(record)
     assert "forward 1.250 (iqr 0.125)  backward 3.000  no grad 1.250 (iqr 0.125) ms" in text
@@ -269,3 +274,27 @@ def test_a_device_without_a_fast_backend_is_not_measured(tmp_path, monkeypatch):
     assert not gpu.run_gpu([Size(48, 32, 60)], torch.device("cuda"), ONCE, file, said.append)
     assert read_records(file.path) == []
     assert any("install triton" in line for line in said)
+
+
+@pytest.mark.parametrize("mode", gsplat_peer.MODES)
+def test_what_gsplat_saw_is_of_all_rows(mode):
+    """Packed answers are of the rows in view, here 3 and 1."""
+    gradients, radii = torch.tensor([[1.0, 2.0], [3.0, 4.0]]), torch.tensor([[5, 6], [8, 7]], dtype=torch.int32)
+    if mode == "packed":
+        meta = {"means2d": SimpleNamespace(absgrad=gradients), "radii": radii, "gaussian_ids": torch.tensor([3, 1])}
+        wanted = torch.tensor([[0.0, 0.0], [3.0, 4.0], [0.0, 0.0], [1.0, 2.0]]), torch.tensor([0.0, 8.0, 0.0, 6.0])
+    else:
+        meta = {"means2d": SimpleNamespace(absgrad=gradients[None]), "radii": radii[None]}
+        wanted = gradients, torch.tensor([6.0, 8.0])
+    found = gsplat_peer.seen(meta, 4 if mode == "packed" else 2)
+    assert all(torch.equal(one, other) for one, other in zip(found, wanted, strict=True))
+
+
+def test_a_step_trains_all_fields_and_counts_the_view(rows):
+    camera = frustum_camera(48, 32)
+    step = gpu_step.TrainingStep(rows, camera, gpu_step.our_render(camera, "cpu"))
+    before = [parameter.detach().clone() for parameter in step.parameters]
+    step()
+    assert all(bool((old != new).any()) for old, new in zip(before, step.parameters, strict=True))
+    assert bool((step.statistics.gradient_sum > 0).any())
+    assert all(parameter.grad is None for parameter in step.parameters)

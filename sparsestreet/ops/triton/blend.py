@@ -21,7 +21,7 @@ LOOK = constant(LOOK_LENGTH)
 
 
 def registers(exclusive: bool) -> int:
-    """Of a lane: the fewest without spills. A multiprocessor runs 24 warps with up to 80 registers, 20 with up to 96."""
+    """Of a lane: the fewest without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
     return 88 if exclusive else 80
 
 
