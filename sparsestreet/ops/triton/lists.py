@@ -15,10 +15,10 @@ from torch import Tensor
 
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.language import jit
+from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.parts import Parts, split_tiles
-from sparsestreet.ops.triton.quarters import MOST_ROWS, QUARTER_SHIFT, touched_quarters
+from sparsestreet.ops.triton.quarters import MOST_ROWS, QUARTER_SHIFT, WARP, half_spans, touched_quarters
 from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
 from sparsestreet.ops.triton.view import View
@@ -27,6 +27,10 @@ PAIR_LIMIT = 1 << 28
 """(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward."""
 _SHORT_KEYS = 1 << 15
 _BLOCK = 256
+_LANES = 2
+"""Lanes of a splat where pairs are listed: most reach one or two rows of tiles."""
+GIANT = constant(48)
+"""Tiles from which on a splat gets a warp there."""
 
 
 @dataclass(frozen=True)
@@ -83,18 +87,13 @@ def list_counts(tile_counts, unsorted_rows, order, rows, counts, first_pairs, vi
     tl.store(first_pairs + rank, 0, rank == 0)
 
 
-@partial(jit, do_not_specialize=["pairs"])
-def list_pairs(
-    records, ranks, rows, first_pairs, keys, pair_rows, pairs, width, height, tiles_x,
-    BOUNDED: tl.constexpr, BLOCK: tl.constexpr,
+@jit
+def list_splats(
+    records, rows, first_pairs, keys, pair_rows, rank, given, lane, width, height, tiles_x,
+    BOUNDED: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """The tile of each pair, and its row with the quarters it touches (quarters.py): pair i of a row lies in the i-th
-    tile of its splat, counted row of tiles by row."""
-    pair = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    given = pair < pairs
-    rank = tl.load(ranks + pair, given, 0)
-    row = tl.load(rows + rank, given, 0)
-    rest = pair - tl.load(first_pairs + rank, given, 0)
+    """The pairs of one splat in each row of ``rank`` [splats, LANES]; each lane takes a row of tiles at a time."""
+    row, at = tl.load(rows + rank, given, 0), tl.load(first_pairs + rank, given, 0)
     s = record.record_of(records, row)
     x, y = tl.load(s + record.X, given, 0.0), tl.load(s + record.Y, given, 0.0)
     l11, l21 = tl.load(s + record.L11, given, 1.0), tl.load(s + record.L21, given, 0.0)
@@ -102,16 +101,42 @@ def list_pairs(
     reach = tl.load(s + record.LOG2_OPACITY, given, 0.0) - tl.load(s + record.CUTOFF, given, 0.0)
     reach = tl.maximum(reach, 0.0)
     first, last = tile_rows(y, l22, reach, height, BOUNDED)
-    column, line = tl.zeros_like(pair), tl.zeros_like(pair)
-    for i in range(tl.max(tl.where(given, last - first + 1, 0), 0)):
-        left, right = tile_columns(x, y, l11, l21, l22, reach, first + i, width, BOUNDED)
-        here = (rest >= 0) & (rest <= right - left) & (first + i <= last)
-        column, line = tl.where(here, left + rest, column), tl.where(here, first + i, line)
-        rest -= right - left + 1
-    # Each lane writes its own pair, so nothing is left unwritten or written outside.
-    tl.store(keys + pair, line * tiles_x + column, given)
-    quarters = touched_quarters((x, y, l11, l21, l22), reach, column, line, BOUNDED)
-    tl.store(pair_rows + pair, row | quarters, given)
+    last = tl.where(given, last, first - 1)
+    for i in range(0, tl.max(last - first + 1), LANES):
+        line = first + i + lane
+        left, right = tile_columns(x, y, l11, l21, l22, reach, line, width, BOUNDED)
+        count = tl.where(line <= last, right - left + 1, 0)
+        spans = half_spans((x, y, l11, l21, l22), reach, line, BOUNDED)
+        begin = at + tl.cumsum(count, 1) - count
+        for j in range(tl.max(count)):
+            tl.store(keys + begin + j, line * tiles_x + left + j, j < count)
+            tl.store(pair_rows + begin + j, row | touched_quarters(spans, left + j, BOUNDED), j < count)
+        at += tl.sum(count, 1)[:, None]
+
+
+@partial(jit, do_not_specialize=["visible"])
+def list_pairs(
+    records, rows, counts, first_pairs, keys, pair_rows, visible, width, height, tiles_x,
+    BOUNDED: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The tile of each pair, and its row with the quarters it touches (quarters.py): pair i of a row lies in the i-th
+    tile of its splat, counted row of tiles by row. Giants get a warp each: nobody else is to wait for them."""
+    lane = tl.arange(0, LANES)[None, :]
+    rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None] + 0 * lane
+    count = tl.load(counts + rank, rank < visible, 0)
+    list_splats(
+        records, rows, first_pairs, keys, pair_rows, rank, (count > 0) & (count < GIANT), lane, width, height, tiles_x,
+        BOUNDED, LANES,
+    )  # fmt: skip
+    if tl.max(count) >= GIANT:
+        all_lanes = tl.arange(0, WARP)[None, :]
+        for i in range(BLOCK):
+            one = tl.program_id(0) * BLOCK + i + 0 * all_lanes
+            giant = tl.load(counts + one, one < visible, 0) >= GIANT
+            list_splats(
+                records, rows, first_pairs, keys, pair_rows, one, giant, all_lanes, width, height, tiles_x,
+                BOUNDED, WARP,
+            )  # fmt: skip
 
 
 @partial(jit, do_not_specialize=["pairs", "tiles", "steps"])
@@ -145,10 +170,10 @@ def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: in
     keys = tile_counts.new_empty(pairs, dtype=torch.int16 if columns * lines <= _SHORT_KEYS else torch.int32)
     unsorted_rows = tile_counts.new_empty(pairs)
     launch(
-        list_pairs, pairs, _BLOCK,
-        records, torch.repeat_interleave(counts, output_size=pairs), rows, first_pairs, keys, unsorted_rows, pairs,
+        list_pairs, visible, 32 // _LANES,
+        records, rows, counts, first_pairs, keys, unsorted_rows, visible,
         float(view.camera.width), float(view.camera.height), columns,
-        BOUNDED=view.bounded, options={"enable_fp_fusion": False},
+        BOUNDED=view.bounded, LANES=_LANES, options={"enable_fp_fusion": False, "num_warps": 1},
     )  # fmt: skip
     keys, slots = torch.sort(keys, stable=True)
     pair_rows = torch.empty_like(unsorted_rows)

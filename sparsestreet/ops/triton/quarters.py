@@ -37,16 +37,26 @@ def touches(pair, QUARTER: tl.constexpr):
 
 
 @jit
-def touched_quarters(splat, reach, tile_x, tile_y, BOUNDED: tl.constexpr):
-    """Bits of the quarters of a tile that hold a pixel center of the ellipse (tiles.py), as a pair carries them."""
-    x, y, l11, l21, l22 = splat
+def half_spans(splat, reach, tile_y, BOUNDED: tl.constexpr):
+    """The least and the largest x of the ellipse (tiles.py) in the upper and in the lower half of a row of tiles, and
+    whether it comes there at all; nothing where nothing ends it."""
+    spans = ()
+    if BOUNDED:
+        x, y, l11, l21, l22 = splat
+        for half in tl.static_range(2):
+            spans += (lines_span(x, y, l11, l21, l22, reach, tile_y * TILE + half * SIDE, SIDE),)
+    return spans
+
+
+@jit
+def touched_quarters(spans, tile_x, BOUNDED: tl.constexpr):
+    """Bits of the quarters of a tile that hold a pixel center of the ellipse, as a pair carries them."""
     bits = tl.zeros_like(tile_x) + ALL
     if BOUNDED:
         bits = tl.zeros_like(tile_x)
         middle = (tile_x * TILE + SIDE).to(tl.float32)
         for half in tl.static_range(2):
-            line = tile_y * TILE + half * SIDE
-            low, high, reached = lines_span(x, y, l11, l21, l22, reach, line, SIDE)
+            low, high, reached = spans[half]
             left = reached & (low <= middle - 0.5) & (high >= middle - (SIDE - 0.5))
             right = reached & (high >= middle + 0.5) & (low <= middle + (SIDE - 0.5))
             bits = bits | (left.to(tl.int32) << (2 * half)) | (right.to(tl.int32) << (2 * half + 1))

@@ -42,8 +42,6 @@ class FakeDevice:
     """A device of compute capability ``arch`` that compiles what is launched and runs nothing."""
 
     arch: int = 90
-    stand_ins: dict[str, Callable[..., None]] = field(default_factory=dict)
-    """By a kernel's name: called with the kernel's arguments in its place, where somebody reads its outputs."""
     binaries: list[Binary] = field(default_factory=list)
     """What was compiled."""
     launches: list[Binary] = field(default_factory=list)
@@ -61,11 +59,8 @@ class _Driver:
         binary, device = Binary(metadata.name, source, metadata.shared), self._device
         device.binaries.append(binary)
 
-        # The grid, stream, function and what hooks get; then the kernel's arguments.
         def start(*arguments: Any) -> None:
             device.launches.append(binary)
-            if binary.name in device.stand_ins:
-                device.stand_ins[binary.name](*arguments[9:])
 
         return start
 

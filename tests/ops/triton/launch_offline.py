@@ -46,23 +46,17 @@ class Dispatches(TorchDispatchMode):
 class Case:
     """One scene and view; the numbers that the host waits for are planted."""
 
-    def __init__(self, device: FakeDevice, case: dict):
+    def __init__(self, case: dict):
         self.view = camera(case["width"], case["height"])
         scene = random_gaussians(ROWS, self.view, terms=case["terms"])
         self.gaussians = cast(scene, torch.float32, requires_grad=True)
         self.background = torch.zeros(3) if case["background"] else None
         self.numbers, self.dispatches = [case["pairs"], VISIBLE, 0], Dispatches()
-        device.stand_ins = {"list_counts": self.write_counts}
         screen.wait_for = self.wait_for
 
     def wait_for(self, numbers: torch.Tensor) -> list[int]:
         self.dispatches.names.clear()
         return self.numbers
-
-    def write_counts(self, tile_counts, unsorted, order, rows, counts, first_pairs, visible, block) -> None:
-        """In place of list_counts, for torch's repeat_interleave reads them."""
-        # NumPy writes: nothing that is counted.
-        counts.numpy()[:] = [self.numbers[0]] + [0] * (VISIBLE - 1)
 
     def run(self, backward: bool = True, counted: bool = False) -> list[str]:
         """Torch's operations after the wait, forward."""
@@ -101,7 +95,7 @@ def launch_time(case: Case, repeats: int) -> float:
 def measure(device: FakeDevice, given: dict) -> dict:
     """All that is asked of a case."""
     before = len(device.binaries)
-    case = Case(device, given)
+    case = Case(given)
     case.run()
     answer = {"compiled": [found_in(binary) for binary in device.binaries[before:]]}
     device.launches.clear()
