@@ -6,6 +6,7 @@ kernel at once.
 """
 
 import warnings
+from contextlib import nullcontext
 from functools import cache
 from typing import Any
 
@@ -14,12 +15,13 @@ import torch
 import triton
 from torch import Tensor
 from triton.compiler import CompiledKernel
+from triton.runtime import driver
 from triton.runtime.interpreter import InterpretedFunction
 from triton.runtime.jit import KernelInterface
 
 _KNOWN = ("3.6.", "3.7.")
-"""Versions of Triton whose specialization ``_kind`` is no coarser than, and whose compiled kernels take the grid and
-then all arguments, constants too."""
+"""Versions of Triton whose specialization ``_kinds`` is no coarser than, and whose compiled kernels take the grid,
+what hooks get, and then all arguments: tensors by address, and constants too."""
 _INT32 = 1 << 31
 _COMPILED: dict[tuple, CompiledKernel] = {}
 
@@ -41,40 +43,52 @@ def launch(
     if not items:
         return
     grid, options, constants = (-(-items // block), 1, 1), options or {}, constants | {"BLOCK": block}
-    device = arguments[0].get_device()
-    key = (kernel.fn, device, tuple([_kind(value) for value in arguments]), *constants.items(), *options.items())
+    # Addresses are what a kernel gets of tensors; of a tensor, its launcher would ask the driver where it lies.
+    given = [value.data_ptr() if isinstance(value, Tensor) else value for value in arguments]
+    key = (kernel.fn, *_kinds(arguments, given), *constants.items(), *options.items())
     if is_interpreted(kernel):
         # NumPy, which the interpreter computes in, would warn of infinities in lanes that are masked off.
         with np.errstate(all="ignore"):
             kernel[grid](*arguments, **constants, **options)
         return
-    if device < 0 or device == torch.cuda.current_device():
-        _launch_here(key, kernel, grid, arguments, constants, options)
-        return
-    with torch.cuda.device(device):
-        _launch_here(key, kernel, grid, arguments, constants, options)
-
-
-def _launch_here(
-    key: tuple, kernel: KernelInterface, grid: tuple[int, int, int], arguments: tuple, constants: dict, options: dict
-) -> None:
-    compiled = _COMPILED.get(key)
-    if compiled is not None:
-        # Constants fill their places in the signature; the machine code has them already.
-        compiled[grid](*arguments, *constants.values())
-        return
-    compiled = kernel[grid](*arguments, **constants, **options)
+    compiled, device = _COMPILED.get(key), arguments[0].get_device()
+    # Triton starts kernels on the current device.
+    elsewhere = device >= 0 and device != torch.cuda.current_device()
+    with torch.cuda.device(device) if elsewhere else nullcontext():
+        if compiled is not None:
+            # Constants fill their places in the signature; the machine code has them already.
+            _start(compiled, device, grid, (*given, *constants.values()))
+            return
+        compiled = kernel[grid](*arguments, **constants, **options)
     # A hook of Triton's may have kept it from compiling.
     if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
         _COMPILED[key] = compiled
 
 
-def _kind(value: Any) -> tuple[object, ...] | type:
-    """What a kernel is compiled for of an argument: never less than what Triton specializes."""
-    if isinstance(value, Tensor):
-        return value.dtype, value.data_ptr() % 16 == 0
-    if type(value) is int:
-        return value == 1, value % 16 == 0, -_INT32 <= value < _INT32
+def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], arguments: tuple) -> None:
+    hooks = triton.knobs.runtime
+    if hooks.launch_enter_hook.calls or hooks.launch_exit_hook.calls:
+        compiled[grid](*arguments)
+    else:
+        # What that comes to where nobody watches launches.
+        stream = driver.active.get_current_stream(device)
+        compiled.run(*grid, stream, compiled.function, compiled.packed_metadata, None, None, None, *arguments)
+
+
+def _kinds(arguments: tuple, given: list[int | float]) -> list[tuple[object, ...] | type]:
+    """What a kernel is compiled for of its arguments, ``given`` as they are or by address: never less than what Triton
+    specializes, and the device."""
+    return [
+        (value.dtype, value.get_device(), number % 16 == 0)
+        if value is not number
+        else (value == 1, value % 16 == 0, -_INT32 <= value < _INT32)
+        if type(value) is int
+        else _float_of(value)
+        for value, number in zip(arguments, given, strict=True)
+    ]
+
+
+def _float_of(value: Any) -> type:
     if type(value) is float:
         return float
     raise TypeError(f"arguments of kernels must be tensors, ints or floats, got {value!r}: pass it as a constant")

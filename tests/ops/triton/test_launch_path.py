@@ -137,7 +137,7 @@ def test_an_unknown_triton_is_named():
 
 def test_other_arguments_are_refused():
     with pytest.raises(TypeError, match="must be tensors, ints or floats, got None"):
-        launch._kind(None)
+        launch._kinds((None,), [None])
 
 
 @pytest.mark.parametrize(("current", "entered"), [(1, []), (0, [1])])
@@ -163,7 +163,7 @@ def test_a_kernel_runs_on_the_device_of_its_tensors(monkeypatch, current, entere
     monkeypatch.setattr(launch.torch.cuda, "device", Entered)
     monkeypatch.setattr(launch.torch.cuda, "current_device", lambda: current)
     tensor = SimpleNamespace(get_device=lambda: 1)
-    monkeypatch.setattr(launch, "_kind", lambda value: None)
+    monkeypatch.setattr(launch, "_kinds", lambda arguments, given: [])
     launch.launch(Kernel(), 33, 16, tensor, 5, options={"num_warps": 1}, DEPTH=True)
     assert devices == entered
     assert started == [((3, 1, 1), (tensor, 5), {"DEPTH": True, "BLOCK": 16, "num_warps": 1})]
