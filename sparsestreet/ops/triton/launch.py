@@ -75,7 +75,7 @@ def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], ar
         compiled.run(*grid, stream, compiled.function, compiled.packed_metadata, None, None, None, *arguments)
 
 
-def _kinds(arguments: tuple, given: list[int | float]) -> list[tuple[object, ...] | type]:
+def _kinds(arguments: tuple, given: list) -> list[tuple[object, ...] | type]:
     """What a kernel is compiled for of its arguments, ``given`` as they are or by address: never less than what Triton
     specializes, and the device."""
     return [

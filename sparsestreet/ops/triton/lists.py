@@ -29,7 +29,7 @@ _SHORT_KEYS = 1 << 15
 _BLOCK = 256
 _LANES = 2
 """Lanes of a splat where pairs are listed: most reach one or two rows of tiles."""
-GIANT = constant(48)
+GIANT = constant(32)
 """Tiles from which on a splat gets a warp there."""
 
 
