@@ -110,13 +110,14 @@ def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, HALF_COLORS: tl.co
 
 @partial(jit, do_not_specialize=["rows"])
 def project_rows(
-    means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, bad, rows,
+    means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, numbers, rows,
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, HALF_COLORS: tl.constexpr, BOUNDED: tl.constexpr,
     DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    ``bad``: whether a program met a bad value. Comparisons are written so that NaN culls.
+    ``numbers``: of each program its pairs, its rows with tiles, and its bad rows. Comparisons are written so that NaN
+    culls.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = row < rows
@@ -154,4 +155,8 @@ def project_rows(
     # In the order of records.py.
     values = (x, y, l11, l21, l22, log2_opacity, cutoff, color[0], color[1], color[2], mean[2], 0 * x)
     store_columns(records, row, values, seen & (tiles > 0), record.RECORD)
-    tl.store(bad + tl.program_id(0), tl.max((wrong | (good == 0)).to(tl.int32), 0))
+    pairs, drawn = tl.sum(tl.where(given, tiles, 0)), tl.sum((given & (tiles > 0)).to(tl.int32))
+    bad = tl.sum((wrong | (good == 0)).to(tl.int32))
+    place = tl.arange(0, 4)
+    number = tl.where(place == 0, pairs, tl.where(place == 1, drawn, bad))
+    tl.store(numbers + 3 * tl.program_id(0) + place, number.to(tl.int64), place < 3)

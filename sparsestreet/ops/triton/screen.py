@@ -36,17 +36,16 @@ def project(gaussians: Gaussians, view: View) -> Screen:
     n, settings, table = len(means), view.settings, view.table(means.device)
     splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
     tile_counts = means.new_empty(n, dtype=torch.int32)
-    bad = means.new_empty(-(-n // rows.block_of(view)), dtype=torch.int32)
+    numbers = means.new_empty(-(-n // rows.block_of(view)), 3, dtype=torch.int64)
     launch(
         rows.project_rows, n, rows.block_of(view),
-        *fields, given_or(displacements, means), table, splats, tile_counts, radii, bad, n,
+        *fields, given_or(displacements, means), table, splats, tile_counts, radii, numbers, n,
         TERMS=sh.shape[1], ANTIALIAS=settings.antialias, HALF_COLORS=settings.half_colors, BOUNDED=view.bounded,
         **effects(view, displacements), options={"enable_fp_fusion": False},
     )  # fmt: skip
     places = (tile_counts > 0).cumsum(0, dtype=torch.int32)
-    numbers = torch.stack((tile_counts.sum(dtype=torch.int64), places[-1:].sum(), bad.sum()))
-    pairs, visible, bad_blocks = wait_for(numbers)
-    if bad_blocks:
+    pairs, visible, bad = wait_for(numbers.sum(0))
+    if bad:
         check_values(gaussians)
     check_pairs(pairs, tile_counts)
     return Screen(table, splats, tile_counts, radii, list_tiles(splats, tile_counts, places, visible, pairs, view))
