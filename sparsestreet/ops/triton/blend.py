@@ -5,6 +5,8 @@ tile (quarters.py), and walks the splats one by one; every number of a splat is 
 the row is fetched ahead. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
 """
 
+from functools import partial
+
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
@@ -153,7 +155,8 @@ def store_quarter(
         tl.store(lasts + at, last, inside)
 
 
-@jit
+# Specialized, sizes of some images would take a register more than there are.
+@partial(jit, do_not_specialize=["width", "height", "tiles_x"])
 def blend_tiles(
     records, pair_rows, begins, ends, order, firsts, products, rgb, transmittance, depth_sum, lasts,
     width, height, tiles_x, alpha_max, transmittance_min,

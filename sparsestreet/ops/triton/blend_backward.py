@@ -8,6 +8,8 @@ A slot holds, with s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d and w the b
 s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + l22 b)|; w times the cotangents.
 """
 
+from functools import partial
+
 import triton.language as tl
 
 from sparsestreet.ops.triton.blend import pairs_of, quarter_places
@@ -158,7 +160,7 @@ def differentiate_quarter(
     return (passed, behind), (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11)
 
 
-@jit
+@partial(jit, do_not_specialize=["width", "height", "tiles_x"])
 def blend_tiles_backward(
     records, pair_rows, pair_slots, begins, ends, order, transmittance, lasts,
     nexts, part_rgb, part_depth, part_transmittance, part_lasts,

@@ -17,7 +17,7 @@ from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.parts import Parts, split_tiles
+from sparsestreet.ops.triton.parts import Parts, part_length, split_tiles
 from sparsestreet.ops.triton.quarters import MOST_ROWS, QUARTER_SHIFT, WARP, half_spans, touched_quarters
 from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
@@ -48,7 +48,7 @@ class Lists:
     begins: Int[Tensor, " t"]
     ends: Int[Tensor, " t"]
     order: Int[Tensor, " t"]
-    """Tiles, those with most pairs first: the longest must not start last."""
+    """Tiles by the power of two of their number of pairs, the longest first: they must not start last."""
     parts: Parts | None
     """Room for the parts of long tiles, empty where there are none; None where no tile can be long."""
 
@@ -139,11 +139,20 @@ def list_pairs(
             )  # fmt: skip
 
 
-@partial(jit, do_not_specialize=["pairs", "tiles", "steps"])
+@jit
+def length_class(length, whole):
+    """Powers of two in length / whole, rounded down; 0 and more if and only if length >= whole."""
+    power = ((length.to(tl.float32) / whole).to(tl.int32, bitcast=True) >> 23) - 127
+    return tl.where(length >= whole, tl.maximum(power, 0), tl.minimum(power, -1))
+
+
+@partial(jit, do_not_specialize=["pairs", "tiles", "steps", "whole"])
 def bound_tiles(
-    keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, pairs, tiles, steps, BLOCK: tl.constexpr
+    keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, classes, pairs, tiles, steps, whole,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Rows of the sorted pairs, and where each tile's pairs begin and end: a program does its share of both."""
+    """Rows of the sorted pairs, where each tile's pairs begin and end, and the class of its length: a program does its
+    share of both."""
     start = tl.program_id(0) * BLOCK
     pair = start + tl.arange(0, BLOCK)
     row = tl.load(unsorted_rows + tl.load(slots + pair, pair < pairs, 0), pair < pairs, 0)
@@ -157,7 +166,9 @@ def bound_tiles(
         tl.store(begins + tile, bound, given & (end == 0))
         tl.store(ends + tile, bound, given & (end == 1))
         tile = start + tl.arange(0, BLOCK)
-        tl.store(lengths + tile, tl.sum(tl.where(end == 1, bound, -bound), 0), tile < tiles)
+        length = tl.sum(tl.where(end == 1, bound, -bound), 0)
+        tl.store(lengths + tile, length, tile < tiles)
+        tl.store(classes + tile, length_class(length, whole), tile < tiles)
 
 
 def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: View) -> Lists:
@@ -177,13 +188,14 @@ def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: in
     )  # fmt: skip
     keys, slots = torch.sort(keys, stable=True)
     pair_rows = torch.empty_like(unsorted_rows)
-    begins, ends, lengths = (tile_counts.new_empty(columns * lines) for _ in range(3))
+    begins, ends, lengths, classes = (tile_counts.new_empty(columns * lines) for _ in range(4))
     launch(
         bound_tiles, max(pairs, len(lengths)), _BLOCK,
-        keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, pairs, len(lengths), pairs.bit_length(),
+        keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, classes, pairs, len(lengths), pairs.bit_length(),
+        2 * part_length(pairs),
     )  # fmt: skip
-    lengths, order = torch.sort(lengths, descending=True, stable=True)
-    order = order.int()
+    # Of one class neighbors follow each other: they share splats, which the caches then still hold.
+    order = torch.sort(classes, descending=True, stable=True).indices.int()
     parts = split_tiles(begins, ends, order, lengths, pairs)
     return Lists(rows, first_pairs, counts, pair_rows, slots, begins, ends, order, parts)
 

@@ -71,20 +71,25 @@ class PartLayers:
         return PartLayers(pixels[0], rgb, pixels[1], pixels[2], lasts)
 
 
+def part_length(pairs: int) -> int:
+    """Least pairs of a part of a view with so many; tiles of twice as many are split."""
+    return max(PART_LENGTH, -(-pairs // PART_LIMIT))
+
+
 def split_tiles(
     begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], order: Int[Tensor, " t"], lengths: Int[Tensor, " t"], pairs: int
 ) -> Parts | None:
     """Parts of all tiles that are long enough for two; None if the pairs are too few for one.
 
-    ``order`` holds the tiles, those with most pairs first, and ``lengths`` their numbers of pairs in that order. Does
-    not wait for the device: there is room for the most parts that so many pairs could need.
+    ``order`` holds the tiles, those that are split first, and ``lengths`` the number of pairs of each tile. Does not
+    wait for the device: there is room for the most parts that so many pairs could need.
     """
-    length = max(PART_LENGTH, -(-pairs // PART_LIMIT))
+    length = part_length(pairs)
     most = pairs // length
     if most < 2:
         return None
     # No more tiles can have two parts. Those too short for two come last, so they move no part of the others.
-    nexts = (lengths[: most // 2] // length).cumsum(0, dtype=torch.int32)
+    nexts = (lengths.index_select(0, order[: most // 2]) // length).cumsum(0, dtype=torch.int32)
     parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends))
     launch(
         list_parts, max(most, len(order)), _BLOCK,
@@ -109,9 +114,10 @@ def list_parts(
 
     # The first tile whose parts end behind this one.
     rank = first_at_least(split_nexts, number + 1, split_count, steps)
-    pairs = tl.load(lengths + rank, rank < split_count, 0)
+    tile = tl.load(order + rank, rank < split_count, 0)
+    pairs = tl.load(lengths + tile, rank < split_count, 0)
     used = pairs >= 2 * length
-    tile, count = tl.load(order + rank, used, 0), tl.where(used, pairs // length, 1)
+    tile, count = tl.where(used, tile, 0), tl.where(used, pairs // length, 1)
     first = tl.where(used, tl.load(split_nexts + rank, used, 0) - count, number)
     share = tl.cdiv(pairs, count)
     # Rounded up, the shares may leave nothing for the last parts: these are not needed, and nobody reads them.

@@ -28,8 +28,10 @@ SLOW = [
 ]
 
 
-def expected(width: int, height: int) -> dict[str, str]:
-    """What is known of the sizes that kernels get; of all other numbers, which change from view to view, nothing."""
+def expected(kernel: str, width: int, height: int) -> dict[str, str]:
+    """What is known of the sizes that a kernel gets; of all other numbers, which change from view to view, nothing."""
+    if kernel in ("blend_tiles", "blend_tiles_backward"):
+        return {}
     sizes = {"width": width, "height": height, "tiles_x": -(-width // 16)}
     return {name: "1" if size == 1 else "16" if size % 16 == 0 else "" for name, size in sizes.items()}
 
@@ -38,8 +40,8 @@ def check(case: dict, found: dict) -> None:
     split = case["pairs"] > 1
     names = [*FORWARD, *BACKWARD] if split else [n for n in [*FORWARD, *BACKWARD] if "parts" not in n]
     assert {kernel["name"] for kernel in found["compiled"]} <= set(names)
-    sizes = expected(case["width"], case["height"])
     for kernel in found["compiled"]:
+        sizes = expected(kernel["name"], case["width"], case["height"])
         assert kernel["spilled"] == 0, kernel
         assert kernel["shared"] <= 48 << 10, kernel
         for name, known in kernel["known"].items():
@@ -56,7 +58,7 @@ def test_every_kernel_compiles_as_it_is_launched():
     # What torch starts on the device after the wait, but for views and bare allocations: 5 of it put the background
     # behind the layers (ops/splat.py).
     assert Counter(found["dispatches"]) == Counter(
-        ["sort"] * 3 + ["cumsum"] * 2 + ["floor_divide", "_to_copy"]
+        ["sort"] * 3 + ["cumsum"] * 2 + ["index_select", "floor_divide", "_to_copy"]
         + ["rsub", "mul", "add", "clamp", "div"]
     )  # fmt: skip
 
@@ -65,7 +67,7 @@ def test_every_kernel_compiles_as_it_is_launched():
 def test_every_kernel_compiles_for_other_sizes():
     for case, found in zip(SLOW, run_compiler("launch_offline", SLOW), strict=True):
         check(case, found)
-        assert len(found["dispatches"]) <= 12
+        assert len(found["dispatches"]) <= 13
 
 
 @pytest.fixture(scope="module")

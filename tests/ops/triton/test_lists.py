@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops.triton import parts
 from sparsestreet.ops.triton.screen import Screen, project
 from sparsestreet.ops.triton.view import View
 from sparsestreet.types import Camera, Gaussians
@@ -109,17 +110,29 @@ def test_no_touched_quarter_is_missing_and_hardly_one_is_listed_in_vain(projecte
     assert len(marked) < 3 * len(tiles)
 
 
-def test_tiles_are_walked_nearest_first_and_the_longest_starts_first():
+def test_tiles_are_walked_nearest_first():
     view = camera(WIDTH, HEIGHT)
     screen = project(cast(random_gaussians(40, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
     lists, depths = screen.lists, screen.records[:, DEPTH]
     for begin, end in zip(lists.begins.tolist(), lists.ends.tolist(), strict=True):
         order = depths[lists.rows_of_pairs[begin:end].long()]
         assert (order[1:] >= order[:-1]).all()
-    lengths = (lists.ends - lists.begins)[lists.order.long()]
-    assert lengths[0] > lengths[-1]
-    assert (lengths[1:] <= lengths[:-1]).all()
-    assert sorted(lists.order.tolist()) == list(range(COLUMNS * ROWS))
+
+
+@pytest.mark.parametrize("rows", [40, 700])
+def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_each_other(rows, monkeypatch):
+    monkeypatch.setattr(parts, "PART_LENGTH", 3)
+    view = camera(WIDTH, HEIGHT)
+    screen = project(cast(random_gaussians(rows, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
+    lists, whole = screen.lists, 2 * parts.part_length(len(screen.lists.slots))
+    lengths = (lists.ends - lists.begins).tolist()
+
+    def key(tile: int) -> tuple[float, int]:
+        power = math.floor(math.log2(lengths[tile] / whole)) if lengths[tile] else -math.inf
+        return -power, tile
+
+    assert len({key(tile)[0] for tile in range(COLUMNS * ROWS)}) >= 3
+    assert lists.order.tolist() == sorted(range(COLUMNS * ROWS), key=key)
 
 
 def test_more_pairs_than_tiles():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import blend_backward, parts, pixels, rasterizer
-from sparsestreet.ops.triton.parts import split_tiles
+from sparsestreet.ops.triton.parts import part_length, split_tiles
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -167,9 +167,10 @@ def test_parts_cover_long_tiles_once(counts, length, limit):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(parts, "PART_LENGTH", length)
         patch.setattr(parts, "PART_LIMIT", limit)
-        lengths, order = torch.sort(ends - begins, descending=True, stable=True)
-        found = split_tiles(*(part.to(DEVICE) for part in (begins, ends, order.int(), lengths)), pairs)
-    share = max(length, -(-pairs // limit))
+        share, lengths = part_length(pairs), ends - begins
+        # Those that are split come first; the others in any order.
+        order = torch.sort(lengths >= 2 * share, descending=True, stable=True).indices.int()
+        found = split_tiles(*(part.to(DEVICE) for part in (begins, ends, order, lengths)), pairs)
     long = [tile for tile, count in enumerate(counts) if count >= 2 * share]
     if found is None:
         assert not long
