@@ -19,8 +19,7 @@ BORDER = WINDOW // 2
 
 def mse(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     """Mean squared error over pixels and channels. Raises ValueError if shapes differ or the image is empty."""
-    _check_pair(image, truth)
-    return float((image.double() - truth.double()).square().mean())
+    return float(_mse(image, truth))
 
 
 def masked_mse(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> float | None:
@@ -40,6 +39,11 @@ def psnr_of_mse(error: float) -> float:
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     """Peak signal-to-noise ratio over all pixels, dB, at most ``PSNR_CAP``."""
     return psnr_of_mse(mse(image, truth))
+
+
+def psnr_on_device(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float64[Tensor, ""]:
+    """:func:`psnr` without a wait for the device, for numbers that are logged in the middle of a step."""
+    return (-10 * _mse(image, truth).log10()).clamp(max=PSNR_CAP)
 
 
 def masked_psnr(
@@ -120,6 +124,11 @@ def _mirrored(length: int, device: torch.device) -> Int[Tensor, " padded"]:
     index = torch.arange(-BORDER, length + BORDER, device=device)
     index = torch.where(index < 0, -1 - index, index)
     return torch.where(index >= length, 2 * length - 1 - index, index)
+
+
+def _mse(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float64[Tensor, ""]:
+    _check_pair(image, truth)
+    return (image.double() - truth.double()).square().mean()
 
 
 def _check_pair(image: Tensor, truth: Tensor) -> None:

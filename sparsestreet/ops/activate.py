@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.ops.eager import eager
 from sparsestreet.ops.fused import fused_backend
 from sparsestreet.ops.poses import Poses
 from sparsestreet.types import Gaussians
@@ -60,6 +61,7 @@ class RawGaussians:
         return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])
 
 
+@eager
 def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "auto") -> Gaussians:
     """All parts one after the other: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
 

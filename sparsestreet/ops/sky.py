@@ -11,6 +11,7 @@ from torch import Tensor
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops.cpu import sky as cpu
 from sparsestreet.ops.cube_map import colors_along
+from sparsestreet.ops.eager import eager
 from sparsestreet.ops.fused import fused_backend
 from sparsestreet.ops.validate import check_camera
 from sparsestreet.types import Camera
@@ -18,6 +19,7 @@ from sparsestreet.types import Camera
 BACKENDS = ("auto", "torch", "cpu", "triton")
 
 
+@eager
 def over_sky(
     rgb: Float[Tensor, "h w 3"],
     alpha: Float[Tensor, "h w"],

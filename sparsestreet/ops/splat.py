@@ -9,6 +9,7 @@ from torch import Tensor
 from sparsestreet.ops import reference
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu import rasterizer as cpu
+from sparsestreet.ops.eager import eager
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_pixel_weights, check_structure
@@ -18,6 +19,7 @@ DEFAULT_SETTINGS = SplatSettings()
 _LEAST_ALPHA = 1e-6
 
 
+@eager
 def splat(
     gaussians: Gaussians,
     camera: Camera,
@@ -30,8 +32,10 @@ def splat(
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
     Differentiable in every field of ``gaussians`` but ``displacements`` (in means also through the view direction of
-    the colors) and in ``background``; not in the camera. Autocast has no effect here: everything runs in the dtype of
-    the Gaussians, whatever the camera's.
+    the colors) and in ``background``; not in the camera. Only once, but for "reference": torch refuses to
+    differentiate a gradient of the other backends, or takes it, without a word, for a constant where the loss is linear
+    in the image. Autocast has no effect here: everything runs in the dtype of the Gaussians, whatever the camera's. A
+    graph of ``torch.compile`` breaks here, and the op runs as it is.
 
     Args:
         gaussians: n rows in the world, meters; n = 0 gives the background.
@@ -59,6 +63,7 @@ def splat(
         return _compose(raster, offsets, background)
 
 
+@eager
 def contribution(
     gaussians: Gaussians,
     camera: Camera,
@@ -76,6 +81,7 @@ def contribution(
         return _module(chosen).contribution(gaussians, camera, settings)
 
 
+@eager
 def leave_one_out(
     gaussians: Gaussians,
     camera: Camera,

@@ -1,5 +1,6 @@
 """The LightningModule: render, sum the losses, log. What changes the scene's rows lives in callbacks."""
 
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,9 +9,8 @@ from jaxtyping import Float
 from lightning import LightningModule
 from torch import Tensor
 from torch.optim import Optimizer
-from torchmetrics.aggregation import RunningMean
 
-from sparsestreet.metrics.image import psnr
+from sparsestreet.metrics.image import psnr, psnr_on_device
 from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
@@ -63,7 +63,7 @@ class StreetSystem(LightningModule):
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
-        self.train_psnr = RunningMean(window=10)
+        self.train_psnr: deque[Tensor] = deque(maxlen=10)
 
     def state(self, *, training: bool = False) -> SceneState:
         """Where training stands, for whoever renders the scene now."""
@@ -117,11 +117,12 @@ class StreetSystem(LightningModule):
         return self.trainer._logger_connector.should_update_logs
 
     def _log_training(self, terms: Mapping[str, Tensor], frame: Frame) -> None:
-        """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms."""
-        with torch.no_grad():
-            image = self.rendering.rgb.detach().clamp(0, 1)
-            self.train_psnr(psnr(image, frame.image.to(image.dtype) / 255))
-        rows = float(sum(self.scene.counts().values()))
-        self.log("psnr", self.train_psnr.compute(), batch_size=1)
-        self.log("gaussians", rows, batch_size=1)
+        """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms.
+
+        All as tensors: a number would wait for the device before the backward pass is launched.
+        """
+        image = self.rendering.rgb.detach().clamp(0, 1)
+        self.train_psnr.append(psnr_on_device(image, frame.image.to(image.dtype) / 255))
+        self.log("psnr", torch.stack(tuple(self.train_psnr)).mean(), batch_size=1)
+        self.log("gaussians", float(sum(self.scene.counts().values())), batch_size=1)
         self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()}, batch_size=1)

@@ -13,6 +13,7 @@ from sparsestreet.metrics.image import (
     masked_ssim,
     psnr,
     psnr_of_mse,
+    psnr_on_device,
     ssim,
     ssim_map,
 )
@@ -52,6 +53,15 @@ def test_psnr_is_capped_and_counts_tiny_errors():
     assert psnr_of_mse(1e-12) == PSNR_CAP
     assert psnr_of_mse(1e-9) == pytest.approx(90)
     assert math.isnan(psnr_of_mse(math.nan))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_psnr_on_a_device_is_the_same_number(size):
+    image, truth = image_pair(size)
+    # Two libraries' logarithms.
+    assert float(psnr_on_device(image, truth)) == pytest.approx(psnr(image, truth), rel=1e-14)
+    assert float(psnr_on_device(image, image)) == PSNR_CAP
+    assert psnr_on_device(torch.full_like(image, torch.nan), truth).isnan()
 
 
 @pytest.mark.parametrize("size", SIZES)

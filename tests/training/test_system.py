@@ -233,7 +233,7 @@ def test_between_two_logs_nothing_is_computed_for_them():
         said.append(len(trainer.log_calls))
         trainer.log_calls.clear()
     assert [count > 0 for count in said] == [False, False, True] * 2
-    assert trainer.system.train_psnr.compute() > 0
+    assert len(trainer.system.train_psnr) == 2
     trainer.log_every_n_steps = 0  # Lightning's word for never
     trainer.train(3, frame_at())
     assert trainer.log_calls == []

@@ -19,7 +19,8 @@ from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
-"""(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward in float32."""
+"""(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward in float32, 32 and 96 in
+float64, and all of that a quarter more where buffers have just grown: up to 24 GB in float32 at the limit."""
 
 
 def rasterize(

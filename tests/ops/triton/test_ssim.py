@@ -95,3 +95,18 @@ def test_small_images_and_other_types_are_refused():
         ssim(image[:, :10].float(), truth[:, :10].float(), backend="triton")
     with pytest.raises(ValueError, match="float32"):
         ssim(image, truth, backend="triton")
+
+
+def test_images_too_large_for_int32_are_refused(monkeypatch):
+    """Maps of 238,609,294 pixels hold 2^31 - 2 numbers; the window takes ten lines and columns from an image."""
+
+    def launched(*_: object, **__: object) -> None:
+        raise RuntimeError("launched")
+
+    monkeypatch.setattr(fused, "launch", launched)
+    line = torch.empty(11, 238_609_294 + 10, 3, device="meta", requires_grad=True)
+    with pytest.raises(RuntimeError, match="launched"):
+        fused.mean_ssim(line, line.detach())
+    longer = torch.empty(11, 238_609_295 + 10, 3, device="meta", requires_grad=True)
+    with pytest.raises(ValueError, match="up to 239 million pixels, got 238609305x11: use smaller"):
+        fused.mean_ssim(longer, longer.detach())

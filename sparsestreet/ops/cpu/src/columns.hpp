@@ -7,14 +7,23 @@
 
 namespace SPLAT_VARIANT {
 
+// The lanes `i` of a and b put together, those of b counted on from LANES<T>.
+#if __has_builtin(__builtin_shufflevector)
+template <class T, int... i>
+inline Lanes<T> picked(const Lanes<T>& a, const Lanes<T>& b) { return __builtin_shufflevector(a, b, i...); }
+#else  // gcc before 12
+template <class T, int... i>
+inline Lanes<T> picked(const Lanes<T>& a, const Lanes<T>& b) { return __builtin_shuffle(a, b, Integers<T>{i...}); }
+#endif
+
 // One step of the butterfly: exchanges the off-diagonal halves of blocks of 2 * half rows and columns.
 template <class T, int half, int... i>
 inline void exchange(Lanes<T>* square, std::integer_sequence<int, i...>) {
   for (int r = 0; r < LANES<T>; ++r) {
     if (r & half) continue;
     const Lanes<T> a = square[r], b = square[r + half];
-    square[r] = __builtin_shufflevector(a, b, (i & half ? LANES<T> + i - half : i)...);
-    square[r + half] = __builtin_shufflevector(a, b, (i & half ? LANES<T> + i : i + half)...);
+    square[r] = picked<T, (i & half ? LANES<T> + i - half : i)...>(a, b);
+    square[r + half] = picked<T, (i & half ? LANES<T> + i : i + half)...>(a, b);
   }
 }
 
