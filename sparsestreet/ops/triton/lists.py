@@ -193,7 +193,7 @@ def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: in
     launch(
         bound_tiles, max(pairs, len(lengths)), _BLOCK,
         keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, classes, pairs, len(lengths), pairs.bit_length(),
-        2 * part_length(pairs, len(lengths)),
+        2 * part_length(pairs),
     )  # fmt: skip
     # Of one class neighbors follow each other: they share splats, which the caches then still hold.
     order = torch.sort(classes, descending=True, stable=True).indices.int()

@@ -26,11 +26,9 @@ from sparsestreet.ops.triton.search import first_at_least
 
 PART_LENGTH = 256
 """Least pairs of a part; none has more than one and a half times as many."""
-PART_LIMIT = 8192
-"""Most parts of a view: about twice the warps that a large GPU runs at once (21 to 28 on each of its 108 to 132
+PART_LIMIT = 4096
+"""Most parts of a view: somewhat more than the warps that a large GPU runs at once (20 to 24 on each of its 108 to 132
 multiprocessors), so that no part takes longer than the device's share of the whole view. 7 kB each."""
-FEW_TILES = 2048
-"""With fewer, one warp each leaves much of a large GPU without work."""
 _BLOCK = 128
 
 
@@ -73,13 +71,13 @@ class PartLayers:
         return PartLayers(pixels[0], rgb, pixels[1], pixels[2], lasts)
 
 
-def part_length(pairs: int, tiles: int) -> int:
-    """Least pairs of a part of a view with so many pairs and tiles; a tile of twice as many is split.
+def part_length(pairs: int) -> int:
+    """Least pairs of a part of a view with so many; a tile of twice as many is split.
 
-    That is four times the mean, unless the tiles are too few to occupy a device: a part does not know which of its
-    pixels the parts before it have closed, so what an opaque tile hides is computed once for nothing.
+    So none is split of 2,400 tiles (960x640) and more that are much alike: a part does not know which of its pixels the parts
+    before it have closed, and what an opaque tile hides is computed once for nothing.
     """
-    return max(PART_LENGTH, -(-pairs // PART_LIMIT), -(-2 * pairs // max(tiles, FEW_TILES)))
+    return max(PART_LENGTH, -(-pairs // PART_LIMIT))
 
 
 def split_tiles(
@@ -90,7 +88,7 @@ def split_tiles(
     ``order`` holds the tiles, those that are split first, and ``lengths`` the number of pairs of each tile. Does not
     wait for the device: there is room for the most parts that so many pairs could need.
     """
-    length = part_length(pairs, len(begins))
+    length = part_length(pairs)
     most = pairs // length
     if most < 2:
         return None

@@ -124,7 +124,7 @@ def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_ea
     monkeypatch.setattr(parts, "PART_LENGTH", 3)
     view = camera(WIDTH, HEIGHT)
     screen = project(cast(random_gaussians(rows, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
-    lists, whole = screen.lists, 2 * parts.part_length(len(screen.lists.slots), COLUMNS * ROWS)
+    lists, whole = screen.lists, 2 * parts.part_length(len(screen.lists.slots))
     lengths = (lists.ends - lists.begins).tolist()
 
     def key(tile: int) -> tuple[float, int]:
