@@ -74,8 +74,8 @@ class PartLayers:
 def part_length(pairs: int) -> int:
     """Least pairs of a part of a view with so many; a tile of twice as many is split.
 
-    So none is split of 2,400 tiles (960x640) and more that are much alike: a part does not know which of its pixels the parts
-    before it have closed, and what an opaque tile hides is computed once for nothing.
+    So none is split of 2,400 tiles (960x640) and more that are much alike: a part does not know which of its pixels the
+    parts before it have closed, and what an opaque tile hides is computed once for nothing.
     """
     return max(PART_LENGTH, -(-pairs // PART_LIMIT))
 
