@@ -14,7 +14,7 @@ from sparsestreet.evaluation.strict_json import EXACT, read_json, version, write
 RUN_FORMAT = 1
 """Version of ``run.json``; raised when a key changes its meaning."""
 
-FORMAT = 3
+FORMAT = 4
 """Version of ``summary.json``; raised when a key changes its meaning."""
 
 HELD_OUT, TRAINING = "held_out", "training"
@@ -148,6 +148,8 @@ class RunSummary:
     """Split -> number of a camera -> id of a metric -> its mean over the split's images of that camera."""
     definitions: dict[str, str]
     """Id of a metric -> what it is, in words."""
+    absent: dict[str, str]
+    """Quantity that could not be measured, such as "lpips_alex" -> why, and what to do about it."""
     gaussians: dict[str, int]
     """Node -> Gaussians, all instances, visible or not."""
     gaussians_total: int

@@ -19,6 +19,7 @@ from sparsestreet.evaluation.pictures import (
     write_picture,
     write_png,
 )
+from sparsestreet.evaluation.predictions import clear_predictions, predictions_folder
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, camera_means, summarize
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
@@ -36,6 +37,7 @@ from sparsestreet.evaluation.records import (
 from sparsestreet.evaluation.sheets import Legend, picture_sheet
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
+from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import Guards, guards
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
@@ -58,7 +60,11 @@ def evaluate_scene(
     warmup: int = 20,
     repeats: int = 50,
 ) -> RunSummary:
-    """Measure quality, speed and size of a scene; write ``out/records`` and ``out/pictures``.
+    """Measure quality, speed and size of a scene; write ``out/records``, ``out/predictions`` and ``out/pictures``.
+
+    The numbers of held-out views are computed from the predictions as they are stored; those of training views from
+    renders rounded alike, without the perceptual distances where there are held-out views: these take seconds per
+    image on a CPU, and nobody reads them twice.
 
     Speed, guards and pictures are of the held-out views, or of the training views where none is held out.
 
@@ -80,10 +86,24 @@ def evaluate_scene(
     if not splits:
         raise ValueError(f"there is no view to evaluate {run.label} on: give held-out views, training views or both")
     scene = scene.to(torch.device(device)).eval()
-    quality = {split: list(evaluate_frames(scene, frames, options)) for split, frames in splits.items()}
     main, frames = next(iter(splits.items()))
+    lpips, absent = open_lpips(scene.device)
+    for split in (HELD_OUT, TRAINING):
+        clear_predictions(predictions_folder(out, split))
+    quality = {
+        split: list(
+            evaluate_frames(
+                scene,
+                frames,
+                options,
+                predictions_folder(out, split) if split == HELD_OUT else None,
+                lpips if split == main else {},
+            )
+        )
+        for split, frames in splits.items()
+    }
     latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
-    summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command)
+    summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent)
     chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
     _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
     for split in (HELD_OUT, TRAINING):
@@ -108,6 +128,7 @@ def _summary(
     guard_counts: GuardCounts,
     run: RunDescription,
     command: str,
+    absent: Mapping[str, str],
 ) -> RunSummary:
     gaussians, bytes_by_part = scene.counts(), scene.bytes_by_part()
     sizes = {f"{image.width}x{image.height}" for images in quality.values() for image in images}
@@ -119,6 +140,7 @@ def _summary(
         quality={split: summarize(images) for split, images in quality.items()},
         by_camera={split: camera_means(images) for split, images in quality.items()},
         definitions=DEFINITIONS,
+        absent=dict(absent),
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
         bytes_by_part=bytes_by_part,

@@ -103,6 +103,7 @@ def make_summary(
     training_psnr: float | None = None,
     evaluated: Evaluation | None = None,
     cameras: dict[str, dict[str, float | None]] | None = None,
+    absent: dict[str, str] | None = None,
     **run: object,
 ) -> RunSummary:
     """A record as a run writes it, with the numbers that a test wants to see in the table; ``run`` as in make_run."""
@@ -122,6 +123,7 @@ def make_summary(
             for split, metrics in quality.items()
         },
         definitions={"psnr_full": "-10 log10(mse)"},
+        absent=absent or {},
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
         bytes_by_part=parts,
