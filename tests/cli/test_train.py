@@ -15,6 +15,8 @@ from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
 from sparsestreet.evaluation.records import read_run, read_summary, run_path, summary_path
 from sparsestreet.export.views import read_views
+from sparsestreet.metrics.protocols import PROTOCOLS
+from tests.cli.recompute import recompute
 
 # One process trains once for the tests that only look.
 pytestmark = pytest.mark.xdist_group("tiny street")
@@ -132,6 +134,23 @@ def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished,
     assert second.run == first.run
     assert second.evaluated.command == f"sparsestreet evaluate run={out}"
     assert first.evaluated.command == first.run.command
+
+
+def test_the_tables_numbers_follow_from_predictions_and_images(finished, tiny_street, tmp_path):
+    """Six numbers in each of two protocols, by a program that shares no code with the metrics; so after evaluate."""
+    (root,) = (Path(word.partition("=")[2]) for word in tiny_street if word.startswith("data.log.root="))
+    again = tmp_path / "again"
+    shutil.copytree(finished, again)
+    assert evaluate([f"run={again}"]) == 0
+    for run in (finished, again):
+        summary, expected = read_summary(summary_path(run)), recompute(run, root)
+        names = [name for protocol in PROTOCOLS.values() for name in protocol.metrics if not name.startswith("lpips")]
+        assert len(names) == len(set(names)) == 12
+        for name in names:
+            # The record keeps 6 digits; the metrics take images in float32, which is 6e-8 of 1.
+            assert summary.mean(name) == pytest.approx(expected[name], rel=2e-5)
+    stored = [path.name for path in (again / "predictions/held_out").iterdir()]
+    assert len(stored) == read_summary(summary_path(again)).images["held_out"]
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
