@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.novel import novel_path
 from sparsestreet.evaluation.pictures import (
     KINDS,
     Picture,
@@ -90,6 +91,7 @@ def evaluate_scene(
     lpips, absent = open_lpips(scene.device)
     for split in (HELD_OUT, TRAINING):
         clear_predictions(predictions_folder(out, split))
+    novel_path(out).unlink(missing_ok=True)  # of an earlier evaluation, perhaps of an earlier scene
     quality = {
         split: list(
             evaluate_frames(
