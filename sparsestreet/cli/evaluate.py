@@ -73,12 +73,12 @@ def _evaluate(options: Options) -> None:
         command=this_command(["evaluate", f"run={run}"]),
         device=_device(description, options.device),
     )
-    if options.novel:
-        _novel(options, cfg, stored, data)
     draw_history(run)
     for split, quality in summary.quality.items():
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
     print(f"{summary.gaussians_total:,} Gaussians, {summary.latency.p50:.1f} ms/frame; records in {summary_path(run)}")
+    if options.novel:
+        _novel(options, cfg, stored, data)
 
 
 def _novel(options: Options, cfg: DictConfig, stored: StoredScene, data: StreetData) -> None:

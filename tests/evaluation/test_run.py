@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import weakref
 
 import numpy as np
 import pytest
@@ -239,6 +240,30 @@ def test_errors_show_where_the_lidar_ends(tmp_path):
     assert not none.shows_lidar_end
     assert summary.by_camera[HELD_OUT]["0"]["psnr_near_lidar"] == summary.mean("psnr_near_lidar")
     assert summary.by_camera[HELD_OUT]["1"]["psnr_near_lidar"] is None
+
+
+@pytest.mark.usefixtures("dark")
+def test_images_are_let_go_one_by_one(tmp_path):
+    """However long a log is: of both splits no more than the image at hand is in memory."""
+    alive, counts = [], []
+
+    def load(view):
+        frame = make_frame(view.frame_index, view.camera_index)
+        counts.append(sum(one() is not None for one in alive))
+        alive.append(weakref.ref(frame.image))
+        return frame
+
+    def lazy(first):
+        views = [make_frame(first + 10 * index) for index in range(6)]
+        return Frames([View(one.camera, one.time, one.frame_index, one.camera_index) for one in views], load)
+
+    evaluate_scene(
+        *(small_scene(), lazy(0), lazy(1)),
+        **{"run": RUN, "options": OPTIONS, "out": tmp_path, "command": "c", "device": "cpu", "pictures": 0},
+        **{"warmup": 1, "repeats": 1},
+    )
+    assert len(counts) >= 12
+    assert max(counts) <= 1  # the one before, until its name is taken
 
 
 def test_no_view_is_an_error(tmp_path):
