@@ -152,4 +152,4 @@ def _unit(features: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
 
 def _full_precision(device: torch.device):
     """cuDNN would round the factors of convolutions to 10 bits."""
-    return torch.backends.cudnn.flags(allow_tf32=False) if device.type == "cuda" else nullcontext()
+    return torch.backends.cudnn.flags(enabled=True, allow_tf32=False) if device.type == "cuda" else nullcontext()

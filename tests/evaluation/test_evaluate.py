@@ -11,6 +11,7 @@ from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.evaluate import evaluate_frames
+from sparsestreet.evaluation.predictions import write_prediction
 from sparsestreet.evaluation.quality import RegionQuality, camera_means, summarize
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import ALEX, Lpips, lpips_of_layers, masked_lpips_of_layers
@@ -56,7 +57,10 @@ def test_a_frame_is_compared_with_its_clamped_render():
     assert part.pixels == 24
     assert part.psnr == pytest.approx(-10 * np.log10(error[chosen].mean()), abs=1e-5)
     assert part.ssim_uniform7 == pytest.approx(similarity[chosen].mean(), abs=1e-5)
-    assert full.psnr8 == pytest.approx(-10 * np.log10(np.mean((np.round(render * 255) / 255 - truth) ** 2)), abs=1e-5)
+    rounding = (np.round(render * 255) / 255 - truth) ** 2
+    assert part.psnr8 == pytest.approx(-10 * np.log10(rounding[chosen].mean()), abs=1e-5)
+    assert abs(part.psnr8 - part.psnr) > 1e-4
+    assert full.psnr8 == pytest.approx(-10 * np.log10(rounding.mean()), abs=1e-5)
     assert quality.regions["no_hood"].mse == full.mse
     assert (full.ssim_gauss11, full.lpips_alex) == (None, None)  # the image is lower than the windows
     assert set(quality.regions) == {"full", "no_hood", "vehicle"}
@@ -137,6 +141,32 @@ def test_regions_of_masks(monkeypatch):
         assert found.lpips_alex is None
     (unmasked,) = evaluate_frames(SCENE, [make_frame(human=masks["human"], size=(16, 48))], OPTIONS)
     assert "static" not in unmasked.regions
+
+
+@pytest.mark.usefixtures("noise")
+def test_what_is_stored_is_what_is_compared(monkeypatch, tmp_path):
+    """A file that held something else would be told by every number."""
+    (kept,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["003_1.png"]
+    (in_memory,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS)
+    assert kept == in_memory
+    monkeypatch.setattr(evaluate, "write_prediction", lambda path, pixels: write_prediction(path, 65535 - pixels))
+    (inverted,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, tmp_path)
+    assert inverted.value("psnr", "full") < in_memory.value("psnr", "full") - 5
+
+
+def test_an_exact_frame_is_exact_in_its_stored_prediction(monkeypatch, tmp_path):
+    """All 256 levels, through a file of 16 bits: the cap, and the count of what was capped."""
+    replace_render(monkeypatch, lambda view: view.image.float() / 255)
+    image = torch.arange(256, dtype=torch.uint8).reshape(16, 16, 1).repeat(1, 1, 3)
+    frame = dataclasses.replace(make_frame(size=(16, 16)), image=image)
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS, tmp_path)
+    for region in ("full", "no_hood"):
+        assert (quality.value("mse", region), quality.value("psnr", region)) == (0, 100)
+        assert quality.value("psnr8", region) == 100
+        assert quality.value("ssim_gauss11", region) == pytest.approx(1, abs=1e-12)
+    summary = summarize([quality, make_image(1)])
+    assert [summary[name].capped for name in ("psnr_full", "psnr8_full", "psnr_no_hood", "mse_full")] == [1, 1, 1, 0]
 
 
 def test_perceptual_distances_by_region(monkeypatch):

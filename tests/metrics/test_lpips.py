@@ -97,6 +97,17 @@ def test_the_smallest_image_that_a_network_takes(quantity):
         lpips(image[1:], truth[1:])
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("quantity", NETWORKS)
+def test_a_gpu_measures_what_the_host_does(quantity):
+    """Factors of 10 bits would be off by 1e-3; the sums are taken in another order."""
+    weights = random_weights(NETWORKS[quantity][1])
+    image, truth = image_pair((64, 96))
+    on_gpu = Lpips(weights.to(torch.device("cuda")))(image.cuda(), truth.cuda())
+    assert on_gpu == pytest.approx(Lpips(weights)(image, truth), rel=1e-5)
+    assert torch.backends.cudnn.allow_tf32
+
+
 def test_black_and_flat_images_have_a_distance():
     """All features may be zero, and have no direction then."""
     weights = random_weights(ALEX)
