@@ -46,7 +46,7 @@ def test_summary_round_trip(tmp_path):
     path = tmp_path / "records" / "summary.json"
     write_summary(path, summary)
     assert read_summary(path) == summary
-    assert json.loads(path.read_text())["latency"]["p90"] == 60.0
+    assert json.loads(path.read_text())["latency"]["clocks"]["frame"]["p90"] == 60.0
     assert json.loads(path.read_text())["by_camera"] == {HELD_OUT: cameras}
     assert (summary.camera_mean("psnr_near_lidar", "10"), summary.camera_mean("psnr_full", "3")) == (23.5, None)
 
@@ -67,7 +67,7 @@ def test_a_summary_holds_the_run_unchanged(tmp_path):
     write_run(tmp_path / "run.json", summary.run)
     entries = json.loads((tmp_path / "summary.json").read_text())["run"]
     assert entries == json.loads((tmp_path / "run.json").read_text())
-    assert (entries["format"], entries["label"], entries["sparsify"]) == (1, "plain", "none")
+    assert (entries["format"], entries["label"], entries["sparsify"]) == (2, "plain", "none")
 
 
 def test_the_main_split_is_the_held_out_one_where_there_is_one():
@@ -95,7 +95,7 @@ def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
 @pytest.mark.parametrize(
     ("write", "read", "value", "remedy"),
     [
-        (write_run, read_run, make_run(), "format 0, this version reads 1: train the run again"),
+        (write_run, read_run, make_run(), "format 0, this version reads 2: train the run again"),
         (write_summary, read_summary, make_summary(), "format 0, this version reads 4: evaluate again"),
     ],
 )
@@ -171,7 +171,13 @@ def drop(entries, key):
         (lambda entries: entries.update(extra=1), r"unknown keys \['extra'\]"),
         (lambda entries: entries["images"].update(held_out="six"), r"images: held_out: expected int, got str 'six'"),
         (lambda entries: entries["images"].update(held_out=True), r"images: held_out: expected int, got bool"),
-        (lambda entries: entries["latency"].update(p50=None), r"latency: p50: expected float, got NoneType"),
+        (
+            lambda entries: entries["latency"]["clocks"]["rig"].update(p50=None),
+            r"latency: clocks: rig: p50: expected float, got NoneType",
+        ),
+        (lambda entries: drop(entries["latency"]["clocks"], "raster"), r"has the clocks raster, frame, rig, got"),
+        (lambda entries: entries["latency"]["removed"].update(frame=entries["latency"]["clocks"]["rig"]), "removed Ga"),
+        (lambda entries: entries["run"]["noise"].update(quiet=1), r"noise: quiet: expected bool"),
         (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
         (
             lambda entries: entries["quality"]["held_out"]["psnr_full"].update(images=1.5),

@@ -47,6 +47,10 @@ class StreetReader(LogReader):
     def shifted(self, log: DrivingLog) -> dict[float, Frames]:
         return shifted_frames(self.folder, log)
 
+    def data_hash(self) -> str:
+        """The street's name, which holds a hash of all of its settings: what they say is what it shows."""
+        return street_name(self.settings)
+
     def _made(self) -> DriveStudioReader:
         root = make_street(self.settings, self.folder, self._report)
         return DriveStudioReader(root, lidar=self.lidar, bodies=self.bodies, cache_mb=self.cache_mb)
