@@ -227,12 +227,6 @@ def test_novel_views_of_a_run(finished, tmp_path, capsys, monkeypatch):
     assert not novel_path(out).exists()  # it was of an earlier evaluation
 
 
-@pytest.mark.parametrize("words", [["novel=-1"], ["novel=1,0"], ["ramp=true"]])
-def test_novel_views_need_offsets_above_zero(words, tmp_path, capsys):
-    assert evaluate([f"run={tmp_path}", *words]) == 2
-    assert "novel" in capsys.readouterr().err
-
-
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
     out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=5")
     summary = read_summary(summary_path(out))
