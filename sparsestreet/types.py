@@ -121,6 +121,8 @@ class Frame(View):
     vehicle: Bool[Tensor, "h w"] | None = None
     depth: Float[Tensor, "h w"] | None = None
     """Lidar depth along the optical axis, meters; 0 where no return fell into the pixel."""
+    ego: Bool[Tensor, "h w"] | None = None
+    """Pixels of the recording car itself, such as its hood."""
 
 
 @dataclass(frozen=True)

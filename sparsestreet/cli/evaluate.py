@@ -5,22 +5,33 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, this_command
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
+from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.history import draw_history
+from sparsestreet.evaluation.novel import evaluate_novel, novel_path, write_novel
 from sparsestreet.evaluation.provenance import this_machine
 from sparsestreet.evaluation.records import RunDescription, read_run, run_path, summary_path
 from sparsestreet.evaluation.run import evaluate_scene
+from sparsestreet.metrics.extractors import LastLayer
+from sparsestreet.metrics.lpips_weights import open_lpips
+from sparsestreet.scene.storage import StoredScene
 
 USAGE = """\
-sparsestreet evaluate run=RUN [device=cpu|cuda]
+sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true]
 
 RUN is a folder that train wrote, also of a run that was interrupted. Its scene is measured against the views of its
 log, on the kind of device that it was trained on unless another is named, with as many threads as trained it; records
 and pictures are made anew, what is said about the training stays.
+
+With novel, the held-out cameras are also shifted by so many meters to both sides, and compared with the real images
+and, on a street that was made with data.log.settings.novel_offsets, with the truth; with ramp the shift grows over the
+drive, as in a change of lane. records/novel.json holds what was found.
 """
 
 
@@ -30,6 +41,14 @@ class Options:
 
     run: Path
     device: Literal["cpu", "cuda"] | None = None
+    novel: tuple[float, ...] = ()
+    ramp: bool = False
+
+    def __post_init__(self) -> None:
+        if any(offset <= 0 for offset in self.novel):
+            raise ValueError(f"novel must be meters above 0, got {list(self.novel)}: each is taken to both sides")
+        if self.ramp and not self.novel:
+            raise ValueError("ramp=true says how the views of novel are shifted: say novel=1,2,3 too")
 
 
 def evaluate(arguments: list[str]) -> int:
@@ -57,7 +76,39 @@ def _evaluate(options: Options) -> None:
     draw_history(run)
     for split, quality in summary.quality.items():
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
-    print(f"{summary.gaussians_total:,} Gaussians, {summary.latency.p50:.1f} ms/frame; records in {summary_path(run)}")
+    latency = summary.latency
+    steady = "" if latency.noise.quiet else " on a machine that was not quiet"
+    print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {summary_path(run)}")
+    if options.novel:
+        _novel(options, cfg, stored, data)
+
+
+def _novel(options: Options, cfg: DictConfig, stored: StoredScene, data: StreetData) -> None:
+    """Measure beside the recorded path, record it and say it."""
+    lpips, missing = open_lpips(stored.scene.device)
+    network = lpips.get("lpips_alex")
+    words = [f"run={options.run}", f"novel={','.join(f'{offset:g}' for offset in options.novel)}"]
+    record = evaluate_novel(
+        stored.scene,
+        data.split.held_out or data.split.train,
+        options.novel,
+        stored.options,
+        command=this_command(["evaluate", *words, *(["ramp=true"] if options.ramp else [])]),
+        truth=instantiate(cfg.data.log, _convert_="all").shifted(data.driving_log),
+        extractor=None if network is None else LastLayer("alexnet", network),
+        absent=missing.get("lpips_alex", ""),
+        ramp=options.ramp,
+    )
+    write_novel(novel_path(options.run), record)
+    for shift in record.shifts:
+        said = [f"{name} {value:.4g}" for name, value in shift.distances.items()]
+        said += [] if shift.psnr is None else [f"{shift.psnr:.2f} dB to the truth (n={shift.true_views})"]
+        side = "right" if shift.offset > 0 else "left"
+        print(
+            f"{abs(shift.offset):g} m to the {side} (n={shift.views}): {', '.join(said) or 'nothing to compare with'}"
+        )
+    if record.absent:
+        print(f"no distances: {record.absent}")
 
 
 def _device(description: RunDescription, device: str | None) -> torch.device:

@@ -1,15 +1,27 @@
-"""Renders against recorded images, one at a time: nothing is kept but numbers."""
+"""Renders against recorded images, one at a time: nothing is kept but numbers, and predictions on disk."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, UInt16
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
 from sparsestreet.data.lidar import near_returns
+from sparsestreet.evaluation.predictions import (
+    prediction_path,
+    quantized,
+    read_prediction,
+    restored,
+    write_prediction,
+)
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.metrics import image as metrics
+from sparsestreet.metrics import ssim
+from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
+from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Frame, View
@@ -31,30 +43,71 @@ def screen_image(scene: SceneGraph, view: View, options: RenderOptions) -> Float
     return rgb.clamp(0, 1)
 
 
-def evaluate_frames(scene: SceneGraph, frames: Iterable[Frame], options: RenderOptions) -> Iterator[FrameQuality]:
+def evaluate_frames(
+    scene: SceneGraph,
+    frames: Iterable[Frame],
+    options: RenderOptions,
+    predictions: Path | None = None,
+    lpips: Mapping[str, Lpips] | None = None,
+) -> Iterator[FrameQuality]:
     """The quality of each frame's render, in order; holds one frame at a time, and moves it to the scene's device.
 
     Args:
         scene: what is rendered.
         frames: recorded views; may load its images while iterating.
         options: how it is rendered.
+        predictions: a folder in which renders are stored; what is compared is then read back from there. None: they
+            are rounded alike, and not stored.
+        lpips: the perceptual distances to measure, by the quantity that each is; on the scene's device.
 
-    Raises ValueError for a render that is not finite.
+    Raises ValueError for a render that is not finite, OSError where a prediction cannot be written.
     """
     for frame in frames:
-        yield frame_quality(screen_image(scene, frame, options), to_device(frame, scene.device))
+        pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
+        if predictions is not None:
+            path = prediction_path(predictions, frame.frame_index, frame.camera_index)
+            write_prediction(path, pixels)
+            pixels = read_prediction(path)
+        yield _quality(pixels, frame, scene.device, lpips)
 
 
-def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame) -> FrameQuality:
+def evaluate_predictions(
+    folder: Path, frames: Iterable[Frame], device: torch.device, lpips: Mapping[str, Lpips] | None = None
+) -> Iterator[FrameQuality]:
+    """The quality of stored predictions of frames, without the scene; otherwise as ``evaluate_frames``.
+
+    Raises PredictionError for a prediction that is absent or damaged.
+    """
+    for frame in frames:
+        pixels = read_prediction(prediction_path(folder, frame.frame_index, frame.camera_index))
+        yield _quality(pixels, frame, device, lpips)
+
+
+def _quality(
+    pixels: UInt16[np.ndarray, "h w 3"], frame: Frame, device: torch.device, lpips: Mapping[str, Lpips] | None
+) -> FrameQuality:
+    return frame_quality(torch.from_numpy(restored(pixels)).to(device), to_device(frame, device), lpips or {})
+
+
+@torch.no_grad()
+def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame, lpips: Mapping[str, Lpips]) -> FrameQuality:
     """Compare one clamped render [0, 1] with the frame's image, in full and by region; both on one device."""
-    truth = frame.image.float() / 255
-    similarity = metrics.ssim_map(rgb, truth)
-    error = metrics.mse(rgb, truth)
     height, width = frame.image.shape[:2]
-    full = RegionQuality(height * width, error, metrics.psnr_of_mse(error), metrics.ssim_of_map(similarity))
-    masks = {"human": frame.human, "vehicle": frame.vehicle} | lidar_masks(frame)
-    parts = {name: _region_quality(rgb, truth, similarity, mask) for name, mask in masks.items() if mask is not None}
-    return FrameQuality(frame.frame_index, frame.camera_index, width, height, {"full": full} | parts)
+    measured = _Measured(rgb, frame.image.float() / 255, lpips)
+    regions = {name: measured.within(name, mask) for name, mask in region_masks(frame).items()}
+    return FrameQuality(frame.frame_index, frame.camera_index, width, height, {"full": measured.whole()} | regions)
+
+
+def region_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
+    """Name -> pixels of the regions that the frame knows, less "full"."""
+    shown = torch.ones(frame.image.shape[:2], dtype=torch.bool, device=frame.image.device)
+    masks = {"no_hood": shown if frame.ego is None else ~frame.ego}
+    masks |= {name: mask for name, mask in (("human", frame.human), ("vehicle", frame.vehicle)) if mask is not None}
+    if frame.human is not None and frame.vehicle is not None:
+        masks["static"] = ~(frame.human | frame.vehicle)
+    if frame.sky is not None:
+        masks["no_sky"] = ~frame.sky
+    return masks | lidar_masks(frame)
 
 
 def lidar_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
@@ -67,15 +120,35 @@ def lidar_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
     return {"near_lidar": near & ground, "beyond_lidar": ~near & ground}
 
 
-def _region_quality(
-    rgb: Float[Tensor, "h w 3"],
-    truth: Float[Tensor, "h w 3"],
-    similarity: Float64[Tensor, "h w 3"],
-    mask: Bool[Tensor, "h w"],
-) -> RegionQuality:
-    error = metrics.masked_mse(rgb, truth, mask)
-    if error is None:
-        return RegionQuality(0, None, None, None)
-    return RegionQuality(
-        int(mask.sum()), error, metrics.psnr_of_mse(error), metrics.masked_ssim_of_map(similarity, mask)
-    )
+class _Measured:
+    """One pair of images with what all regions share: the render in 8 bits, and maps of similarity and distance."""
+
+    def __init__(self, rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], lpips: Mapping[str, Lpips]) -> None:
+        self.rgb, self.truth, self.rgb8 = rgb, truth, metrics.rounded(rgb)
+        shorter = min(rgb.shape[:2])
+        self.windows = {"ssim_uniform7": ssim.UNIFORM7}
+        if shorter >= GAUSS_WINDOW:
+            self.windows["ssim_gauss11"] = ssim.GAUSS11
+        self.maps = {name: ssim.ssim_map(rgb, truth, window) for name, window in self.windows.items()}
+        self.layers = {name: one.layer_maps(rgb, truth) for name, one in lpips.items() if shorter >= LPIPS_SIDES[name]}
+
+    def whole(self) -> RegionQuality:
+        error = metrics.mse(self.rgb, self.truth)
+        return RegionQuality(
+            pixels=self.rgb.shape[0] * self.rgb.shape[1],
+            mse=error,
+            psnr=metrics.psnr_of_mse(error),
+            psnr8=metrics.psnr(self.rgb8, self.truth),
+            **{name: ssim.ssim_of_map(self.maps[name], window) for name, window in self.windows.items()},
+            **{name: lpips_of_layers(layers) for name, layers in self.layers.items()},
+        )
+
+    def within(self, region: str, mask: Bool[Tensor, "h w"]) -> RegionQuality:
+        error = metrics.masked_mse(self.rgb, self.truth, mask)
+        if error is None:
+            return RegionQuality(0, None, None, None)
+        values = {"mse": error, "psnr": metrics.psnr_of_mse(error)}
+        values["psnr8"] = metrics.masked_psnr(self.rgb8, self.truth, mask)
+        values |= {name: ssim.masked_ssim_of_map(one, mask) for name, one in self.maps.items()}
+        values |= {name: masked_lpips_of_layers(layers, mask) for name, layers in self.layers.items()}
+        return RegionQuality(int(mask.sum()), **{name: values.get(name) for name in quantities_of(region)})

@@ -7,18 +7,27 @@ import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, QUANTITIES, REGIONS, metric_id
+from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, REGIONS, metric_id, quantities_of
 
 
 @dataclass(frozen=True)
 class RegionQuality:
-    """Errors within one region of one image; the metrics are None if and only if the region has no pixels."""
+    """Errors within one region of one image.
+
+    All metrics are None where the region has no pixels; those with defaults also where they are not defined for the
+    region, the image is below their window, or LPIPS has no weights.
+    """
 
     pixels: int
     mse: float | None
     psnr: float | None
     """dB."""
     ssim_uniform7: float | None
+    psnr8: float | None = None
+    """dB."""
+    ssim_gauss11: float | None = None
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -62,9 +71,9 @@ def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
     images = list(quality)
     summaries = {}
     for region in REGIONS:
-        for quantity in QUANTITIES:
+        for quantity in quantities_of(region):
             values = [value for image in images if (value := image.value(quantity, region)) is not None]
-            capped = sum(value >= PSNR_CAP for value in values) if quantity == "psnr" else 0
+            capped = sum(value >= PSNR_CAP for value in values) if quantity in ("psnr", "psnr8") else 0
             summaries[metric_id(quantity, region)] = _summary(values, capped)
     return {name: summaries[name] for name in DEFINITIONS}
 

@@ -3,21 +3,20 @@
 import csv
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING
 from sparsestreet.evaluation.strict_json import RecordError, significant, write_atomically
-from sparsestreet.metrics.definitions import QUANTITIES, REGIONS, metric_id
+from sparsestreet.metrics.definitions import REGIONS, metric_id, quantities_of
 
 _FILES = {HELD_OUT: "quality.csv", TRAINING: "quality_train.csv"}
 
 _COLUMNS = (
     *("frame", "camera", "width", "height"),
-    *(metric_id(quantity, region) for region in REGIONS for quantity in ("pixels", *QUANTITIES)),
+    *(metric_id(quantity, region) for region in REGIONS for quantity in ("pixels", *quantities_of(region))),
 )
-_REGION_CELLS = 1 + len(QUANTITIES)
 
 
 def quality_path(run: Path, split: str = HELD_OUT) -> Path:
@@ -34,7 +33,7 @@ def write_quality(path: Path, quality: Iterable[FrameQuality]) -> None:
     for image in quality:
         row: list[object] = [image.frame, image.camera, image.width, image.height]
         for region in REGIONS:
-            row += _region_cells(image.regions.get(region), f"{path}: frame {image.frame}")
+            row += _region_cells(region, image, f"{path}: frame {image.frame}")
         writer.writerow(row)
     write_atomically(path, buffer.getvalue())
 
@@ -49,20 +48,22 @@ def read_quality(path: Path) -> list[FrameQuality]:
     return [_parsed(cells, f"{path}, line {number}") for number, cells in enumerate(lines[1:], start=2)]
 
 
-def _region_cells(region: RegionQuality | None, where: str) -> list[object]:
-    if region is None:
-        return [""] * _REGION_CELLS
-    metrics = (region.mse, region.psnr, region.ssim_uniform7)
-    return [region.pixels, *("" if value is None else significant(value, where) for value in metrics)]
+def _region_cells(region: str, image: FrameQuality, where: str) -> list[object]:
+    names = quantities_of(region)
+    found = image.regions.get(region)
+    if found is None:
+        return [""] * (1 + len(names))
+    values = [getattr(found, name) for name in names]
+    return [found.pixels, *("" if value is None else significant(value, where) for value in values)]
 
 
 def _parsed(cells: list[str], where: str) -> FrameQuality:
     if len(cells) != len(_COLUMNS):
         raise RecordError(f"{where}: {len(cells)} cells, expected {len(_COLUMNS)}")
     try:
+        named = dict(zip(_COLUMNS, cells, strict=True))
         numbers = (int(cell) for cell in cells[:4])
-        parts = (cells[start : start + _REGION_CELLS] for start in range(4, len(cells), _REGION_CELLS))
-        regions = {name: _parsed_region(part) for name, part in zip(REGIONS, parts, strict=True) if any(part)}
+        regions = {region: _parsed_region(region, named) for region in REGIONS if named[metric_id("pixels", region)]}
         image = FrameQuality(*numbers, regions)
     except ValueError as error:
         raise RecordError(f"{where}: {error}") from error
@@ -71,8 +72,9 @@ def _parsed(cells: list[str], where: str) -> FrameQuality:
     return image
 
 
-def _parsed_region(cells: list[str]) -> RegionQuality:
-    values = tuple(float(cell) if cell else None for cell in cells[1:])
-    if any(value is not None and not math.isfinite(value) for value in values):
-        raise ValueError(f"a metric is not a finite number: {cells[1:]}")
-    return RegionQuality(int(cells[0]), *values)
+def _parsed_region(region: str, cells: Mapping[str, str]) -> RegionQuality:
+    texts = {name: cells[metric_id(name, region)] for name in quantities_of(region)}
+    values = {name: float(text) if text else None for name, text in texts.items()}
+    if any(value is not None and not math.isfinite(value) for value in values.values()):
+        raise ValueError(f"a metric is not a finite number: {list(texts.values())}")
+    return RegionQuality(int(cells[metric_id("pixels", region)]), **values)

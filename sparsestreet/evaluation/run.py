@@ -10,7 +10,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
+from sparsestreet.evaluation.costs import update_costs
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.latency_csv import latency_path, write_latency
+from sparsestreet.evaluation.node_costs import measure_scene_costs
+from sparsestreet.evaluation.novel import novel_path
 from sparsestreet.evaluation.pictures import (
     KINDS,
     Picture,
@@ -19,6 +23,7 @@ from sparsestreet.evaluation.pictures import (
     write_picture,
     write_png,
 )
+from sparsestreet.evaluation.predictions import clear_predictions, predictions_folder
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, camera_means, summarize
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
@@ -36,7 +41,9 @@ from sparsestreet.evaluation.records import (
 from sparsestreet.evaluation.sheets import Legend, picture_sheet
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
+from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import Guards, guards
+from sparsestreet.phases import stage
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
@@ -58,7 +65,11 @@ def evaluate_scene(
     warmup: int = 20,
     repeats: int = 50,
 ) -> RunSummary:
-    """Measure quality, speed and size of a scene; write ``out/records`` and ``out/pictures``.
+    """Measure quality, speed and size of a scene; write ``out/records``, ``out/predictions`` and ``out/pictures``.
+
+    The numbers of held-out views are computed from the predictions as they are stored; those of training views from
+    renders rounded alike, without the perceptual distances where there are held-out views: these take seconds per
+    image on a CPU, and nobody reads them twice.
 
     Speed, guards and pictures are of the held-out views, or of the training views where none is held out.
 
@@ -80,16 +91,37 @@ def evaluate_scene(
     if not splits:
         raise ValueError(f"there is no view to evaluate {run.label} on: give held-out views, training views or both")
     scene = scene.to(torch.device(device)).eval()
-    quality = {split: list(evaluate_frames(scene, frames, options)) for split, frames in splits.items()}
     main, frames = next(iter(splits.items()))
-    latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
-    summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command)
-    chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
-    _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
+    lpips, absent = open_lpips(scene.device)
+    for split in (HELD_OUT, TRAINING):
+        clear_predictions(predictions_folder(out, split))
+    novel_path(out).unlink(missing_ok=True)  # of an earlier evaluation, perhaps of an earlier scene
+    quality = {
+        split: list(
+            evaluate_frames(
+                scene,
+                frames,
+                options,
+                predictions_folder(out, split) if split == HELD_OUT else None,
+                lpips if split == main else {},
+            )
+        )
+        for split, frames in splits.items()
+    }
+    with stage("latency"):
+        latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
+    with stage("costs"):
+        costs = measure_scene_costs(scene, frames.views, options, repeats=(repeats + 1) // 2)
+    summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent)
+    with stage("pictures"):
+        chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
+        _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
     for split in (HELD_OUT, TRAINING):
         quality_path(out, split).unlink(missing_ok=True)  # of an earlier evaluation, perhaps on more views
     for split, images in quality.items():
         write_quality(quality_path(out, split), images)
+    write_latency(latency_path(out), latency)
+    update_costs(out, **vars(costs))
     write_summary(summary_path(out), summary)
     return summary
 
@@ -108,6 +140,7 @@ def _summary(
     guard_counts: GuardCounts,
     run: RunDescription,
     command: str,
+    absent: Mapping[str, str],
 ) -> RunSummary:
     gaussians, bytes_by_part = scene.counts(), scene.bytes_by_part()
     sizes = {f"{image.width}x{image.height}" for images in quality.values() for image in images}
@@ -119,6 +152,7 @@ def _summary(
         quality={split: summarize(images) for split, images in quality.items()},
         by_camera={split: camera_means(images) for split, images in quality.items()},
         definitions=DEFINITIONS,
+        absent=dict(absent),
         gaussians=gaussians,
         gaussians_total=sum(gaussians.values()),
         bytes_by_part=bytes_by_part,

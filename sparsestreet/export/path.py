@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.cameras import moved
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera, View
 
@@ -71,7 +71,7 @@ def shifted(path: CameraPath, offset: float) -> CameraPath:
 
     def beside(rig: Rig) -> Rig:
         vector = offset * _view_of(rig, front).camera.camera_from_world[0, :3].double()
-        return tuple(replace(_bare(view), camera=_moved(view.camera, vector), frame_index=None) for view in rig)
+        return tuple(replace(_bare(view), camera=moved(view.camera, vector), frame_index=None) for view in rig)
 
     return tuple(beside(rig) for rig in path)
 
@@ -120,12 +120,6 @@ def _scaled(camera: Camera, width: int) -> Camera:
     factors = torch.tensor([width / camera.width, height / camera.height, 1.0], dtype=camera.intrinsics.dtype)
     # Pixel centers lie at +0.5, so a change of size is a change of unit and nothing else.
     return replace(camera, intrinsics=factors[:, None] * camera.intrinsics, width=width, height=height)
-
-
-def _moved(camera: Camera, vector: Tensor) -> Camera:
-    pose = camera.camera_from_world.double().clone()
-    pose[:3, 3] -= pose[:3, :3] @ vector
-    return replace(camera, camera_from_world=pose.to(camera.camera_from_world.dtype))
 
 
 def _rig_at(path: CameraPath, times: Sequence[float], time: float, step: float) -> Rig:

@@ -1,6 +1,8 @@
 """The pinhole projection outside the splat op: lidar coloring, visibility of seeds, box masks, sky rays; and where
 the camera is, for both."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
@@ -17,6 +19,13 @@ def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
     """
     pose = camera.camera_from_world.detach().double()
     return torch.linalg.solve(pose[:3, :3], -pose[:3, 3])
+
+
+def moved(camera: Camera, vector: Float64[Tensor, "3"]) -> Camera:
+    """The camera elsewhere: moved in the world, meters, turned as it was."""
+    pose = camera.camera_from_world.double().clone()
+    pose[:3, 3] -= pose[:3, :3] @ vector
+    return replace(camera, camera_from_world=pose.to(camera.camera_from_world.dtype))
 
 
 def project(

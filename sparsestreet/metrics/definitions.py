@@ -1,13 +1,18 @@
 """The one place that says what each number in a record means (no torch: the report reads this too).
 
-A metric's id is ``<quantity>_<region>``. The definitions are those of the driving-scene codebases (DriveStudio), so
-that tables can be compared: renders are float32 clamped to [0, 1], not rounded to uint8; a metric is computed per
-image and then averaged over images with equal weight. The choice matters: on one set of masked frames the mean of
-per-image PSNRs, the PSNR of the mean MSE and the pixel-pooled PSNR lie more than 5 dB apart.
+A metric's id is ``<quantity>_<region>``. All are computed of the stored prediction, the render clamped to [0, 1] and
+rounded to 16 bits, per image, and then averaged over images with equal weight. ``protocols`` names the choices of ids
+that tables show. The choice matters: on one set of masked frames the mean of per-image PSNRs, the PSNR of the mean MSE
+and the pixel-pooled PSNR lie more than 5 dB apart.
 """
 
-REGIONS = ("full", "human", "vehicle", "near_lidar", "beyond_lidar")
-QUANTITIES = ("mse", "psnr", "ssim_uniform7")
+REGIONS = ("full", "no_hood", "human", "vehicle", "static", "no_sky", "near_lidar", "beyond_lidar")
+QUANTITIES = ("mse", "psnr", "psnr8", "ssim_uniform7", "ssim_gauss11", "lpips_alex", "lpips_vgg")
+
+LPIPS_SIDES = {"lpips_alex": 31, "lpips_vgg": 16}
+"""LPIPS -> pixels of the shorter side below which its network has no last layer."""
+GAUSS_WINDOW = 11
+"""Side of the window of ``ssim_gauss11``, pixels."""
 
 LIDAR_REACH = 0.04
 """A pixel is near the lidar where a return of the same instant falls into the square window of this fraction of the
@@ -24,30 +29,61 @@ _LIDAR = (
 )
 _DOMAIN = {
     "full": "all pixels of the image, the ego vehicle included",
+    "no_hood": "the pixels outside the mask of the ego vehicle; all pixels where the log has no such mask",
     "human": _MASKED.format("human"),
     "vehicle": _MASKED.format("vehicle"),
+    "static": "the pixels outside the human and the vehicle mask, sky included; images without either are skipped in "
+    "the mean",
+    "no_sky": "the pixels outside the sky mask; images without the mask are skipped in the mean",
     "near_lidar": _LIDAR.format("with"),
     "beyond_lidar": _LIDAR.format("without"),
 }
 
+_PSNR = f"-10 log10(mse) in dB, at most {PSNR_CAP:.0f}; mean of the per-image values"
+_LPIPS = (
+    "learned perceptual distance of Zhang et al. 2018, version 0.1, {} features, inputs scaled from [0, 1] to [-1, 1]; "
+    "lower is better; images with a side below {} pixels are skipped in the mean"
+)
 _QUANTITY = {
     "mse": "mean squared error over pixels and RGB channels, values in [0, 1]",
-    "psnr": f"-10 log10(mse) in dB, at most {PSNR_CAP:.0f}; mean of the per-image values",
+    "psnr": _PSNR,
+    "psnr8": f"{_PSNR}, of the render rounded to 8 bits, as it would be saved",
     "ssim_uniform7": (
         "structural similarity with a 7x7 uniform window, data range 1, K1 = 0.01, K2 = 0.03, sample covariance, "
         "per channel (scikit-image's default; not the 11x11 Gaussian of training losses)"
     ),
+    "ssim_gauss11": (
+        "structural similarity with an 11x11 Gaussian window of sigma 1.5, data range 1, K1 = 0.01, K2 = 0.03, "
+        "weighted covariance, per channel (Wang et al. 2004); images with a side below 11 pixels are skipped in the "
+        "mean"
+    ),
+    "lpips_alex": _LPIPS.format("AlexNet", LPIPS_SIDES["lpips_alex"]),
+    "lpips_vgg": _LPIPS.format("VGG16", LPIPS_SIDES["lpips_vgg"]),
 }
-_SSIM_DOMAIN = {
-    "full": "averaged over the image less its 3 pixel border",
-    "masked": "the map of the full image, borders by reflection, averaged over {region} pixels",
+_OF_MAP = "the map of the full image, borders by reflection, averaged over the region's pixels"
+_LPIPS_OF_MAP = "each layer's map of the full image, brought to its size bilinearly, averaged over the region's pixels"
+_FULL = {
+    "ssim_uniform7": "averaged over the image less its 3 pixel border",
+    "ssim_gauss11": "averaged over the image less its 5 pixel border",
+    "lpips_alex": "each layer averaged over the image",
+    "lpips_vgg": "each layer averaged over the image",
 }
+_MASKED_MAP = dict.fromkeys(("ssim_uniform7", "ssim_gauss11"), _OF_MAP) | dict.fromkeys(LPIPS_SIDES, _LPIPS_OF_MAP)
+
+_LIDAR_QUANTITIES = ("mse", "psnr", "ssim_uniform7")
+"""Where lidar falls is a question about geometry; it gets no columns for perception."""
+
+
+def quantities_of(region: str) -> tuple[str, ...]:
+    """Which quantities are measured in a region, in their order."""
+    return _LIDAR_QUANTITIES if region in ("near_lidar", "beyond_lidar") else QUANTITIES
 
 
 def _definition(quantity: str, region: str) -> str:
     words = [_QUANTITY[quantity], _DOMAIN[region]]
-    if quantity == "ssim_uniform7":
-        words.insert(1, _SSIM_DOMAIN["full" if region == "full" else "masked"].format(region=region))
+    averaged = (_FULL if region == "full" else _MASKED_MAP).get(quantity)
+    if averaged is not None:
+        words.insert(1, averaged)
     return "; ".join(words)
 
 
@@ -57,6 +93,8 @@ def metric_id(quantity: str, region: str) -> str:
 
 
 DEFINITIONS: dict[str, str] = {
-    metric_id(quantity, region): _definition(quantity, region) for region in REGIONS for quantity in QUANTITIES
+    metric_id(quantity, region): _definition(quantity, region)
+    for region in REGIONS
+    for quantity in quantities_of(region)
 }
 """Id of a metric -> its definition in words; every record carries the ones it uses."""

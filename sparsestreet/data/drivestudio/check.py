@@ -120,9 +120,9 @@ def _check_images(layout: Layout, contents: bool) -> list[Problem]:
 
 def _check_masks(layout: Layout, camera: int, size: tuple[int, int], contents: bool) -> list[Problem]:
     problems: list[Problem] = []
-    for kind in MASK_KINDS:
-        paths = [layout.mask(kind, frame, camera) for frame in layout.frames]
-        for path in (path for path in paths if path is not None and path.is_file()):
+    paths = [layout.mask(kind, frame, camera) for kind in MASK_KINDS for frame in layout.frames]
+    for path in (*paths, layout.ego_mask(camera)):
+        if path is not None and path.is_file():
             attempt(problems, partial(_check_mask, path, size, contents))
     return problems
 

@@ -79,6 +79,11 @@ class Layout:
     def bodies(self) -> Path:
         return self.root / "humanpose" / "smpl.pkl"
 
+    def ego_mask(self, camera: int) -> Path | None:
+        """What the recording car covers of a camera's images, the same at all frames; None where it is not told."""
+        path = self.root / "ego_masks" / f"{camera}.png"
+        return path if path.is_file() else None
+
     def mask_folder(self, kind: str) -> Path | None:
         """Folder of the masks of a kind (sky, human, vehicle), or None where the log has none.
 

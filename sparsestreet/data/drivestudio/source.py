@@ -101,6 +101,7 @@ class Source:
             kind: None if path is None else read_mask(path, mount.size, sky=kind == "sky")
             for kind, path in mask_paths.items()
         }
+        ego = self._layout.ego_mask(mount.number)
         return Frame(
             view.camera,
             view.time,
@@ -111,6 +112,7 @@ class Source:
             human=masks["human"],
             vehicle=masks["vehicle"],
             depth=depth_image(self._points(index), view.camera) if self._layout.has_lidar else None,
+            ego=None if ego is None else read_mask(ego, mount.size, sky=False),
         )
 
     def _read_points(self, index: int) -> Float[Tensor, "n 3"]:
@@ -131,5 +133,5 @@ class Source:
 
 
 def _count_bytes(frame: Frame) -> int:
-    pixels = (frame.image, frame.sky, frame.human, frame.vehicle, frame.depth)
+    pixels = (frame.image, frame.sky, frame.human, frame.vehicle, frame.depth, frame.ego)
     return sum(part.nbytes for part in pixels if part is not None)

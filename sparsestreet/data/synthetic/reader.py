@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.shifted import shifted_frames
 from sparsestreet.data.synthetic.street import make_street, street_name
 
 log = logging.getLogger(__name__)
@@ -41,6 +43,13 @@ class StreetReader(LogReader):
 
     def read(self) -> DrivingLog:
         return self._made().read()
+
+    def shifted(self, log: DrivingLog) -> dict[float, Frames]:
+        return shifted_frames(self.folder, log)
+
+    def data_hash(self) -> str:
+        """The street's name, which holds a hash of all of its settings: what they say is what it shows."""
+        return street_name(self.settings)
 
     def _made(self) -> DriveStudioReader:
         root = make_street(self.settings, self.folder, self._report)

@@ -6,16 +6,18 @@ from collections.abc import Iterable, Sequence
 from sparsestreet.evaluation.records import TRAINING, Machine, RunSummary, Source
 from sparsestreet.evaluation.report.variants import Variant
 from sparsestreet.metrics.definitions import LIDAR_REACH
+from sparsestreet.metrics.protocols import Protocol
 
 CAPPED = "†"
 """Marks counts that a node's ``max_gaussians`` held down."""
 
 
-def notes(variants: Sequence[Variant], over_scenes: bool) -> list[str]:
+def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) -> list[str]:
     """The notes of one table, the general ones first, then what a reader must know of these runs."""
     runs = [run for variant in variants for run in variant.runs]
     return [
-        *_general(runs, over_scenes),
+        *_general(runs, over_scenes, protocol),
+        *_absent(runs, protocol),
         *_timing(runs),
         *_training(runs),
         *(_scenes(variants) if over_scenes else ()),
@@ -33,7 +35,7 @@ def camera_notes(variants: Sequence[Variant]) -> list[str]:
     return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
 
 
-def _general(runs: Sequence[RunSummary], over_scenes: bool) -> list[str]:
+def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) -> list[str]:
     alone = "n=1 has no spread and proves nothing below the noise of runs"
     mean = (
         "each scene counts once, with the mean of its runs; ± is the sample sd over scenes"
@@ -42,11 +44,23 @@ def _general(runs: Sequence[RunSummary], over_scenes: bool) -> list[str]:
     )
     return [
         mean,
-        f"of {_views(runs)}: PSNR psnr_full, in dB; SSIM ssim_uniform7_full; masked: psnr_vehicle, "
-        "ssim_uniform7_vehicle, psnr_human (images without the mask skipped); definitions in each summary.json",
+        f"of {_views(runs)}, protocol {protocol.name}: PSNR {protocol.psnr}, in dB; SSIM {protocol.ssim}; masked: "
+        f"{', '.join((*protocol.vehicle, *protocol.human))} (images without the mask skipped); definitions in each "
+        "summary.json",
         *_lidar(runs),
         f"MB: 10^6 bytes of parameters; ms/frame: median, {runs[0].latency.protocol}",
     ]
+
+
+def _absent(runs: Sequence[RunSummary], protocol: Protocol) -> list[str]:
+    """Why a metric of the protocol is not there, once for each reason."""
+    reasons = {
+        (quantity, reason)
+        for run in runs
+        for quantity, reason in run.absent.items()
+        if any(metric.startswith(quantity) for metric in protocol.metrics)
+    }
+    return [f"{quantity} n/a in some runs: {reason}" for quantity, reason in sorted(reasons)]
 
 
 def _views(runs: Sequence[RunSummary]) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING, RunSummary
+from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
 
 
 @dataclass(frozen=True)
@@ -19,25 +20,31 @@ class Quantity:
     """Whether it counts Gaussians, which a cap holds down."""
 
 
-_METRICS = (
-    ("PSNR", "psnr_full", "{:.2f}"),
-    ("SSIM", "ssim_uniform7_full", "{:.4f}"),
-    ("vehicle PSNR", "psnr_vehicle", "{:.2f}"),
-    ("vehicle SSIM", "ssim_uniform7_vehicle", "{:.4f}"),
-    ("human PSNR", "psnr_human", "{:.2f}"),
-    ("near PSNR", "psnr_near_lidar", "{:.2f}"),
-    ("beyond PSNR", "psnr_beyond_lidar", "{:.2f}"),
-)
+def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
+    """Heading, id and format of each metric of a protocol, and of those by lidar."""
+    return (
+        ("PSNR", protocol.psnr, "{:.2f}"),
+        ("SSIM", protocol.ssim, "{:.4f}"),
+        *((f"LPIPS {name.split('_')[1]}", name, "{:.4f}") for name in protocol.lpips),
+        ("vehicle PSNR", protocol.vehicle[0], "{:.2f}"),
+        ("vehicle SSIM", protocol.vehicle[1], "{:.4f}"),
+        ("human PSNR", protocol.human[0], "{:.2f}"),
+        ("human SSIM", protocol.human[1], "{:.4f}"),
+        ("near PSNR", "psnr_near_lidar", "{:.2f}"),
+        ("beyond PSNR", "psnr_beyond_lidar", "{:.2f}"),
+    )
+
 
 _CAMERA_METRICS = (("", "psnr_full"), (" near", "psnr_near_lidar"), (" beyond", "psnr_beyond_lidar"))
 
 
-def quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
-    """Those that at least one of the runs has."""
+def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> tuple[Quantity, ...]:
+    """Those that at least one of the runs has, with the metrics of a protocol."""
+    metrics = protocol_metrics(protocol)
     nodes = dict.fromkeys(name for run in runs for name in run.gaussians)
     known = (
-        *(Quantity(heading, _metric(name, HELD_OUT), text.format, False) for heading, name, text in _METRICS),
-        *_training_metrics(runs),
+        *(Quantity(heading, _metric(name, HELD_OUT), text.format, False) for heading, name, text in metrics),
+        *_training_metrics(runs, metrics),
         Quantity("Gaussians", lambda run: float(run.gaussians_total), "{:,.0f}".format, True, count=True),
         *(Quantity(name, _node_count(name), "{:,.0f}".format, True, count=True) for name in nodes),
         Quantity("MB", lambda run: run.bytes_total / 1e6, "{:.2f}".format, True),
@@ -62,9 +69,9 @@ def _measured(known: Iterable[Quantity], runs: Sequence[RunSummary]) -> tuple[Qu
     return tuple(quantity for quantity in known if any(quantity.value(run) is not None for run in runs))
 
 
-def _training_metrics(runs: Sequence[RunSummary]) -> list[Quantity]:
+def _training_metrics(runs: Sequence[RunSummary], metrics: Sequence[tuple[str, str, str]]) -> list[Quantity]:
     """PSNR beside that of held-out views, which shows overfitting; everything where no run holds out a view."""
-    shown = _METRICS if all(run.main_split == TRAINING for run in runs) else _METRICS[:1]
+    shown = metrics if all(run.main_split == TRAINING for run in runs) else metrics[:1]
     return [
         Quantity(f"train-view {heading}", _metric(name, TRAINING), text.format, False) for heading, name, text in shown
     ]

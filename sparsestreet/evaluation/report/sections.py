@@ -10,6 +10,7 @@ from sparsestreet.evaluation.report.notes import camera_notes, notes
 from sparsestreet.evaluation.report.quantities import Quantity, camera_quantities, quantities
 from sparsestreet.evaluation.report.spread import Spread, spread
 from sparsestreet.evaluation.report.variants import CLIP_KEYS, Variant, log_config, variants
+from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,9 @@ class _Group:
     runs: list[RunSummary]
 
 
-def sections(records: Sequence[RunRecord], baseline: str | None = None) -> list[Section]:
+def sections(
+    records: Sequence[RunRecord], baseline: str | None = None, protocol: Protocol = DRIVESTUDIO
+) -> list[Section]:
     """A section for each scene, split and resolution, then the means over scenes.
 
     Within a scene, a row for each variant (runs of one label and configuration), mean and spread over its runs. Where
@@ -61,6 +64,7 @@ def sections(records: Sequence[RunRecord], baseline: str | None = None) -> list[
         records: the runs.
         baseline: label or name of the variant that others are compared with, pairwise by scene and seed; None for no
             differences. A section without it has none either and says so in its notes.
+        protocol: which definitions of PSNR, SSIM and LPIPS are shown.
 
     Raises ValueError if no record has the baseline, if it is a label of several variants, or if two records define one
     metric differently.
@@ -75,7 +79,7 @@ def sections(records: Sequence[RunRecord], baseline: str | None = None) -> list[
     return [
         section
         for group, title, found in zip(groups, _titles(groups), parted, strict=True)
-        for section in _sections(group, title, found, baseline)
+        for section in _sections(group, title, found, baseline, protocol)
     ]
 
 
@@ -132,12 +136,14 @@ def _reference(found: Sequence[Variant], baseline: str | None) -> Variant | None
     return next(iter(named or of_label), None)
 
 
-def _sections(group: _Group, title: str, found: Sequence[Variant], baseline: str | None) -> list[Section]:
+def _sections(
+    group: _Group, title: str, found: Sequence[Variant], baseline: str | None, protocol: Protocol
+) -> list[Section]:
     """The table of a group, and the one by camera where there are several."""
     reference = _reference(found, baseline)
     ordered = sorted(found, key=lambda variant: (variant is not reference, variant.name))
     compared = ordered[1:] if reference is not None else []
-    said = notes(ordered, group.over_scenes)
+    said = notes(ordered, group.over_scenes, protocol)
     if compared:
         paired = "scene and seed" if group.over_scenes else "seed"
         said.append(f"differences are to {reference.name}, paired by {paired}; per cent is what remains of it")
@@ -149,7 +155,7 @@ def _sections(group: _Group, title: str, found: Sequence[Variant], baseline: str
         rows += [_difference_row(variant, reference, columns, group.over_scenes) for variant in compared]
         return Section(name, group.over_scenes, by_camera, columns, tuple(rows), tuple(said))
 
-    whole = section(title, False, quantities(group.runs), said)
+    whole = section(title, False, quantities(group.runs, protocol), said)
     cameras = camera_quantities(group.runs)
     if not cameras:
         return [whole]

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from sparsestreet.data.pickled import read_pickled
 from sparsestreet.geometry.skeleton import NUM_JOINTS, PARENTS
+from sparsestreet.pickled import read_pickled
 from sparsestreet.scene.body.template import Body, BodyTemplate
 
 _NUM_SHAPES = 10

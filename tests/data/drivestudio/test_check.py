@@ -88,6 +88,11 @@ CORRUPTIONS = {
     "missing boxes": (remove(INFO), INFO, "missing"),
     "some sky masks": (remove("sky_masks/000_1.png"), "sky_masks/000_1.png", "missing"),
     "some human masks": (remove("dynamic_masks/human/000_1.png"), "dynamic_masks/human/000_1.png", "missing"),
+    "small mask of the car": (
+        lambda root: write_image(root / "ego_masks/0.png", np.zeros((3, 4), np.uint8)),
+        "ego_masks/0.png",
+        "the mask is 4x3",
+    ),
     "more sweeps than images": (
         lambda root: shutil.copy(root / "lidar/002.bin", root / "lidar/003.bin"),
         "images/003_0.jpg",

@@ -174,6 +174,26 @@ def test_shrunken_object_masks_keep_every_pixel_they_touch_and_sky_does_not_grow
     assert torch.equal(frame.sky, expected)
 
 
+def test_a_mask_of_the_recording_car_holds_for_all_images_of_its_camera(tmp_path):
+    make_nuscenes(tmp_path)
+    hood = np.zeros((HEIGHT, WIDTH), np.uint8)
+    hood[HEIGHT // 2 :] = 255
+    write_image(tmp_path / "ego_masks/1.png", hood)
+    log = DriveStudioReader(tmp_path).read()
+    for frame in log.frames:
+        if frame.camera_index == 0:
+            assert frame.ego is None
+        else:
+            assert torch.equal(frame.ego, torch.from_numpy(hood > 0))
+    (turned,) = {
+        frame.camera_index
+        for frame in DriveStudioReader(tmp_path, cameras=[1, 0]).read().frames
+        if frame.ego is not None
+    }
+    assert turned == 0  # the folder's camera 1 is the log's first
+    assert DriveStudioReader(tmp_path, width=10).read().frames[1].ego.shape == (6, 10)
+
+
 def test_fine_masks_replace_the_coarse_ones(tmp_path):
     make_nuscenes(tmp_path)
     for kind in ("human", "vehicle"):

@@ -117,5 +117,11 @@ def test_near_and_beyond_are_explained_where_there_is_lidar():
 
 
 def test_which_views_the_metrics_are_of():
-    assert note("of held-out views: PSNR", make_summary(training_psnr=30.0))
-    assert note("of training views (none is held out): PSNR", make_summary(psnr=None, training_psnr=30.0))
+    assert note("of held-out views, protocol drivestudio: PSNR psnr_full", make_summary(training_psnr=30.0))
+    assert note("of training views (none is held out), protocol", make_summary(psnr=None, training_psnr=30.0))
+
+
+def test_a_metric_that_could_not_be_measured_is_explained_once():
+    reason = "no weights (a.ckpt): install them"
+    said = notes(make_summary(absent={"lpips_alex": reason, "lpips_vgg": "?"}), make_summary("b"))
+    assert [one for one in said if "n/a" in one] == [f"lpips_alex n/a in some runs: {reason}"]

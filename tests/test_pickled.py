@@ -14,7 +14,7 @@ import pytest
 import scipy.sparse
 import torch
 
-from sparsestreet.data.pickled import read_pickled
+from sparsestreet.pickled import read_pickled
 
 ARRAYS = {
     "double": np.linspace(0, 1, 12).reshape(2, 3, 2),

@@ -1,0 +1,66 @@
+"""``predictions/<split>/FFF_C.png``: what a run shows of its views, kept so that anybody can compute numbers from it.
+
+16-bit RGB PNGs of the clamped renders: value = round(65535 x), at most 7.7e-6 away from x. Pillow knows no such PNGs,
+so OpenCV reads and writes them.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from sparsestreet.whole_file import whole_file
+
+LEVELS = 65535
+
+
+class PredictionError(ValueError):
+    """A stored prediction that cannot be read; names the file and the remedy."""
+
+
+def predictions_folder(run: Path, split: str) -> Path:
+    """Where a run keeps its predictions of the views of a split."""
+    return run / "predictions" / split
+
+
+def prediction_path(folder: Path, frame: int, camera: int) -> Path:
+    """The prediction of one view."""
+    return folder / f"{frame:03d}_{camera}.png"
+
+
+def clear_predictions(folder: Path) -> None:
+    """Remove those of an earlier evaluation, perhaps of other views; files of other names stay."""
+    for path in folder.glob("[0-9]*_[0-9]*.png"):
+        path.unlink()
+
+
+def quantized(image: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
+    """Values in [0, 1] as a prediction holds them."""
+    return np.round(image.astype(np.float64) * LEVELS).astype(np.uint16)
+
+
+def restored(pixels: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """What a prediction holds as float32 in [0, 1]."""
+    return (pixels / LEVELS).astype(np.float32)
+
+
+def write_prediction(path: Path, pixels: UInt16[np.ndarray, "h w 3"]) -> None:
+    """Write one, the whole file or nothing. Raises OSError where it cannot be written."""
+    with whole_file(path) as temporary:
+        # OpenCV's order is BGR. Of 16 bits the lower are noise, which no effort compresses.
+        done, data = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        if not done:
+            raise OSError(f"{path}: an image of shape {pixels.shape} cannot be encoded as PNG")
+        temporary.write_bytes(data.tobytes())
+
+
+def read_prediction(path: Path) -> UInt16[np.ndarray, "h w 3"]:
+    """Read one back. Raises PredictionError for a file that is absent, damaged or no 16-bit RGB PNG."""
+    if not path.is_file():
+        raise PredictionError(f"{path} is not there: evaluate the run, which stores its predictions")
+    pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        found = "cannot be decoded" if pixels is None else f"is {pixels.dtype} of shape {pixels.shape}"
+        raise PredictionError(f"{path} {found}, a prediction is a 16-bit RGB PNG: evaluate the run again")
+    return np.ascontiguousarray(pixels[..., ::-1])

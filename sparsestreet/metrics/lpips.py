@@ -1,0 +1,155 @@
+"""LPIPS: how far apart two images are for a network that was trained to tell objects, as defined in ``definitions``.
+
+Zhang et al. 2018: features of several layers, each pixel's scaled to unit length; their squared differences, weighted
+by channel; the mean over each layer, and the sum over layers.
+"""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from sparsestreet.metrics.image import check_mask, check_pair
+
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+"""ImageNet's mean and deviation by channel, of values in [-1, 1]."""
+_TINY = 1e-10
+"""Beside the length of a feature, so that one of zeros stays zero."""
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """A layer with a rectifier behind it."""
+
+    channels: int
+    kernel: int
+    stride: int = 1
+
+    @property
+    def padding(self) -> int:
+        """Keeps the size; AlexNet's first layer, of stride 4, loses a little."""
+        return self.kernel // 2 if self.stride == 1 else 2
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What lies between two layers that are compared."""
+
+    pool: int
+    """Side of the maximum that is taken first, in steps of 2 pixels; 0: none."""
+    convolutions: tuple[Convolution, ...]
+
+
+ALEX = (
+    Stage(0, (Convolution(64, 11, stride=4),)),
+    Stage(3, (Convolution(192, 5),)),
+    Stage(3, (Convolution(384, 3),)),
+    Stage(0, (Convolution(256, 3),)),
+    Stage(0, (Convolution(256, 3),)),
+)
+VGG16 = (
+    Stage(0, 2 * (Convolution(64, 3),)),
+    Stage(2, 2 * (Convolution(128, 3),)),
+    Stage(2, 3 * (Convolution(256, 3),)),
+    Stage(2, 3 * (Convolution(512, 3),)),
+    Stage(2, 3 * (Convolution(512, 3),)),
+)
+
+
+@dataclass(frozen=True)
+class LpipsWeights:
+    """Numbers of a network. Raises ValueError for shapes that are not its own."""
+
+    stages: tuple[Stage, ...]
+    kernels: tuple[Float[Tensor, "_ _ _ _"], ...]
+    """Of each convolution, [out, in, row, column]."""
+    biases: tuple[Float[Tensor, " _"], ...]
+    channels: tuple[Float[Tensor, " _"], ...]
+    """Of each stage, what a channel's squared difference counts."""
+
+    def __post_init__(self) -> None:
+        layers = [layer for stage in self.stages for layer in stage.convolutions]
+        inputs = (3, *(layer.channels for layer in layers))
+        expected = [
+            *(
+                (layer.channels, before, layer.kernel, layer.kernel)
+                for layer, before in zip(layers, inputs, strict=False)
+            ),
+            *((layer.channels,) for layer in layers),
+            *((stage.convolutions[-1].channels,) for stage in self.stages),
+        ]
+        found = [tuple(one.shape) for one in (*self.kernels, *self.biases, *self.channels)]
+        if found != expected:
+            raise ValueError(f"LPIPS weights must have the shapes {expected}, got {found}: take another file")
+
+    def to(self, device: torch.device) -> "LpipsWeights":
+        """The same on a device."""
+        moved = (tuple(one.to(device) for one in part) for part in (self.kernels, self.biases, self.channels))
+        return LpipsWeights(self.stages, *moved)
+
+
+class Lpips:
+    """The distance that a network gives; float32, on the device of its weights."""
+
+    def __init__(self, weights: LpipsWeights) -> None:
+        self.weights = weights
+
+    def __call__(self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
+        """LPIPS of two images in [0, 1]; 0 for identical ones."""
+        return lpips_of_layers(self.layer_maps(image, truth))
+
+    @torch.no_grad()
+    def layer_maps(
+        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
+    ) -> tuple[Float[Tensor, "_ _"], ...]:
+        """The weighted squared difference at each place of each layer. Raises ValueError for different shapes."""
+        check_pair(image, truth)
+        pairs = zip(self.features(image), self.features(truth), self.weights.channels, strict=True)
+        return tuple(torch.einsum("chw,c->hw", (_unit(a) - _unit(b)).square(), weight) for a, b, weight in pairs)
+
+    @torch.no_grad()
+    def features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "_ _ _"]]:
+        """What the network sees in an image in [0, 1]: [channels, rows, columns] of each stage."""
+        shift, scale = (torch.tensor(numbers, device=image.device) for numbers in (_SHIFT, _SCALE))
+        values = ((2 * image.float() - 1 - shift) / scale).permute(2, 0, 1)[None]
+        layers = zip(self.weights.kernels, self.weights.biases, strict=True)
+        found = []
+        with _full_precision(image.device):
+            for stage in self.weights.stages:
+                values = functional.max_pool2d(values, stage.pool, stride=2) if stage.pool else values
+                for layer in stage.convolutions:
+                    kernel, bias = next(layers)
+                    values = functional.conv2d(values, kernel, bias, layer.stride, layer.padding).relu()
+                found.append(values[0])
+        return found
+
+
+def lpips_of_layers(layers: Sequence[Float[Tensor, "_ _"]]) -> float:
+    """The image's LPIPS: the sum of the layers' means."""
+    return float(sum(layer.double().mean() for layer in layers))
+
+
+def masked_lpips_of_layers(layers: Sequence[Float[Tensor, "_ _"]], mask: Bool[Tensor, "h w"]) -> float | None:
+    """The sum of the layers' maps, brought to the mask's size bilinearly, averaged over it; None where it is empty."""
+    if not bool(mask.any()):
+        return None
+    spatial = torch.zeros(mask.shape, dtype=torch.float64, device=mask.device)
+    for layer in layers:
+        grown = functional.interpolate(layer[None, None], size=tuple(mask.shape), mode="bilinear", align_corners=False)
+        spatial += grown[0, 0]
+    check_mask(mask, spatial)
+    return float(spatial[mask].mean())
+
+
+def _unit(features: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
+    return features / (features.square().sum(0, keepdim=True).sqrt() + _TINY)
+
+
+def _full_precision(device: torch.device):
+    """cuDNN would round the factors of convolutions to 10 bits."""
+    return torch.backends.cudnn.flags(enabled=True, allow_tf32=False) if device.type == "cuda" else nullcontext()

@@ -1,0 +1,52 @@
+"""Named choices of metrics: which definitions a table shows (no torch). Records hold all of them."""
+
+from dataclasses import dataclass
+
+from sparsestreet.metrics.definitions import DEFINITIONS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """Ids of metrics by what they are called in a table. Raises ValueError for an id that has no definition."""
+
+    name: str
+    psnr: str
+    ssim: str
+    lpips: tuple[str, ...]
+    human: tuple[str, str]
+    """PSNR and SSIM of the pixels of people."""
+    vehicle: tuple[str, str]
+    """PSNR and SSIM of the pixels of vehicles."""
+
+    def __post_init__(self) -> None:
+        unknown = [metric for metric in self.metrics if metric not in DEFINITIONS]
+        if unknown:
+            raise ValueError(f"protocol {self.name} names {unknown}, which have no definition: see DEFINITIONS")
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """All ids, in the order of a table."""
+        return (self.psnr, self.ssim, *self.lpips, *self.human, *self.vehicle)
+
+
+DRIVESTUDIO = Protocol(
+    name="drivestudio",
+    psnr="psnr_full",
+    ssim="ssim_uniform7_full",
+    lpips=("lpips_alex_full",),
+    human=("psnr_human", "ssim_uniform7_human"),
+    vehicle=("psnr_vehicle", "ssim_uniform7_vehicle"),
+)
+"""What DriveStudio computes, so that its tables and the paper's can be compared: not rounded, the hood counts."""
+
+STRICT = Protocol(
+    name="strict",
+    psnr="psnr8_no_hood",
+    ssim="ssim_gauss11_no_hood",
+    lpips=("lpips_alex_no_hood", "lpips_vgg_no_hood"),
+    human=("psnr8_human", "ssim_gauss11_human"),
+    vehicle=("psnr8_vehicle", "ssim_gauss11_vehicle"),
+)
+"""What a viewer gets to see: 8 bits, without the recording car, the window of the SSIM paper, both LPIPS."""
+
+PROTOCOLS = {protocol.name: protocol for protocol in (DRIVESTUDIO, STRICT)}
