@@ -1,10 +1,14 @@
-"""Where the time of a step goes: parts of it with names, timed only while somebody records.
+"""Where time goes: phases of a step and stages of a command, timed only while somebody records.
 
-Code says ``with phase("splat"):`` around what it does; without a recorder that costs a third of a microsecond. Phases
-may stand in one another: time belongs to the innermost one.
+Code says ``with phase("splat"):`` around what a step does often, and ``with stage("points"):`` around what a command
+does a few times; without a recorder a phase costs a third of a microsecond. Both may stand in one another: time belongs
+to the innermost one.
 """
 
 import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from itertools import pairwise
 
 import torch
@@ -38,18 +42,18 @@ def clock_of(device: torch.device) -> WallClock | CudaClock:
     return CudaClock() if device.type == "cuda" else WallClock()
 
 
-class PhaseRecorder:
-    """What happened between ``start`` and ``stop``, as seconds by name of the phase."""
+class Timeline:
+    """Seconds by name of what is under way."""
 
-    def __init__(self, clock: WallClock | CudaClock, outside: str = "rest") -> None:
-        """``outside`` is the name of the time that belongs to no phase."""
+    def __init__(self, clock: WallClock | CudaClock, outside: str) -> None:
+        """``outside`` is the name of the time that belongs to nothing else."""
         self._clock = clock
         self._names = [outside]
         self._marks: list[tuple[object, str]] = []
 
     @property
     def current(self) -> str:
-        """The innermost phase."""
+        """The innermost name."""
         return self._names[-1]
 
     def enter(self, name: str) -> None:
@@ -60,24 +64,85 @@ class PhaseRecorder:
         self._names.pop()
         self._marks.append((self._clock.mark(), self._names[-1]))
 
+    def begin(self) -> None:
+        """Forget what was."""
+        del self._names[1:]
+        self._marks = [(self._clock.mark(), self._names[0])]
+
+    def seconds(self) -> dict[str, float]:
+        """Those of every name since ``begin``; they add up to all of it."""
+        marks = [*self._marks, (self._clock.mark(), "")]
+        seconds: Counter[str] = Counter()
+        for (begin, name), (end, _) in pairwise(marks):
+            seconds[name] += self._clock.seconds(begin, end)
+        return dict(seconds)
+
+
+class PhaseRecorder(Timeline):
+    """What happened between ``start`` and ``stop``, as seconds by name of the phase."""
+
+    def __init__(self, clock: WallClock | CudaClock, outside: str = "rest") -> None:
+        super().__init__(clock, outside)
+
     def start(self) -> None:
         """Forget what was, and record from now on; raises RuntimeError while another recorder does."""
         global _recorder
         if _recorder not in (None, self):
             raise RuntimeError("phases are recorded by one recorder at a time: stop the other one first")
         _recorder = self
-        del self._names[1:]
-        self._marks = [(self._clock.mark(), self._names[0])]
+        self.begin()
 
     def stop(self) -> dict[str, float]:
         """Seconds of every phase since ``start``; they add up to all of it."""
         global _recorder
         _recorder = None
-        marks = [*self._marks, (self._clock.mark(), "")]
-        seconds: dict[str, float] = {}
-        for (begin, name), (end, _) in pairwise(marks):
-            seconds[name] = seconds.get(name, 0.0) + self._clock.seconds(begin, end)
-        return seconds
+        return self.seconds()
+
+
+class StageRecorder(Timeline):
+    """Wall clock of the stages of a command, while ``with`` holds it."""
+
+    def __init__(self, since: float | None = None) -> None:
+        """``since``: ``time.perf_counter`` when the command began; what it did until now is the stage "start"."""
+        super().__init__(WallClock(), outside="other")
+        self._earlier: Counter[str] = Counter()
+        self.begin()
+        if since is not None:
+            self._marks.insert(0, (since, "start"))
+
+    def go_on(self, earlier: Mapping[str, float]) -> None:
+        """Count what an earlier command spent on the same run as well."""
+        self._earlier = Counter(earlier)
+
+    def seconds(self) -> dict[str, float]:
+        """Those of every stage of this command and of the earlier one."""
+        return dict(self._earlier + Counter(super().seconds()))
+
+    def __enter__(self) -> "StageRecorder":
+        global _stages
+        _stages = self
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        global _stages
+        _stages = None
+
+
+_stages: StageRecorder | None = None
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """``with stage(name):`` marks a part of a command for whoever records; ``name/detail`` where there are several."""
+    recorder = _stages
+    if recorder is None:
+        yield
+        return
+    recorder.enter(name)
+    try:
+        yield
+    finally:
+        recorder.leave()
 
 
 _recorder: PhaseRecorder | None = None

@@ -14,58 +14,100 @@ from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_c
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.evaluation.costs import stage_costs, step_costs, update_costs
 from sparsestreet.evaluation.history import draw_history
-from sparsestreet.evaluation.records import read_run, run_path
+from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
+from sparsestreet.evaluation.records import RunSummary, read_run, run_path
 from sparsestreet.evaluation.run import evaluate_scene
+from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.callbacks import (
     Checkpoints,
     Clock,
     GracefulStop,
+    HeldOutCurve,
     RunFiles,
+    StageTimes,
     TrainingProgress,
     newest_checkpoint,
 )
 from sparsestreet.training.curves import kept_curves
+from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
 
-def run(cfg: DictConfig, out: Path) -> float:
+def run(cfg: DictConfig, out: Path, started: float) -> float:
     """Train and evaluate into a folder; a full-image PSNR, of held-out views where there are any.
 
-    Raises ValueError for a configuration that cannot be or a log that is broken, OSError for files. Ends the program
+    ``started``: ``time.perf_counter`` when the command began. Raises ValueError for a configuration that cannot be or a log that is broken, OSError for files. Ends the program
     with the status of the signal that ended training.
     """
     # A sweep's launcher starts processes of its own.
     keep_freed_memory()
+    forget_peaks()
     problem = config_problem(cfg)
     if problem:
         raise ValueError(problem)
     recipe = recipe_of(cfg)
     seed_everything(cfg.seed, verbose=False)
     silence_known_noise()
-    data = data_of(cfg)
-    system = recipe.build(data)
     # The job's own overrides: in a sweep they are not what was typed.
     command = this_command(["train", *HydraConfig.get().overrides.task])
-    trainer = _train(cfg, list(recipe.callbacks.values()), system, data, out, command)
-    if trainer.fast_dev_run:
-        log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
-        return 0.0
-    summary = evaluate_scene(
-        system.scene,
-        data.split.held_out,
-        data.split.train,
-        run=read_run(run_path(out)),
-        options=system.options,
-        out=out,
-        command=command,
-        device=trainer.strategy.root_device,
-    )
-    draw_history(out)
+    with StageRecorder(started) as recorder:
+        summary, device = _train_and_evaluate(cfg, recipe, recorder, out, command)
+        if summary is None:
+            return 0.0
+        with stage("pictures"):
+            draw_history(out)
+        _write_costs(out, recorder, device)
     log.info("records and pictures in %s", out)
     return summary.quality[summary.main_split]["psnr_full"].mean
+
+
+def _train_and_evaluate(
+    cfg: DictConfig, recipe: Recipe, recorder: StageRecorder, out: Path, command: str
+) -> tuple[RunSummary | None, torch.device]:
+    """What was measured (None of a ``fast_dev_run``), and the device."""
+    with stage("data"):
+        data = data_of(cfg)
+    with stage("initialize"):
+        system = recipe.build(data)
+    callbacks = [*recipe.callbacks.values(), StageTimes(recorder)]
+    with stage("train"):
+        trainer = _train(cfg, callbacks, system, data, out, command)
+    device = trainer.strategy.root_device
+    if trainer.fast_dev_run:
+        log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
+        return None, device
+    with stage("evaluate"):
+        summary = evaluate_scene(
+            system.scene,
+            data.split.held_out,
+            data.split.train,
+            run=read_run(run_path(out)),
+            options=system.options,
+            out=out,
+            command=command,
+            device=device,
+        )
+    return summary, device
+
+
+def _write_costs(out: Path, recorder: StageRecorder, device: torch.device) -> None:
+    """What the command cost; the last that it writes, so that a run with costs is a whole one."""
+    host, on_device = peak_megabytes(device)
+    seconds = recorder.seconds()
+    phases, passes = stage_costs(seconds)
+    update_costs(
+        out,
+        wall_seconds=sum(seconds.values()),
+        phases=phases,
+        passes=passes,
+        step_ms=step_costs(out / "records" / "phases.csv"),
+        peak_host_mb=host,
+        peak_device_mb=on_device,
+    )
 
 
 def _train(
@@ -73,7 +115,8 @@ def _train(
 ) -> Trainer:
     """Fit to the end, or end the program as the signal wants that came."""
     clock, stop, checkpoint = Clock(), GracefulStop(), _checkpoint(cfg)
-    trainer = trainer_of(cfg, [clock, *callbacks, TrainingProgress()], out)
+    curve = HeldOutCurve(out / "curves" / "held_out.csv", clock)
+    trainer = trainer_of(cfg, [clock, *callbacks, curve, TrainingProgress()], out)
     description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
     trainer.callbacks += [RunFiles(out, description, clock), Checkpoints(out / "checkpoints"), stop]
     # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from pathlib import Path
 
 import hydra
@@ -15,8 +16,14 @@ from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 
 
+_started = 0.0
+"""``time.perf_counter`` when the command began."""
+
+
 def train(arguments: list[str]) -> int:
     """Run the Hydra app on these overrides; 2 if they are wrong, 1 if the data is, 130 or 143 if a signal ended it."""
+    global _started
+    _started = time.perf_counter()
     if "--help" not in arguments:
         try:
             arguments = resumed_overrides(arguments)
@@ -51,10 +58,12 @@ def _problem_of_values(arguments: list[str]) -> str | None:
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def app(cfg: DictConfig) -> float:
     """One training with its evaluation; returns a full-image PSNR for sweepers (held out, else of training views)."""
+    # The jobs of a sweep begin here.
+    started = time.perf_counter() if HydraConfig.get().mode == RunMode.MULTIRUN else _started
     from sparsestreet.cli.run import run
 
     try:
-        return run(cfg, Path(HydraConfig.get().runtime.output_dir))
+        return run(cfg, Path(HydraConfig.get().runtime.output_dir), started)
     except (InstantiationException, ValueError, OSError, ImportError) as error:
         # In a sweep, and where somebody looks for a fault, Hydra's own report with the whole trace is better.
         if HydraConfig.get().mode == RunMode.MULTIRUN or "HYDRA_FULL_ERROR" in os.environ:

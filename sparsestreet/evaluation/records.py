@@ -11,41 +11,79 @@ from sparsestreet.evaluation.configuration import Setting
 from sparsestreet.evaluation.quality import MetricSummary
 from sparsestreet.evaluation.strict_json import EXACT, read_json, version, write_json
 
-RUN_FORMAT = 1
+RUN_FORMAT = 2
 """Version of ``run.json``; raised when a key changes its meaning."""
 
-FORMAT = 3
+FORMAT = 4
 """Version of ``summary.json``; raised when a key changes its meaning."""
 
 HELD_OUT, TRAINING = "held_out", "training"
 """The splits whose views a record speaks of."""
 
 
+RASTER, FRAME, RIG = "raster", "frame", "rig"
+"""What the clocks of a latency hold: the splat op alone; all from a time and a pose to uint8 on the device; that for
+all cameras of an instant."""
+
+
 @dataclass(frozen=True)
-class Latency:
-    """Milliseconds per image under the protocol of ``speed.measure_latency``."""
+class Noise:
+    """How steady the machine was while something was timed, by a fixed loop before and after it."""
+
+    before: float
+    """Ninth less first decile of the loop's times, relative to their median."""
+    after: float
+    drift: float
+    """Median after / median before - 1."""
+    load_average: float | None
+    """Processes that wanted to run in the minute before; None where the system does not say."""
+    quiet: bool
+    """Whether spreads and drift were small enough for times to be trusted to 5 % (``noise.QUIET``)."""
+
+
+@dataclass(frozen=True)
+class Percentiles:
+    """Of repeated times, milliseconds."""
 
     p50: float
     p90: float
     p99: float
     repeats: int
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Milliseconds by three clocks under the protocol of ``speed.measure_latency``."""
+
+    clocks: dict[str, Percentiles]
+    """``RASTER``, ``FRAME`` and ``RIG`` of the scene as it is stored; Gaussians that a mask closes are masked."""
+    removed: dict[str, Percentiles]
+    """The same with the Gaussians taken out that the masks close at the time of the view; empty without masks."""
     warmup: int
     views: int
     """Number of different views the repeats cycle through."""
     device: str
     threads: int
+    noise: Noise
+
+    def __post_init__(self) -> None:
+        if set(self.clocks) != {RASTER, FRAME, RIG} or set(self.removed) not in (set(), set(self.clocks)):
+            raise ValueError(
+                f"a latency has the clocks {RASTER}, {FRAME}, {RIG}, got {sorted(self.clocks)} and, of removed "
+                f"Gaussians, {sorted(self.removed)}: evaluate again"
+            )
 
     @property
-    def median(self) -> float:
-        """The same as p50."""
-        return self.p50
+    def p50(self) -> float:
+        """Median of a frame."""
+        return self.clocks[FRAME].p50
 
     @property
     def protocol(self) -> str:
-        """How the numbers were taken, in words."""
+        """How the median of a frame was taken, in words."""
         return (
-            f"{self.repeats} renders cycling through {self.views} views after {self.warmup} warm-up renders, batch 1, "
-            "device synchronized, scene assembly to RGB, without loading and metrics"
+            f"{self.clocks[FRAME].repeats} renders cycling through {self.views} views after {self.warmup} warm-up "
+            "renders, batch 1, device synchronized, scene assembly to uint8, without loading and metrics"
         )
 
 
@@ -89,6 +127,8 @@ class RunDescription:
     """The resolved configuration, flat: dotted key -> value."""
     config_hash: str
     """``configuration.config_hash`` of it: equal for repeats."""
+    data_hash: str
+    """``LogReader.data_hash``: equal for the same log, wherever it lies."""
     command: str
     """The command that trained."""
     device: str
@@ -99,6 +139,8 @@ class RunDescription:
     max_steps: int
     training_seconds: float | None
     """Wall clock of training without evaluation; None where it is not known."""
+    noise: Noise | None
+    """While it trained; None where that is not known."""
     caps: dict[str, int]
     """Nodes whose number of Gaussians was held down by their ``max_gaussians`` at least once -> that limit."""
     machine: Machine

@@ -10,7 +10,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
+from sparsestreet.evaluation.costs import update_costs
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.latency_csv import latency_path, write_latency
+from sparsestreet.evaluation.node_costs import measure_scene_costs
 from sparsestreet.evaluation.pictures import (
     KINDS,
     Picture,
@@ -37,6 +40,7 @@ from sparsestreet.evaluation.sheets import Legend, picture_sheet
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.ops import Guards, guards
+from sparsestreet.phases import stage
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
@@ -82,14 +86,20 @@ def evaluate_scene(
     scene = scene.to(torch.device(device)).eval()
     quality = {split: list(evaluate_frames(scene, frames, options)) for split, frames in splits.items()}
     main, frames = next(iter(splits.items()))
-    latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
+    with stage("latency"):
+        latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
+    with stage("costs"):
+        costs = measure_scene_costs(scene, frames.views, options)
     summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command)
-    chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
-    _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
+    with stage("pictures"):
+        chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
+        _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
     for split in (HELD_OUT, TRAINING):
         quality_path(out, split).unlink(missing_ok=True)  # of an earlier evaluation, perhaps on more views
     for split, images in quality.items():
         write_quality(quality_path(out, split), images)
+    write_latency(latency_path(out), latency)
+    update_costs(out, **vars(costs))
     write_summary(summary_path(out), summary)
     return summary
 

@@ -1,29 +1,46 @@
-"""How long one image takes: medians over many renders, with the device waited for."""
+"""How long one image takes by three clocks: medians over many renders, with the device waited for."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from typing import TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
+from sparsestreet.evaluation.noise import calibrate, noise_between
 from sparsestreet.evaluation.provenance import processor_name
-from sparsestreet.evaluation.records import Latency
+from sparsestreet.evaluation.records import FRAME, RASTER, RIG, Latency, Percentiles
+from sparsestreet.evaluation.scene_parts import has_masks, without_closed_rows
+from sparsestreet.ops import splat
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import View
 
+T = TypeVar("T")
 
+SceneAt = Callable[[View], SceneGraph]
+"""The scene that is rendered for a view."""
+
+
+@torch.no_grad()
 def measure_latency(
     scene: SceneGraph, views: Sequence[View], options: RenderOptions, *, warmup: int = 20, repeats: int = 50
 ) -> Latency:
     """Wall clock of rendering a view on the scene's device, milliseconds.
 
     The protocol, which the answer repeats in words: batch of one; ``warmup`` renders that are thrown away, then
-    ``repeats`` timed ones, cycling through all ``views`` so that no easy view is singled out. The clock holds all
-    that a view needs (assembling the scene at that time, projection, blending, sky) and neither loading of images
-    nor metrics nor conversion to uint8. On a CUDA device it waits for the device before and after each render.
-    The median is the headline: the mean of timings with a slow tail is several times noisier. A published number
-    needs ``repeats`` >= 50. Frames per second are 1000 / p50, never the mean of 1 / t.
+    ``repeats`` timed ones, cycling through all ``views`` so that no easy view is singled out. Three clocks: "raster"
+    is the splat op alone, "frame" all that a time and a pose need to become an image of uint8 on the device
+    (assembling the scene at that time, projection, blending, sky, rounding) and neither loading of images nor metrics,
+    "rig" the frames of all cameras of an instant, one after the other. On a CUDA device the clock waits for the device
+    before and after. The median of "frame" is the headline: the mean of timings with a slow tail is several times
+    noisier. A published number needs ``repeats`` >= 50. Frames per second are 1000 / p50, never the mean of 1 / t.
+
+    Where masks close Gaussians at times, the clocks run once more with those taken out beforehand that are closed at
+    the time of the view.
 
     Raises ValueError without views, or if ``warmup`` or ``repeats`` is below 1.
     """
@@ -31,14 +48,35 @@ def measure_latency(
         raise ValueError(
             f"latency needs at least one view, warm-up and repeat, got {len(views)}, {warmup} and {repeats}"
         )
-    with torch.no_grad():
-        for index in range(warmup):
-            render(scene, views[index % len(views)], options=options)
-        timings = [_milliseconds(scene, views[index % len(views)], options) for index in range(repeats)]
-    p50, p90, p99 = (float(value) for value in np.percentile(timings, (50, 90, 99)))
+    before = calibrate(scene.device)
+    rigs = instants(views)
+    clocks = _Clocks(lambda view: scene, options, scene.device)
+    kept = clocks.measure(_cycled(views, repeats), _cycled(rigs, repeats), warmup)
+    removed = {}
+    if has_masks(scene):
+        clocks = _Clocks(_WithoutClosedRows(scene, options), options, scene.device)
+        in_order = [view for rig in rigs for view in rig]
+        removed = clocks.measure(_stretched(in_order, repeats), _stretched(rigs, repeats), warmup)
+    noise = noise_between(before, calibrate(scene.device))
     return Latency(
-        p50, p90, p99, repeats, warmup, len(views), device_name(scene.device), threads=torch.get_num_threads()
+        kept, removed, warmup, len(views), device_name(scene.device), threads=torch.get_num_threads(), noise=noise
     )
+
+
+def frame_image(scene: SceneGraph, view: View, options: RenderOptions) -> UInt8[Tensor, "h w 3"]:
+    """What the clock of a frame holds: from a time and a pose to what a screen takes, on the scene's device."""
+    return to_uint8(render(scene, view, options=options).rgb)
+
+
+def to_uint8(rgb: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+    """Clamped and rounded."""
+    return (rgb.clamp(0, 1) * 255).round().byte()
+
+
+def instants(views: Sequence[View]) -> list[tuple[View, ...]]:
+    """The views of each instant, instants in order of time."""
+    ordered = sorted(views, key=lambda view: view.time)
+    return [tuple(group) for _, group in groupby(ordered, key=lambda view: view.time)]
 
 
 def device_name(device: torch.device) -> str:
@@ -47,12 +85,68 @@ def device_name(device: torch.device) -> str:
     return f"{device.type}: {name}"
 
 
-def _milliseconds(scene: SceneGraph, view: View, options: RenderOptions) -> float:
-    _wait_for(scene.device)
-    start = time.perf_counter()
-    render(scene, view, options=options)
-    _wait_for(scene.device)
-    return 1000 * (time.perf_counter() - start)
+class _Clocks:
+    """The three clocks on a scene that may depend on the view."""
+
+    def __init__(self, scene_at: SceneAt, options: RenderOptions, device: torch.device) -> None:
+        self._scene_at = scene_at
+        self._options = options
+        self._device = device
+
+    def measure(self, frames: Sequence[View], rigs: Sequence[Sequence[View]], warmup: int) -> dict[str, Percentiles]:
+        """Percentiles of as many turns as are given; ``warmup`` frames come first."""
+        for index in range(warmup):
+            self._frame(frames[index % len(frames)])
+        return {
+            FRAME: _percentiles([self._timed(lambda view=view: self._frame(view), view) for view in frames]),
+            RIG: _percentiles([self._timed(lambda rig=rig: [self._frame(v) for v in rig], rig[0]) for rig in rigs]),
+            RASTER: _percentiles([self._timed(self._raster(view), view) for view in frames]),
+        }
+
+    def _frame(self, view: View) -> None:
+        frame_image(self._scene_at(view), view, self._options)
+
+    def _raster(self, view: View) -> Callable[[], object]:
+        gaussians = self._scene_at(view).gaussians_at(view).gaussians
+        settings, backend = self._options.settings, self._options.backend
+        return lambda: splat(gaussians, view.camera, settings=settings, backend=backend, screen_gradients=False)
+
+    def _timed(self, work: Callable[[], object], view: View) -> float:
+        """Milliseconds of some work on the scene of a view, which is there before the clock starts."""
+        self._scene_at(view)
+        _wait_for(self._device)
+        start = time.perf_counter()
+        work()
+        _wait_for(self._device)
+        return 1000 * (time.perf_counter() - start)
+
+
+class _WithoutClosedRows:
+    """The scene without the rows that are closed at the time of a view; it is drawn once whenever it is made."""
+
+    def __init__(self, scene: SceneGraph, options: RenderOptions) -> None:
+        self._scene = scene
+        self._options = options
+        self._made: tuple[float, SceneGraph] | None = None
+
+    def __call__(self, view: View) -> SceneGraph:
+        if self._made is None or self._made[0] != view.time:
+            self._made = view.time, without_closed_rows(self._scene, view.time)
+            frame_image(self._made[1], view, self._options)
+        return self._made[1]
+
+
+def _cycled(items: Sequence[T], count: int) -> list[T]:
+    return [items[index % len(items)] for index in range(count)]
+
+
+def _stretched(items: Sequence[T], count: int) -> list[T]:
+    """In order, equals beside each other: nothing has to be made twice."""
+    return [items[index * len(items) // count] for index in range(count)]
+
+
+def _percentiles(times: Sequence[float]) -> Percentiles:
+    return Percentiles(*(float(value) for value in np.percentile(times, (50, 90, 99))), len(times))
 
 
 def _wait_for(device: torch.device) -> None:

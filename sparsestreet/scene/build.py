@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import Assignment, assign_tracks
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -43,7 +44,8 @@ def build_scene(
     """
     assignment = assign_tracks(log.tracks, nodes)
     _report(assignment)
-    points = None if image_points is None else cached_street_points(train_frames, assignment.claimed, image_points)
+    with stage("points"):
+        points = None if image_points is None else cached_street_points(train_frames, assignment.claimed, image_points)
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
         data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed, points)

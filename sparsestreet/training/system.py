@@ -10,7 +10,7 @@ from lightning import LightningModule
 from torch import Tensor
 from torch.optim import Optimizer
 
-from sparsestreet.metrics.image import psnr, psnr_on_device
+from sparsestreet.metrics.image import masked_psnr, psnr, psnr_on_device
 from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
@@ -102,8 +102,13 @@ class StreetSystem(LightningModule):
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
             image = render(self.scene, frame, self.state(), self.options).rgb.clamp(0, 1)
-            value = psnr(image, frame.image.to(image.dtype) / 255)
-        self.log("val/psnr", value, batch_size=1)
+            truth = frame.image.to(image.dtype) / 255
+            self.log("val/psnr", psnr(image, truth), batch_size=1)
+            for region in ("human", "vehicle"):
+                mask = getattr(frame, region)
+                value = None if mask is None else masked_psnr(image, truth, mask)
+                if value is not None:
+                    self.log(f"val/psnr_{region}", value, batch_size=1)
 
     def configure_optimizers(self) -> Optimizer:
         return self.optimizer_settings.build(self.scene, self.radius)

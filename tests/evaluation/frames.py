@@ -5,12 +5,17 @@ import torch
 from sparsestreet.evaluation.configuration import Setting, config_hash
 from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
 from sparsestreet.evaluation.records import (
+    FRAME,
     HELD_OUT,
+    RASTER,
+    RIG,
     TRAINING,
     Evaluation,
     GuardCounts,
     Latency,
     Machine,
+    Noise,
+    Percentiles,
     RunDescription,
     RunSummary,
     Source,
@@ -33,6 +38,7 @@ def make_frame(
 
 
 MACHINE = Machine("test", 2, "Linux x86_64", "3.11", "2.13.0")
+NOISE = Noise(before=0.01, after=0.02, drift=-0.01, load_average=0.5, quiet=True)
 CLEAN = Source("0123456789abcdef", False)
 
 
@@ -44,6 +50,7 @@ def make_run(
     split: str = "every 10th frame from 0",
     training_seconds: float | None = 100.0,
     config: dict[str, Setting] | None = None,
+    data_hash: str = "0123456789ab",
     device: str = "cpu: test",
     threads: int = 2,
     steps: int = 60,
@@ -66,12 +73,14 @@ def make_run(
         split=split,
         config=whole,
         config_hash=config_hash(whole),
+        data_hash=data_hash,
         command=command or f"sparsestreet train seed={seed}",
         device=device,
         threads=threads,
         steps=steps,
         max_steps=60,
         training_seconds=training_seconds,
+        noise=NOISE,
         caps=caps or {},
         machine=machine,
         source=source,
@@ -91,6 +100,15 @@ def make_quality(psnr: float, vehicle_psnr: float | None = 22.0) -> dict[str, Me
     }
 
 
+def make_latency(milliseconds: float = 40.0, device: str = "cpu: test", removed: bool = False) -> Latency:
+    """A frame takes so long, the op half of it, the cameras of an instant three times as long."""
+    clocks = {
+        clock: Percentiles(share * milliseconds, 1.5 * share * milliseconds, 2 * share * milliseconds, 50)
+        for clock, share in ((RASTER, 0.5), (FRAME, 1.0), (RIG, 3.0))
+    }
+    return Latency(clocks, clocks if removed else {}, 20, 6, device, 2, NOISE)
+
+
 def make_summary(
     label: str = "plain",
     seed: int = 0,
@@ -108,7 +126,7 @@ def make_summary(
     """A record as a run writes it, with the numbers that a test wants to see in the table; ``run`` as in make_run."""
     gaussians = gaussians or {"background": 1000, "rigid": 200}
     parts = {name: 4 * 59 * rows for name, rows in gaussians.items()}
-    latency = Latency(milliseconds, 1.5 * milliseconds, 2 * milliseconds, 50, 20, 6, device, 2)
+    latency = make_latency(milliseconds, device)
     means = {HELD_OUT: psnr, TRAINING: training_psnr}
     quality = {split: make_quality(mean, vehicle_psnr) for split, mean in means.items() if mean is not None}
     return RunSummary(

@@ -46,7 +46,7 @@ def test_summary_round_trip(tmp_path):
     path = tmp_path / "records" / "summary.json"
     write_summary(path, summary)
     assert read_summary(path) == summary
-    assert json.loads(path.read_text())["latency"]["p90"] == 60.0
+    assert json.loads(path.read_text())["latency"]["clocks"]["frame"]["p90"] == 60.0
     assert json.loads(path.read_text())["by_camera"] == {HELD_OUT: cameras}
     assert (summary.camera_mean("psnr_near_lidar", "10"), summary.camera_mean("psnr_full", "3")) == (23.5, None)
 
@@ -67,7 +67,7 @@ def test_a_summary_holds_the_run_unchanged(tmp_path):
     write_run(tmp_path / "run.json", summary.run)
     entries = json.loads((tmp_path / "summary.json").read_text())["run"]
     assert entries == json.loads((tmp_path / "run.json").read_text())
-    assert (entries["format"], entries["label"], entries["sparsify"]) == (1, "plain", "none")
+    assert (entries["format"], entries["label"], entries["sparsify"]) == (2, "plain", "none")
 
 
 def test_the_main_split_is_the_held_out_one_where_there_is_one():
@@ -95,8 +95,8 @@ def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
 @pytest.mark.parametrize(
     ("write", "read", "value", "remedy"),
     [
-        (write_run, read_run, make_run(), "format 0, this version reads 1: train the run again"),
-        (write_summary, read_summary, make_summary(), "format 0, this version reads 3: evaluate again"),
+        (write_run, read_run, make_run(), "format 0, this version reads 2: train the run again"),
+        (write_summary, read_summary, make_summary(), "format 0, this version reads 4: evaluate again"),
     ],
 )
 def test_another_format_is_named_before_its_keys(tmp_path, write, read, value, remedy):

@@ -42,6 +42,10 @@ class StreetReader(LogReader):
     def read(self) -> DrivingLog:
         return self._made().read()
 
+    def data_hash(self) -> str:
+        """The street's name, which holds a hash of all of its settings: what they say is what it shows."""
+        return street_name(self.settings)
+
     def _made(self) -> DriveStudioReader:
         root = make_street(self.settings, self.folder, self._report)
         return DriveStudioReader(root, lidar=self.lidar, bodies=self.bodies, cache_mb=self.cache_mb)

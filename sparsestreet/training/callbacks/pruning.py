@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.phases import stage
 from sparsestreet.pruning import Look, PruningRule
 from sparsestreet.training.callbacks.resizing import resize_rows
 from sparsestreet.training.schedule import milestone
@@ -31,6 +32,10 @@ class Pruning(Callback):
     ) -> None:
         if trainer.global_step not in {milestone(fraction, trainer.max_steps) for fraction in self.at}:
             return
+        with stage(f"prune/{type(self.rule).__name__} at step {trainer.global_step}"):
+            self._prune(trainer, pl_module)
+
+    def _prune(self, trainer: Trainer, pl_module: LightningModule) -> None:
         frames = trainer.datamodule.split.train
         look = Look(pl_module.state(), pl_module.options)
         for name, selection in self.rule.select(pl_module.scene, frames, look).items():

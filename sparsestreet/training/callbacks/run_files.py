@@ -6,8 +6,10 @@ from pathlib import Path
 from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.evaluation.ledger import CountChange
+from sparsestreet.evaluation.noise import Calibration, calibrate, noise_between
 from sparsestreet.evaluation.records import RunDescription, run_path, write_run
 from sparsestreet.export import views
+from sparsestreet.phases import stage
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
 from sparsestreet.training.callbacks.clock import Clock
@@ -32,9 +34,13 @@ class RunFiles(Callback, RowListener):
         self.caps: dict[str, int] = {}
         """Nodes that their limit held down -> the limit."""
         self._limits: dict[str, int | None] = {}
+        self._calibration: Calibration | None = None
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._limits = {name: node.settings.max_gaussians for name, node in pl_module.scene.nodes.items()}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._calibration = calibrate(pl_module.device)
 
     def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         limit = self._limits[change.node]
@@ -52,14 +58,20 @@ class RunFiles(Callback, RowListener):
 
     def write(self, trainer: Trainer, system: StreetSystem) -> RunDescription:
         """Leave the files as training stands now; answers with what ``run.json`` says."""
+        before = self._calibration
+        description = replace(
+            self.description,
+            steps=trainer.global_step,
+            training_seconds=self.clock.seconds,
+            noise=None if before is None else noise_between(before, calibrate(system.device)),
+            caps=dict(self.caps),
+        )
         log, split = trainer.datamodule.driving_log, trainer.datamodule.split
         stored = StoredScene(system.scene, system.options, log.name, log.num_frames)
-        save_scene(self.folder / FILE_NAME, stored)
-        views.write_views(self.folder / views.FILE_NAME, split.train.views, split.held_out.views)
-        description = replace(
-            self.description, steps=trainer.global_step, training_seconds=self.clock.seconds, caps=dict(self.caps)
-        )
-        write_run(run_path(self.folder), description)
+        with stage("save"):
+            save_scene(self.folder / FILE_NAME, stored)
+            views.write_views(self.folder / views.FILE_NAME, split.train.views, split.held_out.views)
+            write_run(run_path(self.folder), description)
         return description
 
     def state_dict(self) -> dict[str, object]:

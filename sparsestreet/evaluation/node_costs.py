@@ -1,0 +1,115 @@
+"""What each node class and each effect costs of a frame: the same frames with and without it, side by side."""
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import sub
+
+import torch
+
+from sparsestreet.evaluation.costs import NodeCost
+from sparsestreet.evaluation.noise import calibrate, noise_between
+from sparsestreet.evaluation.records import Noise
+from sparsestreet.evaluation.scene_parts import has_masks, without_masks, without_node, without_sky
+from sparsestreet.evaluation.speed import frame_image
+from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.types import Camera, View
+
+OUTPUT = "output"
+"""The part of a frame that is in no phase: what holds the others together, and uint8."""
+
+LENS, SHUTTER, SKY, MASKS = "lens", "shutter", "sky", "masks"
+"""Effects."""
+
+_WARMUP = 2
+"""Rounds that do not count."""
+
+
+@dataclass(frozen=True)
+class SceneCosts:
+    """Fields of ``CostRecord``, as far as a scene and views tell them."""
+
+    frame_ms: dict[str, float]
+    nodes: dict[str, NodeCost]
+    effects: dict[str, float]
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """Frames with something left out."""
+
+    scene: SceneGraph
+    seen_by: Callable[[Camera], Camera] = lambda camera: camera
+
+
+@torch.no_grad()
+def measure_scene_costs(
+    scene: SceneGraph, views: Sequence[View], options: RenderOptions, *, repeats: int = 30
+) -> SceneCosts:
+    """Leave-one-out costs on the scene's device, in frames as ``speed.measure_latency`` times them.
+
+    Each of ``repeats`` rounds takes the next view and draws it whole and with one thing left out after the other, so
+    that a machine that gets slower does so for all. Costs are medians over the rounds of whole less left out. A scene
+    of one node is compared with one of no Gaussian.
+
+    Raises ValueError without views, or if ``repeats`` is below 1.
+    """
+    if not views or repeats < 1:
+        raise ValueError(f"costs need at least one view and one repeat, got {len(views)} and {repeats}")
+    before = calibrate(scene.device)
+    left_out = {name: _Variant(without_node(scene, name)) for name in scene.nodes}
+    effects = _effects(scene, views)
+    rounds = _rounds({"": _Variant(scene)} | left_out | effects, views, options, repeats)
+    frames = rounds.pop("")
+    without = {name: [sum(parts.values()) for parts in times] for name, times in rounds.items()}
+    whole = [sum(parts.values()) for parts in frames]
+    costs = {name: statistics.median(map(sub, whole, times)) for name, times in without.items()}
+    counts, sizes = scene.counts(), {name: node.row_bytes() + node.pose_bytes() for name, node in scene.nodes.items()}
+    return SceneCosts(
+        frame_ms={part: statistics.median(parts[part] for parts in frames) for part in frames[0]},
+        nodes={
+            name: NodeCost(counts[name], sizes[name] / 1e6, statistics.median(without[name]), costs[name])
+            for name in left_out
+        },
+        effects={name: costs[name] for name in effects},
+        noise=noise_between(before, calibrate(scene.device)),
+    )
+
+
+def _effects(scene: SceneGraph, views: Sequence[View]) -> dict[str, _Variant]:
+    """Those that the scene and its cameras have."""
+    found = {}
+    if any(view.camera.distortion is not None for view in views):
+        found[LENS] = _Variant(scene, lambda camera: replace(camera, distortion=None))
+    if any(view.camera.shutter is not None for view in views):
+        found[SHUTTER] = _Variant(scene, lambda camera: replace(camera, shutter=None))
+    if scene.sky is not None:
+        found[SKY] = _Variant(without_sky(scene))
+    if has_masks(scene):
+        found[MASKS] = _Variant(without_masks(scene))
+    return found
+
+
+def _rounds(
+    variants: Mapping[str, _Variant], views: Sequence[View], options: RenderOptions, repeats: int
+) -> dict[str, list[dict[str, float]]]:
+    """Variant -> part of a frame -> milliseconds, for each round."""
+    times: dict[str, list[dict[str, float]]] = {name: [] for name in variants}
+    for index in range(-_WARMUP, repeats):
+        view = views[index % len(views)]
+        for name, variant in variants.items():
+            parts = _frame_parts(variant, view, options)
+            if index >= 0:
+                times[name].append(parts)
+    return times
+
+
+def _frame_parts(variant: _Variant, view: View, options: RenderOptions) -> dict[str, float]:
+    view = replace(view, camera=variant.seen_by(view.camera))
+    recorder = PhaseRecorder(clock_of(variant.scene.device), outside=OUTPUT)
+    recorder.start()
+    frame_image(variant.scene, view, options)
+    return {name: 1e3 * seconds for name, seconds in recorder.stop().items()}

@@ -1,0 +1,51 @@
+"""How steady the machine is: a fixed loop before and after what is timed."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from sparsestreet.evaluation.records import Noise
+from sparsestreet.phases import clock_of
+
+QUIET = 0.05
+"""A machine is quiet where the loop's times spread and drift by less than this."""
+
+_REPEATS = 30
+_SIZE = {"cpu": 384, "cuda": 2048}
+"""Side of the square matrices that are multiplied: about a millisecond each."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The fixed loop at one moment."""
+
+    milliseconds: float
+    """Median of a round."""
+    spread: float
+    """Ninth less first decile of the rounds, relative to the median."""
+    load_average: float | None
+
+
+def calibrate(device: torch.device) -> Calibration:
+    """Run the loop on a device: 30 products of two matrices, after a few that do not count."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    clock = clock_of(device)
+    matrix = torch.full((_SIZE[device.type],) * 2, 0.5, device=device)
+    for _ in range(3):
+        matrix @ matrix
+    marks = [clock.mark()]
+    for _ in range(_REPEATS):
+        matrix @ matrix
+        marks.append(clock.mark())
+    times = [1e3 * clock.seconds(*pair) for pair in zip(marks, marks[1:], strict=False)]
+    first, median, ninth = (float(value) for value in np.percentile(times, (10, 50, 90)))
+    return Calibration(median, (ninth - first) / median, load)
+
+
+def noise_between(before: Calibration, after: Calibration) -> Noise:
+    """What two calibrations say of the time between them."""
+    drift = after.milliseconds / before.milliseconds - 1
+    quiet = max(before.spread, after.spread, abs(drift)) < QUIET
+    return Noise(before.spread, after.spread, drift, before.load_average, quiet)
