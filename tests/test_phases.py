@@ -1,9 +1,9 @@
-"""Phases: time belongs to the innermost one, all of it to some, and nobody pays where nobody records."""
+"""Phases and stages: time belongs to the innermost one, all of it to some, and nobody pays where nobody records."""
 
 import pytest
 
 from sparsestreet import phases
-from sparsestreet.phases import PhaseRecorder, phase
+from sparsestreet.phases import PhaseRecorder, StageRecorder, phase, stage
 
 
 class Ticks(phases.WallClock):
@@ -77,3 +77,47 @@ def test_one_recorder_at_a_time(clock):
     first.stop()
     second.start()
     second.stop()
+
+
+@pytest.fixture
+def watch(monkeypatch):
+    """What time.perf_counter answers: its only entry."""
+    now = [100.0]
+    monkeypatch.setattr(phases.time, "perf_counter", lambda: now[0])
+    yield now
+    assert phases._stages is None
+
+
+def test_stages_of_a_command_add_up_from_its_beginning(watch):
+    with StageRecorder(since=97.0) as recorder:
+        watch[0] += 1
+        with stage("train"):
+            watch[0] += 2
+            with stage("prune/at step 7"), phase("splat"):
+                watch[0] += 4
+            watch[0] += 8
+        with pytest.raises(KeyError), stage("save"):
+            watch[0] += 16
+            raise KeyError
+        with stage("train"):
+            watch[0] += 32
+        seconds = recorder.seconds()
+    assert seconds == {"start": 3.0, "other": 1.0, "train": 42.0, "prune/at step 7": 4.0, "save": 16.0}
+    assert sum(seconds.values()) == watch[0] - 97.0
+
+
+def test_a_command_that_goes_on_adds_what_the_earlier_one_spent(watch):
+    with StageRecorder() as recorder:
+        with stage("train"):
+            watch[0] += 2
+        recorder.go_on({"start": 5.0, "train": 7.0})
+    assert recorder.seconds() == {"start": 5.0, "train": 9.0}
+
+
+def test_nobody_records_stages(watch):
+    with stage("train"):
+        watch[0] += 2
+    recorder = StageRecorder()
+    with stage("train"):
+        watch[0] += 2
+    assert recorder.seconds() == {"other": 2.0}

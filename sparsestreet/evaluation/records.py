@@ -38,7 +38,7 @@ class Noise:
     load_average: float | None
     """Processes that wanted to run in the minute before; None where the system does not say."""
     quiet: bool
-    """Whether spreads and drift were small enough for times to be trusted to 5 % (``noise.QUIET``)."""
+    """Whether spreads and drift were small enough for medians to be trusted to 5 % (``noise.QUIET_SPREAD``)."""
 
 
 @dataclass(frozen=True)

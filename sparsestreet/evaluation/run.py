@@ -89,7 +89,7 @@ def evaluate_scene(
     with stage("latency"):
         latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
     with stage("costs"):
-        costs = measure_scene_costs(scene, frames.views, options)
+        costs = measure_scene_costs(scene, frames.views, options, repeats=(repeats + 1) // 2)
     summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command)
     with stage("pictures"):
         chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]

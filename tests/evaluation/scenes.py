@@ -3,11 +3,14 @@
 from types import SimpleNamespace
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from sparsestreet.evaluation import evaluate
-from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes import Background, BackgroundSettings
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.sky import Sky, SkySettings
@@ -53,3 +56,34 @@ def small_scene() -> SceneGraph:
 def replace_render(monkeypatch, colors, module=evaluate) -> None:
     """Let a module see ``colors(view)`` [h, w, 3] instead of a scene's render."""
     monkeypatch.setattr(module, "render", lambda scene, view, options: SimpleNamespace(rgb=colors(view)))
+
+
+class TwoTimes(Mask):
+    """Closes the first row always and the second before time 0.05."""
+
+    columns = ()
+    sparsity_weight = 0.0
+
+    def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
+        return {}
+
+    def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
+        shown = torch.ones(len(rows))
+        shown[: 2 if time < 0.05 else 1] = 0
+        return shown
+
+    def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
+        return torch.zeros(())
+
+    def keep(self, rows: Rows) -> Selection:
+        raise NotImplementedError
+
+    def finish(self, rows: Rows) -> tuple[Mask | None, dict[str, Tensor]]:
+        raise NotImplementedError
+
+
+def masked_scene() -> SceneGraph:
+    """A road of four Gaussians, of which two show at time 0 and three later; a car; a gray sky."""
+    road = node_of([[0.4, 0.3, 2.0], [0.6, 0.5, 3.0], [0.2, 0.1, 2.5], [0.0, 0.2, 2.2]])
+    road.mask = TwoTimes()
+    return SceneGraph({"road": road, "cars": node_of([[0.2, 0.6, 1.5]])}, Sky(SkySettings(2)))

@@ -169,7 +169,13 @@ def drop(entries, key):
         (lambda entries: entries.update(extra=1), r"unknown keys \['extra'\]"),
         (lambda entries: entries["images"].update(held_out="six"), r"images: held_out: expected int, got str 'six'"),
         (lambda entries: entries["images"].update(held_out=True), r"images: held_out: expected int, got bool"),
-        (lambda entries: entries["latency"].update(p50=None), r"latency: p50: expected float, got NoneType"),
+        (
+            lambda entries: entries["latency"]["clocks"]["rig"].update(p50=None),
+            r"latency: clocks: rig: p50: expected float, got NoneType",
+        ),
+        (lambda entries: drop(entries["latency"]["clocks"], "raster"), r"has the clocks raster, frame, rig, got"),
+        (lambda entries: entries["latency"]["removed"].update(frame={"p50": 1, "p90": 1, "p99": 1, "repeats": 1}), "of rem"),
+        (lambda entries: entries["run"]["noise"].update(quiet=1), r"noise: quiet: expected bool"),
         (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
         (
             lambda entries: entries["quality"]["held_out"]["psnr_full"].update(images=1.5),
@@ -181,7 +187,7 @@ def drop(entries, key):
         ),
         (lambda entries: drop(entries, "by_camera"), r"lacks the keys \['by_camera'\]"),
         (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
-        (lambda entries: entries.update(format=99), r"format 99, this version reads 3"),
+        (lambda entries: entries.update(format=99), r"format 99, this version reads 4"),
         (lambda entries: entries["run"].update(format=99), r"run: the record has format 99, .* train the run again"),
         (lambda entries: entries["run"]["config"].update(a={}), r"run: config: a: expected one of bool, .* got dict"),
         (lambda entries: entries["run"].update(training_seconds="1"), r"training_seconds: expected float, got str '1'"),

@@ -79,7 +79,7 @@ def test_a_run_leaves_its_records(tmp_path):
     assert on_disk.gaussians_total == 4
     assert on_disk.bytes_by_part == {"road": 2 * 14 * 4, "cars": 2 * 14 * 4, "poses": 0, "sky": 6 * 2 * 2 * 3 * 4}
     assert (on_disk.images, on_disk.resolutions) == ({HELD_OUT: 5, TRAINING: 3}, ("12x9",))
-    assert (on_disk.latency.warmup, on_disk.latency.repeats, on_disk.latency.views) == (1, 4, 5)
+    assert (on_disk.latency.warmup, on_disk.latency.clocks["frame"].repeats, on_disk.latency.views) == (1, 4, 5)
     assert (on_disk.evaluated.command, on_disk.evaluated.threads) == (
         "sparsestreet evaluate run=x",
         torch.get_num_threads(),

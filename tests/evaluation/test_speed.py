@@ -1,31 +1,44 @@
-"""Latency on renders of known length."""
+"""Latency by three clocks, on renders of known length and on a scene."""
 
+import itertools
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from sparsestreet.evaluation import speed
-from sparsestreet.evaluation.speed import measure_latency
-from tests.evaluation.frames import make_frame
-from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
+from sparsestreet.evaluation.latency_csv import latency_path, write_latency
+from sparsestreet.evaluation.noise import Calibration
+from sparsestreet.evaluation.records import FRAME, RASTER, RIG
+from sparsestreet.evaluation.speed import frame_image, instants, measure_latency
+from tests.evaluation.frames import make_frame, make_latency
+from tests.evaluation.scenes import OPTIONS, masked_scene, replace_render, small_scene
 
 FRAMES = [make_frame(index) for index in range(3)]
 SCENE = small_scene()
+BLACK = torch.zeros(9, 12, 3)
 
 
-def measure(monkeypatch, colors, **protocol):
-    replace_render(monkeypatch, colors, speed)
-    return measure_latency(SCENE, FRAMES, OPTIONS, **protocol)
+def measure(monkeypatch, colors, frames=FRAMES, **protocol):
+    replace_render(monkeypatch, lambda view: BLACK if (image := colors(view)) is None else image, speed)
+    return measure_latency(SCENE, frames, OPTIONS, **protocol)
 
 
+@pytest.fixture
+def steady(monkeypatch):
+    """No calibration loop runs."""
+    monkeypatch.setattr(speed, "calibrate", lambda device: Calibration(1.0, 0.0, None))
+
+
+@pytest.mark.usefixtures("steady")
 def test_percentiles_of_known_durations(monkeypatch):
     """On a clock that only the renders move."""
     now = [10.0]
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0])
     calls = []
-    durations = np.random.default_rng(0).gamma(2, 5, 60)
+    durations = np.random.default_rng(0).gamma(2, 5, 120)
 
     def colors(view):
         calls.append(view.frame_index)
@@ -33,41 +46,115 @@ def test_percentiles_of_known_durations(monkeypatch):
         now[0] += 5.0 if len(calls) <= 7 else durations[len(calls) - 8] / 1000
 
     latency = measure(monkeypatch, colors, warmup=7, repeats=60)
-    expected = np.percentile(durations, [50, 90, 99])
+    frame, rig, raster = (latency.clocks[name] for name in (FRAME, RIG, RASTER))
     # A double of about 50 s holds 1e-14 s; differences are in milliseconds.
-    np.testing.assert_allclose((latency.p50, latency.p90, latency.p99), expected, rtol=0, atol=1e-8)
-    assert latency.median == latency.p50
-    assert (latency.repeats, latency.warmup, latency.views) == (60, 7, 3)
+    for clock, taken in ((frame, durations[:60]), (rig, durations[60:])):  # every instant has one camera
+        expected = np.percentile(taken, [50, 90, 99])
+        np.testing.assert_allclose((clock.p50, clock.p90, clock.p99), expected, rtol=0, atol=1e-8)
+    assert (raster.p50, raster.p99) == (0.0, 0.0)  # it renders no view
+    assert latency.p50 == frame.p50
+    assert (frame.repeats, rig.repeats, raster.repeats, latency.warmup, latency.views) == (60, 60, 60, 7, 3)
     assert latency.threads == torch.get_num_threads()
     assert latency.device.startswith("cpu: ")
-    assert calls[7:] == [0, 1, 2] * 20
+    assert calls[7:67] == [0, 1, 2] * 20
     assert "60 renders cycling through 3 views after 7 warm-up renders" in latency.protocol
 
 
+@pytest.mark.usefixtures("steady")
+def test_a_rig_is_all_cameras_of_an_instant(monkeypatch):
+    """Two instants of two and one camera, given out of order; each render takes a second."""
+    frames = [make_frame(1, 0), make_frame(0, 1), make_frame(0, 0)]
+    assert [[view.camera_index for view in rig] for rig in instants(frames)] == [[1, 0], [0]]
+    now = [0.0]
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0])
+
+    def colors(view):
+        now[0] += 1.0
+
+    latency = measure(monkeypatch, colors, frames, warmup=1, repeats=3)
+    assert latency.clocks[FRAME].p99 == 1000.0
+    # Two renders, one, two.
+    assert (latency.clocks[RIG].p50, latency.clocks[RIG].p99) == (2000.0, 2000.0)
+
+
 def test_real_clock_sees_the_whole_render(monkeypatch):
-    latency = measure(monkeypatch, lambda view: time.sleep(0.003), warmup=2, repeats=50)
-    assert 3 <= latency.p50 <= latency.p90 <= latency.p99
-    assert latency.p50 < 30  # sleep never wakes early; ten times late would be a unit mistake, not a busy machine
+    frame = measure(monkeypatch, lambda view: time.sleep(0.003), warmup=2, repeats=50).clocks[FRAME]
+    assert 3 <= frame.p50 <= frame.p90 <= frame.p99
+    assert frame.p50 < 30  # sleep never wakes early; ten times late would be a unit mistake, not a busy machine
 
 
 def test_the_scene_is_what_is_timed():
     """No render is replaced here."""
-    assert measure_latency(SCENE, FRAMES, OPTIONS, warmup=1, repeats=3).p50 > 0
+    latency = measure_latency(SCENE, FRAMES, OPTIONS, warmup=1, repeats=5)
+    assert 0 < latency.clocks[RASTER].p50 < latency.p50  # the op is a part of the frame
+    assert latency.removed == {}
 
 
+def test_an_image_for_a_screen_is_clamped_and_rounded(monkeypatch):
+    colors = torch.tensor([-0.5, 0.5, 1.5]).expand(9, 12, 3)
+    replace_render(monkeypatch, lambda view: colors, speed)
+    image = frame_image(SCENE, FRAMES[0], OPTIONS)
+    assert image.dtype == torch.uint8
+    assert image[0, 0].tolist() == [0, 128, 255]
+
+
+@pytest.mark.usefixtures("steady")
+def test_closed_gaussians_are_timed_masked_and_removed(monkeypatch):
+    """The mask closes two rows at time 0 and one at time 0.1; what is removed is not in the scene that is drawn."""
+    drawn = []
+    render = speed.render
+    monkeypatch.setattr(
+        speed,
+        "render",
+        lambda scene, view, options: drawn.append((view.time, scene.counts()["road"])) or render(scene, view, options=options),
+    )
+    latency = measure_latency(masked_scene(), FRAMES[:2], OPTIONS, warmup=1, repeats=4)
+    kept, removed = drawn[:9], drawn[9:]
+    assert {rows for _, rows in kept} == {4}
+    assert set(removed) == {(0.0, 2), (0.1, 3)}
+    assert set(latency.removed) == set(latency.clocks)
+    assert latency.removed[FRAME].repeats == 4
+
+
+@pytest.mark.usefixtures("steady")
 def test_cuda_is_waited_for_around_each_render(monkeypatch):
     log = []
     monkeypatch.setattr(type(SCENE), "device", torch.device("cuda"))
     monkeypatch.setattr(torch.cuda, "synchronize", lambda device: log.append(("wait", device.type)))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "fake")
     monkeypatch.setattr(speed.time, "perf_counter", lambda: log.append("clock") or 0.0)
+    monkeypatch.setattr(speed, "splat", lambda *given, **how: log.append("splat"))
     latency = measure(monkeypatch, lambda view: log.append("render"), warmup=1, repeats=2)
     wait = ("wait", "cuda")
-    assert log == ["render", *[wait, "clock", "render", wait, "clock"] * 2]
+
+    def timed(what):
+        return [wait, "clock", what, wait, "clock"] * 2
+
+    assert log == ["render", *timed("render"), *timed("render"), *timed("splat")]
     assert latency.device == "cuda: fake"
+
+
+def test_noise_is_that_of_before_and_after(monkeypatch):
+    loops = itertools.chain([Calibration(1.0, 0.01, 3.5), Calibration(1.5, 0.02, 9.0)])
+    monkeypatch.setattr(speed, "calibrate", lambda device: next(loops))
+    noise = measure_latency(SCENE, FRAMES, OPTIONS, warmup=1, repeats=1).noise
+    assert (noise.before, noise.after, noise.drift, noise.load_average, noise.quiet) == (0.01, 0.02, 0.5, 3.5, False)
 
 
 @pytest.mark.parametrize(("frames", "warmup", "repeats"), [([], 20, 50), (FRAMES, 0, 50), (FRAMES, 1, 0)])
 def test_nothing_to_time_is_an_error(frames, warmup, repeats):
     with pytest.raises(ValueError, match="at least one view, warm-up and repeat"):
         measure_latency(SCENE, frames, OPTIONS, warmup=warmup, repeats=repeats)
+
+
+def test_the_table_has_a_row_for_each_clock(tmp_path):
+    path = latency_path(tmp_path)
+    write_latency(path, make_latency(40.0))
+    header, *rows = path.read_text().splitlines()
+    assert header == "clock,rows,p50,p90,p99,repeats"
+    assert rows == ["raster,all,20.0,30.0,40.0,50", "frame,all,40.0,60.0,80.0,50", "rig,all,120.0,180.0,240.0,50"]
+    masked = make_latency(40.0, removed=True)
+    faster = {name: replace(clock, p50=1.0) for name, clock in masked.removed.items()}
+    write_latency(path, replace(masked, removed=faster))
+    rows = [row.split(",") for row in path.read_text().splitlines()[1:]]
+    assert [row[:3] for row in rows[1::3]] == [["frame", "masked", "40.0"], ["frame", "removed", "1.0"]]

@@ -1,0 +1,135 @@
+"""What is left out of a scene, and what its frames then cost."""
+
+import time
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.evaluation import node_costs
+from sparsestreet.evaluation.node_costs import measure_scene_costs
+from sparsestreet.evaluation.noise import Calibration
+from sparsestreet.evaluation.scene_parts import without_closed_rows, without_masks, without_node, without_sky
+from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions, render, sky_image
+from sparsestreet.types import Shutter
+from tests.evaluation.frames import make_frame
+from tests.evaluation.scenes import OPTIONS, masked_scene, node_of, small_scene
+from tests.training.stubs import background, frame_at, rigid
+
+FRAMES = [make_frame(index) for index in range(2)]
+BENT = [
+    replace(
+        frame,
+        camera=replace(frame.camera, distortion=torch.full((5,), 0.01), shutter=Shutter(torch.ones(3), torch.zeros(3))),
+    )
+    for frame in FRAMES
+]
+
+
+def picture(scene, frame=FRAMES[0]):
+    with torch.no_grad():
+        return render(scene, frame, options=OPTIONS).rgb
+
+
+def test_a_scene_without_a_node_is_the_scene_of_the_others():
+    scene = small_scene()
+    other = without_node(scene, "cars")
+    assert other.counts() == {"road": 2}
+    assert other.nodes["road"] is scene.nodes["road"]
+    assert torch.equal(picture(other), picture(SceneGraph({"road": scene.nodes["road"]}, scene.sky)))
+
+
+def test_a_lone_node_leaves_the_sky():
+    scene = SceneGraph({"road": node_of([[0.4, 0.3, 2.0]])}, small_scene().sky)
+    empty = without_node(scene, "road")
+    assert empty.counts() == {"road": 0}
+    assert scene.counts() == {"road": 1}
+    assert torch.equal(picture(empty), sky_image(scene, FRAMES[0].camera))
+
+
+def test_the_sky_and_the_masks_can_be_left_out():
+    scene = masked_scene()
+    assert without_sky(scene).sky is None
+    assert without_sky(scene).counts() == scene.counts()
+    bare = without_masks(scene)
+    assert bare.nodes["road"].mask is None
+    assert scene.nodes["road"].mask is not None
+    assert bare.nodes["cars"] is scene.nodes["cars"]
+
+
+@pytest.mark.parametrize(("index", "rows"), [(0, 2), (1, 3)])
+def test_closed_rows_change_no_image(index, rows):
+    scene = masked_scene()
+    removed = without_closed_rows(scene, FRAMES[index].time)
+    assert removed.counts() == {"road": rows, "cars": 1}
+    assert torch.equal(picture(removed, FRAMES[index]), picture(scene, FRAMES[index]))
+    assert scene.counts() == {"road": 4, "cars": 1}
+
+
+def timed(monkeypatch, seconds):
+    """Frames on a clock that only they move; ``seconds`` of (scene, view)."""
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(node_costs, "calibrate", lambda device: Calibration(1.0, 0.0, None))
+
+    def frame(scene, view, options):
+        now[0] += seconds(scene, view)
+
+    monkeypatch.setattr(node_costs, "frame_image", frame)
+
+
+def test_costs_are_what_a_frame_takes_longer(monkeypatch):
+    """A millisecond for every row, 8 for the sky, 16 for masks, 32 for a lens, 64 for a shutter; and it gets slower."""
+    slower = [0.0]
+
+    def seconds(scene, view):
+        slower[0] += 1e-9
+        rows = sum(scene.counts().values())
+        masks = any(node.mask is not None for node in scene.nodes.values())
+        camera = view.camera
+        extra = 8 * (scene.sky is not None) + 16 * masks
+        return 1e-3 * (rows + extra + 32 * (camera.distortion is not None) + 64 * (camera.shutter is not None)) + slower[0]
+
+    timed(monkeypatch, seconds)
+    costs = measure_scene_costs(masked_scene(), BENT, OPTIONS, repeats=4)
+    road, cars = costs.nodes["road"], costs.nodes["cars"]
+    assert (road.gaussians, cars.gaussians) == (4, 1)
+    assert road.megabytes == 4 * 14 * 4 / 1e6
+    # Without the road its mask is gone, too. A nanosecond a frame is 1e-5 ms at most within a round.
+    assert road.ms == pytest.approx(4 + 16, abs=1e-4)
+    assert cars.ms == pytest.approx(1, abs=1e-4)
+    assert cars.frame_ms == pytest.approx(4 + 8 + 16 + 32 + 64, abs=1e-4)
+    assert costs.effects == pytest.approx({"lens": 32, "shutter": 64, "sky": 8, "masks": 16}, abs=1e-4)
+    assert costs.noise.quiet
+
+
+def test_what_a_scene_lacks_costs_nothing_and_is_not_named(monkeypatch):
+    timed(monkeypatch, lambda scene, view: 1e-3)
+    assert set(measure_scene_costs(small_scene(), FRAMES, OPTIONS, repeats=1).effects) == {"sky"}
+    assert measure_scene_costs(without_sky(small_scene()), FRAMES, OPTIONS, repeats=1).effects == {}
+
+
+def test_quiet_machines_agree_with_themselves():
+    """The parts of a frame add up to the frame, which is timed by another clock at another time, within 10 %, and the
+    protocol taken twice gives medians within 5 %. Where the machine is not quiet, the records say so."""
+    scene = SceneGraph({"background": background(1000), "rigid": rigid(100)}, small_scene().sky)
+    views, options = [frame_at(index, 96, 64) for index in range(3)], RenderOptions()
+    disagreed = []
+    for _ in range(5):
+        first, second = (measure_latency(scene, views, options, warmup=5, repeats=30) for _ in range(2))
+        costs = measure_scene_costs(scene, views, options, repeats=20)
+        assert set(costs.frame_ms) == {"scene", "splat", "sky", "output"}
+        parts = sum(costs.frame_ms.values()) / second.p50
+        if abs(parts - 1) < 0.1 and abs(second.p50 / first.p50 - 1) < 0.05:
+            return
+        disagreed.append(first.noise.quiet and second.noise.quiet and costs.noise.quiet)
+    assert not all(disagreed)  # five times in a row on a quiet machine
+
+
+def test_nothing_to_measure_is_an_error():
+    with pytest.raises(ValueError, match="at least one view and one repeat, got 0 and 30"):
+        measure_scene_costs(small_scene(), [], OPTIONS)
+    with pytest.raises(ValueError, match="got 2 and 0"):
+        measure_scene_costs(small_scene(), FRAMES, OPTIONS, repeats=0)
