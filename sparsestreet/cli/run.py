@@ -117,7 +117,8 @@ def _train(
     clock, stop, checkpoint = Clock(), GracefulStop(), _checkpoint(cfg)
     curve = HeldOutCurve(out / "curves" / "held_out.csv", clock)
     trainer = trainer_of(cfg, [clock, *callbacks, curve, TrainingProgress()], out)
-    description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
+    with stage("data"):  # its files are read for a hash
+        description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
     trainer.callbacks += [RunFiles(out, description, clock), Checkpoints(out / "checkpoints"), stop]
     # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
     resume = {} if checkpoint is None else {"ckpt_path": checkpoint, "weights_only": False}

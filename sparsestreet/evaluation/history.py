@@ -1,7 +1,7 @@
 """Curves of one training, drawn from the files it left (no torch)."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sparsestreet.evaluation.ledger import MASK, PRUNING, CountChange, ledger_path, read_changes
@@ -14,21 +14,30 @@ PSNR_COLUMNS = {"training, running mean": "psnr", "held out": "val/psnr"}
 """Curve -> its column in ``curves/metrics.csv``."""
 
 
+HELD_OUT_COLUMNS = {"full image": "psnr_full", "humans": "psnr_human", "vehicles": "psnr_vehicle"}
+"""Curve -> its column in ``curves/held_out.csv``."""
+
+
 def draw_history(run: Path) -> None:
-    """Write ``curves/counts.png`` and ``curves/psnr.png`` from ``records/counts.csv`` and ``curves/metrics.csv``.
+    """Write ``counts.png``, ``psnr.png`` and ``held_out.png`` in ``curves``, from ``records/counts.csv`` and, beside
+    them, ``metrics.csv`` and ``held_out.csv``.
 
     A file that the run was configured not to write leaves its picture out. Raises RecordError for a malformed ledger.
     """
-    ledger, metrics = ledger_path(run), run / "curves" / "metrics.csv"
+    ledger, metrics, held_out = ledger_path(run), run / "curves" / "metrics.csv", run / "curves" / "held_out.csv"
     events: list[tuple[int, str]] = []
     if ledger.is_file():
         changes = read_changes(ledger)
         events = marks(changes)
         steps, counts = count_curves(changes)
         plot_counts(run / "curves" / "counts.png", steps, counts, events)
-    curves = psnr_curves(metrics) if metrics.is_file() else {}
+    curves = psnr_curves(metrics, PSNR_COLUMNS, "step") if metrics.is_file() else {}
     if curves:
         plot_psnr(run / "curves" / "psnr.png", curves, events)
+    curves = psnr_curves(held_out, HELD_OUT_COLUMNS, "seconds") if held_out.is_file() else {}
+    if curves:
+        title = "Held-out PSNR over training time, without evaluation"
+        plot_psnr(run / "curves" / "held_out.png", curves, (), title, "seconds")
 
 
 def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, list[int]]]:
@@ -50,13 +59,15 @@ def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
     return list(dict.fromkeys((change.step, change.reason) for change in changes if change.reason in MARKED))
 
 
-def psnr_curves(path: Path) -> dict[str, tuple[Sequence[int], Sequence[float]]]:
-    """Name of a curve -> (steps, dB), from the rows of Lightning's ``metrics.csv`` that hold it."""
+def psnr_curves(
+    path: Path, columns: Mapping[str, str], along: str
+) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
+    """Name of a curve -> (steps or seconds, dB), from the rows of a table that hold it."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     curves = {}
-    for label, column in PSNR_COLUMNS.items():
-        points = [(int(row["step"]), float(row[column])) for row in rows if row.get(column)]
+    for label, column in columns.items():
+        points = [(float(row[along]), float(row[column])) for row in rows if row.get(column)]
         if points:
             curves[label] = tuple(zip(*points, strict=True))
     return curves

@@ -47,12 +47,16 @@ def plot_counts(
 
 def plot_psnr(
     path: Path,
-    curves: Mapping[str, tuple[Sequence[int], Sequence[float]]],
+    curves: Mapping[str, tuple[Sequence[int | float], Sequence[float]]],
     events: Sequence[tuple[int, str]] = (),
     title: str = "PSNR over training",
+    along: str = "step",
 ) -> None:
-    """Draw PSNR in dB against training steps, one curve per name -> (steps, PSNR), with (step, name) events marked."""
-    figure, axes = _figure(title, "step", "PSNR (dB)")
+    """Draw PSNR in dB against training steps, one curve per name -> (steps, PSNR), with (step, name) events marked.
+
+    ``along`` names the axis where it is not steps that the curves run over.
+    """
+    figure, axes = _figure(title, along, "PSNR (dB)")
     for index, (name, (steps, values)) in enumerate(curves.items()):
         axes.plot(steps, values, label=name, **_line(index))
     _mark(axes, events)

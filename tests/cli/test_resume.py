@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from sparsestreet.cli.train import train
+from sparsestreet.evaluation.costs import cost_path, read_costs
 from sparsestreet.training.callbacks import RowLedger
 
 pytestmark = pytest.mark.xdist_group("tiny street")
@@ -58,7 +59,9 @@ def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, tiny_street, tmp
         with pytest.raises(RuntimeError, match="stopped by the test"):
             train([*tiny_street, *ALL_STAGES, f"out={part}"])
     before = curve(part)
+    started = time.perf_counter()
     assert train([f"resume={part}"]) == 0
+    assert read_costs(cost_path(part)).wall_seconds > time.perf_counter() - started  # what was spent before counts
     assert_equal(whole, part)
     # The curve of before is still there, and the ledger is that of the whole run.
     assert [row for row in curve(part) if row in before] == before

@@ -5,6 +5,8 @@ import json
 import shutil
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ import torch
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
+from sparsestreet.evaluation.costs import cost_path, read_costs
 from sparsestreet.evaluation.records import read_run, read_summary, run_path, summary_path
 from sparsestreet.export.views import read_views
 
@@ -51,6 +54,47 @@ def test_training_improves_and_leaves_records(finished, run_train, tmp_path):
         assert (finished / picture).is_file()
 
 
+def test_phases_are_the_wall_clock_of_the_command(run_train, tmp_path):
+    """By a clock outside: each second belongs to one phase."""
+    started = time.perf_counter()
+    out = run_train(tmp_path / "run", "schedule.max_steps=2")
+    wall = time.perf_counter() - started
+    costs = read_costs(cost_path(out))
+    assert costs.wall_seconds == pytest.approx(wall, rel=0.02)
+    assert sum(costs.phases.values()) == pytest.approx(wall, rel=0.02)
+    assert costs.phases["other"] < 0.02 * wall
+
+
+def test_costs_of_a_run(finished):
+    costs, summary = read_costs(cost_path(finished)), read_summary(summary_path(finished))
+    stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "save"}
+    assert set(costs.phases) == stages | {"evaluate", "latency", "costs", "pictures", "other"}
+    assert all(seconds > 0 for seconds in costs.phases.values())
+    assert list(costs.passes) == [f"LeaveOneOutRule at step {step}" for step in (24, 30, 36)]
+    assert sum(costs.passes.values()) == pytest.approx(costs.phases["prune"], rel=1e-4)  # six digits each
+    parts = {"scene", "splat", "sky", "losses", "regularizers", "backward", "optimizer", "density", "loop"}
+    assert set(costs.step_ms) == parts | {"data"}
+    assert 50 < costs.peak_host_mb < 20_000  # of this process, megabytes and neither KiB nor bytes
+    assert costs.peak_device_mb is None
+    assert {name: node.gaussians for name, node in costs.nodes.items()} == summary.gaussians
+    assert sum(node.megabytes for node in costs.nodes.values()) == pytest.approx(
+        1e-6 * (summary.bytes_total - summary.bytes_by_part["sky"]), rel=1e-4
+    )
+    assert set(costs.effects) == {"sky"}
+
+
+def test_held_out_psnr_over_seconds(finished):
+    with (finished / "curves" / "held_out.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert row["step"] == "60"
+    assert float(row["seconds"]) == pytest.approx(read_run(run_path(finished)).training_seconds, abs=0.2)
+    mean = read_summary(summary_path(finished)).quality["held_out"]["psnr_full"].mean
+    # All held-out views are within val_frames; harmonics have the degree of the end here and there.
+    assert float(row["psnr_full"]) == pytest.approx(mean, abs=0.05)
+    assert row["psnr_vehicle"]
+    assert (finished / "curves" / "held_out.png").is_file()
+
+
 def test_the_ledger_is_a_chain_that_ends_in_the_record(finished):
     summary = read_summary(summary_path(finished))
     with (finished / "records" / "counts.csv").open() as file:
@@ -71,6 +115,8 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
     assert run.device.startswith("cpu: ")
     assert run.threads == torch.get_num_threads()
     assert run.training_seconds > 0
+    assert run.noise.before > 0
+    assert run.data_hash.startswith("64x40x12_")  # the street's name
     assert "sparsify=removal" in run.command
     assert run == read_summary(summary_path(finished)).run
 
@@ -120,11 +166,13 @@ def test_instances_keep_the_names_of_their_tracks(finished, tiny_street):
 def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(finished, out)
-    first = read_summary(summary_path(out))
-    shutil.rmtree(out / "records")
+    first, costs = read_summary(summary_path(out)), read_costs(cost_path(out))
     torch.set_num_threads(first.run.threads + 1)  # evaluate goes back to the number that trained
     assert evaluate([f"run={out}"]) == 0
-    second = read_summary(summary_path(out))
+    second, again = read_summary(summary_path(out)), read_costs(cost_path(out))
+    made_anew = ("frame_ms", "nodes", "effects", "noise")
+    assert replace(again, **{name: getattr(costs, name) for name in made_anew}) == costs
+    assert again.nodes != costs.nodes  # other milliseconds
     assert second.evaluated.threads == min(first.run.threads, second.evaluated.machine.cores)
     assert (second.quality, second.by_camera) == (first.quality, first.by_camera)
     assert list(second.by_camera["held_out"]) == ["0", "1"]

@@ -54,6 +54,18 @@ def test_psnr_is_taken_where_it_was_logged(tmp_path, drawn):
     assert events == [(20, "mask"), (30, "pruning")]
 
 
+def test_held_out_views_are_drawn_over_seconds(tmp_path, drawn):
+    (tmp_path / "curves").mkdir()
+    (tmp_path / "curves" / "held_out.csv").write_text(
+        "seconds,step,psnr_full,psnr_human,psnr_vehicle\n1.500,10,20.5,,19.5\n3.000,20,21.5,,20.0\n"
+    )
+    draw_history(tmp_path)
+    curves, events, title, along = drawn["held_out.png"]
+    assert curves == {"full image": ((1.5, 3.0), (20.5, 21.5)), "vehicles": ((1.5, 3.0), (19.5, 20.0))}
+    assert (events, along) == ((), "seconds")
+    assert "without evaluation" in title
+
+
 def test_files_that_were_not_written_leave_their_picture_out(tmp_path, drawn):
     draw_history(tmp_path)
     (tmp_path / "curves").mkdir()
