@@ -57,7 +57,9 @@ def _evaluate(options: Options) -> None:
     draw_history(run)
     for split, quality in summary.quality.items():
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
-    print(f"{summary.gaussians_total:,} Gaussians, {summary.latency.p50:.1f} ms/frame; records in {summary_path(run)}")
+    latency = summary.latency
+    steady = "" if latency.noise.quiet else " on a machine that was not quiet"
+    print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {summary_path(run)}")
 
 
 def _device(description: RunDescription, device: str | None) -> torch.device:

@@ -40,7 +40,9 @@ log = logging.getLogger(__name__)
 def run(cfg: DictConfig, out: Path, started: float) -> float:
     """Train and evaluate into a folder; a full-image PSNR, of held-out views where there are any.
 
-    ``started``: ``time.perf_counter`` when the command began. Raises ValueError for a configuration that cannot be or a log that is broken, OSError for files. Ends the program
+    ``started`` is ``time.perf_counter`` when the command began.
+
+    Raises ValueError for a configuration that cannot be or a log that is broken, OSError for files. Ends the program
     with the status of the signal that ended training.
     """
     # A sweep's launcher starts processes of its own.

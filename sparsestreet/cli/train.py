@@ -15,7 +15,6 @@ from omegaconf import DictConfig, OmegaConf
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 
-
 _started = 0.0
 """``time.perf_counter`` when the command began."""
 

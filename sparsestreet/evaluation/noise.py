@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -13,9 +14,11 @@ QUIET_SPREAD, QUIET_DRIFT = 0.1, 0.05
 """A machine is quiet where the loop's times spread by less than the one and their median drifts by less than the other.
 Medians move far less than single times: those of one scene, measured twice, then agree within 5 %."""
 
-_REPEATS = 30
-_SIZE = {"cpu": 384, "cuda": 2048}
-"""Side of the square matrices that are multiplied: a millisecond or less each."""
+_WARMUP, _REPEATS = 30, 30
+_NUMBERS = {"cpu": 2**17, "cuda": 2**22}
+_COSINES = 4
+"""In a round, which takes some tenths of a millisecond. (A matrix product would leave its workspace on a GPU, where it
+counts as the run's memory.)"""
 
 
 @dataclass(frozen=True)
@@ -30,17 +33,16 @@ class Calibration:
 
 
 def calibrate(device: torch.device) -> Calibration:
-    """Run the loop on a device: 30 products of two matrices, after a few that do not count."""
+    """Run the loop on a device: 30 rounds of cosines, after as many that do not count."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     clock = clock_of(device)
-    matrix = torch.full((_SIZE[device.type],) * 2, 0.5, device=device)
-    for _ in range(3):
-        matrix @ matrix
-    marks = [clock.mark()]
-    for _ in range(_REPEATS):
-        matrix @ matrix
+    numbers = torch.zeros(_NUMBERS[device.type], device=device)
+    marks = []
+    for _ in range(_WARMUP + 1 + _REPEATS):
+        for _ in range(_COSINES):
+            numbers.cos_()
         marks.append(clock.mark())
-    times = [1e3 * clock.seconds(*pair) for pair in zip(marks, marks[1:], strict=False)]
+    times = [1e3 * clock.seconds(*pair) for pair in pairwise(marks[_WARMUP:])]
     first, median, ninth = (float(value) for value in np.percentile(times, (10, 50, 90)))
     return Calibration(median, (ninth - first) / median, load)
 

@@ -89,8 +89,9 @@ def test_costs_are_what_a_frame_takes_longer(monkeypatch):
         rows = sum(scene.counts().values())
         masks = any(node.mask is not None for node in scene.nodes.values())
         camera = view.camera
-        extra = 8 * (scene.sky is not None) + 16 * masks
-        return 1e-3 * (rows + extra + 32 * (camera.distortion is not None) + 64 * (camera.shutter is not None)) + slower[0]
+        effects = 8 * (scene.sky is not None) + 16 * masks
+        effects += 32 * (camera.distortion is not None) + 64 * (camera.shutter is not None)
+        return 1e-3 * (rows + effects) + slower[0]
 
     timed(monkeypatch, seconds)
     costs = measure_scene_costs(masked_scene(), BENT, OPTIONS, repeats=4)

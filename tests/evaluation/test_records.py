@@ -174,7 +174,7 @@ def drop(entries, key):
             r"latency: clocks: rig: p50: expected float, got NoneType",
         ),
         (lambda entries: drop(entries["latency"]["clocks"], "raster"), r"has the clocks raster, frame, rig, got"),
-        (lambda entries: entries["latency"]["removed"].update(frame={"p50": 1, "p90": 1, "p99": 1, "repeats": 1}), "of rem"),
+        (lambda entries: entries["latency"]["removed"].update(frame=entries["latency"]["clocks"]["rig"]), "removed Ga"),
         (lambda entries: entries["run"]["noise"].update(quiet=1), r"noise: quiet: expected bool"),
         (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
         (

@@ -102,12 +102,12 @@ def test_an_image_for_a_screen_is_clamped_and_rounded(monkeypatch):
 def test_closed_gaussians_are_timed_masked_and_removed(monkeypatch):
     """The mask closes two rows at time 0 and one at time 0.1; what is removed is not in the scene that is drawn."""
     drawn = []
-    render = speed.render
-    monkeypatch.setattr(
-        speed,
-        "render",
-        lambda scene, view, options: drawn.append((view.time, scene.counts()["road"])) or render(scene, view, options=options),
-    )
+
+    def render(scene, view, *, options, true=speed.render):
+        drawn.append((view.time, scene.counts()["road"]))
+        return true(scene, view, options=options)
+
+    monkeypatch.setattr(speed, "render", render)
     latency = measure_latency(masked_scene(), FRAMES[:2], OPTIONS, warmup=1, repeats=4)
     kept, removed = drawn[:9], drawn[9:]
     assert {rows for _, rows in kept} == {4}

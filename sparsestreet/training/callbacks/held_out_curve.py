@@ -17,8 +17,8 @@ class HeldOutCurve(Callback):
     """Writes ``held_out.csv`` after each validation: seconds, step, and PSNR in dB by region, all pixels, people and
     vehicles; a cell stays blank where no view has the mask.
 
-    The views are those of ``split.val_frames``, the same each time. Seconds are those of the clock: training alone, over
-    all commands of a run that was interrupted.
+    The views are those of ``split.val_frames``, the same each time. Seconds are those of the clock: training alone,
+    over all commands of a run that was interrupted.
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
