@@ -86,6 +86,8 @@ def test_costs_are_what_a_frame_takes_longer(monkeypatch):
 
     def seconds(scene, view):
         slower[0] += 1e-9
+        if slower[0] < 14.5e-9:  # two rounds of seven frames that warm up
+            return 5.0 if slower[0] < 1.5e-9 or 7.5e-9 < slower[0] < 8.5e-9 else 1.0
         rows = sum(scene.counts().values())
         masks = any(node.mask is not None for node in scene.nodes.values())
         camera = view.camera
@@ -94,7 +96,7 @@ def test_costs_are_what_a_frame_takes_longer(monkeypatch):
         return 1e-3 * (rows + effects) + slower[0]
 
     timed(monkeypatch, seconds)
-    costs = measure_scene_costs(masked_scene(), BENT, OPTIONS, repeats=4)
+    costs = measure_scene_costs(masked_scene(), BENT, OPTIONS, repeats=1)
     road, cars = costs.nodes["road"], costs.nodes["cars"]
     assert (road.gaussians, cars.gaussians) == (4, 1)
     assert road.megabytes == 4 * 14 * 4 / 1e6
