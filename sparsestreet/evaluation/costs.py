@@ -49,8 +49,8 @@ class CostRecord:
 
     format: int = version(FORMAT, "train the run again")
     wall_seconds: float | None = None
-    """Of the whole ``train`` command, imports included, and of the interrupted ones that it went on from; None until
-    one has ended."""
+    """Of the whole ``train`` command, torch's import included (the interpreter's own start, 0.2 s, is not), and of the
+    interrupted ones that it went on from; None until one has ended."""
     phases: dict[str, float]
     """Part of the command (start, data, points, initialize, train, validate, prune, save, evaluate, latency, costs,
     pictures, other) -> seconds, each second in one of them."""
