@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,8 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+
+import sparsestreet.cli.resolvers  # noqa: F401: conf/ asks for them
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.
@@ -31,6 +33,7 @@ class TrainSchema:
     capacity: str = MISSING
     split: Any = MISSING
     resume: str | None = None
+    count_of: str | None = None
     data: Any = MISSING
     schedule: Any = MISSING
     assignment: Any = MISSING
@@ -50,27 +53,7 @@ class TrainSchema:
     folder: str = MISSING
 
 
-def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
-    """The resolver of conf/node: the entry of the capacity that is chosen."""
-    if _root_.capacity not in values:
-        raise ValueError(f"no capacity {_root_.capacity!r}: choose one of {', '.join(values)}")
-    return values[_root_.capacity]
-
-
-def joined(*lists: Iterable[Any]) -> list[Any]:
-    """The resolver of conf/assignment: all lists as one."""
-    return [entry for entries in lists for entry in entries]
-
-
-def times(factor: float, rate: float) -> float:
-    """The resolver of conf/node: a rate of the schedule times a number."""
-    return float(factor) * float(rate)
-
-
 ConfigStore.instance().store(name="train_schema", node=TrainSchema)
-OmegaConf.register_new_resolver("by_capacity", by_capacity, replace=True)
-OmegaConf.register_new_resolver("joined", joined, replace=True)
-OmegaConf.register_new_resolver("times", times, replace=True)
 
 
 @contextmanager
@@ -128,6 +111,9 @@ def _explain(reason: str, overrides: list[str], config_name: str) -> str:
     option = re.search(r"Could not find '([^']+)/([^/']+)'|Could not load '([^']+)/([^/']+)'", reason)
     if option:
         group, name = (part for part in option.groups() if part)
+        if group == "hydra/launcher":
+            package = name.partition("_")[0]
+            return f"no launcher {name!r} is installed: pip install hydra-{package}-launcher, or leave it out"
         return f"no option {name!r} in conf/{group}: choose one of {', '.join(_options(group))}"
     unknown = re.search(r"[Kk]ey '([^']+)' is not in struct|Key '([^']+)' not in|Could not override '([^']+)'", reason)
     if not unknown:

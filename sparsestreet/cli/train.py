@@ -14,19 +14,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
+from sparsestreet.cli.sweep import as_sweep, run_job, sentence, sweep_problem, sweep_status
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
 
 
 def train(arguments: list[str]) -> int:
-    """Run the Hydra app on these overrides; 2 if they are wrong, 1 if the data is, 130 or 143 if a signal ended it."""
+    """Run the Hydra app on these overrides; 2 if they are wrong, 1 if the data is or a job of a sweep failed, 130 or 143
+    if a signal ended it."""
     global _started
     _started = time.perf_counter()
     if "--help" not in arguments:
         try:
-            arguments = resumed_overrides(arguments)
-            problem = override_problem(arguments) or _problem_of_values(arguments)
+            arguments = as_sweep(resumed_overrides(arguments))
+            problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:
@@ -34,7 +36,7 @@ def train(arguments: list[str]) -> int:
             return 2
     sys.argv = ["sparsestreet train", *arguments]
     app()
-    return 0
+    return sweep_status()
 
 
 def _problem_of_values(arguments: list[str]) -> str | None:
@@ -61,18 +63,14 @@ def app(cfg: DictConfig) -> float:
     started = time.perf_counter() if HydraConfig.get().mode == RunMode.MULTIRUN else _started
     from sparsestreet.cli.run import run
 
+    out = Path(HydraConfig.get().runtime.output_dir)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        return run_job(cfg, out, started)
     try:
-        return run(cfg, Path(HydraConfig.get().runtime.output_dir), started)
+        return run(cfg, out, started)
     except (InstantiationException, ValueError, OSError, ImportError) as error:
-        # In a sweep, and where somebody looks for a fault, Hydra's own report with the whole trace is better.
-        if HydraConfig.get().mode == RunMode.MULTIRUN or "HYDRA_FULL_ERROR" in os.environ:
+        # Where somebody looks for a fault, Hydra's own report with the whole trace is better.
+        if "HYDRA_FULL_ERROR" in os.environ:
             raise
-        print(f"sparsestreet train: {_sentence(error)}", file=sys.stderr)
+        print(f"sparsestreet train: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
-
-
-def _sentence(error: BaseException) -> str:
-    """The reason without Hydra's wrapping."""
-    while isinstance(error, InstantiationException) and error.__cause__ is not None:
-        error = error.__cause__
-    return str(error) or type(error).__name__

@@ -20,6 +20,7 @@ IDENTITY_KEYS = (
     "resume",  # a resumed run is the run
     "out",
     "folder",
+    "count_of",  # where a control has its numbers from; they are options of their own
     "data.root",  # where a log lies; the scene's name says which it is
     "data.log.root",
     "data.log.parent",

@@ -31,7 +31,7 @@ def composed(*overrides: str):
 
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
-    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity"} == set(SPARSIFY)
+    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity", "capped"} == set(SPARSIFY)
 
 
 @pytest.mark.parametrize(("method", "sparsify"), PAIRS)

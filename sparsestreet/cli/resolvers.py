@@ -1,0 +1,61 @@
+"""What conf/ may ask for in ``${name:...}``."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from sparsestreet.evaluation.records import read_summary, summary_path
+
+
+def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
+    """Of conf/node: the entry of the capacity that is chosen."""
+    if _root_.capacity not in values:
+        raise ValueError(f"no capacity {_root_.capacity!r}: choose one of {', '.join(values)}")
+    return values[_root_.capacity]
+
+
+def joined(*lists: Iterable[Any]) -> list[Any]:
+    """Of conf/assignment: all lists as one."""
+    return [entry for entries in lists for entry in entries]
+
+
+def times(factor: float, rate: float) -> float:
+    """Of conf/node: a rate of the schedule times a number."""
+    return float(factor) * float(rate)
+
+
+def least(*numbers: int) -> int:
+    """Of conf/sparsify: the smallest number."""
+    return min(numbers)
+
+
+def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> Any:
+    """Of the controls: how many Gaussians a run ended with, by node or of one; without a run, what else is given.
+
+    Raises FileNotFoundError where the run has no record.
+    """
+    if run is None:
+        return otherwise
+    if not summary_path(Path(run)).is_file():
+        raise FileNotFoundError(
+            f"count_of={run}: that run has no record, and a control has its count from it; make it first"
+        )
+    gaussians = read_summary(summary_path(Path(run))).gaussians
+    return gaussians if node is None else gaussians[node]
+
+
+def by_drive(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
+    """Of conf/sweep: the entry of the drive whose folder is ``data.root``, by the number that is its name."""
+    name = Path(_root_.data.root).name
+    return values.get(int(name), otherwise) if name.isdigit() else otherwise
+
+
+def last_part(path: str) -> str:
+    """Of conf/sweep: the name of a folder."""
+    return Path(path).name
+
+
+for resolver in (by_capacity, joined, times, least, gaussians_of, by_drive, last_part):
+    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

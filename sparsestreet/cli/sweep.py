@@ -1,0 +1,123 @@
+"""Sweeps: what they ask for, jobs that are skipped, jobs that fail."""
+
+import logging
+import math
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from sparsestreet.evaluation.configuration import config_hash, flat_config, only
+from sparsestreet.evaluation.failures import FailedRun, failure_path, read_failures, write_failure
+from sparsestreet.evaluation.records import read_summary, summary_path
+from sparsestreet.evaluation.strict_json import RecordError
+
+log = logging.getLogger(__name__)
+
+OF_DRIVES = "table"
+"""What the names of sweeps over recorded drives start with."""
+
+_ALIKE = ("seed", "data.root", "data.log.root")
+"""Beside the hash: what tells the jobs of a sweep apart and is part of no configuration's identity."""
+
+
+class SweepFolder(Callback):
+    """Keeps where the sweep of this process writes."""
+
+    folder: Path | None = None
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        SweepFolder.folder = Path(config.hydra.sweep.dir)
+
+
+def as_sweep(arguments: list[str]) -> list[str]:
+    """The arguments, with Hydra's flag where a sweep is named."""
+    flagged = {"-m", "--multirun", "--cfg", "-c", "--info", "-i"} & set(arguments)
+    return arguments if flagged or not _named(arguments) else ["-m", *arguments]
+
+
+def sweep_problem(arguments: list[str]) -> str | None:
+    """What a sweep over recorded drives lacks, in one sentence."""
+    name = _named(arguments)
+    if name is None or not name.startswith(OF_DRIVES):
+        return None
+    roots = next((text.partition("=")[2] for text in arguments if text.startswith("data.root=")), None)
+    if roots is None:
+        return f"+sweep={name} trains on recorded drives: give their folders, data.root=DIR,DIR,... (conf/sweep/{name}.yaml)"
+    absent = [root for root in roots.split(",") if not Path(root).is_dir()]
+    if absent:
+        return f"data.root names {', '.join(absent)}, which is no folder here: give drives in DriveStudio's layout"
+    return None
+
+
+def sweep_status() -> int:
+    """0, or 1 with a line on standard error where a job of this process's sweep failed."""
+    if SweepFolder.folder is None:
+        return 0
+    failures = read_failures(SweepFolder.folder)
+    for folder, failure in failures:
+        print(f"sparsestreet train: {folder} failed: {failure.error}", file=sys.stderr)
+    if failures:
+        print(f"sparsestreet train: {len(failures)} failed; the same command runs them again", file=sys.stderr)
+    return 1 if failures else 0
+
+
+def run_job(cfg: DictConfig, out: Path, started: float) -> float:
+    """One job of a sweep: skipped where its folder holds its record, and written down where it fails.
+
+    ``started``: ``time.perf_counter`` when it began. Answers with its PSNR, NaN for a job that failed.
+    """
+    from sparsestreet.cli.assemble import this_command
+    from sparsestreet.cli.run import run
+
+    try:
+        done = finished(cfg, out)
+        if done is None:
+            done = run(cfg, out, started)
+        else:
+            log.info("%s holds a complete record of this configuration: skipped", out)
+    except Exception as error:  # a sweep goes on, whatever one job dies of
+        log.exception("%s failed", out)
+        command = this_command(["train", *HydraConfig.get().overrides.task])
+        trace = "".join(traceback.format_exception(error))
+        write_failure(
+            out, FailedRun(label=cfg.name, seed=cfg.seed, command=command, error=sentence(error), trace=trace)
+        )
+        return math.nan
+    failure_path(out).unlink(missing_ok=True)
+    return done
+
+
+def finished(cfg: DictConfig, out: Path) -> float | None:
+    """The PSNR of a folder that holds the complete record of this very job; None where it has to be trained."""
+    try:
+        summary = read_summary(summary_path(out))
+    except RecordError:
+        return None
+    config = flat_config(OmegaConf.to_container(cfg, resolve=True))
+    same = summary.run.config_hash == config_hash(config) and only(summary.run.config, _ALIKE) == only(config, _ALIKE)
+    if not same or summary.run.steps < summary.run.max_steps:
+        return None
+    return summary.mean("psnr_full")
+
+
+def sweep_name(folder: Path) -> str | None:
+    """Which of conf/sweep a folder is of; None for any other sweep."""
+    path = folder / "multirun.yaml"
+    return OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
+
+
+def sentence(error: BaseException) -> str:
+    """The reason without Hydra's wrapping."""
+    while isinstance(error, InstantiationException) and error.__cause__ is not None:
+        error = error.__cause__
+    return str(error) or type(error).__name__
+
+
+def _named(arguments: list[str]) -> str | None:
+    return next((text.partition("=")[2] for text in arguments if text.startswith("+sweep=")), None)

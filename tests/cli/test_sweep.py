@@ -1,0 +1,142 @@
+"""Sweeps: what composes, what is skipped, what fails and stands."""
+
+import subprocess
+import sys
+
+import pytest
+from hydra import compose
+
+from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.compose import CONF, configuration, override_problem
+from sparsestreet.cli.sweep import as_sweep, sweep_name, sweep_problem
+from sparsestreet.cli.train import train
+from sparsestreet.evaluation.failures import read_failures
+from sparsestreet.evaluation.records import read_summary, summary_path, write_summary
+from tests.evaluation.frames import make_summary
+
+SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
+OF_DRIVES = [name for name in SWEEPS if name.startswith("table")]
+
+
+def composed(*overrides: str):
+    with configuration():
+        return compose("train", ["folder=sweep/run", *overrides], return_hydra_config=True)
+
+
+def jobs(name: str) -> list[list[str]]:
+    """One job for each value of the sweep's first option."""
+    params = composed(f"+sweep={name}").hydra.sweeper.params
+    first, *others = ((key, str(value).replace("[background]", "null").split(",")) for key, value in params.items())
+    rest = [f"{key}={values[-1]}" for key, values in others]
+    return [[f"{first[0]}={value}", *rest, f"+sweep={name}"] for value in first[1]]
+
+
+@pytest.mark.parametrize("name", SWEEPS)
+def test_every_job_of_a_sweep_can_be(name, tmp_path):
+    write_summary(
+        summary_path(tmp_path), make_summary(gaussians={"background": 20_000, "rigid": 2000})
+    )  # the run that controls have their count from
+    drive = [f"data.root={tmp_path}"] if name in OF_DRIVES else []
+    for job in jobs(name):
+        cfg = composed(*job, *drive, f"count_of={tmp_path}")
+        del cfg.hydra
+        assert config_problem(cfg) is None, job
+
+
+def test_the_rows_of_table_1_are_the_papers():
+    labels = [composed(*job, "data.root=/drives/172").name for job in jobs("table1_waymo")]
+    assert labels == ["3dgs-legacy", "deformgs-legacy", "pvg-legacy", "streetgs-legacy", "omnire-legacy"] + [
+        "streetgs-legacy+paper",
+        "omnire-legacy+paper",
+    ]
+
+
+def test_drives_are_read_where_the_authors_read_them():
+    windows = {}
+    for drive in ("172", "023", "500"):
+        log = composed("+sweep=table5_ablation", f"data.root=/drives/{drive}").data.log
+        windows[drive] = (log.first_frame, log.last_frame)
+    assert windows == {"172": (30, 180), "023": (0, 150), "500": (0, -1)}
+
+
+def test_a_control_keeps_what_the_other_run_ended_with(tmp_path):
+    write_summary(summary_path(tmp_path), make_summary(gaussians={"background": 20_000, "rigid": 2000}))
+    capped = composed("sparsify=capped", f"count_of={tmp_path}").node.background
+    assert (capped.num_points, capped.max_gaussians) == (20_000, 20_000)
+    rule = composed("sparsify=random", f"count_of={tmp_path}").callback.pruning.rule
+    assert rule.keep == {"background": 20_000, "rigid": 2000}
+    assert composed("sparsify=random").callback.pruning.rule.keep == 0.5
+    cfg = composed("sparsify=opacity", f"count_of={tmp_path / 'nothing'}")
+    del cfg.hydra
+    assert "that run has no record" in config_problem(cfg)
+
+
+def test_drives_must_be_named_and_there(tmp_path):
+    assert "give their folders, data.root=DIR,DIR" in sweep_problem(["+sweep=table1_waymo"])
+    absent = sweep_problem(["+sweep=table1_waymo", f"data.root={tmp_path},{tmp_path}/no"])
+    assert f"{tmp_path}/no, which is no folder" in absent
+    assert sweep_problem(["+sweep=table1_waymo", f"data.root={tmp_path}"]) is None
+    assert sweep_problem(["+sweep=streets"]) is sweep_problem(["seed=1"]) is None
+
+
+def test_a_named_sweep_is_one_without_its_flag():
+    assert as_sweep(["+sweep=tiny"]) == ["-m", "+sweep=tiny"]
+    for asked in (["seed=1"], ["-m", "+sweep=tiny"], ["+sweep=tiny", "--cfg", "job"]):
+        assert as_sweep(asked) == asked
+
+
+def test_launchers_compose_or_say_how_they_are_installed():
+    assert override_problem(["-m", "+sweep=tiny", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]) is None
+    problem = override_problem(["hydra/launcher=submitit_slurm"])
+    try:
+        import hydra_plugins.hydra_submitit_launcher  # noqa: F401
+    except ImportError:
+        assert "pip install hydra-submitit-launcher" in problem
+    else:
+        assert problem is None
+
+
+def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street):
+    """Three jobs: the control comes before its run and fails, the others stand; the same command makes it good."""
+    street = [word for word in tiny_street if word.startswith(("data.log.root", "image_points.cache"))]
+    command = [
+        "+sweep=tiny",
+        *street,
+        f"hydra.sweep.dir={tmp_path}",
+        "seed=0",
+        "sparsify=random,removal",
+        "schedule.max_steps=20",
+    ]
+    first = swept(command)
+    assert first.returncode == 1
+    assert "1 failed; the same command runs them again" in first.stderr
+    ((folder, failure),) = read_failures(tmp_path)
+    assert folder.name == "streetgs+random_seed0"
+    assert "that run has no record" in failure.error
+    assert sweep_name(tmp_path) == "tiny"
+    pruned = summary_path(tmp_path / "streetgs+removal_seed0")
+    made = pruned.stat().st_mtime_ns
+
+    again = swept(command)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.count("complete record of this configuration: skipped") == 1
+    assert pruned.stat().st_mtime_ns == made
+    assert not read_failures(tmp_path)
+    kept = read_summary(summary_path(folder)).run.config["callback.pruning.rule.keep.background"]
+    assert kept == read_summary(pruned).gaussians["background"]
+
+    # Another configuration in the same folder is another job.
+    other = swept([word.replace("removal", "none").replace("max_steps=20", "max_steps=10") for word in command])
+    assert "skipped" not in other.stdout
+
+
+def swept(command: list[str]) -> subprocess.CompletedProcess:
+    """A process of its own: Hydra keeps what it saw."""
+    return subprocess.run(
+        [sys.executable, "-m", "sparsestreet", "train", *command], capture_output=True, text=True, check=False
+    )
+
+
+def test_a_slip_in_a_sweep_is_one_line(capsys):
+    assert train(["+sweep=tony"]) == 2
+    assert "no option 'tony' in conf/sweep: choose one of streets, table1_waymo" in capsys.readouterr().err
