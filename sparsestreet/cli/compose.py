@@ -14,7 +14,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import sparsestreet.cli.resolvers  # noqa: F401: conf/ asks for them
+import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.

@@ -48,7 +48,9 @@ def sweep_problem(arguments: list[str]) -> str | None:
         return None
     roots = next((text.partition("=")[2] for text in arguments if text.startswith("data.root=")), None)
     if roots is None:
-        return f"+sweep={name} trains on recorded drives: give their folders, data.root=DIR,DIR,... (conf/sweep/{name}.yaml)"
+        return (
+            f"+sweep={name} trains on recorded drives: give their folders, data.root=DIR,DIR (conf/sweep/{name}.yaml)"
+        )
     absent = [root for root in roots.split(",") if not Path(root).is_dir()]
     if absent:
         return f"data.root names {', '.join(absent)}, which is no folder here: give drives in DriveStudio's layout"

@@ -21,8 +21,10 @@ _started = 0.0
 
 
 def train(arguments: list[str]) -> int:
-    """Run the Hydra app on these overrides; 2 if they are wrong, 1 if the data is or a job of a sweep failed, 130 or 143
-    if a signal ended it."""
+    """Run the Hydra app on these overrides.
+
+    Returns 2 if they are wrong, 1 if the data is or a job of a sweep failed, 130 or 143 if a signal ended it.
+    """
     global _started
     _started = time.perf_counter()
     if "--help" not in arguments:
