@@ -5,23 +5,30 @@ from pathlib import Path
 
 from rich.console import Console
 
+from sparsestreet.cli.sweep import sweep_name
 from sparsestreet.evaluation.report import collect, figure, markdown, sections, tables
+from sparsestreet.evaluation.report.sweep import write_report
 from sparsestreet.evaluation.strict_json import RecordError
-from sparsestreet.metrics.protocols import DRIVESTUDIO, PROTOCOLS
+from sparsestreet.metrics.protocols import DRIVESTUDIO, PROTOCOLS, Protocol
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
                             [markdown=FILE] [figure=FILE.png]
+sparsestreet report sweep=DIR [protocol=drivestudio|strict]
 
 Tables of all runs below the folders: one per scene, then the mean over scenes. Runs of one label and one configuration
 are repeats and share a column; a label's other configurations have columns named by the options that differ. With a
 baseline (label or name of a column), differences to it, paired by scene and seed. The figure shows PSNR against size.
 
+Of a sweep (sparsestreet train +sweep=NAME) DIR/report is written: tables.md, tables.tex and tables.csv in the layout of
+the paper, with its published figures in columns of their own, paired differences with intervals, the best arm at one
+quality and at one size; figures; and index.html, all of it in one file for a browser.
+
 The protocol chooses definitions: drivestudio as in published tables; strict counts 8 bits, leaves out the hood of the
 recording car, takes the Gaussian window of SSIM, and both networks of LPIPS. A record holds all of them.
 """
 
-OPTIONS = ("baseline", "sections", "protocol", "markdown", "figure")
+OPTIONS = ("sweep", "baseline", "sections", "protocol", "markdown", "figure")
 SECTIONS = ("scenes", "mean", "all")
 
 
@@ -38,10 +45,13 @@ def report(arguments: list[str]) -> int:
         else:
             roots.append(Path(text))
     wanted = options.get("sections", "all")
-    # A run's folder may have an equals sign in its name; what has one and is no folder is a slip.
     protocol = PROTOCOLS.get(options.get("protocol", DRIVESTUDIO.name))
+    if "sweep" in options and not roots and protocol is not None and options.keys() <= {"sweep", "protocol"}:
+        return _report_sweep(Path(options["sweep"]), protocol)
+    # A run's folder may have an equals sign in its name; what has one and is no folder is a slip.
     if (
-        not roots
+        "sweep" in options
+        or not roots
         or wanted not in SECTIONS
         or protocol is None
         or any("=" in str(root) and not root.exists() for root in roots)
@@ -65,4 +75,17 @@ def report(arguments: list[str]) -> int:
         console.print(part)
     if "markdown" in options:
         Path(options["markdown"]).write_text(markdown(shown))
+    return 0
+
+
+def _report_sweep(folder: Path, protocol: Protocol) -> int:
+    """Write the report of a sweep and say where; 1 if records are missing or malformed."""
+    try:
+        written = write_report(folder, sweep_name(folder), protocol)
+    except (RecordError, FileNotFoundError, ValueError) as error:
+        print(f"sparsestreet report: {error}", file=sys.stderr)
+        return 1
+    for note in written.notes:
+        print(note)
+    print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
     return 0

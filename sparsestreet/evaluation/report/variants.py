@@ -23,6 +23,21 @@ SECTION_KEYS = ("split.*", *LOG_KEYS)
 CLIP_KEYS = ("data.log.first_frame", "data.log.last_frame")
 """Options that say which part of a log is read: where they differ, scenes differ, as where logs do."""
 
+CONTROLS = {
+    "random": "as many Gaussians, drawn at random",
+    "opacity": "as many Gaussians, the most opaque",
+    "capped": "the plain method, stopped at as many Gaussians",
+}
+"""Sparsifications that are no way to get small but the size of another run -> what they are."""
+
+COUNT_KEYS = (
+    "callback.pruning.rule.keep",
+    "callback.pruning.rule.keep.*",
+    "node.background.num_points",
+    "node.background.max_gaussians",
+)
+"""Options of a control that follow from the run whose size it has, seed by seed."""
+
 _MOST_NAMED = 3
 """Options in the name of a column; what is beyond goes into a note."""
 _LONGEST = 40
@@ -75,7 +90,8 @@ def log_config(run: RunSummary) -> dict[str, Setting]:
 
 def _compared(run: RunSummary) -> dict[str, Setting]:
     """The options by which runs of one table may differ."""
-    return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS))
+    follows = COUNT_KEYS if run.run.sparsify in CONTROLS and run.run.config.get("count_of") else ()
+    return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS, *follows))
 
 
 def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, ...], tuple[str, ...]]:
