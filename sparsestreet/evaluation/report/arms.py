@@ -124,8 +124,11 @@ def why_apart(found: Sequence[Arm]) -> list[str]:
 
 
 def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
-    threads = f"{run.run.threads} thread{'s' if run.run.threads != 1 else ''}"
-    return run.run.device, threads, (run.run.source.commit or "no commit")[:9], _edition(run, records)
+    made, measured = run.run, run.evaluated
+    device = made.device if made.device == measured.device else f"{made.device}, measured on {measured.device}"
+    threads = f"{made.threads} thread{'s' if made.threads != 1 else ''}"
+    threads += f", measured with {measured.threads}" if made.threads != measured.threads else ""
+    return device, threads, (made.source.commit or "no commit")[:9], _edition(run, records)
 
 
 def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:

@@ -10,13 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from sparsestreet.evaluation.records import HELD_OUT, RunSummary
 from sparsestreet.evaluation.report.arms import Arm, Value, plain_of
 from sparsestreet.metrics.protocols import Protocol
 
-# Okabe and Ito's palette: distinguishable with any color vision, on white and on black.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# Okabe and Ito's palette, its blue a little lighter: distinguishable with any color vision, on white and on black.
+COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GREY = "#8c8c8c"
 _MARKERS = {"none": "o", "paper": "s", "removal": "D", "masks": "^", "importance": "v", "random": "x", "opacity": "+"}
 _INK = "#010203"
@@ -27,14 +28,15 @@ _STYLE = {
     "font.family": "sans-serif",
     "font.size": 9,
     **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
-    "legend.labelcolor": _INK,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "grid.alpha": 0.25,
     "grid.color": GREY,
-    "legend.frameon": False,
 }
+
+LEGEND = {"frameon": False, "labelcolor": _INK, "fontsize": 8}
+"""Style of every legend."""
 
 COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
     ("gaussians", "Gaussians", lambda run: float(run.gaussians_total)),
@@ -45,12 +47,12 @@ COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
 """Name, axis and value of what quality is drawn against."""
 
 
-def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, Sequence[Axes]]:
+def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
     """A figure with panels beside each other."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(width * columns, height), layout="constrained")
         figure.patch.set_alpha(0)
-        axes = figure.subplots(1, columns, squeeze=False)[0]
+        axes = list(figure.subplots(1, columns, squeeze=False)[0])
     for one in axes:
         one.patch.set_alpha(0)
     return figure, axes
@@ -64,7 +66,7 @@ def write_svg(figure: Figure, path: Path) -> None:
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(_INK, "currentColor")
     # Names of groups, which several figures of one page would share; references are to definitions, named by content.
-    text = re.sub(r' id="[A-Za-z.]+\d*_\d+"', "", text)
+    text = re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", text)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
 
@@ -73,6 +75,12 @@ def colors(arms: Sequence[Arm]) -> dict[str, str]:
     """Label of a plain method -> its color."""
     labels = list(dict.fromkeys(arm.plain_label for arm in arms))
     return {label: COLORS[index % len(COLORS)] for index, label in enumerate(labels)}
+
+
+def short(value: float) -> str:
+    """12000 -> 12k, 1500000 -> 1.5M."""
+    unit, size = next(((unit, size) for unit, size in (("M", 1e6), ("k", 1e3)) if value >= size), ("", 1.0))
+    return f"{value / size:g}{unit}"
 
 
 def marker(arm: Arm) -> str:
@@ -96,12 +104,8 @@ def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value]
     the means, controls are grey and in no front.
     """
     wanted = {"full image": protocol.psnr, "people": protocol.human[0], "vehicles": protocol.vehicle[0]}
-    regions = {
-        name: value
-        for name, metric in wanted.items()
-        if any(arm.mean(value) is not None for value in [_held_out(metric)] for arm in arms)
-        for value in [_held_out(metric)]
-    }
+    regions = {name: _held_out(metric) for name, metric in wanted.items()}
+    regions = {name: value for name, value in regions.items() if any(arm.mean(value) is not None for arm in arms)}
     if not regions or all(arm.mean(cost[2]) is None for arm in arms):
         return False
     figure, axes = panels(len(regions))
@@ -111,7 +115,7 @@ def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value]
         one.set_xlabel(cost[1])
         if index == 0:
             one.set_ylabel("held-out PSNR, dB")
-    figure.legend(handles=_legend(arms), loc="outside lower center", ncols=4, fontsize=8)
+    figure.legend(handles=_legend(arms), loc="outside lower center", ncols=4, **LEGEND)
     write_svg(figure, path)
     return True
 
@@ -144,6 +148,9 @@ def _pareto_panel(axes: Axes, arms: Sequence[Arm], cost: Value, quality: Value) 
     best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control])
     axes.plot(*zip(*best, strict=True), color=_INK, linewidth=0.9, linestyle="--", zorder=1)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _legend(arms: Sequence[Arm]) -> list[Line2D]:

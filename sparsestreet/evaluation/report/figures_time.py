@@ -11,7 +11,7 @@ from sparsestreet.evaluation.history import count_curves, marks
 from sparsestreet.evaluation.ledger import ledger_path, read_changes
 from sparsestreet.evaluation.report.arms import Arm
 from sparsestreet.evaluation.report.curves import curves_of
-from sparsestreet.evaluation.report.figures import COLORS, GREY, panels, write_svg
+from sparsestreet.evaluation.report.figures import COLORS, GREY, LEGEND, panels, short, write_svg
 from sparsestreet.evaluation.strict_json import RecordError, parsed
 
 _PAINT = {"none": COLORS[0], "paper": COLORS[1], "removal": COLORS[2], "masks": COLORS[3], "importance": COLORS[4]}
@@ -47,7 +47,7 @@ def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
             for record in arm.records:
                 if ledger_path(record.folder).is_file():
                     _counts(one, arm, record.folder)
-        one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 1000:g}k"))
+        one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
         _finish(one, method, "step")
     axes[0].set_ylabel("Gaussians")
     write_svg(figure, path)
@@ -87,7 +87,7 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
     axes.invert_yaxis()
     axes.axvline(0, color=GREY, linewidth=0.8)
     axes.set_xlabel("milliseconds that a frame takes longer with it")
-    figure.legend(loc="outside lower center", ncols=5, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=5, **LEGEND)
     write_svg(figure, path)
     return True
 
@@ -128,4 +128,4 @@ def _finish(axes: Axes, title: str, x_label: str) -> None:
     axes.set_xlabel(x_label)
     handles, names = axes.get_legend_handles_labels()
     once = dict(zip(names, handles, strict=True))
-    axes.legend(once.values(), once.keys(), fontsize=7)
+    axes.legend(once.values(), once.keys(), **LEGEND)

@@ -1,5 +1,6 @@
 """A sweep's report as one HTML file: no network, no file beside it."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -105,7 +106,12 @@ def _cell(cell: Cell, sets: Mapping[tuple[str, ...], str]) -> str:
 
 def _figure(index: int, caption: str, svg: str) -> str:
     heading = "<h2 id='figures'>Figures</h2>" if index == 0 else ""
-    return f"{heading}<figure><div class='drawing'>{svg}</div><figcaption>{escape(caption)}</figcaption></figure>"
+    found = re.search(r'<svg[^>]* width="([0-9.]+pt)"', svg)
+    natural = found[1] if found else "100%"
+    return (
+        f"{heading}<figure><div class='drawing' tabindex='0' style='--natural: {natural}'>{svg}</div>"
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
 
 
 def _comparison(pictures: str | None) -> str:

@@ -1,0 +1,73 @@
+"""Which runs are averaged, and what they are compared with."""
+
+from dataclasses import replace
+
+import pytest
+
+from sparsestreet.evaluation.records import Source
+from sparsestreet.evaluation.report.arms import arms, plain_of, why_apart
+from tests.evaluation.frames import make_summary
+from tests.evaluation.report.sweep_folder import record, street_runs
+
+
+def psnr(run):
+    return run.mean("psnr_full")
+
+
+def test_controls_of_other_counts_are_one_arm():
+    found = {arm.name: arm for arm in arms([record(run, name) for name, run in street_runs().items()])}
+    assert list(found) == ["streetgs", "streetgs+removal", "streetgs+random"]
+    control = found["streetgs+random"]
+    assert control.title == "control: streetgs+random"
+    assert len(control.records) == 3
+    assert control.mean(psnr) == pytest.approx(24.0)
+    assert plain_of(control, found.values()) is found["streetgs"]
+    assert plain_of(found["streetgs"], found.values()) is found["streetgs"]
+
+
+def test_each_scene_counts_once():
+    runs = [
+        make_summary("plain", 0, 20.0, scene="a"),
+        make_summary("plain", 1, 22.0, scene="a"),
+        make_summary("plain", 0, 30.0, scene="b"),
+    ]
+    (arm,) = arms([record(run) for run in runs])
+    assert arm.mean(psnr) == 25.5
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"device": "cuda: other"}, "runs differ in devices (cpu: test, cpu: test, measured on cuda: other)"),
+        ({"threads": 1}, "runs differ in numbers of threads (1 thread, measured with 2, 2 threads)"),
+        ({"source": Source("fedcba9876543210", False)}, "runs differ in commits (012345678, fedcba987)"),
+        ({"config": {"schedule.max_steps": 70}}, "plain: runs of one label that differ are rows of their own"),
+    ],
+)
+def test_runs_that_differ_are_never_averaged(other, said):
+    found = arms([record(make_summary("plain", 0, 20.0)), record(make_summary("plain", 1, 30.0, **other))])
+    assert [len(arm.records) for arm in found] == [1, 1]
+    assert len({arm.name for arm in found}) == 2
+    assert any(note.startswith(said) for note in why_apart(found))
+
+
+def test_no_comparison_between_places():
+    runs = [make_summary("plain", 0), make_summary("plain+removal", 0, threads=1)]
+    found = arms([record(run) for run in runs])
+    assert [plain_of(arm, found) is None for arm in found] == [False, True]
+
+
+def test_one_place_has_nothing_to_say():
+    assert why_apart(arms([record(make_summary("plain", seed)) for seed in (0, 1)])) == []
+    run = make_summary("plain")
+    dirty = replace(run, run=replace(run.run, source=Source("0123456789abcdef", True)))
+    assert why_apart(arms([record(dirty)])) == ["made by code with uncommitted changes: plain"]
+
+
+def test_runs_on_all_views_stand_apart():
+    """DriveStudio's two trainings: reconstruction is of the one without held-out views."""
+    held = make_summary("plain", 0, 20.0, training_psnr=25.0)
+    whole = make_summary("plain", 0, None, training_psnr=28.0, split="none")
+    (arm,) = arms([record(held), record(whole)])
+    assert list(arm.units(psnr).values()) == [20.0]
+    assert list(arm.units(psnr, whole=True).values()) == [28.0]
