@@ -13,6 +13,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet train sparsify=paper                   the same with the paper's masks and background pruning
   sparsestreet train method=3dgs sparsify=removal data=drivestudio data.root=DIR    on a drive of your own
   sparsestreet train -m sparsify=none,paper,removal seed=0,1,2                      a sweep
+  sparsestreet train +sweep=streets                   a sweep of conf/sweep; sparsestreet report sweep=DIR shows it
   sparsestreet train resume=RUN                       go on after an interruption
   sparsestreet evaluate run=RUN                       measure a trained run again, without training
   sparsestreet report DIR [DIR ...]                   tables from the records of runs

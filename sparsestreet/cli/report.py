@@ -7,14 +7,16 @@ from rich.console import Console
 
 from sparsestreet.cli.sweep import sweep_name
 from sparsestreet.evaluation.report import collect, figure, markdown, sections, tables
-from sparsestreet.evaluation.report.sweep import write_report
+from sparsestreet.evaluation.report.arms import arms
+from sparsestreet.evaluation.report.figures_readme import time_figure
+from sparsestreet.evaluation.report.sweep import sweep_records, write_report
 from sparsestreet.evaluation.strict_json import RecordError
 from sparsestreet.metrics.protocols import DRIVESTUDIO, PROTOCOLS, Protocol
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
                             [markdown=FILE] [figure=FILE.png]
-sparsestreet report sweep=DIR [protocol=drivestudio|strict]
+sparsestreet report sweep=DIR [protocol=drivestudio|strict] [figure=FILE.png]
 
 Tables of all runs below the folders: one per scene, then the mean over scenes. Runs of one label and one configuration
 are repeats and share a column; a label's other configurations have columns named by the options that differ. With a
@@ -22,7 +24,8 @@ baseline (label or name of a column), differences to it, paired by scene and see
 
 Of a sweep (sparsestreet train +sweep=NAME) DIR/report is written: tables.md, tables.tex and tables.csv in the layout of
 the paper, with its published figures in columns of their own, paired differences with intervals, the best arm at one
-quality and at one size; figures; and index.html, all of it in one file for a browser.
+quality and at one size; figures; and index.html, all of it in one file for a browser. Its figure=FILE shows quality
+against the seconds of training and the milliseconds of a frame.
 
 The protocol chooses definitions: drivestudio as in published tables; strict counts 8 bits, leaves out the hood of the
 recording car, takes the Gaussian window of SSIM, and both networks of LPIPS. A record holds all of them.
@@ -46,8 +49,8 @@ def report(arguments: list[str]) -> int:
             roots.append(Path(text))
     wanted = options.get("sections", "all")
     protocol = PROTOCOLS.get(options.get("protocol", DRIVESTUDIO.name))
-    if "sweep" in options and not roots and protocol is not None and options.keys() <= {"sweep", "protocol"}:
-        return _report_sweep(Path(options["sweep"]), protocol)
+    if "sweep" in options and not roots and protocol is not None and options.keys() <= {"sweep", "protocol", "figure"}:
+        return _report_sweep(Path(options["sweep"]), protocol, options.get("figure"))
     # A run's folder may have an equals sign in its name; what has one and is no folder is a slip.
     if (
         "sweep" in options
@@ -78,10 +81,12 @@ def report(arguments: list[str]) -> int:
     return 0
 
 
-def _report_sweep(folder: Path, protocol: Protocol) -> int:
+def _report_sweep(folder: Path, protocol: Protocol, picture: str | None) -> int:
     """Write the report of a sweep and say where; 1 if records are missing or malformed."""
     try:
         written = write_report(folder, sweep_name(folder), protocol)
+        if picture is not None:
+            time_figure(arms(sweep_records(folder)), protocol, Path(picture))
     except (RecordError, FileNotFoundError, ValueError) as error:
         print(f"sparsestreet report: {error}", file=sys.stderr)
         return 1

@@ -5,6 +5,7 @@ import pytest
 from sparsestreet.cli.report import report
 from sparsestreet.evaluation.records import summary_path, write_summary
 from tests.evaluation.frames import make_summary
+from tests.evaluation.report.sweep_folder import write_sweep
 
 
 @pytest.fixture
@@ -67,3 +68,27 @@ def test_a_protocol_is_chosen(runs, tmp_path):
     for protocol, metric in (("drivestudio", "PSNR psnr_full"), ("strict", "PSNR psnr8_no_hood")):
         assert report([str(runs), f"protocol={protocol}", f"markdown={table}"]) == 0
         assert f"protocol {protocol}: {metric}" in table.read_text()
+
+
+def test_the_report_of_a_sweep(tmp_path, capsys):
+    """In the layout that the sweep's name asks for; with a figure where one is wanted."""
+    sweep, picture = write_sweep(tmp_path), tmp_path / "time.png"
+    (sweep / "multirun.yaml").write_text("hydra: {runtime: {choices: {sweep: table5_ablation}}}")
+    assert report([f"sweep={sweep}", f"figure={picture}"]) == 0
+    text = (sweep / "report" / "tables.md").read_text()
+    assert "### Table 5 of the paper" in text
+    assert "| w/o Node Pruning (not run) |" in text
+    assert "streetgs+paper, seed 0: failed" in text
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert f"{sweep / 'report'}: tables.md" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments", [["sweep=x", "."], ["sweep=x", "baseline=plain"], ["sweep=x", "protocol=mine"]])
+def test_what_does_not_go_with_a_sweep(arguments, capsys):
+    assert report(arguments) == 2
+    assert "sparsestreet report sweep=DIR" in capsys.readouterr().err
+
+
+def test_an_empty_sweep_is_one_line(tmp_path, capsys):
+    assert report([f"sweep={tmp_path}"]) == 1
+    assert "holds no records/summary.json" in capsys.readouterr().err

@@ -40,11 +40,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     mean different things by one metric.
     """
     failures = read_failures(sweep)
-    # A folder that says it failed may hold the record of an earlier configuration.
-    records = [record for record in collect([sweep]) if not failure_path(record.folder).is_file()]
-    if not records:
-        raise FileNotFoundError(f"{sweep} holds no run that did not fail: run the sweep again")
-    check_definitions(records)
+    records = sweep_records(sweep)
     found = arms(records)
     grids = _grids(found, failures, protocol, name)
     folder = sweep / "report"
@@ -64,6 +60,16 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     )
     write_atomically(folder / "index.html", html(page))
     return SweepReport(folder, tuple(grids), tuple(notes))
+
+
+def sweep_records(sweep: Path) -> list[RunRecord]:
+    """The records of the runs of a sweep that did not fail. Raises as ``write_report``."""
+    # A folder that says it failed may hold the record of an earlier configuration.
+    records = [record for record in collect([sweep]) if not failure_path(record.folder).is_file()]
+    if not records:
+        raise FileNotFoundError(f"{sweep} holds no run that did not fail: run the sweep again")
+    check_definitions(records)
+    return records
 
 
 def _grids(
