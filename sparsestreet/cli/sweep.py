@@ -4,6 +4,7 @@ import logging
 import math
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,18 +70,17 @@ def sweep_status() -> int:
     return 1 if failures else 0
 
 
-def run_job(cfg: DictConfig, out: Path, started: float) -> float:
+def run_job(cfg: DictConfig, out: Path, train: Callable[[], float]) -> float:
     """One job of a sweep: skipped where its folder holds its record, and written down where it fails.
 
-    ``started``: ``time.perf_counter`` when it began. Answers with its PSNR, NaN for a job that failed.
+    Answers with the PSNR that ``train`` answered with or the record holds, NaN for a job that failed.
     """
     from sparsestreet.cli.assemble import this_command
-    from sparsestreet.cli.run import run
 
     try:
         done = finished(cfg, out)
         if done is None:
-            done = run(cfg, out, started)
+            done = train()
         else:
             log.info("%s holds a complete record of this configuration: skipped", out)
     except Exception as error:  # a sweep goes on, whatever one job dies of

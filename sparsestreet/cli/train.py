@@ -67,7 +67,7 @@ def app(cfg: DictConfig) -> float:
 
     out = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        return run_job(cfg, out, started)
+        return run_job(cfg, out, lambda: run(cfg, out, started))
     try:
         return run(cfg, out, started)
     except (InstantiationException, ValueError, OSError, ImportError) as error:

@@ -6,6 +6,7 @@ from pathlib import Path
 from sparsestreet.evaluation.failures import FailedRun
 from sparsestreet.evaluation.records import HELD_OUT, TRAINING
 from sparsestreet.evaluation.report.arms import Arm, Value
+from sparsestreet.evaluation.report.beside import mean_beside
 from sparsestreet.evaluation.report.grid import ABSENT, Cell, Grid
 from sparsestreet.evaluation.report.published import LAYOUT, TABLES, Key, PublishedRow, PublishedTable
 from sparsestreet.evaluation.report.variants import CONTROLS
@@ -72,6 +73,8 @@ def _row(
 
 def _ours(arm: Arm, key: Key, protocol: Protocol) -> float | None:
     views = key[0]
+    if views == "novel":
+        return mean_beside(arm, float(key[1].split()[0]), key[2])
     value = _value(key, protocol)
     if value is None:
         return None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sparsestreet.evaluation.failures import FailedRun, failure_path, read_failures
 from sparsestreet.evaluation.report.arms import Arm, arms, why_apart
+from sparsestreet.evaluation.report.beside import beside_the_path
 from sparsestreet.evaluation.report.collect import RunRecord, check_definitions, collect
 from sparsestreet.evaluation.report.comparison import comparison_data
 from sparsestreet.evaluation.report.curves import time_to_quality
@@ -81,6 +82,7 @@ def _grids(
         matched_quality(found, protocol),
         matched_budget(found, protocol),
         time_to_quality(found),
+        beside_the_path(found),
     ]
     return [grid for grid in grids if grid is not None and grid.rows]
 
