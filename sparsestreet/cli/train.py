@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
-from sparsestreet.cli.sweep import as_sweep, run_job, sentence, sweep_problem, sweep_status
+from sparsestreet.cli.sweep import SweepFolder, as_sweep, run_job, sentence, sweep_problem, sweep_status
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -37,6 +37,7 @@ def train(arguments: list[str]) -> int:
             print(f"sparsestreet train: {problem}", file=sys.stderr)
             return 2
     sys.argv = ["sparsestreet train", *arguments]
+    SweepFolder.folder = None  # of an earlier command of this process
     app()
     return sweep_status()
 

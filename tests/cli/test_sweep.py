@@ -1,8 +1,5 @@
 """Sweeps: what composes, what is skipped, what fails and stands."""
 
-import subprocess
-import sys
-
 import pytest
 from hydra import compose
 
@@ -95,46 +92,35 @@ def test_launchers_compose_or_say_how_they_are_installed():
 
 
 @pytest.mark.lengthy
-def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path):
-    """Three jobs: the control comes before its run and fails, the others stand; the same command makes it good."""
-    sweep = tmp_path / "sweep"
+def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, capsys):
+    """The control comes before its run and fails, the other stands; the same command makes it good."""
     command = [
         "+sweep=tiny",
-        f"data.log.parent={tmp_path}",
-        f"image_points.cache={tmp_path}",
-        f"hydra.sweep.dir={sweep}",
+        *(word for word in tiny_street if word.startswith(("data.", "image_points."))),
+        f"hydra.sweep.dir={tmp_path}",
         "seed=0",
         "sparsify=random,removal",
         "schedule.max_steps=20",
     ]
-    first = swept(command)
-    assert first.returncode == 1
-    assert "1 failed; the same command runs them again" in first.stderr
-    ((folder, failure),) = read_failures(sweep)
+    assert train(command) == 1
+    assert "1 failed; the same command runs them again" in capsys.readouterr().err
+    ((folder, failure),) = read_failures(tmp_path)
     assert folder.name == "streetgs+random_seed0"
     assert "that run has no record" in failure.error
-    assert sweep_name(sweep) == "tiny"
-    pruned = summary_path(sweep / "streetgs+removal_seed0")
+    assert "sparsify=random" in failure.command
+    assert sweep_name(tmp_path) == "tiny"
+    pruned = summary_path(tmp_path / "streetgs+removal_seed0")
     made = pruned.stat().st_mtime_ns
 
-    again = swept(command)
-    assert again.returncode == 0, again.stderr
-    assert again.stdout.count("complete record of this configuration: skipped") == 1
-    assert pruned.stat().st_mtime_ns == made
-    assert not read_failures(sweep)
+    assert train(command) == 0
+    assert not read_failures(tmp_path)
+    assert pruned.stat().st_mtime_ns == made  # skipped
     kept = read_summary(summary_path(folder)).run.config["callback.pruning.rule.keep.background"]
     assert kept == read_summary(pruned).gaussians["background"]
 
     # Another configuration in the same folder is another job.
-    other = swept([word.replace("removal", "none").replace("max_steps=20", "max_steps=10") for word in command])
-    assert "skipped" not in other.stdout
-
-
-def swept(command: list[str]) -> subprocess.CompletedProcess:
-    """A process of its own: Hydra keeps what it saw."""
-    return subprocess.run(
-        [sys.executable, "-m", "sparsestreet", "train", *command], capture_output=True, text=True, check=False
-    )
+    assert train([word.replace("random,removal", "removal").replace("=20", "=10") for word in command]) == 0
+    assert pruned.stat().st_mtime_ns > made
 
 
 def test_a_slip_in_a_sweep_is_one_line(capsys):
