@@ -71,3 +71,12 @@ def test_runs_on_all_views_stand_apart():
     (arm,) = arms([record(held), record(whole)])
     assert list(arm.units(psnr).values()) == [20.0]
     assert list(arm.units(psnr, whole=True).values()) == [28.0]
+
+
+def test_data_that_differ_under_one_name_stand_apart():
+    runs = [make_summary("plain", seed) for seed in (0, 1)]
+    for run, data_hash in zip(runs, ("aaaaaaaa", "bbbbbbbb"), strict=True):
+        object.__setattr__(run.run, "data_hash", data_hash)
+    found = arms([record(run) for run in runs])
+    assert [arm.name for arm in found] == ["plain (data aaaaaa)", "plain (data bbbbbb)"]
+    assert why_apart(found)[0].startswith("runs differ in data of one name (data aaaaaa, data bbbbbb)")
