@@ -133,9 +133,5 @@ def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
 
 def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:
     """The hash of the data where one scene occurs with several; else nothing."""
-    alike = {_data(record.summary) for record in records if unit_of(record.summary)[0] == unit_of(run)[0]}
-    return f"data {_data(run)[:6]}" if len(alike) > 1 else ""
-
-
-def _data(run: RunSummary) -> str:
-    return getattr(run.run, "data_hash", "")
+    alike = {record.summary.run.data_hash for record in records if unit_of(record.summary)[0] == unit_of(run)[0]}
+    return f"data {run.run.data_hash[:6]}" if len(alike) > 1 else ""
