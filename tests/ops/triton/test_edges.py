@@ -37,7 +37,10 @@ def assert_same_bits(result, other) -> None:
 def test_two_runs_are_bitwise_equal():
     view = camera(19, 17)
     gaussians = random_gaussians(12, view)
-    assert_same_bits(*(render(gaussians, view, "triton", torch.float32) for _ in range(2)))
+    first = render(gaussians, view, "triton", torch.float32)
+    # The interpreter has one order; on a device programs run in another one each time.
+    for _ in range(1 if DEVICE.type == "cpu" else 19):
+        assert_same_bits(first, render(gaussians, view, "triton", torch.float32))
 
 
 def test_the_order_of_rows_does_not_matter_without_ties():
