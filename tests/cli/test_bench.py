@@ -45,6 +45,7 @@ def test_a_masks_network_is_timed_beside_its_bits(tmp_path, capsys):
     assert "ms saved a frame" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, capsys):
     assert (
         bench(
@@ -90,6 +91,7 @@ def test_a_folder_that_is_no_run(tmp_path):
         trained_street(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_street_of_a_run_is_what_the_run_renders(run_train, tmp_path):
     run = run_train(tmp_path / "run", "schedule.max_steps=20")
     street = trained_street(run)

@@ -93,15 +93,15 @@ def test_steps_are_medians_of_parts(tmp_path):
 def test_a_peak_is_seen_and_forgotten():
     forget_peaks()
     before, on_device = peak_megabytes(torch.device("cpu"))
-    large = torch.ones(30_000_000)  # 120 MB
+    large = torch.ones(100_000_000)  # 400 MB, of which the process may have kept a part from earlier tests
     during = peak_megabytes(torch.device("cpu"))[0]
-    assert 115 < during - before < 200
+    assert 200 < during - before < 480
     assert on_device is None
     del large
     forget_peaks()
     after = peak_megabytes(torch.device("cpu"))[0]
     assert after <= during
-    assert after < during - 100 or not _peaks_can_be_forgotten()
+    assert after < during - 200 or not _peaks_can_be_forgotten()
 
 
 def _peaks_can_be_forgotten() -> bool:
