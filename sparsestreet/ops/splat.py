@@ -44,8 +44,8 @@ def splat(
             values are not looked at, which would be one more wait for the device: what is not finite shows in rgb.
         settings: cut-offs and filters.
         backend: "reference", "cpu", "triton" or "auto".
-        screen_gradients: whether ``Rendering.screen_offsets`` gathers gradients; without, Triton's backward pass has a
-            tenth less to do.
+        screen_gradients: whether ``Rendering.screen_offsets`` gathers gradients; without, the pixel loop of Triton's
+            backward pass takes 8 % fewer instructions.
 
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is no rigid motion, whose size or lens is

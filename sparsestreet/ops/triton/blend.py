@@ -11,12 +11,20 @@ import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import across, centers, load_splat, of_lines, quarter_pixels, row_of, touches
+from sparsestreet.ops.triton.quarters import (
+    WARP,
+    across,
+    centers,
+    load_splat,
+    of_lines,
+    quarter_pixels,
+    row_of,
+    touches,
+)
 from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
-WARP = constant(32)
 # Pairs between two looks at whether the whole tile is finished.
 LOOK_LENGTH = 32
 LOOK = constant(LOOK_LENGTH)
