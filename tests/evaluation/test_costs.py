@@ -1,6 +1,7 @@
 """cost.json: round trip, who writes what, and what is made of stages and noted steps."""
 
 import json
+import mmap
 
 import pytest
 import torch
@@ -91,17 +92,18 @@ def test_steps_are_medians_of_parts(tmp_path):
 
 
 def test_a_peak_is_seen_and_forgotten():
+    """Pages of the system's: an allocator may keep what is freed (``keep_freed_memory`` asks it to)."""
     forget_peaks()
     before, on_device = peak_megabytes(torch.device("cpu"))
-    large = torch.ones(100_000_000)  # 400 MB, of which the process may have kept a part from earlier tests
-    during = peak_megabytes(torch.device("cpu"))[0]
-    assert 200 < during - before < 480
+    with mmap.mmap(-1, 400_000_000) as pages:
+        for page in range(0, len(pages), mmap.PAGESIZE):
+            pages[page] = 1
+        during = peak_megabytes(torch.device("cpu"))[0]
     assert on_device is None
-    del large
+    assert 380 < during - before < 420  # the kernel counts pages in batches for each thread
     forget_peaks()
     after = peak_megabytes(torch.device("cpu"))[0]
-    assert after <= during
-    assert after < during - 200 or not _peaks_can_be_forgotten()
+    assert after < during - 380 or not _peaks_can_be_forgotten()
 
 
 def _peaks_can_be_forgotten() -> bool:
