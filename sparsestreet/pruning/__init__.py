@@ -9,7 +9,7 @@ from sparsestreet.pruning.floors import Floors, InstanceAreas
 from sparsestreet.pruning.importance import Importance, measure_importance
 from sparsestreet.pruning.rule import Look, PruningRule
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
-from sparsestreet.pruning.select import keep_by_cost, keep_by_importance
+from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
 
 __all__ = [
     "Floors",
@@ -23,5 +23,6 @@ __all__ = [
     "RandomRule",
     "keep_by_cost",
     "keep_by_importance",
+    "keep_by_rank",
     "measure_importance",
 ]

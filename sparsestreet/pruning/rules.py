@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.importance import Importance
 from sparsestreet.pruning.rule import Look, PruningRule, contributions, on_device
-from sparsestreet.pruning.select import keep_by_cost, keep_by_importance
+from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import render, sky_image
@@ -29,6 +29,13 @@ class ImportanceRule(PruningRule):
 
     gate: bool = True
     """Count a view only for rows that are the largest contributor of one of its pixels."""
+    remove: int | float | None = None
+    """For comparisons at equal count: so many rows go instead, the least important of all nodes together that the rule
+    may take from; up to 1 a fraction of the rows of the whole scene, above 1 their number."""
+
+    def __post_init__(self) -> None:
+        if self.remove is not None and not self.remove >= 0:
+            raise ValueError(f"remove must be a fraction in [0, 1] or a number of Gaussians, got {self.remove}")
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
@@ -36,8 +43,11 @@ class ImportanceRule(PruningRule):
         for view, spans in contributions(scene, frames, how):
             importance.add(view)
             areas.add(view, spans)
-        scores = importance.scores()
-        return {name: keep_by_importance(scores[spans[name]], floors) for name, floors in areas.floors().items()}
+        every, floors = importance.scores(), areas.floors()
+        scores = {name: every[spans[name]] for name in floors}
+        if self.remove is None:
+            return {name: keep_by_importance(scores[name], floors[name]) for name in floors}
+        return keep_by_rank(scores, round(self.remove * len(every) if self.remove <= 1 else self.remove), floors)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from sparsestreet.pruning.floors import Floors
@@ -35,9 +35,38 @@ def keep_by_cost(
     everything = torch.cat([cost.double() for cost in costs.values()])
     if not (everything >= 0).all():
         raise ValueError(f"costs of removal must be numbers >= 0, got {float(everything[~(everything >= 0)][0])}")
-    # Of equals the later goes first, as at the floors.
-    cheapest_first = torch.sort(everything.flip(0), stable=True)
+    order = _lowest_first(everything)
     unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
-    unwanted[len(everything) - 1 - cheapest_first.indices] = cheapest_first.values.cumsum(0) <= allowed
-    parts = unwanted.split([len(cost) for cost in costs.values()])
-    return {name: keep_best(costs[name], part, *floors[name]) for name, part in zip(costs, parts, strict=True)}
+    unwanted[order] = everything[order].cumsum(0) <= allowed
+    return _keep_in_each(costs, unwanted, floors)
+
+
+def keep_by_rank(
+    scores: Mapping[str, Float[Tensor, " _"]], number: int, floors: Mapping[str, Floors]
+) -> dict[str, Selection]:
+    """Drop so many rows of the lowest score, of all nodes together; otherwise as ``keep_by_cost``.
+
+    Raises ValueError for a number that is negative or more than there are, or a negative floor.
+    """
+    everything = torch.cat([score.double() for score in scores.values()]) if scores else torch.zeros(0)
+    if not 0 <= number <= len(everything):
+        raise ValueError(
+            f"{number:,} rows are to go, and the nodes that the rule may take from have {len(everything):,}: take "
+            "fewer, or let it take from more nodes"
+        )
+    unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
+    unwanted[_lowest_first(everything)[:number]] = True
+    return _keep_in_each(scores, unwanted, floors)
+
+
+def _lowest_first(values: Float[Tensor, " n"]) -> Int64[Tensor, " n"]:
+    """Rows in order of their values; of equals the later comes first, as at the floors."""
+    return len(values) - 1 - torch.sort(values.flip(0), stable=True).indices
+
+
+def _keep_in_each(
+    scores: Mapping[str, Float[Tensor, " _"]], unwanted: Bool[Tensor, " n"], floors: Mapping[str, Floors]
+) -> dict[str, Selection]:
+    """What stays of each node, when the rows of all nodes are marked one after the other."""
+    parts = unwanted.split([len(score) for score in scores.values()])
+    return {name: keep_best(scores[name], part, *floors[name]) for name, part in zip(scores, parts, strict=True)}

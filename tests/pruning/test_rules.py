@@ -156,6 +156,28 @@ def test_the_floor_holds():
         assert isinstance(rule, PruningRule)
 
 
+@pytest.mark.parametrize("remove", [0.5, 2])
+def test_a_number_of_the_whole_scene_goes_whatever_nodes_it_may_take_from(remove):
+    """Mean blend weights, front to back: 0.5, 0.5 x 0.5, 0.25 x 0.1, 0.225 x 0.3."""
+    mine, theirs = (
+        background(scene_of(opacities, depths).nodes["background"].rows)
+        for opacities, depths in (([0.5, 0.3], [2.0, 5.0]), ([0.5, 0.1], [3.0, 4.0]))
+    )
+    scene = SceneGraph({"mine": mine, "theirs": theirs})
+    frames = [frame_of(scene, 5)]
+
+    def kept(nodes: list[str] | None) -> dict[str, list[bool]]:
+        chosen = ImportanceRule(gate=False, remove=remove, nodes=nodes).select(scene, frames, LOOK)
+        return {name: each.keep.tolist() for name, each in chosen.items()}
+
+    assert kept(None) == {"mine": [True, False], "theirs": [True, False]}
+    assert kept(["mine"]) == {"mine": [False, False]}
+    with pytest.raises(ValueError, match="have 2"):
+        ImportanceRule(remove=3, nodes=["mine"]).select(scene, frames, LOOK)
+    with pytest.raises(ValueError, match="remove must be"):
+        ImportanceRule(remove=-0.5)
+
+
 @pytest.mark.parametrize(("allowed_db", "noticeable"), [(-0.1, 0.0), (float("nan"), 0.0), (0.1, -1.0)])
 def test_bad_settings_are_refused(allowed_db, noticeable):
     with pytest.raises(ValueError, match="must be >= 0"):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from sparsestreet.pruning import Floors, keep_by_cost, keep_by_importance
+from sparsestreet.pruning import Floors, keep_by_cost, keep_by_importance, keep_by_rank
 from tests.scene.gaussians.oracle import by_hand
 
 # A coarse grid, so that ties are common.
@@ -63,8 +63,27 @@ def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, seco
     assert chosen["b"].keep.tolist() == by_hand(second, unwanted[len(first) :], 0)
 
 
+@settings(max_examples=200, deadline=None)
+@given(score_lists, score_lists, st.floats(0, 1), st.integers(0, 5))
+def test_rank_rule_drops_a_number_of_the_lowest_of_all_nodes(first, second, share, floor):
+    number = round(share * len(first + second))
+    scores = {name: torch.tensor(values, dtype=torch.float64) for name, values in (("a", first), ("b", second))}
+    chosen = keep_by_rank(scores, number, {"a": Floors(floor), "b": Floors(0)})
+    order = sorted(range(len(first) + len(second)), key=lambda row: ((first + second)[row], -row))
+    unwanted = [row in order[:number] for row in range(len(order))]
+    assert chosen["a"].keep.tolist() == by_hand(first, unwanted[: len(first)], floor)
+    assert chosen["b"].keep.tolist() == by_hand(second, unwanted[len(first) :], 0)
+
+
+@pytest.mark.parametrize("number", [-1, 3])
+def test_no_more_may_go_than_there_are(number):
+    with pytest.raises(ValueError, match="have 2"):
+        keep_by_rank({"a": torch.ones(2)}, number, {"a": Floors(0)})
+
+
 def test_without_nodes_nothing_is_chosen():
     assert keep_by_cost({}, 1.0, {}) == {}
+    assert keep_by_rank({}, 0, {}) == {}
 
 
 def test_a_budget_may_be_met_exactly():
