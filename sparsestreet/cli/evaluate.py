@@ -15,15 +15,19 @@ from sparsestreet.cli.scene import open_scene
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.history import draw_history
 from sparsestreet.evaluation.novel import evaluate_novel, novel_path, write_novel
+from sparsestreet.evaluation.preset_record import preset_path, write_presets
+from sparsestreet.evaluation.presets import evaluate_presets
 from sparsestreet.evaluation.provenance import this_machine
 from sparsestreet.evaluation.records import RunDescription, read_run, run_path, summary_path
 from sparsestreet.evaluation.run import evaluate_scene
 from sparsestreet.metrics.extractors import LastLayer
 from sparsestreet.metrics.lpips_weights import open_lpips
+from sparsestreet.ops import SplatSettings
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene
 
 USAGE = """\
-sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true]
+sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true] [presets=fast,default,exact]
 
 RUN is a folder that train wrote, also of a run that was interrupted. Its scene is measured against the views of its
 log, on the kind of device that it was trained on unless another is named, with as many threads as trained it; records
@@ -32,6 +36,9 @@ and pictures are made anew, what is said about the training stays.
 With novel, the held-out cameras are also shifted by so many meters to both sides, and compared with the real images
 and, on a street that was made with data.log.settings.novel_offsets, with the truth; with ramp the shift grows over the
 drive, as in a change of lane. records/novel.json holds what was found.
+
+With presets (of conf/render), the same views are also rendered in these ways, whatever training did: what it costs and
+saves is in records/presets.json, and in the report of the run's sweep.
 """
 
 
@@ -43,8 +50,11 @@ class Options:
     device: Literal["cpu", "cuda"] | None = None
     novel: tuple[float, ...] = ()
     ramp: bool = False
+    presets: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for preset in self.presets:
+            SplatSettings.preset(preset)
         if any(offset <= 0 for offset in self.novel):
             raise ValueError(f"novel must be meters above 0, got {list(self.novel)}: each is taken to both sides")
         if self.ramp and not self.novel:
@@ -81,6 +91,8 @@ def _evaluate(options: Options) -> None:
     print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {summary_path(run)}")
     if options.novel:
         _novel(options, cfg, stored, data)
+    if options.presets:
+        _presets(options, stored, data)
 
 
 def _novel(options: Options, cfg: DictConfig, stored: StoredScene, data: StreetData) -> None:
@@ -109,6 +121,23 @@ def _novel(options: Options, cfg: DictConfig, stored: StoredScene, data: StreetD
         )
     if record.absent:
         print(f"no distances: {record.absent}")
+
+
+def _presets(options: Options, stored: StoredScene, data: StreetData) -> None:
+    """Render in other ways, record it and say it."""
+    record = evaluate_presets(
+        stored.scene,
+        data.split.held_out or data.split.train,
+        {name: RenderOptions(SplatSettings.preset(name)) for name in options.presets},
+        stored.options,
+        command=this_command(["evaluate", f"run={options.run}", f"presets={','.join(options.presets)}"]),
+    )
+    write_presets(preset_path(options.run), record)
+    for one in record.rendered:
+        print(
+            f"{one.preset}{' (as trained)' if one.trained else ''}: {one.quality['psnr_full']:.2f} dB, "
+            f"{one.psnr_to_exact:.1f} dB to the exact image, {one.frame_ms:.1f} ms/frame"
+        )
 
 
 def _device(description: RunDescription, device: str | None) -> torch.device:

@@ -24,6 +24,7 @@ from sparsestreet.evaluation.pictures import (
     write_png,
 )
 from sparsestreet.evaluation.predictions import clear_predictions, predictions_folder
+from sparsestreet.evaluation.preset_record import preset_path
 from sparsestreet.evaluation.provenance import this_machine, this_source
 from sparsestreet.evaluation.quality import FrameQuality, camera_means, summarize
 from sparsestreet.evaluation.quality_csv import quality_path, write_quality
@@ -95,7 +96,8 @@ def evaluate_scene(
     lpips, absent = open_lpips(scene.device)
     for split in (HELD_OUT, TRAINING):
         clear_predictions(predictions_folder(out, split))
-    novel_path(out).unlink(missing_ok=True)  # of an earlier evaluation, perhaps of an earlier scene
+    for path in (novel_path(out), preset_path(out)):
+        path.unlink(missing_ok=True)  # of an earlier evaluation, perhaps of an earlier scene
     quality = {
         split: list(
             evaluate_frames(

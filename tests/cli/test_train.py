@@ -17,6 +17,7 @@ from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
 from sparsestreet.evaluation.costs import cost_path, read_costs
 from sparsestreet.evaluation.novel import novel_path, read_novel
+from sparsestreet.evaluation.preset_record import preset_path, read_presets
 from sparsestreet.evaluation.records import read_run, read_summary, run_path, summary_path
 from sparsestreet.export.views import read_views
 from sparsestreet.metrics.lpips import ALEX
@@ -205,7 +206,7 @@ def test_the_tables_numbers_follow_from_predictions_and_images(finished, tiny_st
     assert len(stored) == read_summary(summary_path(again)).images["held_out"]
 
 
-def test_novel_views_of_a_run(finished, tmp_path, capsys, monkeypatch):
+def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monkeypatch):
     """The street has the truth a meter to the left, of two instants; the networks' weights are random ones."""
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
     out = tmp_path / "again"
@@ -223,7 +224,11 @@ def test_novel_views_of_a_run(finished, tmp_path, capsys, monkeypatch):
     assert all(set(one.distances) == {"frechet_alexnet", "kernel_alexnet"} for one in record.shifts)
     assert f"evaluate run={out} novel=1 ramp=true" in record.command
     assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
-    assert evaluate([f"run={out}"]) == 0
+    assert evaluate([f"run={out}", "presets=default,fast"]) == 0
+    default, fast = read_presets(preset_path(out)).rendered
+    assert default.quality["psnr_full"] == read_summary(summary_path(out)).mean("psnr_full")
+    assert (default.trained, fast.trained) == (True, False)
+    assert default.psnr_to_exact > fast.psnr_to_exact > 30
     assert not novel_path(out).exists()  # it was of an earlier evaluation
 
 

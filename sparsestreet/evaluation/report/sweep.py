@@ -15,6 +15,7 @@ from sparsestreet.evaluation.report.figures_time import counts_over_time, frame_
 from sparsestreet.evaluation.report.grid import Grid, comma_separated, latex, markdown
 from sparsestreet.evaluation.report.layouts import paper_table
 from sparsestreet.evaluation.report.page import Page, html
+from sparsestreet.evaluation.report.presets import rendered_otherwise
 from sparsestreet.evaluation.report.tradeoffs import differences, matched_budget, matched_quality
 from sparsestreet.evaluation.strict_json import write_atomically
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
@@ -83,6 +84,7 @@ def _grids(
         matched_budget(found, protocol),
         time_to_quality(found),
         beside_the_path(found),
+        rendered_otherwise(found, protocol),
     ]
     return [grid for grid in grids if grid is not None and grid.rows]
 

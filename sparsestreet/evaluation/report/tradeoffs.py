@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sparsestreet.evaluation.records import HELD_OUT, RunSummary
-from sparsestreet.evaluation.report.arms import Arm, Value, by_scene, plain_of
+from sparsestreet.evaluation.report.arms import Arm, Unit, Value, by_scene, plain_of
 from sparsestreet.evaluation.report.grid import Cell, Grid
 from sparsestreet.evaluation.report.intervals import CONFIDENCE, Interval, t_interval
 from sparsestreet.metrics.protocols import Protocol
@@ -49,18 +49,20 @@ def _held_out(metric: str) -> Value:
 
 
 def paired(arm: Arm, plain: Arm, value: Value, relative: bool = False) -> Interval | None:
-    """The difference to the plain arm over the pairs of scene and seed that both have.
-
-    Each scene counts once, with the mean of its seeds; with a single scene each seed does.
-    """
+    """The difference to the plain arm over the pairs of scene and seed that both have."""
     ours, theirs = arm.units(value), plain.units(value)
     differences = {
         unit: 100 * (ours[unit] / theirs[unit] - 1) if relative else ours[unit] - theirs[unit]
         for unit in ours.keys() & theirs.keys()
         if not relative or theirs[unit]
     }
-    scenes = by_scene(differences)
-    return t_interval(list((scenes if len(scenes) > 1 else differences).values()))
+    return interval_over_scenes(differences)
+
+
+def interval_over_scenes(values: dict[Unit, float]) -> Interval | None:
+    """Each scene counts once, with the mean of its seeds; with a single scene each seed does."""
+    scenes = by_scene(values)
+    return t_interval(list((scenes if len(scenes) > 1 else values).values()))
 
 
 def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
@@ -77,7 +79,7 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
         runs = tuple(record.folder.name for one in (arm, plain) for record in one.records)
         found = [paired(arm, plain, one.value, one.relative) for one in shown]
         n = max((interval.n for interval in found if interval), default=0)
-        cells = [_difference(interval, one, n, runs) for interval, one in zip(found, shown, strict=True)]
+        cells = [difference_cell(interval, one.text, n, runs) for interval, one in zip(found, shown, strict=True)]
         rows.append((Cell(f"{arm.title} - {plain.name}", runs=runs), Cell(str(n), runs=runs), *cells))
     notes = [
         f"differences paired by scene and seed, mean [{100 * CONFIDENCE:.0f} % t interval]; n: scenes, each the mean "
@@ -90,12 +92,13 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
     return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
 
 
-def _difference(interval: Interval | None, measure: Measure, n: int, runs: tuple[str, ...]) -> Cell:
+def difference_cell(interval: Interval | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
+    """Mean and interval, bold where it excludes 0; says its own n where that is not the row's."""
     if interval is None:
         return Cell()
-    text = measure.text.format(interval.mean)
+    text = form.format(interval.mean)
     if interval.low is not None:
-        text += f" [{measure.text.format(interval.low)}, {measure.text.format(interval.high)}]"
+        text += f" [{form.format(interval.low)}, {form.format(interval.high)}]"
     return Cell(text if interval.n == n else f"{text} (n={interval.n})", interval.proven, runs=runs)
 
 

@@ -1,0 +1,69 @@
+"""A trained scene rendered in other ways: which image each is, what is compared with what."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sparsestreet.data.lazy import Frames
+from sparsestreet.evaluation.evaluate import evaluate_frames
+from sparsestreet.evaluation.preset_record import preset_path, read_presets, write_presets
+from sparsestreet.evaluation.presets import evaluate_presets
+from sparsestreet.evaluation.strict_json import RecordError
+from sparsestreet.ops import SplatSettings
+from sparsestreet.scene.rendering import RenderOptions, render
+from tests.evaluation.frames import make_frame
+from tests.evaluation.scenes import OPTIONS, small_scene
+
+SCENE = small_scene()
+FRAMES = Frames.of((make_frame(0), make_frame(1, size=(11, 7))))
+COARSE = RenderOptions(SplatSettings(alpha_min=0.3))
+
+
+def evaluated(presets, trained=OPTIONS):
+    return evaluate_presets(SCENE, FRAMES, presets, trained, command="c", warmup=1, repeats=1)
+
+
+def test_each_preset_is_rendered_and_compared():
+    """The distance to the exact image in numpy; quality as evaluation says it of that way to render."""
+    record = evaluated({"default": RenderOptions(), "coarse": COARSE})
+    assert (record.views, [one.trained for one in record.rendered]) == (2, [True, False])
+    for one, settings in zip(record.rendered, (SplatSettings(), COARSE.settings), strict=True):
+        options = replace(OPTIONS, settings=settings)
+        expected = [frame.value("psnr", "full") for frame in evaluate_frames(SCENE, FRAMES, options)]
+        assert one.quality["psnr_full"] == pytest.approx(np.mean(expected), rel=1e-12)
+        assert "psnr_human" not in one.quality  # these frames have no such mask
+        distances = []
+        for view in FRAMES.views:
+            images = [
+                render(SCENE, view, options=replace(OPTIONS, settings=how)).rgb.detach().double().numpy().clip(0, 1)
+                for how in (settings, SplatSettings(alpha_min=0.0, transmittance_min=0.0))
+            ]
+            distances.append(-10 * np.log10(np.mean((images[0] - images[1]) ** 2)))
+        assert one.psnr_to_exact == pytest.approx(np.mean(distances), rel=1e-5)
+        assert min(one.frame_ms, one.raster_ms) > 0
+    assert record.rendered[0].psnr_to_exact > record.rendered[1].psnr_to_exact + 10
+
+
+def test_exact_keeps_what_a_splat_is():
+    """With the low-pass and the clamp that the scene was trained with, the exact image is the trained one's limit."""
+    trained = RenderOptions(SplatSettings(eps2d=1.0, alpha_max=0.6, antialias=True), backend="reference")
+    exact = RenderOptions(replace(trained.settings, alpha_min=0.0, transmittance_min=0.0))
+    assert evaluated({"exact": exact}, trained).rendered[0].psnr_to_exact == 100
+
+
+def test_a_record_is_read_back(tmp_path):
+    record = evaluated({"default": RenderOptions()})
+    path = preset_path(tmp_path)
+    path.parent.mkdir()
+    write_presets(path, record)
+    again = read_presets(path)
+    assert again.rendered[0].psnr_to_exact == pytest.approx(record.rendered[0].psnr_to_exact, rel=1e-5)
+    path.write_text(path.read_text().replace("psnr_to_exact", "psnr_to_nothing"))
+    with pytest.raises(RecordError, match=r"presets\.json"):
+        read_presets(path)
+
+
+def test_without_presets_there_is_nothing_to_measure():
+    with pytest.raises(ValueError, match="at least one preset"):
+        evaluated({})
