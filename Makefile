@@ -28,7 +28,7 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 	touch $@
 
 # One thread a process: tests are small, and threads that wait for each other cost more than they bring.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 quick: lint ## the loop of daily work, under a minute: lint and unit tests without trainings and Triton's interpreter
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'

@@ -145,7 +145,7 @@ run_tests() { # part, limit in seconds, arguments of pytest...
     -o faulthandler_timeout=60 --durations=15)
   # Without beartype the shape annotations are not checked.
   ! lacks beartype || options+=(-o "addopts=-q --strict-markers")
-  lacks xdist || options+=(-n "$JOBS" --dist loadgroup)
+  lacks xdist || options+=(-n "$JOBS" --dist load)
   OMP_NUM_THREADS=1 run_part "$part" "$limit" "$log" "$PYTHON" -m pytest "${options[@]}" "$@"
   { grep -E '^(FAILED|ERROR) ' "$log" | head -n 5; grep '^left out: ' "$log"; } | cut -c 1-150 |
     while read -r line; do more "$line"; done

@@ -20,7 +20,7 @@ from sparsestreet.evaluation.strict_json import RecordError
 
 log = logging.getLogger(__name__)
 
-OF_DRIVES = "table"
+OF_DRIVES = ("table", "drives")
 """What the names of sweeps over recorded drives start with."""
 
 _ALIKE = ("seed", "data.root", "data.log.root")

@@ -181,7 +181,7 @@ def test_parts_end_as_by_ctrl_c_and_tests_keep_going_at_warnings(tmp_path):
         if call.startswith(("parity", "kernels")):
             assert "-rfE" in call
             assert "-o filterwarnings=default" in call
-            assert "--dist loadgroup" in call
+            assert "--dist load" in call
             named = [ROOT / word for word in call.split() if word.startswith("tests/")]
             assert named
             assert all(path.exists() for path in named)

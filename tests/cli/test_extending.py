@@ -33,8 +33,6 @@ from tests.cli.toy.source import DrivenPoints
 from tests.scene.street import street_log, training_data
 from tests.training.stubs import background, frame_at, make_rows, set_rows
 
-pytestmark = pytest.mark.xdist_group("tiny street")
-
 ROOT = Path(__file__).parents[2]
 OUTSIDE = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
 PROBIT = "node.background.mask._target_=tests.cli.toy.mask.ProbitMaskSettings"
@@ -137,6 +135,7 @@ def test_a_method_goes_with_every_sparsification(sparsify):
     assert "depth" not in recipe.losses
 
 
+@pytest.mark.slow
 def test_they_train_together(run):
     with (run / "records" / "counts.csv").open() as file:
         pruned = [row for row in csv.DictReader(file) if row["reason"] == "pruning"]
@@ -147,6 +146,7 @@ def test_they_train_together(run):
     assert description.config["loss.mean_color.weight"] == 0.1
 
 
+@pytest.mark.slow
 def test_a_number_of_a_finished_run(run, tiny_street):
     root = next(word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
     errors = largest_errors(run, DriveStudioReader(root).read())

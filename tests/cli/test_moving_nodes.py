@@ -10,8 +10,6 @@ from sparsestreet import load_scene
 from sparsestreet.cli.train import train
 from sparsestreet.scene.graph import SceneGraph
 
-pytestmark = pytest.mark.xdist_group("tiny street")
-
 
 def trained(tiny_street: list[str], out: Path, *overrides: str) -> tuple[SceneGraph, list[dict[str, str]]]:
     """The scene of a run, and its curves."""
@@ -52,6 +50,7 @@ def test_a_street_deformed_by_a_network(tiny_street, tmp_path):
     assert torch.isfinite(node.network.last.weight).all()
 
 
+@pytest.mark.slow
 def test_objects_deformed_by_a_network(tiny_street, tmp_path):
     """Its loss falls, the network and the boxes are learned, rows come and go, with a mask over time."""
     scene, curves = trained(

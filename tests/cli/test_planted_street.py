@@ -30,8 +30,6 @@ from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
 from tests.pruning.planted import Views, activated, judge, plant
 
-# One process trains for all tests.
-pytestmark = pytest.mark.xdist_group("planted street")
 STEPS = 600
 FEW_VISIBLE = 300
 """Rows whose visibility is measured; each costs about one rendering of a few views."""

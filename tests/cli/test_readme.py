@@ -5,14 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from sparsestreet.cli import COMMANDS
 from sparsestreet.cli.compose import override_problem
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
-
-pytestmark = pytest.mark.xdist_group("tiny street")
 
 
 def test_the_lines_of_python_render_a_run(run_train, tmp_path):

@@ -15,8 +15,6 @@ from sparsestreet.cli.train import train
 from sparsestreet.evaluation.costs import cost_path, read_costs
 from sparsestreet.training.callbacks import RowLedger
 
-pytestmark = pytest.mark.xdist_group("tiny street")
-
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
     return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]

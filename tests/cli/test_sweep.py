@@ -5,14 +5,14 @@ from hydra import compose
 
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, configuration, override_problem
-from sparsestreet.cli.sweep import as_sweep, sweep_name, sweep_problem
+from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, sweep_name, sweep_problem
 from sparsestreet.cli.train import train
 from sparsestreet.evaluation.failures import read_failures
 from sparsestreet.evaluation.records import read_summary, summary_path, write_summary
 from tests.evaluation.frames import make_summary
 
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
-OF_DRIVES = [name for name in SWEEPS if name.startswith("table")]
+NEED_DRIVES = [name for name in SWEEPS if name.startswith(OF_DRIVES)]
 
 
 def composed(*overrides: str):
@@ -33,7 +33,7 @@ def test_every_job_of_a_sweep_can_be(name, tmp_path):
     write_summary(
         summary_path(tmp_path), make_summary(gaussians={"background": 20_000, "rigid": 2000})
     )  # the run that controls have their count from
-    drive = [f"data.root={tmp_path}"] if name in OF_DRIVES else []
+    drive = [f"data.root={tmp_path}"] if name in NEED_DRIVES else []
     for job in jobs(name):
         cfg = composed(*job, *drive, f"count_of={tmp_path}")
         del cfg.hydra

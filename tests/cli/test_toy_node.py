@@ -15,7 +15,6 @@ from sparsestreet.evaluation.records import read_summary, summary_path
 from sparsestreet.export.views import read_views
 from tests.cli.toy.bobbing import Bobbing
 
-pytestmark = pytest.mark.xdist_group("tiny street")
 CONF = Path(__file__).parent / "toy" / "conf"
 
 

@@ -27,7 +27,6 @@ from tests.cli.recompute import recompute
 from tests.metrics.networks import random_weights, write_weights
 
 # One process trains once for the tests that only look.
-pytestmark = pytest.mark.xdist_group("tiny street")
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:

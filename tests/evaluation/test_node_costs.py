@@ -114,6 +114,7 @@ def test_what_a_scene_lacks_costs_nothing_and_is_not_named(monkeypatch):
     assert measure_scene_costs(without_sky(small_scene()), FRAMES, OPTIONS, repeats=1).effects == {}
 
 
+@pytest.mark.slow
 def test_quiet_machines_agree_with_themselves():
     """The parts of a frame add up to the frame, which is timed by another clock at another time, within 10 %, and the
     protocol taken twice gives medians within 5 %. Where the machine is not quiet, the records say so."""

@@ -36,7 +36,7 @@ ROW_BAR = {torch.float32: 1e-5, torch.float64: 1e-13}
 WIDTH, HEIGHT = 75, 53
 
 # One process compiles for all tests.
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiles")]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(params=[8, 32])

@@ -52,6 +52,7 @@ def test_the_nearer_of_box_and_cut_off_ends_a_splat(backend):
 
 
 @every_precision
+@pytest.mark.slow_if_interpreted
 def test_a_box_that_ends_nothing_changes_no_bit(backend, dtype):
     view = camera(21, 13)
     gaussians = random_gaussians(60, view)
@@ -143,6 +144,7 @@ def test_half_colors_over_their_range(backend):
 
 
 @every_precision
+@pytest.mark.slow_if_interpreted
 def test_half_colors_in_a_scene(backend, dtype):
     view = camera(21, 13)
     gaussians = random_gaussians(60, view)

@@ -81,6 +81,7 @@ def test_04_exponent_far_along_a_needle(backend):
     assert (alpha - truth.alpha).abs().max() < 2e-4
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_06_through_the_near_plane(backend, dtype):
     view = front_camera(21, 13, 20.0)
@@ -171,6 +172,7 @@ def test_07_gradients_on_both_sides_of_the_jacobian_limit(backend, dtype, slope)
             assert relative_error(result.gradients[field], truth.gradients[field]) < 1e-4
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_07_the_limit_acts_and_is_continuous(backend, dtype):
     # Past the limit only the Jacobian stays behind: the image goes on without a step, but not as without a limit.

@@ -102,6 +102,7 @@ def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend, dtype):
     _check_tiles(backend, dtype, (37, 11), [150.0, 60.0] + 10 * [40.0, 20.0, 10.0, 4.0])
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_23_tiles_of_a_few_ellipses(backend, dtype):
     _check_tiles(backend, dtype, (5, 2), [20.0, 8.0])

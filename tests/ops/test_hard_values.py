@@ -123,6 +123,7 @@ def test_05_zero_quaternion_is_the_identity(backend, dtype):
     assert guards(cast(turned, dtype), view).alarms == {"identity_quaternion": 1}
 
 
+@pytest.mark.slow_if_interpreted
 @every_precision
 def test_05_length_of_quaternions_does_not_matter(backend, dtype):
     view = front_camera(21, 13, 20.0)

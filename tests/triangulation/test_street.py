@@ -17,7 +17,7 @@ from sparsestreet.types import Camera
 from tests.triangulation.conftest import traced
 
 SETTINGS = ImagePointSettings(threads=1)
-pytestmark = [pytest.mark.lengthy, pytest.mark.xdist_group("triangulated_street")]
+pytestmark = pytest.mark.lengthy
 
 
 def _moving(log):

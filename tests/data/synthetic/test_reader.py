@@ -40,6 +40,7 @@ def test_a_street_opens_as_a_log(tmp_path):
 
 
 @pytest.mark.lengthy
+@pytest.mark.slow
 def test_shifted_views_are_those_of_a_rig_beside_the_path(tmp_path):
     """Their poses are the recorded ones moved sideways, by whom the tracer is not asked."""
     settings = replace(SETTINGS, num_frames=3, novel_offsets=(1.0, -2.5), novel_stride=2)

@@ -10,7 +10,7 @@ from sparsestreet.ops.triton import launch
 from tests.ops.triton.recording import run_compiler
 
 # One process compiles for all tests.
-pytestmark = [pytest.mark.xdist_group("machine code"), pytest.mark.lengthy]
+pytestmark = pytest.mark.lengthy
 
 FORWARD = [
     "project_rows", "list_visible", "list_counts", "list_pairs", "bound_tiles", "list_parts", "blend_tiles",

@@ -21,7 +21,6 @@ from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
 # One process compiles for all tests.
-pytestmark = pytest.mark.xdist_group("machine code")
 DEVICE = device_of("triton")
 
 STILL = camera(5, 4)

@@ -99,7 +99,7 @@ def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatc
     assert torch.equal(written[False], ~written[True])
 
 
-@pytest.mark.parametrize("length", [1, pytest.param(4, marks=pytest.mark.slow_if_interpreted)])
+@pytest.mark.parametrize("length", [pytest.param(1, marks=pytest.mark.slow_if_interpreted), 4])
 def test_any_length_draws_the_same(length, monkeypatch):
     view = camera(19, 17)
     scene = random_gaussians(12, view)
