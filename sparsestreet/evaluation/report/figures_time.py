@@ -10,9 +10,9 @@ from matplotlib.ticker import FuncFormatter
 from sparsestreet.evaluation.history import count_curves, marks
 from sparsestreet.evaluation.ledger import ledger_path, read_changes
 from sparsestreet.evaluation.report.arms import Arm
+from sparsestreet.evaluation.report.costs import costs_of
 from sparsestreet.evaluation.report.curves import curves_of
 from sparsestreet.evaluation.report.figures import COLORS, GREY, LEGEND, panels, short, write_svg
-from sparsestreet.evaluation.strict_json import RecordError, parsed
 
 _PAINT = {"none": COLORS[0], "paper": COLORS[1], "removal": COLORS[2], "masks": COLORS[3], "importance": COLORS[4]}
 
@@ -95,21 +95,11 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
 def _frame_costs(arm: Arm) -> dict[str, float]:
     """Node or effect -> mean milliseconds over the runs that recorded it."""
     found: dict[str, list[float]] = {}
-    for record in arm.records:
-        path = record.folder / "records" / "cost.json"
-        if path.is_file():
-            for part, ms in _parts_of(path).items():
-                found.setdefault(part, []).append(ms)
+    for costs in filter(None, map(costs_of, arm.records)):
+        parts = {name: node.ms for name, node in costs.nodes.items()}
+        for part, ms in (parts | {f"effect: {name}": ms for name, ms in costs.effects.items()}).items():
+            found.setdefault(part, []).append(ms)
     return {part: statistics.fmean(values) for part, values in found.items()}
-
-
-def _parts_of(path: Path) -> dict[str, float]:
-    costs = parsed(path.read_text(encoding="utf-8"), str(path))
-    try:
-        nodes = {name: float(node["ms"]) for name, node in costs["nodes"].items()}
-        return nodes | {f"effect: {name}": float(ms) for name, ms in costs["effects"].items()}
-    except (KeyError, TypeError) as error:
-        raise RecordError(f"{path}: lacks {error}; evaluate the run again") from error
 
 
 def _of(arms: Sequence[Arm], method: str) -> list[Arm]:

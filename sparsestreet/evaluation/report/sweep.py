@@ -9,6 +9,7 @@ from sparsestreet.evaluation.report.arms import Arm, arms, why_apart
 from sparsestreet.evaluation.report.beside import beside_the_path
 from sparsestreet.evaluation.report.collect import RunRecord, check_definitions, collect
 from sparsestreet.evaluation.report.comparison import comparison_data
+from sparsestreet.evaluation.report.costs import what_arms_cost
 from sparsestreet.evaluation.report.curves import time_to_quality
 from sparsestreet.evaluation.report.figures import COSTS, pareto
 from sparsestreet.evaluation.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
@@ -79,6 +80,7 @@ def _grids(
 ) -> list[Grid]:
     grids = [
         paper_table(found, failures, protocol, name),
+        what_arms_cost(found),
         differences(found, protocol),
         matched_quality(found, protocol),
         matched_budget(found, protocol),

@@ -1,10 +1,10 @@
 """A sweep's folder as training leaves it, with numbers that tests choose."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 
+from sparsestreet.evaluation.costs import NodeCost, update_costs
 from sparsestreet.evaluation.failures import FailedRun, write_failure
 from sparsestreet.evaluation.ledger import CountChange, ledger_path, write_changes
 from sparsestreet.evaluation.pictures import KINDS, picture_path, write_png
@@ -53,8 +53,9 @@ def write_sweep(folder: Path, *, curves: bool = True, failed: bool = True) -> Pa
             write_png(picture_path(run / "pictures", 5, 0, kind), image)
         if curves:
             _write_curve(run, summary.mean("psnr_full"))
-            nodes = {"background": {"ms": 3.0}, "rigid": {"ms": 1.0}}
-            (run / "records" / "cost.json").write_text(json.dumps({"nodes": nodes, "effects": {"sky": 0.5}}))
+            nodes = {name: NodeCost(10, 0.1, 4.0, ms) for name, ms in (("background", 3.0), ("rigid", 1.0))}
+            steps = {"scene": 1.0, "splat": 2.0, "backward": 4.0, "optimizer": 0.5}
+            update_costs(run, nodes=nodes, effects={"sky": 0.5}, step_ms=steps, phases={"train": 9.0, "prune": 0.25})
     if failed:
         failure = FailedRun(label="streetgs+paper", seed=0, command="train x", error="no <memory>", trace="Trace ...")
         write_failure(folder / "streetgs+paper_seed0", failure)
