@@ -42,8 +42,8 @@ def what_arms_cost(arms: Sequence[Arm]) -> Grid:
         rows.append((Cell(arm.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
     header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _, _ in shown))
     notes = [
-        "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import of "
-        "torch to the pictures; a step: medians over the steps that records/phases.csv notes"
+        "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import "
+        "of torch to the pictures; a step: medians over the steps that records/phases.csv notes"
     ]
     if not all(record.summary.latency.noise.quiet for arm in arms for record in arm.records):
         notes.append("some milliseconds are of a machine that was not quiet, as their records say")
