@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.lazy import Frames
+from sparsestreet.evaluation import presets as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.preset_record import preset_path, read_presets, write_presets
-from sparsestreet.evaluation.presets import evaluate_presets
+from sparsestreet.evaluation.presets import ROUNDS, evaluate_presets
 from sparsestreet.evaluation.strict_json import RecordError
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -21,7 +22,7 @@ COARSE = RenderOptions(SplatSettings(alpha_min=0.3))
 
 
 def evaluated(presets, trained=OPTIONS):
-    return evaluate_presets(SCENE, FRAMES, presets, trained, command="c", warmup=1, repeats=1)
+    return evaluate_presets(SCENE, FRAMES, presets, trained, command="c")
 
 
 def test_each_preset_is_rendered_and_compared():
@@ -41,7 +42,8 @@ def test_each_preset_is_rendered_and_compared():
             ]
             distances.append(-10 * np.log10(np.mean((images[0] - images[1]) ** 2)))
         assert one.psnr_to_exact == pytest.approx(np.mean(distances), rel=1e-5)
-        assert min(one.frame_ms, one.raster_ms) > 0
+        assert one.frame_ms > 0
+        assert one.repeats == 2 * ROUNDS
     assert record.rendered[0].psnr_to_exact > record.rendered[1].psnr_to_exact + 10
 
 
@@ -50,6 +52,11 @@ def test_exact_keeps_what_a_splat_is():
     trained = RenderOptions(SplatSettings(eps2d=1.0, alpha_max=0.6, antialias=True), backend="reference")
     exact = RenderOptions(replace(trained.settings, alpha_min=0.0, transmittance_min=0.0))
     assert evaluated({"exact": exact}, trained).rendered[0].psnr_to_exact == 100
+
+
+def test_what_is_slow_is_timed_once_a_view(monkeypatch):
+    monkeypatch.setattr(presets_module, "SLOW_MS", 0.0)
+    assert evaluated({"default": RenderOptions()}).rendered[0].repeats == 2
 
 
 def test_a_record_is_read_back(tmp_path):
