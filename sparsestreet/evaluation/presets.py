@@ -92,7 +92,9 @@ def _frame_times(scene: SceneGraph, views: Sequence[View], ways: Mapping[str, Re
     clock = clock_of(scene.device)
     times: dict[str, list[float]] = {name: [] for name in ways}
     for turn in range(ROUNDS):
-        timed = {name: options for name, options in ways.items() if not turn or statistics.median(times[name]) < SLOW_MS}
+        timed = {
+            name: options for name, options in ways.items() if not turn or statistics.median(times[name]) < SLOW_MS
+        }
         for view in views:
             for name, options in timed.items():
                 start = clock.mark()
