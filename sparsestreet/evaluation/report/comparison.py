@@ -22,7 +22,7 @@ VIEWS = 2
 def comparison_data(arms: Sequence[Arm]) -> str | None:
     """JSON of the views with their images, truth first, as data addresses; None where no two images show one view.
 
-    Of each scene the lowest seed, and of its views those of most vehicle pixels that evaluation drew.
+    Of each scene the lowest seed, and of its views the first that evaluation drew.
     """
     views = []
     scenes = sorted({record.summary.run.scene for arm in arms for record in arm.records})
@@ -31,8 +31,8 @@ def comparison_data(arms: Sequence[Arm]) -> str | None:
             record.summary.run.seed for arm in arms for record in arm.records if record.summary.run.scene == scene
         )
         shown = [(arm, record) for arm in arms if (record := _record(arm, scene, seed)) is not None]
-        keys = [(frame, camera) for frame, camera in _drawn(shown[0][1]) if len(shown) > 0] if shown else []
-        views += [view for key in keys[:VIEWS] if (view := _view(scene, seed, key, shown)) is not None]
+        keys = _drawn(shown[0][1])[:VIEWS] if shown else []
+        views += [view for key in keys if (view := _view(scene, seed, key, shown)) is not None]
     # A tag inside the text would end the script element.
     return json.dumps(views).replace("</", "<\\/") if views else None
 
