@@ -67,7 +67,7 @@ claims: $(VENV)/.ok ## what the paper claims, at equal count, and what accuracy 
 	  $(BIN)/sparsestreet evaluate run=RUN presets=fast,default,fine,exact
 	for sweep in claims renders; do $(BIN)/sparsestreet report sweep=outputs/sweeps/$$sweep; done
 
-figure: $(VENV)/.ok ## quality against training and frame time on the default streets (18 trainings): docs/figures/time.png
+figure: $(VENV)/.ok ## quality against training and frame time on the default streets (9 trainings): docs/figures/time.png
 	$(TRAIN) +sweep=readme || $(TRAIN) +sweep=readme; status=$$?; \
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/readme figure=docs/figures/time.png; exit $$status
 
