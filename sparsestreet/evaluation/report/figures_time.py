@@ -1,6 +1,7 @@
 """Figures of a sweep over time: held-out quality, counts, and what a frame's milliseconds are spent on."""
 
 import statistics
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -83,7 +84,7 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
     for index, part in enumerate(parts):
         hatch = "//" if part.startswith("effect") else None
         axes.barh([0], [0], color=COLORS[index % len(COLORS)], hatch=hatch, edgecolor="white", label=part)
-    axes.set_yticks(range(len(drawn)), [arm.title for arm in drawn])
+    axes.set_yticks(range(len(drawn)), [textwrap.fill(arm.title, 40) for arm in drawn])
     axes.invert_yaxis()
     axes.axvline(0, color=GREY, linewidth=0.8)
     axes.set_xlabel("milliseconds that a frame takes longer with it")

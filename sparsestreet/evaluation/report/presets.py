@@ -1,5 +1,6 @@
 """Trained one way and rendered another (``records/presets.json``): what that costs and saves."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 from sparsestreet.evaluation.preset_record import PresetRecord, RenderedAs, preset_path, read_presets
@@ -23,7 +24,8 @@ def rendered_otherwise(arms: Sequence[Arm], protocol: Protocol) -> Grid | None:
     Raises RecordError for a malformed record.
     """
     recorded = [(arm, _records(arm)) for arm in arms]
-    rows = [row for arm, records in recorded for row in _rows(arm, records, protocol)]
+    labels = Counter(arm.label for arm in arms)
+    rows = [row for arm, records in recorded for row in _rows(arm, records, protocol, labels[arm.label] > 1)]
     if not rows:
         return None
     header = [("", "trained"), ("", "rendered"), ("", "n")]
@@ -43,14 +45,17 @@ def _records(arm: Arm) -> dict[Unit, PresetRecord]:
     return {unit: read_presets(path) for unit, path in paths.items() if path.is_file()}
 
 
-def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol) -> Iterator[tuple[Cell, ...]]:
+def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
+    """``several``: arms have this label; then the preset of training, if it is known, tells them apart."""
     runs = tuple(run.folder.name for run in arm.records)
     metrics = (protocol.psnr, protocol.human[0], protocol.vehicle[0])
     trained = {unit: one for unit, record in records.items() for one in record.rendered if one.trained}
+    presets = {one.preset for one in trained.values()}
+    title = f"{arm.label}, {presets.pop()}" if several and len(presets) == 1 else arm.title
     for preset in dict.fromkeys(one.preset for record in records.values() for one in record.rendered):
         found = {unit: one for unit, record in records.items() for one in record.rendered if one.preset == preset}
         name = f"{preset}, as trained" if all(one.trained for one in found.values()) else preset
-        cells = [Cell(arm.title, runs=runs), Cell(name, runs=runs), Cell(str(len(found)), runs=runs)]
+        cells = [Cell(title, runs=runs), Cell(name, runs=runs), Cell(str(len(found)), runs=runs)]
         for metric in metrics:
             cells += _quality(found, trained, metric, runs)
         for _, _, form, number in _COSTS:

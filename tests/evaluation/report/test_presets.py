@@ -1,5 +1,6 @@
 """Trained one way, rendered another: rows, means over scenes, differences to the way that training rendered."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from sparsestreet.evaluation.preset_record import PresetRecord, RenderedAs, preset_path, write_presets
@@ -42,6 +43,16 @@ def test_a_row_for_each_arm_and_preset(tmp_path):
     ]
     assert not any("quiet" in note for note in grid.notes)
     assert rendered_otherwise(found, STRICT).rows[1][3].text == "-"  # its metric was not recorded
+
+
+def test_arms_of_one_label_are_told_apart_by_how_they_were_trained(tmp_path):
+    sweep = write_sweep(tmp_path, failed=False)
+    for seed in range(3):
+        write_rendered(sweep / f"streetgs_seed{seed}", 0.1)
+    (plain, *_) = arms(collect([sweep]))
+    other = replace(plain, name="streetgs render.settings.alpha_min=0.1")
+    grid = rendered_otherwise([plain, other], DRIVESTUDIO)
+    assert [row[0].text for row in grid.rows] == ["streetgs, default"] * 4
 
 
 def test_none_recorded_no_table(tmp_path):
