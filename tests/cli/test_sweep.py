@@ -125,4 +125,4 @@ def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, caps
 
 def test_a_slip_in_a_sweep_is_one_line(capsys):
     assert train(["+sweep=tony"]) == 2
-    assert "no option 'tony' in conf/sweep: choose one of readme, streets, table1_waymo" in capsys.readouterr().err
+    assert f"no option 'tony' in conf/sweep: choose one of {', '.join(SWEEPS)}" in capsys.readouterr().err
