@@ -44,7 +44,7 @@ def evaluate_presets(
     Raises ValueError without views or presets, or for renders that are not finite.
     """
     if not frames or not presets:
-        raise ValueError(f"presets need views and at least one preset, got {len(frames)} and {list(presets)}")
+        raise ValueError(f"give views and at least one preset, got {len(frames)} and {list(presets)}")
     before = calibrate(scene.device)
     ways = {name: replace(options, backend=trained.backend) for name, options in presets.items()}
     quality, distances = _looks(scene, frames, ways, replace(trained, settings=_exact(trained.settings)))
