@@ -60,11 +60,8 @@ tables: $(VENV)/.ok ## five methods, pruned, and controls on three streets (75 t
 	$(TRAIN) +sweep=streets || $(TRAIN) +sweep=streets; status=$$?; \
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/streets; exit $$status
 
-# A scene is rendered in other ways than it was trained by a command of its own.
 claims: $(VENV)/.ok ## what the paper claims, at equal count, and what accuracy costs a trained scene (30 trainings): outputs/sweeps
 	for sweep in claims renders; do $(TRAIN) +sweep=$$sweep || $(TRAIN) +sweep=$$sweep || exit $$?; done
-	ls -d outputs/sweeps/renders/*_seed* | OMP_NUM_THREADS=1 xargs -P 2 -I RUN \
-	  $(BIN)/sparsestreet evaluate run=RUN presets=fast,default,fine,exact
 	for sweep in claims renders; do $(BIN)/sparsestreet report sweep=outputs/sweeps/$$sweep; done
 
 figure: $(VENV)/.ok ## quality against training and frame time on the default streets (9 trainings): docs/figures/time.png

@@ -113,7 +113,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(View):
-    """A recorded view: its image, and what is known about its pixels. Both of a view's numbers are given."""
+    """A view with its image, and what is known about its pixels. Of a recorded one both numbers are given."""
 
     image: UInt8[Tensor, "h w 3"]
     sky: Bool[Tensor, "h w"] | None = None

@@ -49,6 +49,7 @@ class TrainSchema:
     render: Any = MISSING
     trainer: Any = MISSING
     logger: Any = None
+    evaluation: Any = MISSING
     out: str = MISSING
     folder: str = MISSING
 

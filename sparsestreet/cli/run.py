@@ -7,11 +7,13 @@ from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from lightning import Callback, Trainer, seed_everything
 from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command, trainer_of
 from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.further import FurtherLooks
 from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.costs import stage_costs, step_costs, update_costs
@@ -51,13 +53,13 @@ def run(cfg: DictConfig, out: Path, started: float) -> float:
     problem = config_problem(cfg)
     if problem:
         raise ValueError(problem)
-    recipe = recipe_of(cfg)
+    recipe, looks = recipe_of(cfg), instantiate(cfg.evaluation, _convert_="all")
     seed_everything(cfg.seed, verbose=False)
     silence_known_noise()
     # The job's own overrides: in a sweep they are not what was typed.
     command = this_command(["train", *HydraConfig.get().overrides.task])
     with StageRecorder(started) as recorder:
-        summary, device = _train_and_evaluate(cfg, recipe, recorder, out, command)
+        summary, device = _train_and_evaluate(cfg, recipe, looks, recorder, out, command)
         if summary is None:
             return 0.0
         with stage("pictures"):
@@ -68,7 +70,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float:
 
 
 def _train_and_evaluate(
-    cfg: DictConfig, recipe: Recipe, recorder: StageRecorder, out: Path, command: str
+    cfg: DictConfig, recipe: Recipe, looks: FurtherLooks, recorder: StageRecorder, out: Path, command: str
 ) -> tuple[RunSummary | None, torch.device]:
     """What was measured (None of a ``fast_dev_run``), and the device."""
     with stage("data"):
@@ -93,6 +95,7 @@ def _train_and_evaluate(
             command=command,
             device=device,
         )
+    looks.take(system.scene, data, system.options, out=out, command=command, say=log.info)
     return summary, device
 
 

@@ -1,6 +1,6 @@
 """A driving log as the rest of the package sees it, whatever data set it came from."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +18,11 @@ _SEEN_AHEAD = 50.0
 """Meters a camera is taken to see where no lidar says so."""
 _QUANTILE_POINTS = 1_000_000
 """Quantiles of this many points are as good as of all of them, and take a tenth of a second."""
+
+
+Truth = Callable[[View], Frame | None]
+"""A view of the log's world -> the frame that its camera would have recorded; None where none can be, as inside of a
+car."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class DrivingLog:
     """Adds back what re-centering took away: maps the log's world to the data set's own."""
     notes: tuple[str, ...] = ()
     """What is absent, and what a run does without it, one sentence each."""
+    truth: Truth | None = None
+    """Of views beside the recorded path; None: nobody knows it, as of all recorded drives."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", Frames.of(self.frames))

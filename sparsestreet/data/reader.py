@@ -2,10 +2,8 @@
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
 
-from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 
@@ -26,11 +24,6 @@ class LogReader(ABC):
     def read(self) -> DrivingLog:
         """The log, its pixels and points still on disk. Raises LogError where it needs repair, and ValueError as
         ``check`` does; a file that turns out to be broken when it is decoded raises LogError then."""
-
-    def shifted(self, log: DrivingLog) -> Mapping[float, Frames]:
-        """Images beside the recorded path, where there are any: meters to the right of the rig -> front views at the
-        instants of the log that was read. Recorded drives have none."""
-        return {}
 
     def data_hash(self) -> str:
         """12 hexadecimal digits of the SHA-256 over all files below ``folder``, in order of their names: name, size,

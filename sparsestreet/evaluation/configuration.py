@@ -37,9 +37,7 @@ IDENTITY_KEYS = (
     "trainer.limit_val_batches",
     "trainer.enable_*",
     "trainer.default_root_dir",
-    "evaluation.pictures",
-    "evaluation.warmup",
-    "evaluation.repeats",
+    "evaluation.*",
 )
 """Patterns of the options that name a run, place it or watch it, and cannot change what it arrives at. All other
 options are part of the configuration's identity."""

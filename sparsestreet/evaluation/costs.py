@@ -53,7 +53,7 @@ class CostRecord:
     interrupted ones that it went on from; None until one has ended."""
     phases: dict[str, float]
     """Part of the command (start, data, points, initialize, train, validate, prune, save, evaluate, latency, costs,
-    pictures, other) -> seconds, each second in one of them."""
+    novel, presets, pictures, other) -> seconds, each second in one of them."""
     step_ms: dict[str, float]
     """Part of a training step -> median milliseconds, over the noted steps that have it; empty where none was."""
     passes: dict[str, float]

@@ -3,25 +3,30 @@
 Distances of sets of images say little of few images, and something of the shift alone: compare scenes on equal views.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
+from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
+from sparsestreet.data.log import Truth
+from sparsestreet.evaluation.evaluate import screen_image
 from sparsestreet.evaluation.strict_json import read_json, version, write_json
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.metrics.distances import frechet_distance, frechet_name, kernel_distance, kernel_name
 from sparsestreet.metrics.extractors import Extractor
+from sparsestreet.metrics.image import masked_psnr, psnr
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.types import View
+from sparsestreet.types import Frame, View
 
-FORMAT = 1
+FORMAT = 2
 """Version of ``novel.json``; raised when a key changes its meaning."""
 
 
@@ -35,10 +40,11 @@ class NovelShift:
     """Number of its renders that are compared with the real images."""
     distances: dict[str, float]
     """Name of a distance, such as "frechet_alexnet" -> its value; empty where it could not be measured."""
-    psnr: float | None
-    """dB; mean over the true images at this offset. None: the log has none."""
+    truth: dict[str, float]
+    """"psnr_full", "psnr_human", "psnr_vehicle" -> dB, mean over the true images that have such pixels; empty where
+    nobody knows the truth."""
     true_views: int
-    """Number of true images."""
+    """Number of true images: views whose camera would sit in something have none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +68,7 @@ class NovelRecord:
         return fmean(found) if found else None
 
 
+@torch.no_grad()
 def evaluate_novel(
     scene: SceneGraph,
     frames: Frames,
@@ -69,7 +76,7 @@ def evaluate_novel(
     options: RenderOptions,
     *,
     command: str,
-    truth: Mapping[float, Frames],
+    truth: Truth | None,
     extractor: Extractor | None,
     absent: str = "",
     ramp: bool = False,
@@ -82,8 +89,7 @@ def evaluate_novel(
         offsets: meters, above 0.
         options: how the scene is rendered.
         command: that asked for it.
-        truth: meters to the right -> true images there; may be empty. They are compared at their own poses and
-            instants, whatever ``ramp`` says.
+        truth: what a view would have recorded; None: nobody knows.
         extractor: of the features that distances compare; None: no distances.
         absent: why there is no extractor.
         ramp: as in ``NovelRecord``.
@@ -95,18 +101,25 @@ def evaluate_novel(
     if len(frames) < 2:
         extractor, absent = None, "distances need at least two images: hold out more views"
     device = scene.device
-    real = extractor and _stacked(extractor(frame.image.to(device).float() / 255) for frame in frames)
+    real = extractor and np.stack([extractor(frame.image.to(device).float() / 255) for frame in frames])
 
     def shift(offset: float) -> NovelShift:
         views = shifted_views(frames.views, offset, ramp)
-        distances = {}
-        if extractor is not None:
-            ours = _stacked(extractor(screen_image(scene, view, options)) for view in views)
-            distances[frechet_name(extractor.name)] = frechet_distance(ours, real)
-            distances[kernel_name(extractor.name)] = kernel_distance(ours, real)
-        psnr = [one.value("psnr", "full") for one in evaluate_frames(scene, truth.get(offset, ()), options)]
-        mean = fmean(psnr) if psnr else None
-        return NovelShift(offset=offset, views=len(views), distances=distances, psnr=mean, true_views=len(psnr))
+        features, quality = [], []
+        for view in views:
+            image = screen_image(scene, view, options)
+            if extractor is not None:
+                features.append(extractor(image))
+            true = truth and truth(view)
+            if true is not None:
+                quality.append(_psnr(image, to_device(true, device)))
+        return NovelShift(
+            offset=offset,
+            views=len(views),
+            distances={} if extractor is None else _distances(extractor.name, np.stack(features), real),
+            truth=_means(quality),
+            true_views=len(quality),
+        )
 
     shifts = tuple(shift(sign * offset) for offset in offsets for sign in (1, -1))
     return NovelRecord(
@@ -116,6 +129,27 @@ def evaluate_novel(
         absent=None if extractor is not None else absent,
         shifts=shifts,
     )
+
+
+def _distances(extractor: str, ours: Float[np.ndarray, "n d"], real: Float[np.ndarray, "m d"]) -> dict[str, float]:
+    return {
+        frechet_name(extractor): frechet_distance(ours, real),
+        kernel_name(extractor): kernel_distance(ours, real),
+    }
+
+
+def _psnr(image: Float[Tensor, "h w 3"], true: Frame) -> dict[str, float]:
+    """Of the whole image, and of the regions that it has."""
+    target = true.image.float() / 255
+    regions = {"psnr_human": true.human, "psnr_vehicle": true.vehicle}
+    found = {name: masked_psnr(image, target, mask) for name, mask in regions.items() if mask is not None}
+    return {"psnr_full": psnr(image, target)} | {name: value for name, value in found.items() if value is not None}
+
+
+def _means(quality: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Of each number over the images that have it."""
+    names = dict.fromkeys(name for one in quality for name in one)
+    return {name: fmean(one[name] for one in quality if name in one) for name in names}
 
 
 def shifted_views(views: Sequence[View], offset: float, ramp: bool = False) -> list[View]:
@@ -150,7 +184,3 @@ def write_novel(path: Path, record: NovelRecord) -> None:
 def read_novel(path: Path) -> NovelRecord:
     """Read ``novel.json``. Raises RecordError naming the file and the entry that is wrong."""
     return read_json(path, NovelRecord)
-
-
-def _stacked(features: Iterable[Float[np.ndarray, " d"]]) -> Float[np.ndarray, "n d"]:
-    return np.stack(list(features))

@@ -18,7 +18,6 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "data.log.settings.width=64",
         "data.log.settings.height=40",
         "data.log.settings.num_cameras=2",
-        "data.log.settings.novel_offsets=[1.0]",
         "data.lidar.beams=24",
         "data.lidar.azimuth_steps=300",
         "sky.resolution=8",

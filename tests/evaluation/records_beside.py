@@ -7,8 +7,9 @@ from sparsestreet.evaluation.novel import NovelRecord, NovelShift, novel_path, w
 
 def write_beside(run: Path, distances: dict[float, float], name: str = "fid", psnr: float | None = None) -> None:
     """Write ``novel.json`` with one distance at each offset."""
+    truth = {} if psnr is None else {"psnr_full": psnr}
     shifts = tuple(
-        NovelShift(offset=offset, views=6, distances={name: value}, psnr=psnr, true_views=0 if psnr is None else 6)
+        NovelShift(offset=offset, views=6, distances={name: value}, truth=truth, true_views=6 if truth else 0)
         for offset, value in distances.items()
     )
     write_novel(novel_path(run), NovelRecord(command="evaluate", ramp=False, real_views=6, absent=None, shifts=shifts))

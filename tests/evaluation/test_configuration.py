@@ -29,7 +29,7 @@ def test_a_tree_becomes_flat():
         {"callback.row_ledger.path": "out/counts.csv"},
         {"trainer.accelerator": "gpu"},
         {"trainer.val_check_interval": 5},
-        {"evaluation.repeats": 3},
+        {"evaluation.novel": [1, 2]},
     ],
 )
 def test_what_names_or_places_a_run_is_no_part_of_its_identity(names):

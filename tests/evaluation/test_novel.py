@@ -11,6 +11,7 @@ from sparsestreet.evaluation import novel as novel_module
 from sparsestreet.evaluation.evaluate import screen_image
 from sparsestreet.evaluation.novel import evaluate_novel, novel_path, read_novel, shifted_views, write_novel
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
+from sparsestreet.types import Frame
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 
@@ -44,7 +45,7 @@ def rig(count):
 
 
 def evaluate(frames, offsets=(2.0,), truth=None, extractor=None, **replaced):
-    options = {"command": "c", "truth": truth or {}, "extractor": extractor, "absent": "no weights"} | replaced
+    options = {"command": "c", "truth": truth, "extractor": extractor, "absent": "no weights"} | replaced
     return evaluate_novel(SCENE, Frames.of(tuple(frames)), offsets, OPTIONS, **options)
 
 
@@ -75,22 +76,40 @@ def test_distances_are_of_shifted_renders_and_real_images():
         ours = [MeanColor()(screen_image(SCENE, view, OPTIONS)) for view in shifted_views(frames, shift.offset)]
         expected = {"frechet_mean_color": frechet_distance(np.stack(ours), real)}
         assert shift.distances == expected | {"kernel_mean_color": kernel_distance(np.stack(ours), real)}
-        assert (shift.psnr, shift.true_views) == (None, 0)
+        assert (shift.truth, shift.true_views) == ({}, 0)
     left, right = (shift.distances["frechet_mean_color"] for shift in record.shifts[2:])
     assert record.mean(2.0, "frechet_mean_color") == pytest.approx((left + right) / 2)
     assert (record.mean(3.0, "frechet_mean_color"), record.mean(2.0, "fid")) == (None, None)
 
 
-def test_the_truth_is_compared_at_its_own_pose(monkeypatch):
-    error = {5: 0.1, 6: 0.01}
-    replace_render(monkeypatch, lambda view: view.image.float() / 255 + error[view.frame_index])
-    truth = [make_frame(index) for index in error]
-    truth = [dataclasses.replace(frame, image=frame.image // 2) for frame in truth]
-    record = evaluate(rig(2), (1.0, 2.0), truth={-2.0: Frames.of(tuple(truth))})
-    assert [shift.psnr for shift in record.shifts[:3]] == [None] * 3
-    assert record.shifts[3].psnr == pytest.approx((20 + 40) / 2, abs=0.01)  # 16 bits at 40 dB: 7.6e-6 of 0.01
-    assert record.shifts[3].true_views == 2
-    assert (record.absent, record.shifts[3].distances) == ("no weights", {})
+def test_the_truth_of_each_shifted_view_is_compared_by_region(monkeypatch):
+    """The front camera's render is 0.1 off among people and 0.01 elsewhere, the other's 0.1; one view has no truth."""
+    people = torch.zeros(make_frame().image.shape[:2], dtype=torch.bool)
+    people[:5] = True
+    blank = torch.full((*people.shape, 3), 102, dtype=torch.uint8)
+    nowhere = torch.zeros_like(people)
+
+    def rendered(view):
+        error = torch.where(people, 0.1, 0.01) if view.camera_index == 0 else torch.full(people.shape, 0.1)
+        return 0.4 + error[..., None].expand(-1, -1, 3)
+
+    def truth(view):
+        assert view.frame_index is None
+        if view.time > 0 and view.camera_index == 1:
+            return None
+        human = people if view.camera_index == 0 else nowhere
+        return Frame(view.camera, view.time, image=blank, human=human, vehicle=~human)
+
+    replace_render(monkeypatch, rendered)
+    right, left = evaluate(rig(2), truth=truth).shifts
+    assert right.truth == left.truth
+    assert (right.views, right.true_views) == (4, 3)
+    share = float(people.float().mean())
+    front = -10 * np.log10(share * 0.01 + (1 - share) * 0.0001)
+    # Rounding of 0.4 to float32 is 3e-8 of an error of 0.01: 3e-5 dB.
+    assert right.truth["psnr_full"] == pytest.approx((2 * front + 20) / 3, abs=1e-4)
+    assert right.truth["psnr_human"] == pytest.approx(20, abs=1e-4)
+    assert right.truth["psnr_vehicle"] == pytest.approx((40 + 40 + 20) / 3, abs=1e-4)
 
 
 def test_two_images_have_a_distance_and_one_has_none():

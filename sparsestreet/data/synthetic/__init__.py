@@ -6,7 +6,8 @@
    (``models``, ``parts``), convex solids (``shapes``);
 3. how it looks: ``textures`` with ``coverage`` and ``noise``, light (``sky``, ``shading``);
 4. one instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
-   ``lidar``), all of it to pictures and truth (``render``), frames to disk (``write``).
+   ``lidar``), all of it to pictures and truth (``render``), frames to disk (``write``), and whatever a camera beside
+   the path would have seen (``truth``).
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader

@@ -54,14 +54,9 @@ class EgoDrive:
 
     speed: float
 
-    def pose(self, time: float, offset: float = 0.0) -> Pose:
-        """World from ego: x forward, y left, z up, origin on the road under the rear axle.
-
-        ``offset`` shifts the car to its left, meters.
-        """
+    def pose(self, time: float) -> Pose:
+        """World from ego: x forward, y left, z up, origin on the road under the rear axle."""
         x = self.speed * (time + 0.15 * np.sin(0.9 * time))
         y = 0.12 * np.sin(0.8 * time)
         slope = 0.12 * 0.8 * np.cos(0.8 * time) / (self.speed * (1 + 0.15 * 0.9 * np.cos(0.9 * time)))
-        heading = float(np.arctan(slope))
-        left = np.array([-np.sin(heading), np.cos(heading)])
-        return at(float(x + offset * left[0]), float(y + offset * left[1]), 0.0, heading)
+        return at(float(x), float(y), 0.0, float(np.arctan(slope)))

@@ -1,17 +1,16 @@
 """The embedded default: a street that is made when it is first asked for, and read like any other log."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.synthetic.settings import StreetSettings
-from sparsestreet.data.synthetic.shifted import shifted_frames
 from sparsestreet.data.synthetic.street import make_street, street_name
+from sparsestreet.data.synthetic.truth import street_truth
 
 log = logging.getLogger(__name__)
 
@@ -42,10 +41,8 @@ class StreetReader(LogReader):
         return self._made().check()
 
     def read(self) -> DrivingLog:
-        return self._made().read()
-
-    def shifted(self, log: DrivingLog) -> dict[float, Frames]:
-        return shifted_frames(self.folder, log)
+        log = self._made().read()
+        return replace(log, truth=street_truth(self.settings, log.dataset_from_world))
 
     def data_hash(self) -> str:
         """The street's name, which holds a hash of all of its settings: what they say is what it shows."""

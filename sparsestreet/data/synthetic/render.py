@@ -37,53 +37,66 @@ class StreetFrame:
     sweep: StreetSweep
     actor_poses: tuple[Pose, ...]
     """World from object of every actor of the world."""
-    novel: dict[float, StreetImage]
-    """The front camera with the ego car shifted left by the key, meters."""
+
+
+@dataclass(frozen=True)
+class Instant:
+    """The street as it stands at a time, in its light."""
+
+    scene: Scene
+    sunlit: SunView
+    weather: Weather
+    actors: tuple[tuple[Pose, tuple[float, float, float]], ...]
+    """World from object and the size of the box, meters, of every actor of the world."""
+
+    @staticmethod
+    def at(world: World, time: float) -> "Instant":
+        """``time`` in seconds."""
+        scene = Scene.of(world.parts_at(time))
+        actors = tuple((actor.pose(time), actor.model.size) for actor in world.actors)
+        return Instant(scene, SunView.of(scene, world.weather.sun), world.weather, actors)
+
+    def inside_an_actor(self, camera: StreetCamera, margin: float = 0.3) -> bool:
+        """Whether the camera would sit in (or within ``margin`` meters of) the box of something annotated."""
+        for pose, size in self.actors:
+            local = np.linalg.inv(pose) @ camera.world_from_camera[:, 3]
+            if (np.abs(local[:3]) < np.array(size) / 2 + margin).all():
+                return True
+        return False
+
+    def actors_within(self, meters: float, camera: StreetCamera) -> list[int]:
+        """Positions in World.actors of those that are no farther from the camera, seen from above."""
+        here = camera.world_from_camera[:2, 3]
+        return [at for at, (pose, _) in enumerate(self.actors) if np.linalg.norm(pose[:2, 3] - here) <= meters]
 
 
 def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFrame:
     """Everything that is seen at frame ``index``."""
     time = index / settings.frame_rate
-    scene = Scene.of(world.parts_at(time))
-    view = SunView.of(scene, world.weather.sun)
+    instant = Instant.at(world, time)
     ego = world.ego.pose(time)
     cameras = [street_camera(settings, camera, ego) for camera in range(settings.num_cameras)]
-    novel = {}
-    if index % settings.novel_stride == 0:
-        for offset in settings.novel_offsets:
-            camera = street_camera(settings, 0, world.ego.pose(time, offset))
-            if not _inside_an_actor(world, time, camera):
-                novel[offset] = _render(settings, scene, view, world.weather, camera)
     return StreetFrame(
         index=index,
         world_from_ego=ego,
-        images=tuple(_render(settings, scene, view, world.weather, camera) for camera in cameras),
-        sweep=sweep(settings, scene, ego, index),
-        actor_poses=tuple(actor.pose(time) for actor in world.actors),
-        novel=novel,
+        images=tuple(render_image(settings, instant, camera) for camera in cameras),
+        sweep=sweep(settings, instant.scene, ego, index),
+        actor_poses=tuple(pose for pose, _ in instant.actors),
     )
 
 
-def _render(
-    settings: StreetSettings, scene: Scene, view: SunView, weather: Weather, camera: StreetCamera
-) -> StreetImage:
+def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:
+    """What a camera sees at an instant; of the settings the number of rays a pixel."""
     samples = settings.supersampling
+    scene = instant.scene
     center_rays = camera.rays(1)
     center_hits = first_hits(scene, center_rays)
     rays = center_rays if samples == 1 else camera.rays(samples)
     hits = center_hits if samples == 1 else first_hits(scene, rays)
-    linear = radiance(scene, view, weather, rays, hits, 1 / float(camera.intrinsics[0, 0]) / samples)
+    pixel = 1 / float(camera.intrinsics[0, 0]) / samples
+    linear = radiance(scene, instant.sunlit, instant.weather, rays, hits, pixel)
     linear = linear.reshape(3, camera.height, samples, camera.width, samples).mean((2, 4))
     sky = center_hits.parts == NOTHING
     depth = np.where(sky, 0, center_hits.distances * camera.axis_cosines()).astype(np.float32)
     objects = np.where(sky, BACKGROUND, scene.object_indices[center_hits.parts]).astype(np.int16)
     return StreetImage(camera, to_srgb(linear), depth, objects, sky)
-
-
-def _inside_an_actor(world: World, time: float, camera: StreetCamera, margin: float = 0.3) -> bool:
-    """Whether the camera would sit in (or within ``margin`` meters of) the box of something annotated."""
-    for actor in world.actors:
-        local = np.linalg.inv(actor.pose(time)) @ camera.world_from_camera[:, 3]
-        if (np.abs(local[:3]) < np.array(actor.model.size) / 2 + margin).all():
-            return True
-    return False

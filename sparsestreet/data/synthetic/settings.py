@@ -1,6 +1,5 @@
 """What a synthetic street is made from; two equal settings give the same bytes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
@@ -40,17 +39,10 @@ class StreetSettings:
     lidar: LidarSensor = WAYMO_TOP
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, meters."""
-    novel_offsets: Sequence[float] = ()
-    """Sideways shifts (to the left, meters) of the ego car for which the front camera is rendered as well.
-
-    A view from inside another car is left out."""
-    novel_stride: int = 10
-    """Shifted views are rendered for every frame divisible by this."""
 
     def __post_init__(self) -> None:
         positive = (
-            "num_frames", "width", "height", "supersampling", "frame_rate", "ego_speed",
-            "annotation_range", "novel_stride",
+            "num_frames", "width", "height", "supersampling", "frame_rate", "ego_speed", "annotation_range",
         )  # fmt: skip
         for name in positive:
             if not getattr(self, name) > 0:
@@ -65,8 +57,6 @@ class StreetSettings:
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
-        # A list (as a config file gives it) becomes a tuple, so that equal settings compare equal.
-        object.__setattr__(self, "novel_offsets", tuple(float(offset) for offset in self.novel_offsets))
 
     @property
     def duration(self) -> float:

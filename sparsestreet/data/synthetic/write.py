@@ -46,10 +46,6 @@ class StreetWriter:
                 self._write_intrinsics(image, camera)
         frame.sweep.points.tofile(self._file("lidar", f"{frame.index:03d}.bin"))
         np.savetxt(self._file("lidar_pose", f"{frame.index:03d}.txt"), frame.sweep.world_from_lidar)
-        for offset, image in frame.novel.items():
-            folder, name = f"novel/{offset:g}m", f"{frame.index:03d}_0"
-            Image.fromarray(image.rgb).save(self._file(f"{folder}/images", f"{name}.png"))
-            np.savetxt(self._file(f"{folder}/extrinsics", f"{name}.txt"), image.camera.world_from_camera)
 
     def finish(self) -> None:
         """The files about the whole drive."""

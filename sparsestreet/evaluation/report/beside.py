@@ -8,7 +8,11 @@ from sparsestreet.evaluation.report.arms import Arm, Unit, mean_over_scenes, uni
 from sparsestreet.evaluation.report.grid import Cell, Grid
 from sparsestreet.evaluation.strict_json import Json, RecordError, parsed
 
-TRUTH = "PSNR to the truth, dB"
+TRUTH = {
+    "psnr_full": "PSNR to the truth, dB",
+    "psnr_human": "PSNR of people, dB",
+    "psnr_vehicle": "PSNR of vehicles, dB",
+}
 
 
 def shifts_of(run: Path) -> dict[float, dict[str, float]]:
@@ -32,7 +36,7 @@ def shifts_of(run: Path) -> dict[float, dict[str, float]]:
 
 
 def _numbers(shift: dict[str, Json]) -> dict[str, float]:
-    truth = {} if shift["psnr"] is None else {TRUTH: float(shift["psnr"])}
+    truth = {TRUTH[name]: float(value) for name, value in shift["truth"].items()}
     return {name: float(value) for name, value in shift["distances"].items()} | truth
 
 

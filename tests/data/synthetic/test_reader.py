@@ -6,15 +6,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.synthetic.world import Actor, build_world
-from sparsestreet.geometry.cameras import moved, project
+from sparsestreet.geometry.cameras import project
 
 SETTINGS = StreetSettings(
-    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1, novel_offsets=[],
+    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1,
     lidar=replace(WAYMO_TOP, beams=12, azimuth_steps=120),
 )  # fmt: skip
 
@@ -39,35 +38,9 @@ def test_a_street_opens_as_a_log(tmp_path):
         np.testing.assert_allclose(track.size.numpy(), actor.model.size, rtol=1e-6)
 
 
-@pytest.mark.lengthy
-@pytest.mark.slow
-def test_shifted_views_are_those_of_a_rig_beside_the_path(tmp_path):
-    """Their poses are the recorded ones moved sideways, by whom the tracer is not asked."""
-    settings = replace(SETTINGS, num_frames=3, novel_offsets=(1.0, -2.5), novel_stride=2)
-    reader = StreetReader(settings, tmp_path / "street")
-    log = reader.read()
-    shifted = reader.shifted(log)
-    assert list(shifted) == [-1.0, 2.5]
-    front = [view for view in log.views if view.camera_index == 0]
-    for offset, frames in shifted.items():
-        assert [view.frame_index for view in frames.views] == [0, 2]
-        for frame in frames:
-            right = front[frame.frame_index].camera.camera_from_world[0, :3].double()
-            expected = moved(front[frame.frame_index].camera, offset * right)
-            # Files hold 64 bits, camera matrices 32: 1e-6 of some meters.
-            torch.testing.assert_close(frame.camera.camera_from_world, expected.camera_from_world, rtol=0, atol=1e-5)
-            assert (frame.time, frame.camera_index) == (front[frame.frame_index].time, 0)
-            path = tmp_path / f"street/novel/{-offset:g}m/images/{frame.frame_index:03d}_0.png"
-            with Image.open(path) as image:
-                assert (frame.image.numpy() == np.asarray(image)).all()
-    assert reader.shifted(replace(log, frames=log.frames[:2]))[-1.0].views[0].frame_index == 0
-    plain = StreetReader(replace(SETTINGS, num_frames=1), tmp_path / "plain")
-    assert plain.shifted(plain.read()) == {}
-
-
 def test_every_setting_has_a_folder_of_its_own_and_the_seed_comes_last():
     folders = {}
-    others = {"novel_offsets": (1.0,), "lidar": replace(SETTINGS.lidar, dropout=0.5), "num_cameras": 3}
+    others = {"lidar": replace(SETTINGS.lidar, dropout=0.5), "num_cameras": 3}
     for field in fields(StreetSettings):
         changed = others[field.name] if field.name in others else getattr(SETTINGS, field.name) + 1
         folders[field.name] = StreetReader(replace(SETTINGS, **{field.name: changed})).folder

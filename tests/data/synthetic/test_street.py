@@ -18,7 +18,7 @@ pytestmark = pytest.mark.lengthy
 
 TINY = StreetSettings(
     seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, num_parked_cars=8, num_moving_cars=3,
-    num_pedestrians=3, num_cyclists=1, annotation_range=25.0, novel_offsets=(1.0, 2.5), novel_stride=2,
+    num_pedestrians=3, num_cyclists=1, annotation_range=25.0,
     lidar=replace(WAYMO_TOP, beams=16, azimuth_steps=200),
 )  # fmt: skip
 VIEWS = [(frame, camera) for frame in range(3) for camera in range(2)]
@@ -85,14 +85,8 @@ def test_all_files_are_there(street):
     ):  # fmt: skip
         expected |= {f"{folder}/{view}.{kind}" for view in views}
     expected |= {f"lidar/{frame:03d}.bin" for frame in range(3)} | {f"lidar_pose/{frame:03d}.txt" for frame in range(3)}
-    for offset in ("1m", "2.5m"):
-        for frame in (0, 2):
-            expected |= {f"novel/{offset}/images/{frame:03d}_0.png", f"novel/{offset}/extrinsics/{frame:03d}_0.txt"}
     found = {str(path.relative_to(street)) for path in street.rglob("*") if path.is_file()}
-    # A shifted camera inside a car is left out; nothing else may be missing, and nothing may be too much.
-    assert found <= expected
-    assert {path for path in expected - found if not path.startswith("novel")} == set()
-    assert any(path.startswith("novel/1m/images") for path in found)
+    assert found == expected
 
 
 def test_images_are_pictures(street):
@@ -200,17 +194,6 @@ def test_lidar_points_lie_on_what_the_cameras_see(street):
     assert checked > 1000
 
 
-def test_shifted_views_lie_to_the_left(street):
-    _, at_front = pinhole(street, 0, 0)
-    shifted = np.loadtxt(street / "novel/2.5m/extrinsics/000_0.txt")
-    np.testing.assert_allclose(shifted[:3, :3], at_front[:3, :3])
-    # Camera x points right, so 2.5 m to the left is -2.5 along it.
-    np.testing.assert_allclose(at_front[:3, :3].T @ (shifted[:3, 3] - at_front[:3, 3]), [-2.5, 0, 0], atol=1e-9)
-    image = np.array(Image.open(street / "novel/2.5m/images/000_0.png"), int)
-    assert image.shape == (61, 97, 3)
-    assert np.abs(image - np.array(Image.open(street / "images/000_0.jpg"), int)).mean() > 5
-
-
 def digest(root: Path) -> dict[str, str]:
     """Hash of every file but the compressed archives, which hold the time of writing; those by their arrays."""
     hashes = {}
@@ -229,7 +212,7 @@ def digest(root: Path) -> dict[str, str]:
 def test_equal_settings_give_equal_bytes_and_other_seeds_other_streets(street, tmp_path):
     again = make_street(TINY, tmp_path / "again")
     assert digest(again) == digest(street)
-    other = make_street(replace(TINY, seed=4, num_frames=1, novel_offsets=()), tmp_path / "other")
+    other = make_street(replace(TINY, seed=4, num_frames=1), tmp_path / "other")
     first, second = (np.array(Image.open(root / "images/000_0.jpg"), int) for root in (street, other))
     assert np.abs(first - second).mean() > 15
 
@@ -259,7 +242,6 @@ def test_an_interruption_leaves_nothing(tmp_path):
         width=16,
         height=9,
         lidar=replace(WAYMO_TOP, beams=2, azimuth_steps=16),
-        novel_offsets=(),
     )
 
     def interrupt(done: int, total: int) -> None:

@@ -17,7 +17,8 @@ from tests.evaluation.report.sweep_folder import record, write_sweep
 
 def test_both_sides_count_alike(tmp_path):
     write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0, 2.0: 60.0}, psnr=20.0)
-    assert shifts_of(tmp_path) == {1.0: {"fid": 42.0, TRUTH: 20.0}, 2.0: {"fid": 60.0, TRUTH: 20.0}}
+    true = TRUTH["psnr_full"]
+    assert shifts_of(tmp_path) == {1.0: {"fid": 42.0, true: 20.0}, 2.0: {"fid": 60.0, true: 20.0}}
 
 
 def test_an_arm_is_the_mean_of_its_scenes(tmp_path):
@@ -48,5 +49,5 @@ def test_what_a_record_lacks_is_named(tmp_path):
     path = tmp_path / "records" / "novel.json"
     path.parent.mkdir()
     path.write_text(json.dumps({"shifts": [{"offset": 1.0}]}))
-    with pytest.raises(RecordError, match=r"novel\.json: lacks 'psnr'"):
+    with pytest.raises(RecordError, match=r"novel\.json: lacks 'truth'"):
         shifts_of(tmp_path)

@@ -1,0 +1,57 @@
+"""What a camera anywhere in a street sees: the truth that no recorded drive has."""
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from sparsestreet.data.log import Truth
+from sparsestreet.data.synthetic.cameras import StreetCamera
+from sparsestreet.data.synthetic.render import Instant, render_image
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.world import build_world
+from sparsestreet.data.synthetic.write import HUMAN_CLASSES, VEHICLE_CLASSES
+from sparsestreet.geometry.transforms import inverse
+from sparsestreet.types import Frame, View
+
+
+def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]) -> Truth:
+    """A camera and a time in the log's world -> what the street's own camera would have recorded there.
+
+    None where the camera is inside of something annotated. People and vehicles count as far as boxes reach
+    (``annotation_range``, here from the camera), seen or not. Pinholes only: a view's lens and shutter are ignored, as
+    no street has any.
+    """
+    world = build_world(settings)
+    instant_at = lru_cache(maxsize=1)(lambda seconds: Instant.at(world, seconds))
+
+    def truth(view: View) -> Frame | None:
+        camera = view.camera
+        world_from_camera = street_from_world @ inverse(camera.camera_from_world.double())
+        traced = StreetCamera(
+            world_from_camera.numpy(), camera.intrinsics.double().numpy(), camera.width, camera.height
+        )
+        instant = instant_at(view.time * settings.duration)
+        if instant.inside_an_actor(traced):
+            return None
+        image = render_image(settings, instant, traced)
+        near = instant.actors_within(settings.annotation_range, traced)
+
+        def of_classes(names: tuple[str, ...]) -> Tensor:
+            chosen = [index for index in near if world.actors[index].model.class_name in names]
+            return torch.from_numpy(np.isin(image.object_indices, chosen))
+
+        return Frame(
+            camera,
+            view.time,
+            view.frame_index,
+            view.camera_index,
+            image=torch.from_numpy(image.rgb),
+            sky=torch.from_numpy(image.sky),
+            human=of_classes(HUMAN_CLASSES),
+            vehicle=of_classes(VEHICLE_CLASSES),
+        )
+
+    return truth
