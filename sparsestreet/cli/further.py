@@ -22,7 +22,7 @@ from sparsestreet.scene.rendering import RenderOptions
 class FurtherLooks:
     """Raises ValueError for offsets that are not above 0, a ramp without offsets, or unknown presets."""
 
-    novel: Sequence[float] = ()
+    novel: Sequence[float | int] = ()
     """Meters by which the held-out cameras are shifted to both sides."""
     ramp: bool = False
     """Whether the shift grows over the drive, as in a change of lane."""

@@ -235,15 +235,18 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
-    looks = ["evaluation.novel=[1.5]", "evaluation.presets=[fast]"]
-    out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=5", *looks)
+    out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=5")
     summary = read_summary(summary_path(out))
     assert list(summary.quality) == ["training"]
     assert summary.quality["training"]["psnr_full"].images == 24
     assert summary.run.split == "none"
-    # What the configuration asks for is measured at the end of training, and again by every evaluation.
+    assert evaluate([f"run={out}"]) == 0
+
+
+def test_training_measures_what_its_configuration_asks_for_and_so_does_every_evaluation(run_train, tmp_path):
+    out = run_train(tmp_path, "schedule.max_steps=5", "evaluation.novel=[1.5]", "evaluation.presets=[fast]")
     trained = read_novel(novel_path(out))
-    assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 24), (-1.5, 24)]
+    assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 2), (-1.5, 2)]
     assert trained.command.startswith("sparsestreet train ")
     assert [one.preset for one in read_presets(preset_path(out)).rendered] == ["fast"]
     assert {"novel", "presets"} < read_costs(cost_path(out)).phases.keys()
