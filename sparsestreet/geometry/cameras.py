@@ -1,12 +1,14 @@
-"""The pinhole projection outside the splat op: lidar coloring, visibility of seeds, box masks, sky rays; and where
-the camera is, for both."""
+"""Projection and rays outside the splat op, through the lens where there is one: lidar coloring, visibility of seeds,
+sky rays; and where the camera is, for both."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from sparsestreet.geometry.distortion import distort, fold_radius_squared, undistort
 from sparsestreet.geometry.transforms import transform_points
 from sparsestreet.types import Camera
 
@@ -32,12 +34,17 @@ def project(
     camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Pixel coordinates, depth along the optical axis (meters) and whether each world point is in the image; on any
-    device, while the camera is on the host."""
+    device, while the camera is on the host. A point past the fold of a lens (``geometry.distortion``) is not."""
     in_camera = transform_points(camera.camera_from_world.to(points), points)
     depth = in_camera[:, 2]
     safe = depth.clamp(min=near)
+    seen = depth > near
+    if camera.distortion is not None:
+        slopes = in_camera[:, :2] / safe[:, None]
+        seen = seen & (slopes.square().sum(-1) <= fold_radius_squared(camera.distortion))
+        in_camera = torch.cat((safe[:, None] * distort(slopes, camera.distortion), depth[:, None]), dim=1)
     pixels = (in_camera @ camera.intrinsics.to(points).T)[:, :2] / safe[:, None]
-    inside = (depth > near) & (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    inside = seen & (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
     return pixels, depth, inside
 
 
@@ -50,15 +57,44 @@ def ray_matrix(camera: Camera) -> list[list[float]]:
 
 
 def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[Tensor, "h w 3"]:
-    """Unit directions in the world through the pixel centers, in the camera's dtype on a device."""
-    like = {"dtype": camera.intrinsics.dtype, "device": device}
+    """Unit directions in the world through the pixel centers, in the camera's dtype on a device.
+
+    A lens takes a second per million pixels, once for all views of its camera. Raises ValueError where it has no
+    inverse.
+    """
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-    x = (torch.arange(camera.width, **like) + 0.5 - cx) / fx
-    y = (torch.arange(camera.height, **like) + 0.5 - cy) / fy
-    y, x = torch.meshgrid(y, x, indexing="ij")
-    in_camera = torch.stack((x, y, torch.ones_like(x)), dim=-1)
+    image = ((fx, fy, cx, cy), camera.width, camera.height, camera.intrinsics.dtype, torch.device(device))
+    if camera.distortion is None:
+        in_camera = _pinhole_rays(*image)
+    else:
+        in_camera = _lens_rays(tuple(camera.distortion.tolist()), *image)
     in_world = in_camera @ camera.camera_from_world[:3, :3].to(device)
     return in_world / in_world.norm(dim=-1, keepdim=True)
+
+
+def _pinhole_rays(
+    intrinsics: tuple[float, ...], width: int, height: int, dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "h w 3"]:
+    """(x, y, 1) in the camera through the pixel centers; ``intrinsics`` are fx, fy, cx, cy."""
+    fx, fy, cx, cy = intrinsics
+    x = (torch.arange(width, dtype=dtype, device=device) + 0.5 - cx) / fx
+    y = (torch.arange(height, dtype=dtype, device=device) + 0.5 - cy) / fy
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack((x, y, torch.ones_like(x)), dim=-1)
+
+
+@lru_cache(maxsize=8)  # a rig's cameras, at 12 bytes a pixel
+def _lens_rays(
+    distortion: tuple[float, ...],
+    intrinsics: tuple[float, ...],
+    width: int,
+    height: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Float[Tensor, "h w 3"]:
+    rays = _pinhole_rays(intrinsics, width, height, torch.float64, device)
+    rays[..., :2] = undistort(rays[..., :2], torch.tensor(distortion, dtype=torch.float64))
+    return rays.to(dtype)
 
 
 def distance_to_view(camera: Camera, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Float[Tensor, " n"]:

@@ -22,6 +22,8 @@ from torch import Tensor
 _STEEPEST = 4.0
 """Largest d(r radial)/dr: lenses stay far below it."""
 _NEWTON_STEPS = 30
+_GRID = 65
+"""Columns and rows of places where a shift is looked at, the border's among them."""
 
 
 def fold_radius_squared(distortion: Float[Tensor, "5"]) -> float:
@@ -64,15 +66,36 @@ def undistort(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> 
     target = points.double()
     guess = target.clone()
     for _ in range(_NEWTON_STEPS):
-        residual = distort(guess, distortion) - target
-        guess = guess - torch.linalg.solve(_continued_jacobian(guess, distortion), residual[..., None])[..., 0]
-    error = (distort(guess, distortion) - target).abs()
-    if error.numel() and not bool((error < 1e-9 * (1 + target.abs())).all()):
+        error = distort(guess, distortion) - target
+        # Not solve(), whose error of a singular matrix is no ValueError.
+        guess = guess - torch.linalg.solve_ex(_continued_jacobian(guess, distortion), error[..., None]).result[..., 0]
+        if _found(error, target):  # before this step, which squares what was left
+            break
+    error = distort(guess, distortion) - target
+    if not _found(error, target):
         raise ValueError(
-            f"distorted points must have an inverse, but Newton's method is {float(error.max()):.1e} off for "
+            f"distorted points must have an inverse, but Newton's method is {float(error.abs().max()):.1e} off for "
             f"coefficients {distortion.tolist()}: check k1, k2, p1, p2, k3 against the calibration"
         )
     return guess.to(points.dtype)
+
+
+def largest_shift(intrinsics: Float[Tensor, "3 3"], distortion: Float[Tensor, "5"], width: int, height: int) -> float:
+    """Pixels between a place in the image and where a pinhole would show what the lens shows there, at most.
+
+    Found on a grid that reaches to the image's border: the shift of a polynomial need not be largest there. Raises
+    ValueError for a lens without an inverse in the image.
+    """
+    (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+    x = (torch.linspace(0, width, _GRID, dtype=torch.float64) - cx) / fx
+    y = (torch.linspace(0, height, _GRID, dtype=torch.float64) - cy) / fy
+    places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
+    shift = (undistort(places, distortion) - places) * torch.tensor([fx, fy], dtype=torch.float64)
+    return float(shift.norm(dim=-1).max())
+
+
+def _found(error: Float[Tensor, "*b 2"], target: Float[Tensor, "*b 2"]) -> bool:
+    return bool((error.abs() < 1e-9 * (1 + target.abs())).all())
 
 
 def _brown_conrady(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> Float[Tensor, "*b 2"]:

@@ -32,7 +32,7 @@ def over_sky(
     """``rgb`` plus the light 1 - alpha times the sky's color, where that light is more than ``transmittance_min``.
 
     Differentiable in ``rgb``, ``alpha`` and ``texels``, not in the camera. The sky is at infinity: a pixel sees it
-    along its ray (``ray_directions``), as if there were no rolling shutter.
+    along its ray through the lens (``ray_directions``), as if there were no rolling shutter.
 
     Args:
         rgb: color premultiplied by alpha.

@@ -57,3 +57,14 @@ def test_near_returns_is_a_square_about_each_return():
     expected |= ((rows - 8).abs() <= 2) & ((columns - 19).abs() <= 2)
     assert torch.equal(near_returns(depth, reach=0.1), expected)
     assert not near_returns(torch.zeros(4, 5)).any()
+
+
+def test_a_lens_decides_which_pixel_a_point_falls_into():
+    """r^2 = 0.2: (0.4, 0.2) is imaged at 0.94 of it, 15.04 and 7.52 pixels from the center in place of 16 and 8."""
+    intrinsics = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+    camera = Camera(torch.eye(4), intrinsics, 40, 24, torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    image = torch.zeros(24, 40, 3, dtype=torch.uint8)
+    image[19, 35], image[20, 36] = torch.tensor([255, 0, 51]), 102
+    point = torch.tensor([[2.0, 1.0, 5.0]])
+    assert torch.equal(color_points(point, [(camera, image)])[0], torch.tensor([[1.0, 0.0, 0.2]]))
+    assert depth_image(point, camera).nonzero().tolist() == [[19, 35]]

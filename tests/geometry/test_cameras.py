@@ -1,11 +1,18 @@
+from dataclasses import replace
+
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sparsestreet.geometry import cameras
 from sparsestreet.geometry.cameras import distance_to_view, exact_position, project, ray_directions, ray_matrix
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.types import Camera
 from tests.scene.street import camera_at
+
+LENS = torch.tensor([-0.28, 0.09, 2e-3, -1e-3, -0.012], dtype=torch.float64)
+"""A wide-angle front camera's order of magnitude."""
 
 
 def camera_of(seed: int, width: int = 13, height: int = 7) -> Camera:
@@ -100,3 +107,100 @@ def test_a_margin_enlarges_the_image():
     points = torch.tensor([[10.0, 14.9, 1.5], [10.0, -15.1, 1.5], [10.0, 0.0, 8.9], [10.0, 0.0, -6.1]])
     assert (distance_to_view(camera, points, margin=0.25) < 0).tolist() == [True, False, True, False]
     assert (distance_to_view(camera, points) > 0).all()
+
+
+def test_a_pinhole_is_computed_as_it_ever_was():
+    """To the last bit, in the precision that training uses: a lens must cost it nothing."""
+    camera = camera_of(5)
+    camera = replace(camera, camera_from_world=camera.camera_from_world.float(), intrinsics=camera.intrinsics.float())
+    points = 5 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
+    rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+    local = points @ rotation.T + translation
+    pixels, depth, inside = project(camera, points)
+    assert torch.equal(depth, local[:, 2])
+    assert torch.equal(pixels, (local @ camera.intrinsics.T)[:, :2] / local[:, 2:].clamp(min=0.2))
+    within = (pixels >= 0).all(1) & (pixels < torch.tensor([13, 7])).all(1)
+    assert torch.equal(inside, within & (depth > 0.2))
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    x, y = (torch.arange(13) + 0.5 - cx) / fx, (torch.arange(7) + 0.5 - cy) / fy
+    rays = torch.stack((x.expand(7, 13), y[:, None].expand(7, 13), torch.ones(7, 13)), -1) @ rotation
+    assert torch.equal(ray_directions(camera), rays / rays.norm(dim=-1, keepdim=True))
+
+
+def test_a_lens_bends_points_as_brown_and_conrady_say():
+    camera = replace(camera_of(6), distortion=LENS)
+    generator = torch.Generator().manual_seed(1)
+    local = torch.rand(60, 3, generator=generator, dtype=torch.float64) - 0.5
+    local[:, 2] = 0.8 + local[:, 2].abs()
+    rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+    pixels, depth, inside = project(camera, (local - translation) @ rotation)
+    torch.testing.assert_close(depth, local[:, 2])
+    k1, k2, p1, p2, k3 = LENS.tolist()
+    for (x, y, z), pixel, seen in zip(local.tolist(), pixels.tolist(), inside.tolist(), strict=True):
+        x, y = x / z, y / z
+        r2 = x**2 + y**2
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        right = 11.0 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + 6.1
+        down = 12.0 * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + 3.7
+        assert pixel == pytest.approx([right, down], rel=1e-12)
+        assert seen == (0 <= right < 13 and 0 <= down < 7)
+    assert 0 < inside.sum() < 60
+
+
+def test_a_point_past_the_fold_is_not_in_the_image():
+    """1 - 0.9 r^2 = 0 at r = 1.054; just past it the point would lie 7.07 pixels from the center."""
+    lens = torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0])
+    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 8.0], [0, 10.0, 6.0], [0, 0, 1]]), 16, 12, lens)
+    pixels, _, inside = project(camera, torch.tensor([[1.05, 0.0, 1.0], [1.06, 0.0, 1.0], [0.0, 0.0, -1.0]]))
+    assert inside.tolist() == [True, False, False]
+    assert pixels[1, 0] < 16
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+def test_rays_of_a_lens_project_onto_their_pixel_centers(dtype, tolerance):
+    """float32: the camera is a few meters from the origin, an eps of which is a few eps of 11 pixels at 1 m."""
+    for seed in range(5):
+        camera = camera_of(seed)
+        pose, intrinsics = camera.camera_from_world.to(dtype), camera.intrinsics.to(dtype)
+        camera = Camera(pose, intrinsics, 13, 7, LENS.to(dtype))
+        directions = ray_directions(camera)
+        assert directions.dtype == dtype
+        torch.testing.assert_close(directions.norm(dim=-1), torch.ones(7, 13, dtype=dtype))
+        depths = 1 + 50 * torch.rand(7, 13, 1, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+        pixels, _, inside = project(camera, (camera.position + depths * directions).reshape(-1, 3))
+        row, column = torch.meshgrid(torch.arange(7) + 0.5, torch.arange(13) + 0.5, indexing="ij")
+        expected = torch.stack((column, row), dim=-1).reshape(-1, 2).to(dtype)
+        assert inside.all()
+        torch.testing.assert_close(pixels, expected, atol=tolerance, rtol=0)
+        straight = project(replace(camera, distortion=None), camera.position + 9 * directions.reshape(-1, 3))[0]
+        assert (straight - expected).abs().max() > 0.3  # or the test would hold without a lens
+
+
+def test_the_rays_of_a_lens_are_found_once_for_all_its_views(monkeypatch):
+    asked = []
+    undistort = cameras.undistort
+    monkeypatch.setattr(cameras, "undistort", lambda *a: asked.append(a) or undistort(*a))
+    cameras._lens_rays.cache_clear()
+    views = [replace(camera_of(seed), distortion=LENS) for seed in range(3)]
+    directions = [ray_directions(view) for view in views]
+    assert len(asked) == 1
+    assert not torch.allclose(directions[0], directions[1])
+    others = {"distortion": 2 * LENS, "intrinsics": 2 * views[0].intrinsics, "width": 9, "height": 9}
+    for name, value in others.items():
+        ray_directions(replace(views[0], **{name: value}))
+    assert len(asked) == 5
+    ray_directions(camera_of(0))
+    assert len(asked) == 5
+
+
+@pytest.mark.parametrize("k1", [-0.3, -0.1])
+def test_a_quarter_of_the_image_makes_up_for_a_barrel(k1):
+    """At the fold of a lens of k1 alone, 1 + 3 k1 r^2 = 0, a point is 1.5 times as far out as it is imaged."""
+    focal = 20 / torch.tensor(torch.pi / 6).tan().item()  # 60 degrees
+    intrinsics = torch.tensor([[focal, 0, 20], [0, focal, 13], [0, 0, 1]])
+    camera = Camera(torch.eye(4), intrinsics, 40, 26, torch.tensor([k1, 0.0, 0.0, 0.0, 0.0]))
+    slopes = 3 * torch.rand(20_000, 2, generator=torch.Generator().manual_seed(0)) - 1.5
+    points = torch.cat((slopes, torch.ones(20_000, 1)), 1)
+    seen = points[project(camera, points)[2]]
+    assert (distance_to_view(camera, seen, margin=0.25) < 0).all()
+    assert (distance_to_view(camera, seen) > 0).any()

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from sparsestreet.geometry import distortion
 from sparsestreet.geometry.distortion import (
     _continued_jacobian,
     distort,
     distortion_jacobian,
     fold_radius_squared,
+    largest_shift,
     undistort,
 )
 
@@ -126,3 +128,37 @@ def test_no_inverse_is_an_error():
     wild = torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0], dtype=torch.float64)
     with pytest.raises(ValueError, match=r"must have an inverse, but Newton's method is .* off for coefficients \[0.0"):
         undistort(torch.tensor([[-2.0, -2.0]], dtype=torch.float64), wild)
+    # At other places the matrix of a step is singular.
+    with pytest.raises(ValueError, match="must have an inverse"):
+        largest_shift(torch.tensor([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), wild, 40, 40)
+
+
+def test_the_inverse_stops_when_all_points_are_found(monkeypatch):
+    steps = []
+    jacobian = distortion._continued_jacobian
+    monkeypatch.setattr(distortion, "_continued_jacobian", lambda *a: steps.append(a) or jacobian(*a))
+    points = torch.rand(100, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64) - 0.5
+    torch.testing.assert_close(undistort(distort(points, FULL), FULL), points, rtol=0, atol=1e-14)
+    assert 2 <= len(steps) <= 6  # digits double: 1e-1, 1e-2, 1e-4, 1e-8, and the step that is checked
+
+
+def test_the_largest_shift_by_hand():
+    """r = 1 is imaged at 1 + 0.1: (0.6, 0.8) at (0.66, 0.88), the top left corner, the farthest from the center."""
+    intrinsics = torch.tensor([[100.0, 0, 66], [0, 200, 176], [0, 0, 1]])
+    lens = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0])
+    assert largest_shift(intrinsics, lens, 120, 300) == pytest.approx(math.hypot(6, 16), rel=1e-6)  # 0.1 in float32
+    assert largest_shift(intrinsics, torch.zeros(5), 120, 300) == 0.0
+
+
+def test_the_largest_shift_may_lie_inside():
+    """r radial - r = r^3 (1 - r^2 / 0.7) (1 - r^2) / 2, in a square from whose middle the border is 0.71 to 1 away."""
+    a, b = 1 / 0.7, 1.0
+    lens = torch.tensor([0.5, -0.5 * (a + b), 0.0, 0.0, 0.5 * a * b], dtype=torch.float64)
+    half = 100 * math.sqrt(0.5)
+    intrinsics = torch.tensor([[100, 0, half], [0, 100, half], [0, 0, 1]], dtype=torch.float64)
+    size = round(2 * half)
+    radii = np.linspace(0, 1, 10_001)
+    shift = 100 * np.abs(radii**3 * (1 - a * radii**2) * (1 - b * radii**2) / 2)
+    at_border = shift[radii**2 > 0.46].max()  # 0.5 and more once imaged
+    assert shift.max() > 1.1 * at_border
+    assert largest_shift(intrinsics, lens, size, size) == pytest.approx(shift.max(), rel=1e-3)  # places of a grid

@@ -12,6 +12,7 @@ from sparsestreet.ops import fused, over_sky
 from sparsestreet.ops import sky as torch_sky
 from sparsestreet.ops.cpu import sky as cpu
 from sparsestreet.ops.cpu.library import load_library
+from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.phases import PhaseRecorder, WallClock
 from sparsestreet.types import Camera
 from tests.ops.scenes import device_of, every_fast_precision, relative_error, with_threads
@@ -133,6 +134,30 @@ def test_a_lens_is_asked_for_its_rays_and_a_pinhole_is_not(monkeypatch, backend,
         monkeypatch.setattr(module, "ray_directions", lambda *_: other)
     assert_matches_torch(given, view, backend, dtype)
     assert torch.equal(answer(given, plain, backend, dtype)[0], before)
+
+
+@pytest.mark.parametrize("backend", ["torch", "cpu"])
+def test_a_lens_shows_the_sky_along_its_rays(backend):
+    """Found by the fixed point of x = (x_d - tangential) / radial."""
+    k1, k2, p1, p2, k3 = lens = [-0.2, 0.05, 2e-3, -1e-3, -0.01]
+    intrinsics = torch.tensor([[8.0, 0, 4.2], [0, 8, 3.8], [0, 0, 1]], dtype=torch.float64)
+    plain = dataclasses.replace(camera(9, 7), intrinsics=intrinsics)
+    y, x = torch.meshgrid((torch.arange(7).double() - 3.3) / 8, (torch.arange(9).double() - 3.7) / 8, indexing="ij")
+    imaged = torch.stack((x, y), -1)
+    for _ in range(100):
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        x, y = (
+            (imaged[..., 0] - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) / radial,
+            (imaged[..., 1] - p1 * (r2 + 2 * y * y) - 2 * p2 * x * y) / radial,
+        )
+    directions = torch.stack((x, y, torch.ones_like(x)), -1) @ plain.camera_from_world[:3, :3]
+    given = image(plain, 5) | {"alpha": torch.zeros(7, 9).double()}
+    sky = colors_along(given["texels"], directions.reshape(63, 3)).reshape(7, 9, 3)
+    view = dataclasses.replace(plain, distortion=torch.tensor(lens, dtype=torch.float64))
+    # The inverse is exact to rounding, and texels differ by 1 at most.
+    torch.testing.assert_close(answer(given, view, backend)[0], given["rgb"] + sky, atol=1e-12, rtol=0)
+    assert (answer(given, plain, backend)[0] - given["rgb"] - sky).abs().max() > 0.01
 
 
 def modules(backend: str) -> list[ModuleType]:
