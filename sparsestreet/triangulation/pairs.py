@@ -1,10 +1,13 @@
 """Which images to compare: those that look at the same space from places far enough apart."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float64, Int
 
+from sparsestreet.geometry.cameras import project
 from sparsestreet.triangulation.matches import NEAREST
 from sparsestreet.types import Camera, View
 
@@ -55,11 +58,9 @@ def image_pairs(views: Sequence[View], cameras_from_frame: Float64[np.ndarray, "
 def in_image(
     camera: Camera, camera_from_frame: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which points lie in the image of a camera at some pose, lens distortion aside."""
-    local = points @ camera_from_frame[:3, :3].T + camera_from_frame[:3, 3]
-    ahead = local[:, 2] > NEAREST
-    x, y, _ = (local @ camera.intrinsics.double().numpy().T).T / np.where(ahead, local[:, 2], 1)
-    return ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    """Which points lie in the image of a camera at some pose."""
+    posed = replace(camera, camera_from_world=torch.from_numpy(camera_from_frame))
+    return project(posed, torch.from_numpy(points), near=NEAREST)[2].numpy()
 
 
 def _partners(
@@ -73,7 +74,7 @@ def _partners(
 
 
 def _probes(camera: Camera) -> Float64[np.ndarray, "p 3"]:
-    """Points of the camera's frame that may lie on surfaces, meters."""
+    """Points of the camera's frame that may lie on surfaces, meters; a sample, for which the lens does not matter."""
     columns, rows = (np.arange(count) + 0.5 for count in PROBE_GRID)
     at = np.stack(np.meshgrid(columns / PROBE_GRID[0] * camera.width, rows / PROBE_GRID[1] * camera.height), -1)
     pixels = np.concatenate((at.reshape(-1, 2), np.ones((at.size // 2, 1))), 1)

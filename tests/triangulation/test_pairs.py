@@ -1,6 +1,9 @@
 """Which views are compared."""
 
+from dataclasses import replace
+
 import numpy as np
+import torch
 
 from sparsestreet.triangulation.pairs import image_pairs, in_image
 from tests.triangulation.worlds import INTRINSICS, pose, view
@@ -64,3 +67,12 @@ def test_a_point_lies_in_the_image_from_the_first_to_the_last_pixel():
     points = np.array([9 * corner * [0.999, 0.999, 1], 9 * corner * [1.001, 1, 1], [0, 0, -9], [0, 0, 0.4]])
     assert in_image(camera, pose(), points).tolist() == [True, False, False, False]
     assert in_image(camera, pose(z=-1.0), points).tolist() == [True, True, False, True]
+
+
+def test_a_lens_decides_what_is_in_the_image():
+    """0.7 is imaged at 0.7 (1 - 0.3 * 0.49) = 0.597, of an image that ends at 0.578; 0.65 at 0.568."""
+    camera = view(pose(), 0).camera
+    points = np.array([[0.7, 0, 1], [0.65, 0, 1], [0.5, 0, 1]])
+    assert in_image(camera, pose(), points).tolist() == [False, False, True]
+    barrel = replace(camera, distortion=torch.tensor([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    assert in_image(barrel, pose(), points).tolist() == [False, True, True]
