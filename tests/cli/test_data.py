@@ -28,9 +28,9 @@ SMALL = [
 
 @pytest.fixture
 def lens(tmp_path) -> Path:
-    """A log of 12 frames whose second camera has a lens with distortion, and whose frame 7 lacks its points."""
+    """A log of 12 frames whose second camera has a lens without inverse, and whose frame 7 lacks its points."""
     make_waymo(tmp_path, frames=12)
-    write_lines(tmp_path / "intrinsics/1.txt", [40.0, 40, 20, 12, 0.25, 0, 0, 0, 0])
+    write_lines(tmp_path / "intrinsics/1.txt", [40.0, 40, 20, 12, 0, 0, 1, 1, 0])
     (tmp_path / "lidar/007.bin").unlink()
     return tmp_path
 
@@ -51,11 +51,10 @@ def test_a_folder_may_be_named_as_it_likes(tmp_path, capsys):
     ("choice", "count"),
     [
         ([], 2),
-        (["data.log.ignore_distortion=true"], 1),
         (["data.log.cameras=[0]"], 1),
         (["data.log.last_frame=6"], 1),
         (["data.log.first_frame=8", "data.log.cameras=[0]"], 0),
-        (["data.log.last_frame=5", "data.log.ignore_distortion=true"], 0),
+        (["data.log.last_frame=5", "data.log.cameras=[0]"], 0),
     ],
 )
 def test_only_what_would_be_read_is_checked(choice, count, lens, capsys):
@@ -66,10 +65,21 @@ def test_only_what_would_be_read_is_checked(choice, count, lens, capsys):
         assert "4 x 1" in printed
 
 
-def test_the_remedy_names_the_key_that_works(lens, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("choice", "said"),
+    [
+        ([], "is simulated"),
+        (["data.log.min_lens_shift=2.0"], "is left out"),
+        (["data.log.min_lens_shift=null"], "as asked"),
+    ],
+)
+def test_the_check_says_what_becomes_of_a_lens(choice, said, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
-    data(["check", str(lens)])
-    assert "data.log.ignore_distortion=true" in capsys.readouterr().out
+    write_lines(make_waymo(tmp_path) / "intrinsics/1.txt", [40.0, 40, 20, 12, 0.25, 0, 0, 0, 0])
+    assert data(["check", str(tmp_path), *choice]) == 0
+    printed = capsys.readouterr().out
+    assert "camera 1: its lens" in printed
+    assert said in printed
 
 
 def test_the_size_is_the_one_that_would_be_read(tmp_path, capsys):

@@ -13,19 +13,20 @@ from sparsestreet.data.drivestudio.poses import read_intrinsics, read_pose
 from sparsestreet.data.drivestudio.sweeps import check_sweep_size, read_sweep
 from sparsestreet.data.images import check_pixels, image_size
 from sparsestreet.data.problems import Problem, attempt, fault, missing_files
+from sparsestreet.geometry.distortion import largest_shift
 
 LARGEST_SCENE = 20_000.0
 """Meters. Re-centered coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""
 
 
-def check_layout(layout: Layout, *, ignore_distortion: bool, contents: bool) -> list[Problem]:
+def check_layout(layout: Layout, *, contents: bool) -> list[Problem]:
     """Every problem of the frames and cameras that are read; an empty list means that reading will succeed.
 
     ``contents=False`` is quick: it trusts lidar points of the right size, and images that are not cut short.
     """
     return [
         *missing_files(_required(layout)),
-        *_check_cameras(layout, ignore_distortion),
+        *_check_cameras(layout),
         *_check_poses(layout),
         *_check_images(layout, contents),
         *_check_sweeps(layout, contents),
@@ -55,17 +56,30 @@ def _pose_files(layout: Layout) -> list[Path]:
     return list(dict.fromkeys(poses))
 
 
-def _check_cameras(layout: Layout, ignore_distortion: bool) -> list[Problem]:
+def _check_cameras(layout: Layout) -> list[Problem]:
     problems: list[Problem] = []
-    for path in filter(Path.is_file, map(layout.intrinsics, layout.cameras)):
-        camera = attempt(problems, partial(read_intrinsics, path))
-        if camera is not None and camera[1].any() and not ignore_distortion:
-            message = (
-                f"the lens distortion k1 k2 p1 p2 k3 = {camera[1].tolist()} is not zero; images must be undistorted"
-            )
-            remedy = "undistort the images and write zeros, or accept the error with data.log.ignore_distortion=true"
-            problems.append(Problem(path, message, remedy))
+    for camera in layout.cameras:
+        path = layout.intrinsics(camera)
+        if path.is_file():
+            # A broken image is reported with the images, once.
+            found: list[Problem] = []
+            attempt(found, partial(_check_camera, layout, camera))
+            problems += [problem for problem in found if problem.path == path]
     return problems
+
+
+def _check_camera(layout: Layout, camera: int) -> None:
+    path = layout.intrinsics(camera)
+    intrinsics, distortion = read_intrinsics(path)
+    if not distortion.any():
+        return
+    size = image_size(layout.image(layout.frames[0], camera))
+    try:
+        largest_shift(intrinsics, distortion, *size)
+    except ValueError as error:
+        message = f"the lens k1 k2 p1 p2 k3 = {distortion.tolist()} images nothing in parts of the image: no inverse"
+        remedy = "write the coefficients of the calibration, in OpenCV's order; zeros for images without distortion"
+        raise fault(path, message, remedy) from error
 
 
 def _check_poses(layout: Layout) -> list[Problem]:

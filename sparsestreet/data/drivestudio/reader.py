@@ -12,7 +12,7 @@ from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
 from sparsestreet.data.drivestudio.instances import read_instances, window
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
-from sparsestreet.data.drivestudio.poses import read_intrinsics, world_origin
+from sparsestreet.data.drivestudio.poses import world_origin
 from sparsestreet.data.drivestudio.source import Source, read_mount
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
@@ -50,8 +50,9 @@ class DriveStudioReader(LogReader):
     """False: as if the log had none."""
     bodies: bool = True
     """False: as if the log had no body poses of people."""
-    ignore_distortion: bool = False
-    """Take images of a lens with distortion for pinhole images."""
+    min_lens_shift: float | None = 0.5
+    """Pixels; a lens that moves some pixel of the image, as it is read, by at least so much is simulated; 0: every lens
+    that is one, None: none. The log's notes say which."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes); a frame takes about 10 bytes a pixel."""
 
@@ -62,19 +63,22 @@ class DriveStudioReader(LogReader):
     def check(self) -> list[Problem]:
         """Every problem of the chosen cameras and frames, pixels and lidar points among them, which are all decoded."""
         try:
-            return self._check(self._layout(), contents=True)
+            return check_layout(self._layout(), contents=True)
         except LogError as error:
             return list(error.problems)
 
     def read(self) -> DrivingLog:
         layout = self._layout()
-        problems = self._check(layout, contents=False)
+        problems = check_layout(layout, contents=False)
         if problems:
             raise LogError(problems)
         origin = world_origin(layout)
         tracks, people = _read_tracks(layout, origin)
-        mounts = [read_mount(layout, index, number, self.width) for index, number in enumerate(layout.cameras)]
-        source = Source(layout, mounts, origin, 1_000_000 * self.cache_mb, lambda: self._check(layout, contents=True))
+        mounts = [
+            read_mount(layout, index, number, self.width, self.min_lens_shift)
+            for index, number in enumerate(layout.cameras)
+        ]
+        source = Source(layout, mounts, origin, 1_000_000 * self.cache_mb, lambda: check_layout(layout, contents=True))
         dataset_from_world = torch.eye(4, dtype=torch.float64)
         dataset_from_world[:3, 3] = origin
         return DrivingLog(
@@ -85,7 +89,7 @@ class DriveStudioReader(LogReader):
             num_frames=len(layout.frames),
             num_cameras=len(mounts),
             dataset_from_world=dataset_from_world,
-            notes=(*_notes(layout), *people),
+            notes=(*_notes(layout), *(mount.note for mount in mounts if mount.note is not None), *people),
         )
 
     def _layout(self) -> Layout:
@@ -97,9 +101,6 @@ class DriveStudioReader(LogReader):
             lidar=self.lidar,
             bodies=self.bodies,
         )
-
-    def _check(self, layout: Layout, *, contents: bool) -> list[Problem]:
-        return check_layout(layout, ignore_distortion=self.ignore_distortion, contents=contents)
 
 
 def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Track, ...], tuple[str, ...]]:
@@ -114,9 +115,4 @@ def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Tr
 def _notes(layout: Layout) -> tuple[str, ...]:
     present = {kind: layout.mask_folder(kind) is not None for kind in ("sky", "human", "vehicle")}
     present |= {"lidar": layout.has_lidar, "boxes": layout.has_instances}
-    notes = [sentence for kind, sentence in _ABSENT.items() if not present[kind]]
-    for camera in layout.cameras:
-        distortion = read_intrinsics(layout.intrinsics(camera))[1]
-        if distortion.any():
-            notes.append(f"camera {camera} has lens distortion {distortion.tolist()} that is ignored, as asked")
-    return tuple(notes)
+    return tuple(sentence for kind, sentence in _ABSENT.items() if not present[kind])

@@ -15,6 +15,7 @@ from sparsestreet.data.images import image_size, read_image, read_mask
 from sparsestreet.data.lazy import RecentlyUsed
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.problems import LogError, Problem
+from sparsestreet.geometry.distortion import largest_shift
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera, Frame, Sweep, View
 
@@ -31,9 +32,13 @@ class Mount:
     """As the log counts it."""
     intrinsics: Float[Tensor, "3 3"]
     size: tuple[int, int]
+    distortion: Float[Tensor, "5"] | None
+    """Of a lens that is simulated."""
+    note: str | None
+    """What becomes of the lens, where the camera has one."""
 
 
-def read_mount(layout: Layout, index: int, number: int, width: int | None) -> Mount:
+def read_mount(layout: Layout, index: int, number: int, width: int | None, min_lens_shift: float | None) -> Mount:
     """Size after scaling, and intrinsics scaled per axis with it: pixel centers lie at +0.5, so cx and cy scale too.
 
     Raises ValueError for a width that the images do not have.
@@ -43,8 +48,22 @@ def read_mount(layout: Layout, index: int, number: int, width: int | None) -> Mo
         raise ValueError(f"width must be within 1 to {full_width}, the images of camera {number}, got {width}")
     size = (full_width, full_height) if width is None else (width, max(1, round(full_height * width / full_width)))
     scale = torch.tensor([size[0] / full_width, size[1] / full_height, 1.0], dtype=torch.float64)
-    intrinsics, _ = read_intrinsics(layout.intrinsics(number))
-    return Mount(number, index, (scale[:, None] * intrinsics).float(), size)
+    intrinsics, distortion = read_intrinsics(layout.intrinsics(number))
+    intrinsics = scale[:, None] * intrinsics
+    simulated, note = False, None
+    if distortion.any():
+        simulated, note = _choice(number, largest_shift(intrinsics, distortion, *size), min_lens_shift)
+    return Mount(number, index, intrinsics.float(), size, distortion.float() if simulated else None, note)
+
+
+def _choice(number: int, shift: float, min_lens_shift: float | None) -> tuple[bool, str]:
+    """Whether a lens that moves pixels by up to ``shift`` is simulated, and a sentence that says so."""
+    lens = f"camera {number}: its lens"
+    if min_lens_shift is None:
+        return False, f"{lens}, which moves pixels by up to {shift:.3g}, is ignored, as asked"
+    if shift < min_lens_shift:
+        return False, f"{lens} moves pixels by at most {shift:.3g} and is left out (data.log.min_lens_shift)"
+    return True, f"{lens} moves pixels by up to {shift:.3g} and is simulated"
 
 
 class Source:
@@ -89,7 +108,7 @@ class Source:
     def _read_view(self, index: int, mount: Mount) -> View:
         pose = world_from_camera(self._layout, self._layout.frames[index], mount.number)
         pose[:3, 3] -= self._origin
-        camera = Camera(inverse(pose).float(), mount.intrinsics, *mount.size)
+        camera = Camera(inverse(pose).float(), mount.intrinsics, *mount.size, mount.distortion)
         return View(camera, index / max(len(self._layout.frames) - 1, 1), index, mount.index)
 
     def _read_frame(self, key: tuple[int, int]) -> Frame:

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 40, 24, 40.0
-COLORS = ((200, 30, 30), (30, 30, 200))
+COLORS = ((200, 30, 30), (30, 30, 200), (30, 200, 30))
 CAR = np.array([10.0, 2.0, 0.75])
 CAR_SIZE = [4.0, 2.0, 1.5]
 

@@ -115,7 +115,7 @@ CORRUPTIONS = {
     "eight intrinsics": (intrinsics([40.0, 40, 20, 12, 0, 0, 0, 0]), "intrinsics/1.txt", "9 numbers"),
     "negative focal length": (intrinsics([-40.0, 40, 20, 12, 0, 0, 0, 0, 0]), "intrinsics/1.txt", "positive"),
     "NaN focal length": (intrinsics([np.nan, 40, 20, 12, 0, 0, 0, 0, 0]), "intrinsics/1.txt", "positive"),
-    "distortion": (intrinsics([40.0, 40, 20, 12, 0.1, 0, 0, 0, 0]), "intrinsics/1.txt", "undistort"),
+    "lens without inverse": (intrinsics([40.0, 40, 20, 12, 0, 0, 1, 1, 0]), "intrinsics/1.txt", "no inverse"),
     "half a lidar row": (truncate("lidar/001.bin", 24), "lidar/001.bin", "24 bytes"),
     "NaN lidar point": (points(np.nan), "lidar/001.bin", "1 of 2 points"),
     "far lidar point": (points(2e3), "lidar/001.bin", "1 of 2 points"),
@@ -175,6 +175,14 @@ def test_pixels_that_break_later_are_reported_with_all_others_when_they_are_aske
     assert len(caught.value.problems) == 2
     with pytest.raises(LogError, match="2 problems"):
         log.sweeps[2]
+
+
+def test_a_lens_with_an_inverse_is_no_problem_and_needs_sound_images(tmp_path):
+    intrinsics([40.0, 40, 20, 12, -0.3, 0.1, 0.001, 0, 0])(make_nuscenes(tmp_path))
+    assert DriveStudioReader(tmp_path).check() == []
+    truncate("images/000_1.jpg", 5)(tmp_path)
+    (problem,) = DriveStudioReader(tmp_path).check()
+    assert problem.path == tmp_path / "images/000_1.jpg"
 
 
 def test_bytes_behind_the_end_of_an_image_do_no_harm(tmp_path):
