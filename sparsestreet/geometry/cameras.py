@@ -59,8 +59,8 @@ def ray_matrix(camera: Camera) -> list[list[float]]:
 def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[Tensor, "h w 3"]:
     """Unit directions in the world through the pixel centers, in the camera's dtype on a device.
 
-    A lens takes a second per million pixels, once for all views of its camera. Raises ValueError where it has no
-    inverse.
+    Those of a lens take a second or two per million pixels, once for all views of a camera. Raises ValueError where the
+    lens has no inverse.
     """
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     image = ((fx, fy, cx, cy), camera.width, camera.height, camera.intrinsics.dtype, torch.device(device))
@@ -83,7 +83,7 @@ def _pinhole_rays(
     return torch.stack((x, y, torch.ones_like(x)), dim=-1)
 
 
-@lru_cache(maxsize=8)  # a rig's cameras, at 12 bytes a pixel
+@lru_cache(maxsize=8)  # the cameras of a rig; 12 bytes a pixel in float32
 def _lens_rays(
     distortion: tuple[float, ...],
     intrinsics: tuple[float, ...],

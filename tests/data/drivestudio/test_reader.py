@@ -278,7 +278,8 @@ BARREL_IS, SLIGHT_IS = "camera 1: its lens moves pixels by up to 3.38", "camera 
 CHOICES = {
     "as it comes": ({}, (True, False), (f"{BARREL_IS} and is simulated", f"{SLIGHT_IS} at most 0.378 and is left out")),
     "every lens": ({"min_lens_shift": 0.0}, (True, True), (BARREL_IS, f"{SLIGHT_IS} up to 0.378 and is simulated")),
-    "strong ones": ({"min_lens_shift": 3.4}, (False, False), ("at most 3.38 and is left out", SLIGHT_IS)),
+    "just so strong": ({"min_lens_shift": 3.38}, (True, False), (BARREL_IS, SLIGHT_IS)),
+    "stronger ones": ({"min_lens_shift": 3.4}, (False, False), ("at most 3.38 and is left out", SLIGHT_IS)),
     "none": (
         {"min_lens_shift": None},
         (False, False),
