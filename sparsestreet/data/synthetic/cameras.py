@@ -1,13 +1,16 @@
 """The camera rig: where the cameras sit on the ego car and which rays they send."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from sparsestreet.data.synthetic.parts import Pose, at
 from sparsestreet.data.synthetic.settings import CAMERA_YAWS_DEGREES, StreetSettings
 from sparsestreet.data.synthetic.tracer import Rays
+from sparsestreet.geometry.distortion import undistort
 
 _EGO_AXES_FROM_CAMERA = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
 """Columns: camera x (right), y (down), z (forward) in ego axes (x forward, y left, z up)."""
@@ -17,12 +20,14 @@ _MOUNT = (1.6, 0.0, 1.65)
 
 @dataclass(frozen=True)
 class StreetCamera:
-    """A pinhole at an instant."""
+    """A camera at an instant."""
 
     world_from_camera: Pose
     intrinsics: Float64[np.ndarray, "3 3"]
     width: int
     height: int
+    distortion: tuple[float, ...] = ()
+    """Brown-Conrady k1, k2, p1, p2, k3; empty: a pinhole."""
 
     def rays(self, supersampling: int) -> Rays:
         """supersampling x supersampling rays per pixel, evenly spread; one ray goes through the pixel's center."""
@@ -37,7 +42,11 @@ class StreetCamera:
     def _directions(self, supersampling: int) -> Float64[np.ndarray, "3 a b"]:
         x = (np.arange(self.width * supersampling) + 0.5) / supersampling - self.intrinsics[0, 2]
         y = (np.arange(self.height * supersampling) + 0.5) / supersampling - self.intrinsics[1, 2]
-        y, x = np.meshgrid(y / self.intrinsics[1, 1], x / self.intrinsics[0, 0], indexing="ij")
+        x, y = x / self.intrinsics[0, 0], y / self.intrinsics[1, 1]
+        if self.distortion:
+            x, y = _undistorted(tuple(x.tolist()), tuple(y.tolist()), self.distortion)
+        else:
+            y, x = np.meshgrid(y, x, indexing="ij")
         directions = np.stack((x, y, np.ones_like(x)))
         return directions / np.linalg.norm(directions, axis=0)
 
@@ -48,4 +57,18 @@ def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) ->
     ego_from_camera[:3, :3] = ego_from_camera[:3, :3] @ _EGO_AXES_FROM_CAMERA
     focal = settings.width / 2 / np.tan(np.radians(settings.field_of_view) / 2)
     intrinsics = np.array([[focal, 0, settings.width / 2], [0, focal, settings.height / 2], [0, 0, 1]])
-    return StreetCamera(world_from_ego @ ego_from_camera, intrinsics, settings.width, settings.height)
+    pose = world_from_ego @ ego_from_camera
+    return StreetCamera(pose, intrinsics, settings.width, settings.height, tuple(settings.lens))
+
+
+@lru_cache(maxsize=4)
+def _undistorted(
+    columns: tuple[float, ...], rows: tuple[float, ...], distortion: tuple[float, ...]
+) -> Float64[np.ndarray, "2 a b"]:
+    """x and y at which a pinhole would image what the lens images in these columns and rows, all normalized.
+
+    Kept, as all frames of a rig share them: Newton's method over all rays takes as long as a frame.
+    """
+    y, x = np.meshgrid(rows, columns, indexing="ij")
+    imaged = torch.from_numpy(np.stack((x, y), -1))
+    return undistort(imaged, torch.tensor(distortion, dtype=torch.float64)).movedim(-1, 0).numpy()

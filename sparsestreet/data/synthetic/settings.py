@@ -1,8 +1,13 @@
 """What a synthetic street is made from; two equal settings give the same bytes."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
+
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
+from sparsestreet.geometry.distortion import fold_radius_squared, undistort
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
 """Front, front left, front right; with 60 degrees of view each, neighbors overlap by 10."""
@@ -22,7 +27,9 @@ class StreetSettings:
     num_cameras: int = 3
     """1: front; 2: and front left; 3: and front right."""
     field_of_view: float = 60.0
-    """Horizontal field of view of every camera, degrees."""
+    """Horizontal field of view of every camera, degrees; a lens changes it and keeps the focal length."""
+    lens: Sequence[float] = ()
+    """Brown-Conrady k1, k2, p1, p2, k3 of every camera, in OpenCV's order; empty: pinholes."""
     supersampling: int = 2
     """Rays per pixel and axis: a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -57,8 +64,27 @@ class StreetSettings:
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
+        # Equal lenses compare equal, in whatever sequence of whatever numbers they were given.
+        object.__setattr__(self, "lens", tuple(float(value) for value in self.lens))
+        if self.lens and not (len(self.lens) == 5 and self._sees_every_pixel()):
+            raise ValueError(
+                "StreetSettings.lens must be empty or five coefficients k1, k2, p1, p2, k3 whose polynomial can be "
+                f"undone in the whole image but is {list(self.lens)}: choose smaller ones or a smaller field_of_view"
+            )
 
     @property
     def duration(self) -> float:
         """Seconds from the first frame to the last."""
         return (self.num_frames - 1) / self.frame_rate
+
+    def _sees_every_pixel(self) -> bool:
+        """Whether every place in the image has a ray that the polynomial describes: one before its fold."""
+        coefficients = torch.tensor(self.lens, dtype=torch.float64)
+        if not coefficients.isfinite().all():
+            return False
+        side = torch.linspace(-1, 1, 17, dtype=torch.float64) * math.tan(math.radians(self.field_of_view) / 2)
+        try:
+            rays = undistort(torch.cartesian_prod(side, side * self.height / self.width), coefficients)
+        except ValueError:
+            return False
+        return bool((rays.square().sum(-1) <= fold_radius_squared(coefficients)).all())

@@ -21,8 +21,8 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
     """A camera and a time in the log's world -> what the street's own camera would have recorded there.
 
     None where the camera is inside of something annotated. People and vehicles count as far as boxes reach
-    (``annotation_range``, here from the camera), seen or not. Pinholes only: a view's lens and shutter are ignored, as
-    no street has any.
+    (``annotation_range``, here from the camera), seen or not. A view's lens is followed, its shutter ignored, as no
+    street has any.
     """
     world = build_world(settings)
     instant_at = lru_cache(maxsize=1)(lambda seconds: Instant.at(world, seconds))
@@ -31,7 +31,11 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
         camera = view.camera
         world_from_camera = street_from_world @ inverse(camera.camera_from_world.double())
         traced = StreetCamera(
-            world_from_camera.numpy(), camera.intrinsics.double().numpy(), camera.width, camera.height
+            world_from_camera.numpy(),
+            camera.intrinsics.double().numpy(),
+            camera.width,
+            camera.height,
+            () if camera.distortion is None else tuple(camera.distortion.tolist()),
         )
         instant = instant_at(view.time * settings.duration)
         if instant.inside_an_actor(traced):

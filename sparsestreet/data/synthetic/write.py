@@ -109,7 +109,7 @@ class StreetWriter:
 
     def _write_intrinsics(self, image: StreetImage, camera: int) -> None:
         k = image.camera.intrinsics
-        values = [k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0]
+        values = [k[0, 0], k[1, 1], k[0, 2], k[1, 2], *(image.camera.distortion or (0.0,) * 5)]
         np.savetxt(self._file("intrinsics", f"{camera}.txt"), values)
 
 
