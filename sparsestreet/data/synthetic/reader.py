@@ -30,6 +30,8 @@ class StreetReader(LogReader):
     """False: as if the street had none, though it is traced with its own."""
     bodies: bool = True
     """False: as if the street had no body poses of its pedestrians."""
+    min_lens_shift: float | None = 0.5
+    """A lens that moves no pixel by more pixels is left out; 0: none is; None: every one."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
@@ -50,7 +52,9 @@ class StreetReader(LogReader):
 
     def _made(self) -> DriveStudioReader:
         root = make_street(self.settings, self.folder, self._report)
-        return DriveStudioReader(root, lidar=self.lidar, bodies=self.bodies, cache_mb=self.cache_mb)
+        return DriveStudioReader(
+            root, lidar=self.lidar, bodies=self.bodies, min_lens_shift=self.min_lens_shift, cache_mb=self.cache_mb
+        )
 
     def _report(self, done: int, total: int) -> None:
         """A line when a quarter more is traced."""
