@@ -77,14 +77,19 @@ def _trace_tile(
 def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, "k 3"]:
     """Inward normals of up to four planes through the origin with all rays of the tile on one side.
 
-    Sides of a lidar's tile are cones, not planes: a plane that would cut off rays is left out.
+    Sides of a lidar's tile are cones, and a lens bends those of a camera's: a plane that would cut off rays is turned
+    towards the middle until it does not, or left out of a tile too wide for that.
     """
     corners = tile[:, [0, 0, -1, -1], [0, -1, -1, 0]].T
     normals = np.cross(corners, np.roll(corners, -1, axis=0))
     lengths = np.linalg.norm(normals, axis=1)
     normals = normals[lengths > 1e-6] / lengths[lengths > 1e-6, None]
-    normals *= np.sign(normals @ tile.mean((1, 2)))[:, None]
-    lowest = rotated(normals, tile.reshape(3, -1)).min(1) if len(normals) else np.empty(0, np.float32)
+    middle, rays = tile.mean((1, 2)), tile.reshape(3, -1)
+    normals *= np.sign(normals @ middle)[:, None]
+    ahead = rotated(middle[None], rays)
+    if ahead.min() > 0:
+        normals += (-rotated(normals, rays) / ahead).max(1, initial=0)[:, None] * middle
+    lowest = rotated(normals, rays).min(1, initial=np.inf)
     return np.ascontiguousarray(normals[lowest >= -1e-6], np.float32)
 
 
