@@ -21,15 +21,20 @@ SETTINGS = StreetSettings(
 pytestmark = pytest.mark.lengthy
 
 
+BEHIND_A_LENS = replace(SETTINGS, num_frames=2, lens=(-0.3, 0.1, 0.004, -0.006, 0.02))
+
+
 @pytest.fixture(scope="module")
 def log(tmp_path_factory) -> DrivingLog:
     return StreetReader(SETTINGS, tmp_path_factory.mktemp("streets") / "tiny").read()
 
 
-def test_at_recorded_views_it_is_what_was_recorded(log):
+@pytest.mark.parametrize("settings", [SETTINGS, BEHIND_A_LENS], ids=["pinhole", "lens"])
+def test_at_recorded_views_it_is_what_was_recorded(settings, request, tmp_path):
     """Pixels before compression; masks as they were written, from the annotations."""
-    world = build_world(SETTINGS)
-    traced = [render_frame(SETTINGS, world, index) for index in range(SETTINGS.num_frames)]
+    log = request.getfixturevalue("log") if settings is SETTINGS else StreetReader(settings, tmp_path / "lens").read()
+    world = build_world(settings)
+    traced = [render_frame(settings, world, index) for index in range(settings.num_frames)]
     people, vehicles = 0, 0
     for frame in log.frames:
         found = log.truth(frame)
