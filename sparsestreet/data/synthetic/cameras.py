@@ -67,7 +67,7 @@ def _undistorted(
 ) -> Float64[np.ndarray, "2 a b"]:
     """x and y at which a pinhole would image what the lens images in these columns and rows, all normalized.
 
-    Kept, as all frames of a rig share them: Newton's method over all rays takes as long as a frame.
+    Kept, as all frames of a rig share them: Newton's method over all rays takes as long as tracing them.
     """
     y, x = np.meshgrid(rows, columns, indexing="ij")
     imaged = torch.from_numpy(np.stack((x, y), -1))

@@ -31,7 +31,7 @@ class StreetReader(LogReader):
     bodies: bool = True
     """False: as if the street had no body poses of its pedestrians."""
     min_lens_shift: float | None = 0.5
-    """A lens that moves no pixel by more pixels is left out; 0: none is; None: every one."""
+    """Pixels; the settings' lens is simulated where it moves some pixel by at least so much; 0: always, None: never."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 

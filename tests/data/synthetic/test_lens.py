@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic import StreetSettings, cameras, make_street
+from sparsestreet.data.synthetic import StreetReader, StreetSettings, cameras, make_street
 from sparsestreet.data.synthetic.cameras import StreetCamera, street_camera
 from sparsestreet.data.synthetic.render import Instant, render_image
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP
@@ -67,9 +67,9 @@ def test_a_pixel_shows_what_a_pinhole_of_one_pixel_sees_there():
 
 
 @pytest.mark.lengthy
-def test_files_of_a_street_say_and_hold_its_lens(tmp_path):
+def test_files_of_a_street_say_its_lens_and_show_it(tmp_path):
     """Unprojected by what the files say, the road is flat."""
-    root = make_street(SETTINGS, tmp_path / "street")
+    root = make_street(SETTINGS, tmp_path)
     fx, fy, cx, cy, *lens = np.loadtxt(root / "intrinsics/0.txt")
     assert tuple(lens) == LENS
     with np.load(root / "depth/000_0.npz") as stored:
@@ -82,6 +82,9 @@ def test_files_of_a_street_say_and_hold_its_lens(tmp_path):
     assert len(road) > 300
     # Float32 depth is good to 1e-7 of 50 m.
     np.testing.assert_allclose(road[:, 2], 0, atol=1e-4)
+    read = StreetReader(SETTINGS, root).read().views[0].camera
+    np.testing.assert_array_equal(read.distortion, np.float32(LENS))
+    assert StreetReader(SETTINGS, root, min_lens_shift=None).read().views[0].camera.distortion is None
 
 
 def test_frames_share_the_rays_of_a_lens(monkeypatch):

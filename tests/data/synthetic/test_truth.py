@@ -21,7 +21,7 @@ SETTINGS = StreetSettings(
 pytestmark = pytest.mark.lengthy
 
 
-BEHIND_A_LENS = replace(SETTINGS, num_frames=2, lens=(-0.3, 0.1, 0.004, -0.006, 0.02))
+BEHIND_A_LENS = replace(SETTINGS, num_frames=2, num_cameras=1, supersampling=1, lens=(-0.3, 0.1, 0.004, -0.006, 0.02))
 
 
 @pytest.fixture(scope="module")
