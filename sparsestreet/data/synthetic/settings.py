@@ -80,8 +80,6 @@ class StreetSettings:
     def _sees_every_pixel(self) -> bool:
         """Whether every place in the image has a ray that the polynomial describes: one before its fold."""
         coefficients = torch.tensor(self.lens, dtype=torch.float64)
-        if not coefficients.isfinite().all():
-            return False
         side = torch.linspace(-1, 1, 17, dtype=torch.float64) * math.tan(math.radians(self.field_of_view) / 2)
         try:
             rays = undistort(torch.cartesian_prod(side, side * self.height / self.width), coefficients)

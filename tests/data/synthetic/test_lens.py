@@ -113,7 +113,8 @@ def test_tiles_with_bent_sides_are_bounded_on_all_of_them(k1):
     "lens",
     [
         (-0.3, 0.1, 0.0, 0.0),
-        (-0.3, 0.1, 0.0, float("nan"), 0.0),
+        (float("nan"), 0.1, 0.0, 0.0, 0.0),
+        (-0.3, 0.1, 0.0, float("inf"), 0.0),
         # Folds at r = 0.75, which it images at 0.50: the image's corner lies at 0.69.
         (-0.6, 0.0, 0.0, 0.0, 0.0),
         # Images nothing left of x = -1 / 6.
