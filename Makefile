@@ -27,8 +27,9 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 	  echo 'torchvision must not be installed beside the CPU build of torch: it breaks torchmetrics and lightning'; exit 1; fi
 	touch $@
 
-# One thread a process: tests are small, and threads that wait for each other cost more than they bring.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+# One thread a process: tests are small, and threads that wait for each other cost more than they bring. Files in the order
+# of their names: trainings (tests/cli) come early, where files of few tests would come last and leave a process idle.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 quick: lint ## the loop of daily work, under a minute: lint and unit tests without trainings and Triton's interpreter
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'

@@ -14,14 +14,14 @@ from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import View
 
 SETTINGS = StreetSettings(
-    seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, annotation_range=25.0,
+    seed=3, num_frames=3, width=97, height=61, num_cameras=2, frame_rate=2.0, supersampling=1,
+    annotation_range=25.0,
     lidar=replace(WAYMO_TOP, beams=16, azimuth_steps=200),
 )  # fmt: skip
 
+BEHIND_A_LENS = replace(SETTINGS, num_frames=2, num_cameras=1, lens=(-0.3, 0.1, 0.004, -0.006, 0.02))
+
 pytestmark = pytest.mark.lengthy
-
-
-BEHIND_A_LENS = replace(SETTINGS, num_frames=2, num_cameras=1, supersampling=1, lens=(-0.3, 0.1, 0.004, -0.006, 0.02))
 
 
 @pytest.fixture(scope="module")
