@@ -6,7 +6,7 @@ Asked before any data is read, so that nobody waits for a street to hear of a sl
 import inspect
 import re
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from beartype.door import is_bearable
@@ -58,14 +58,25 @@ def _fits(value: Tree, hint: typing.Any) -> bool:
     if isinstance(value, str) and typing.get_origin(hint) is Sequence:
         return False  # a word is a sequence of letters, which nobody means
     try:
-        if is_bearable(value, hint):
-            return True
-        # YAML writes 1 where a float is meant, and has lists only.
-        if isinstance(value, int) and not isinstance(value, bool):
-            return is_bearable(float(value), hint)
-        return isinstance(value, list) and is_bearable(tuple(value), hint)
+        if isinstance(value, list):
+            return all(_item_fits(item, len(value), hint) for item in value) if value else _any_fits(([], ()), hint)
+        return _any_fits(_meant(value), hint)
     except BeartypeException:
         return True  # an annotation that cannot be checked at run time says nothing
+
+
+def _item_fits(item: Tree, count: int, hint: typing.Any) -> bool:
+    """In a list or tuple (YAML has lists only) of its like: of one of any length beartype looks at some item only."""
+    return _any_fits((kind([one] * count) for one in _meant(item) for kind in (list, tuple)), hint)
+
+
+def _meant(value: Tree) -> tuple[Tree, ...]:
+    """YAML writes 1 where a float is meant."""
+    return (value, float(value)) if isinstance(value, int) and not isinstance(value, bool) else (value,)
+
+
+def _any_fits(values: Iterable[Tree], hint: typing.Any) -> bool:
+    return any(is_bearable(value, hint) for value in values)
 
 
 def _in_words(hint: typing.Any) -> str:

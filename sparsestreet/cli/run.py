@@ -75,6 +75,8 @@ def _train_and_evaluate(
     """What was measured (None of a ``fast_dev_run``), and the device."""
     with stage("data"):
         data = data_of(cfg)
+    for note in data.driving_log.notes:
+        log.info(note)
     with stage("initialize"):
         system = recipe.build(data)
     callbacks = [*recipe.callbacks.values(), StageTimes(recorder)]

@@ -57,6 +57,8 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
         ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
         ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),
         ("node.rigid.classes=Car", "node.rigid.classes must be"),
+        ("data.log.settings.lens=[a,0.1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0]", "data.log.settings.lens must be"),
+        ("evaluation.presets=[fast,1,fast,fast,fast,fast,fast,fast,fast]", "evaluation.presets must be"),
         ("data.lidar.dropout=often", "data.lidar.dropout must be float, got 'often'"),
         ("data.lidar=hdl64", "data.log.settings.lidar must be LidarSensor, got 'hdl64'"),
         ("capacity=huge", "no capacity 'huge': choose one of small, paper"),

@@ -256,6 +256,21 @@ def test_training_measures_what_its_configuration_asks_for_and_so_does_every_eva
     assert again.command == f"sparsestreet evaluate run={out} novel=1.5 presets=fast"
 
 
+def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
+    """With whole numbers among the coefficients, as one types them; and what else the log's notes have to say."""
+    street = [
+        f"data.log.root={tmp_path / 'street'}",
+        "data.log.settings.num_frames=3",
+        "data.log.settings.num_cameras=1",
+    ]
+    lens = ["data.log.settings.lens=[-0.3,0.1,0,0,0]", "data.log.lidar=false", "split.offset=1"]
+    out = run_train(tmp_path, *street, *lens, "trainer.fast_dev_run=2")
+    said = (out / "train.log").read_text()
+    assert "camera 0: its lens moves pixels by up to" in said
+    assert "and is simulated" in said
+    assert "no lidar: Gaussians start from points in images" in said
+
+
 def test_adam_of_visible_gaussians_runs(run_train, tmp_path):
     run_train(tmp_path, "optimizer=visible_adam", "trainer.fast_dev_run=2")
 

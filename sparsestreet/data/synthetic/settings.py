@@ -28,7 +28,7 @@ class StreetSettings:
     """1: front; 2: and front left; 3: and front right."""
     field_of_view: float = 60.0
     """Horizontal field of view of every camera, degrees; a lens changes it and keeps the focal length."""
-    lens: Sequence[float] = ()
+    lens: Sequence[float | int] = ()
     """Brown-Conrady k1, k2, p1, p2, k3 of every camera, in OpenCV's order; empty: pinholes."""
     supersampling: int = 2
     """Rays per pixel and axis: a pixel's color is the mean of supersampling^2 rays."""
