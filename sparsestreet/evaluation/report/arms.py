@@ -4,10 +4,10 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sparsestreet.evaluation.configuration import config_hash, only
+from sparsestreet.evaluation.configuration import config_hash, differing_options, only, without
 from sparsestreet.evaluation.records import RunSummary
 from sparsestreet.evaluation.report.collect import RunRecord
-from sparsestreet.evaluation.report.variants import CLIP_KEYS, CONTROLS, variants
+from sparsestreet.evaluation.report.variants import CLIP_KEYS, CONTROLS, in_few_words, log_config, variants
 
 Value = Callable[[RunSummary], float | None]
 Unit = tuple[tuple[str, str], int]
@@ -23,7 +23,7 @@ class Arm:
     method: str
     sparsify: str
     place: tuple[str, ...]
-    """Device, threads, commit; and which data, where one scene has several."""
+    """Device, threads, commit; and where a sweep has several: data of one scene, options of the log, splits."""
     records: tuple[RunRecord, ...]
     """Of both kinds: trained without held-out views, and on all."""
 
@@ -78,7 +78,11 @@ def by_scene(units: dict[Unit, float]) -> dict[tuple[str, str], float]:
 def arms(records: Sequence[RunRecord]) -> list[Arm]:
     """The runs of a sweep in arms, those of a method together, plain before pruned before controls."""
     folder_of = {id(record.summary): record for record in records}
-    places = {id(record.summary): _place(record.summary, records) for record in records}
+    of_log, of_split = _logs_in_words(records), _splits_in_words(records)
+    places = {
+        key: (*_place(record.summary, records), of_log[key], of_split[key])
+        for key, record in ((id(record.summary), record) for record in records)
+    }
     columns = list(zip(*places.values(), strict=True))
     told = [index for index, column in enumerate(columns) if len(set(column)) > 1]
     found = []
@@ -109,7 +113,7 @@ def why_apart(found: Sequence[Arm]) -> list[str]:
     if not found:
         return []
     said = []
-    names = ("devices", "numbers of threads", "commits", "data of one name")
+    names = ("devices", "numbers of threads", "commits", "data of one name", "options of the log", "splits")
     for name, column in zip(names, zip(*(arm.place for arm in found), strict=True), strict=True):
         if len(set(column)) > 1:
             said.append(f"runs differ in {name} ({', '.join(sorted(set(column)))}): shown apart, never averaged")
@@ -129,6 +133,20 @@ def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
     threads = f"{made.threads} thread{'s' if made.threads != 1 else ''}"
     threads += f", measured with {measured.threads}" if made.threads != measured.threads else ""
     return device, threads, (made.source.commit or "no commit")[:9], _edition(run, records)
+
+
+def _logs_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
+    """Run (its id) -> the options of how its log is read, the part that is read aside, in which runs differ."""
+    logs = {id(record.summary): without(log_config(record.summary), CLIP_KEYS) for record in records}
+    distinct = {config_hash(log): log for log in logs.values()}
+    words = dict(zip(distinct, differing_options(list(distinct.values())), strict=True))
+    return {key: in_few_words(words[config_hash(log)], config_hash(log)) for key, log in logs.items()}
+
+
+def _splits_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
+    """Run (its id) -> what it holds out, where runs that hold views out differ in it; else nothing."""
+    splits = {id(record.summary): record.summary.run.split for record in records}
+    return splits if len(set(splits.values()) - {"none"}) > 1 else dict.fromkeys(splits, "")
 
 
 def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:

@@ -119,7 +119,12 @@ def _not_of_data(options: Iterable[str]) -> list[str]:
 
 
 def _name(label: str, options: Sequence[str], identity: str) -> str:
+    return f"{label} {in_few_words(options, identity)}".rstrip()
+
+
+def in_few_words(options: Sequence[str], identity: str) -> str:
+    """Options for a name: the first few, cut to a length; where there are more, a hash tells them apart."""
     named = [word if len(word) <= _LONGEST else f"{word[:_LONGEST]}..." for word in options[:_MOST_NAMED]]
     if len(options) > _MOST_NAMED:
         named.append(f"and {len(options) - _MOST_NAMED} more #{identity[:6]}")
-    return f"{label} {', '.join(named)}" if named else label
+    return ", ".join(named)

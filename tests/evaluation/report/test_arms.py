@@ -42,6 +42,11 @@ def test_each_scene_counts_once():
         ({"threads": 1}, "runs differ in numbers of threads (1 thread, measured with 2, 2 threads)"),
         ({"source": Source("fedcba9876543210", False)}, "runs differ in commits (012345678, fedcba987)"),
         ({"config": {"schedule.max_steps": 70}}, "plain: runs of one label that differ are rows of their own"),
+        (
+            {"config": {"data.log.lidar": False}},
+            "runs differ in options of the log (data.log.lidar=false, data.log.lidar=null)",
+        ),
+        ({"split": "every 4th frame"}, "runs differ in splits (every 10th frame from 0, every 4th frame)"),
     ],
 )
 def test_runs_that_differ_are_never_averaged(other, said):
@@ -49,6 +54,19 @@ def test_runs_that_differ_are_never_averaged(other, said):
     assert [len(arm.records) for arm in found] == [1, 1]
     assert len({arm.name for arm in found}) == 2
     assert any(note.startswith(said) for note in why_apart(found))
+
+
+def test_options_of_the_log_name_arms_in_few_words():
+    """Parts of a log are scenes of their own, and where it lies makes no difference."""
+    read = {"data.log.lidar": True, "data.log.width": 480, "data.log.root": "/a", "data.log.first_frame": 0}
+    other = read | {"data.log.width": 960, "data.log.root": "/b", "data.log.first_frame": 30}
+    runs = [make_summary("plain", config=config) for config in (read, other, other | {"data.log.lidar": False})]
+    names = {arm.name for arm in arms([record(run) for run in runs])}
+    assert names == {
+        "plain (data.log.lidar=true, data.log.width=480)",
+        "plain (data.log.lidar=true, data.log.width=960)",
+        "plain (data.log.lidar=false, data.log.width=960)",
+    }
 
 
 def test_no_comparison_between_places():
