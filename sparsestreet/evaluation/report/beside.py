@@ -13,6 +13,7 @@ TRUTH = {
     "psnr_human": "PSNR of people, dB",
     "psnr_vehicle": "PSNR of vehicles, dB",
 }
+_PSNR = {title: place for place, title in enumerate(TRUTH.values())}
 
 
 def shifts_of(run: Path) -> dict[float, dict[str, float]]:
@@ -55,16 +56,18 @@ def _mean(arm: Arm, value: Callable[[Path], float | None]) -> float | None:
 
 
 def beside_the_path(arms: Sequence[Arm]) -> Grid | None:
-    """Every distance that a run recorded, by meters; None where none did."""
+    """PSNR to the truth and every distance that a run recorded, by meters; None where none did."""
     measured = [shifts_of(record.folder) for arm in arms for record in arm.records]
-    columns = sorted({(name, meters) for shifts in measured for meters, found in shifts.items() for name in found})
+    found = {(name, meters) for shifts in measured for meters, numbers in shifts.items() for name in numbers}
+    columns = sorted(found, key=lambda column: (column[0] not in _PSNR, _PSNR.get(column[0], 0), column))
     if not columns:
         return None
     rows = []
     for arm in arms:
         runs = tuple(record.folder.name for record in arm.records)
         means = [mean_beside(arm, meters, name) for name, meters in columns]
-        cells = [Cell() if mean is None else Cell(f"{mean:.4g}", runs=runs) for mean in means]
+        texts = [None if mean is None else _text(name, mean) for (name, _), mean in zip(columns, means, strict=True)]
+        cells = [Cell() if text is None else Cell(text, runs=runs) for text in texts]
         rows.append((Cell(arm.title, runs=runs), *cells))
     header = (("", "arm"), *((name, f"{meters:g} m") for name, meters in columns))
     notes = (
@@ -72,3 +75,7 @@ def beside_the_path(arms: Sequence[Arm]) -> Grid | None:
         "and says nothing by its level; only that of Inception's features is the published FID",
     )
     return Grid("beside", "Beside the recorded path", header, tuple(rows), notes)
+
+
+def _text(name: str, mean: float) -> str:
+    return f"{mean:.2f}" if name in _PSNR else f"{mean:.4g}"

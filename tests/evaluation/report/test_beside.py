@@ -30,6 +30,15 @@ def test_an_arm_is_the_mean_of_its_scenes(tmp_path):
     assert [row[1].text for row in grid.rows] == ["41", "-", "-"]
 
 
+def test_the_truth_comes_before_distances(tmp_path):
+    sweep = write_sweep(tmp_path)
+    write_beside(sweep / "streetgs_seed0", {1.0: 41.25, -1.0: 41.25, 2.0: 50.0}, name="a_distance", psnr=20.4)
+    grid = beside_the_path(arms(collect([sweep])))
+    names = [TRUTH["psnr_full"]] * 2 + ["a_distance"] * 2
+    assert grid.header[1:] == tuple(zip(names, ["1 m", "2 m"] * 2, strict=True))
+    assert [cell.text for cell in grid.rows[0][1:]] == ["20.40", "20.40", "41.25", "50"]
+
+
 def test_table_4_holds_the_inception_distance_alone(tmp_path):
     summary = make_summary("omnire", scene="023")
     object.__setattr__(summary.run, "method", "omnire")
