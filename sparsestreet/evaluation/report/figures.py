@@ -77,6 +77,12 @@ def colors(arms: Sequence[Arm]) -> dict[str, str]:
     return {label: COLORS[index % len(COLORS)] for index, label in enumerate(labels)}
 
 
+def of_sparsify(arm: Arm) -> str:
+    """The color of what was done to get small, where arms of one method are drawn."""
+    known = ("none", "paper", "removal", "masks", "importance")
+    return COLORS[known.index(arm.sparsify) if arm.sparsify in known else len(known)]
+
+
 def short(value: float) -> str:
     """12000 -> 12k, 1500000 -> 1.5M."""
     unit, size = next(((unit, size) for unit, size in (("M", 1e6), ("k", 1e3)) if value >= size), ("", 1.0))

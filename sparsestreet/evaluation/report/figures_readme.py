@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from sparsestreet.evaluation.records import HELD_OUT, RunSummary
 from sparsestreet.evaluation.report.arms import Arm, Value, mean_over_scenes
 from sparsestreet.evaluation.report.curves import HeldOutCurve, curves_of
-from sparsestreet.evaluation.report.figures import GREY, LEGEND, colors, marker, panels
+from sparsestreet.evaluation.report.figures import LEGEND, colors, marker, of_sparsify, panels
 from sparsestreet.metrics.protocols import Protocol
 
 _DASHES = {"none": "-", "paper": "--", "removal": ":"}
@@ -32,7 +32,7 @@ def time_figure(arms: Sequence[Arm], protocol: Protocol, path: Path) -> None:
     training.set_xlabel("training seconds")
     frame.set_xlabel("milliseconds a frame")
     training.set_ylabel("held-out PSNR, dB")
-    handles, names = frame.get_legend_handles_labels()
+    handles, names = training.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=4, **LEGEND)
     FigureCanvasAgg(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,9 +49,14 @@ def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protoco
         _points(axes, arm, shown, _seconds, protocol)
         return
     seconds, psnr = mean_curve(curves)
-    paint = colors(shown)[arm.plain_label]
-    last = [len(seconds) - 1]
-    axes.plot(seconds, psnr, color=paint, linestyle=_DASHES.get(arm.sparsify, "-."), marker=marker(arm), markevery=last)
+    style = {"color": _paint(arm, shown), "linestyle": _DASHES.get(arm.sparsify, "-."), "marker": marker(arm)}
+    axes.plot(seconds, psnr, **style, markevery=[len(seconds) - 1], label=arm.name)
+
+
+def _paint(arm: Arm, shown: Sequence[Arm]) -> str:
+    """A color a method; where there is one only, a color for each way to get small."""
+    of_method = colors(shown)
+    return of_method[arm.plain_label] if len(of_method) > 1 else of_sparsify(arm)
 
 
 def mean_curve(curves: Sequence[HeldOutCurve]) -> tuple[list[float], list[float]]:
@@ -63,21 +68,15 @@ def mean_curve(curves: Sequence[HeldOutCurve]) -> tuple[list[float], list[float]
 
 
 def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: Protocol) -> None:
-    """The mean, and every run small in grey."""
+    """The mean, and every run small and pale."""
     costs, qualities = arm.units(cost), arm.units(_psnr(protocol))
     units = sorted(costs.keys() & qualities.keys())
     if not units:
         return
-    axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=7, color=GREY, alpha=0.6)
+    paint = _paint(arm, shown)
+    axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
     mean = [mean_over_scenes({unit: values[unit] for unit in units}) for values in (costs, qualities)]
-    axes.scatter(
-        *([value] for value in mean),
-        s=44,
-        color=colors(shown)[arm.plain_label],
-        marker=marker(arm),
-        label=arm.name,
-        zorder=3,
-    )
+    axes.scatter(*([value] for value in mean), s=44, color=paint, marker=marker(arm), label=arm.name, zorder=3)
 
 
 def _seconds(run: RunSummary) -> float | None:

@@ -13,9 +13,7 @@ from sparsestreet.evaluation.ledger import ledger_path, read_changes
 from sparsestreet.evaluation.report.arms import Arm
 from sparsestreet.evaluation.report.costs import costs_of
 from sparsestreet.evaluation.report.curves import curves_of
-from sparsestreet.evaluation.report.figures import COLORS, GREY, LEGEND, panels, short, write_svg
-
-_PAINT = {"none": COLORS[0], "paper": COLORS[1], "removal": COLORS[2], "masks": COLORS[3], "importance": COLORS[4]}
+from sparsestreet.evaluation.report.figures import COLORS, GREY, LEGEND, of_sparsify, panels, short, write_svg
 
 
 def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
@@ -109,7 +107,7 @@ def _of(arms: Sequence[Arm], method: str) -> list[Arm]:
 
 def _line(arm: Arm) -> dict[str, str | float]:
     dashes = {"capped": ":", "random": "--", "opacity": "-."}.get(arm.sparsify, "-")
-    paint = GREY if arm.control else _PAINT.get(arm.sparsify, COLORS[5])
+    paint = GREY if arm.control else of_sparsify(arm)
     name = f"control: {arm.sparsify}" if arm.control else {"none": "plain"}.get(arm.sparsify, arm.sparsify)
     return {"color": paint, "linestyle": dashes, "linewidth": 1.2, "alpha": 0.85, "label": name}
 
