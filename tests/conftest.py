@@ -1,8 +1,11 @@
 """What all tests share: where recorded data may lie."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import torch
 
@@ -25,3 +28,14 @@ def kitti() -> Path:
     if not root.is_dir():
         pytest.skip(f"no recorded drive at {root}: set SPARSESTREET_DATA to the folder that holds kitti_0001")
     return root
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """Without checks of shapes, for what other tests are about: the tracer's many small calls take four times as long
+    with them."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)

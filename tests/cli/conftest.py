@@ -5,14 +5,16 @@ from pathlib import Path
 
 import pytest
 
+from sparsestreet.cli.data import data
 from sparsestreet.cli.train import train
+from tests.conftest import unchecked
 
 
 @pytest.fixture(scope="session")
 def tiny_street(tmp_path_factory) -> list[str]:
     """Overrides that select it; it is traced once per session."""
     root = tmp_path_factory.mktemp("street") / "tiny"
-    return [
+    street = [
         f"data.log.root={root}",
         "data.log.settings.num_frames=12",
         "data.log.settings.width=64",
@@ -20,6 +22,11 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "data.log.settings.num_cameras=2",
         "data.lidar.beams=24",
         "data.lidar.azimuth_steps=300",
+    ]
+    with unchecked():
+        assert data(["make", *street]) == 0
+    return [
+        *street,
         "sky.resolution=8",
         *TINY_BACKGROUND,
         f"image_points.cache={root.parent / 'points'}",

