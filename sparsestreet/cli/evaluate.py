@@ -62,6 +62,8 @@ def evaluate(arguments: list[str]) -> int:
 def _evaluate(options: Options) -> None:
     run = options.run
     cfg, description = load_run_config(run), read_run(run_path(run))
+    if "evaluation" not in cfg:
+        raise ValueError(f"{run} is of an earlier version, its configuration lacks 'evaluation': train it again")
     # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
     torch.set_num_threads(min(description.threads, this_machine().cores))
     looks = options.looks(instantiate(cfg.evaluation, _convert_="all"))

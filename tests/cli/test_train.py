@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
@@ -234,6 +235,16 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
     assert f"evaluate run={out} novel=1 ramp=true" in record.command
     assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
     assert not preset_path(out).exists()  # it was of an earlier evaluation
+
+
+def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, capsys):
+    shutil.copytree(finished, tmp_path / "old")
+    path = tmp_path / "old/.hydra/config.yaml"
+    cfg = OmegaConf.load(path)
+    del cfg.evaluation
+    OmegaConf.save(cfg, path)
+    assert evaluate([f"run={tmp_path / 'old'}"]) == 1
+    assert "is of an earlier version, its configuration lacks 'evaluation': train it again" in capsys.readouterr().err
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
