@@ -34,8 +34,9 @@ def kitti() -> Path:
 def unchecked() -> Iterator[None]:
     """Without checks of shapes, for what other tests are about: the tracer's many small calls take four times as long
     with them."""
+    before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         yield
     finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+        jaxtyping.config.update("jaxtyping_disable", before)
