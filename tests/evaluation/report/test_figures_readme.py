@@ -5,7 +5,7 @@ import pytest
 from sparsestreet.evaluation.report import collect
 from sparsestreet.evaluation.report.arms import arms
 from sparsestreet.evaluation.report.curves import HeldOutCurve
-from sparsestreet.evaluation.report.figures_readme import mean_curve, time_figure
+from sparsestreet.evaluation.report.figures_readme import _paint, mean_curve, time_figure
 from sparsestreet.metrics.protocols import DRIVESTUDIO
 from tests.evaluation.frames import make_summary
 from tests.evaluation.report.sweep_folder import record, write_sweep
@@ -27,3 +27,11 @@ def test_without_held_out_views_there_is_none(tmp_path):
     found = arms([record(make_summary(psnr=None, training_psnr=20.0, split="none"))])
     with pytest.raises(ValueError, match="no run was evaluated on held-out views"):
         time_figure(found, DRIVESTUDIO, tmp_path / "time.png")
+
+
+def test_arms_of_one_method_differ_in_color_and_those_of_several_by_method():
+    one = arms([record(make_summary(label)) for label in ("a", "a+paper")])
+    assert len({_paint(arm, one) for arm in one}) == 2
+    several = [*one, *arms([record(make_summary("b"))])]
+    assert len({_paint(arm, several) for arm in one}) == 1
+    assert len({_paint(arm, several) for arm in several}) == 2
