@@ -10,7 +10,7 @@ from sparsestreet.bench import torch_tiles
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Cotangent, OpTimes, Spread, TimingBudget, leaves, spread, time_op
+from sparsestreet.bench.timing import Cotangent, OpTimes, TimeSpread, TimingBudget, leaves, spread, time_op
 from sparsestreet.ops.reference import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
@@ -45,7 +45,7 @@ class BlendRecord:
     width: int
     height: int
     times: OpTimes
-    peer: dict[str, Spread] | None
+    peer: dict[str, TimeSpread] | None
     """Vectorized torch on splats that are already on the screen: ``forward``, and ``both`` with the backward."""
     peak_gflops: float | None
     """float32 operations of a matrix product in the same run."""
@@ -94,7 +94,7 @@ def _scene(size: Size) -> tuple[Gaussians, Camera]:
     return frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16), camera
 
 
-def time_torch(gaussians: Gaussians, camera: Camera, budget: TimingBudget) -> dict[str, Spread]:
+def time_torch(gaussians: Gaussians, camera: Camera, budget: TimingBudget) -> dict[str, TimeSpread]:
     """Forward alone, and forward + backward, each with the listing of tiles, of splats already on the screen."""
     splats, size = _projected(gaussians, camera), (camera.width, camera.height)
     cotangent = Cotangent.of(camera, gaussians.means).rgb

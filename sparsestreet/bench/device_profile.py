@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch.profiler import DeviceType, ProfilerActivity, profile
 
-from sparsestreet.bench.timing import Spread, spread
+from sparsestreet.bench.timing import TimeSpread, spread
 
 STAGES = {
     "blend_backward": r"(blend|raster).*(backward|bwd)",
@@ -25,7 +25,7 @@ def stage_of(kernel: str) -> str:
     return next((stage for stage, pattern in STAGES.items() if re.search(pattern, kernel.lower())), "other")
 
 
-def kernel_milliseconds(run: Callable[[], None], repeats: int = 7) -> dict[str, Spread]:
+def kernel_milliseconds(run: Callable[[], None], repeats: int = 7) -> dict[str, TimeSpread]:
     """Device time of each stage in one ``run``, over repeats that are profiled one by one; copies and fills of memory
     under ``other``. A stage that a repeat does not have takes no time in it."""
     _stages_of(run)  # does not count: the profiler starts, kernels are compiled

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from sparsestreet.bench.fit import Line
-from sparsestreet.evaluation.strict_json import Json
+from sparsestreet.records.strict_json import Json
 
 Record = dict[str, Json]
 PlottedPoint = tuple[float, float, Record]

@@ -19,7 +19,7 @@ from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.timing import (
     Cotangent,
     Draw,
-    Spread,
+    TimeSpread,
     TimingBudget,
     drop_gradients,
     leaves,
@@ -59,13 +59,13 @@ class GpuRecord:
     samples: int | None = None
     failed: str | None = None
     """Why a measurement is missing; what was measured before it stands."""
-    inference: Spread | None = None
+    inference: TimeSpread | None = None
     """Forward without gradients."""
-    forward: Spread | None = None
-    backward: Spread | None = None
-    step: Spread | None = None
+    forward: TimeSpread | None = None
+    backward: TimeSpread | None = None
+    step: TimeSpread | None = None
     """A whole step of training (gpu_step.py)."""
-    stages: dict[str, Spread] | None = None
+    stages: dict[str, TimeSpread] | None = None
     """Device time of the kernels of one forward and backward by stage; None without a CUDA device."""
     memory_before: float | None = None
     memory_peak: float | None = None
@@ -244,7 +244,7 @@ def _against_truth(workload: Workload, backend: str) -> Errors:
     return errors(ours, answer(workload.rows, workload.camera, settings, "cpu", torch.float64))
 
 
-def _times(draw: Draw, cotangent: Cotangent, workload: Workload, budget: TimingBudget) -> tuple[Spread, Spread]:
+def _times(draw: Draw, cotangent: Cotangent, workload: Workload, budget: TimingBudget) -> tuple[TimeSpread, TimeSpread]:
     taken: list[dict[str, float]] = []
     budget.runs(lambda: taken.append(time_once(draw, cotangent, workload.rows)))
     forward, backward = (spread([times[part] for times in taken]) for part in ("forward", "backward"))
@@ -252,7 +252,7 @@ def _times(draw: Draw, cotangent: Cotangent, workload: Workload, budget: TimingB
 
 
 @torch.no_grad()
-def _inference(draw: Draw, workload: Workload, budget: TimingBudget) -> Spread:
+def _inference(draw: Draw, workload: Workload, budget: TimingBudget) -> TimeSpread:
     clock, seconds = clock_of(workload.device), []
 
     def run() -> None:
@@ -292,5 +292,5 @@ def line(record: GpuRecord) -> str:
     return text + (f"  FAILED: {record.failed}" if record.failed else "")
 
 
-def _short(value: Spread) -> str:
+def _short(value: TimeSpread) -> str:
     return f"{value.median:.3f}" + ("" if value.iqr is None else f" (iqr {value.iqr:.3f})")

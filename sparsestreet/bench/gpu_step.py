@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.bench import gsplat_peer
-from sparsestreet.bench.timing import Spread, TimingBudget, on_device, spread
+from sparsestreet.bench.timing import TimeSpread, TimingBudget, on_device, spread
 from sparsestreet.ops.splat import splat
 from sparsestreet.ops.ssim import ssim
 from sparsestreet.phases import clock_of
@@ -73,7 +73,7 @@ class TrainingStep:
         self.optimizer.zero_grad(set_to_none=True)
 
 
-def step_time(start: Gaussians, camera: Camera, render: Render, budget: TimingBudget) -> Spread:
+def step_time(start: Gaussians, camera: Camera, render: Render, budget: TimingBudget) -> TimeSpread:
     """Milliseconds of a step, each waited for."""
     step, clock, seconds = TrainingStep(start, camera, render), clock_of(start.means.device), []
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.bench.records import RecordFile
-from sparsestreet.bench.timing import Spread, TimingBudget, spread
+from sparsestreet.bench.timing import TimeSpread, TimingBudget, spread
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import init_gaussians
 from sparsestreet.scene.masks import Mask, MaskScope, TemporalMaskSettings
@@ -25,8 +25,8 @@ class MaskTimes:
 
     rows: int
     frames: int
-    network: Spread
-    bits: Spread
+    network: TimeSpread
+    bits: TimeSpread
     bytes_of_bits: int
 
 
@@ -49,7 +49,7 @@ def run_masks(
 
 
 @torch.no_grad()
-def _time(mask: Mask, rows: Rows, budget: TimingBudget) -> Spread:
+def _time(mask: Mask, rows: Rows, budget: TimingBudget) -> TimeSpread:
     moments, seconds = iter(range(10**9)), []
 
     def run() -> None:

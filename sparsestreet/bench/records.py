@@ -6,9 +6,9 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.evaluation.records import Machine, Source
-from sparsestreet.evaluation.strict_json import Json, json_line, parsed
 from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.records.run import CodeVersion, Machine
+from sparsestreet.records.strict_json import Json, json_line, parsed
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Provenance:
     command: str
     threads: int
     machine: Machine
-    source: Source
+    source: CodeVersion
 
 
 class RecordFile:

@@ -10,10 +10,11 @@ from lightning import Callback, LightningModule, Trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestreet.bench.blend import measured_peak
-from sparsestreet.bench.floors import Floor, StepWork, floors, measured_bandwidth
+from sparsestreet.bench.floors import StepWork, floors, measured_bandwidth
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.step_figure import draw_step
-from sparsestreet.bench.timing import Spread, last_workspace, spread
+from sparsestreet.bench.step_record import PhaseRecord, StepRecord
+from sparsestreet.bench.timing import last_workspace, spread
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.training.callbacks.phase_times import LOOP
 
@@ -34,40 +35,6 @@ class StepWindow:
 
 
 FULL, QUICK = StepWindow(740, 100, 10), StepWindow(10, 8, 4)
-
-
-@dataclass(frozen=True)
-class PhaseRecord:
-    """One phase; a floor of None is not known, or next to nothing."""
-
-    name: str
-    time: Spread
-    operations: float
-    """Dispatched tensor operations a step; views are not counted."""
-    floor: Floor | None
-    floor_ms: float | None
-
-
-@dataclass(frozen=True)
-class StepRecord:
-    """A step of training, from one batch's end to the next one's; times are milliseconds."""
-
-    what: str
-    gaussians: dict[str, int]
-    width: int
-    height: int
-    step: Spread
-    op: Spread
-    """The splat op, forward and backward."""
-    operations: float
-    bandwidth_gb_s: float
-    peak_gflops: float
-    phases: tuple[PhaseRecord, ...]
-
-    @property
-    def ratio(self) -> float:
-        """The step over its op."""
-        return self.step.median / self.op.median
 
 
 class StepWatch(Callback):

@@ -1,20 +1,17 @@
 """The picture of a training step: a bar a phase, its floor inside."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sparsestreet.bench.figures import save_figure
-
-if TYPE_CHECKING:
-    from sparsestreet.bench.step import StepRecord
+from sparsestreet.bench.step_record import StepRecord
 
 _OP, _REST, _FLOOR = "#0072B2", "#E69F00", "#333333"
 
 
-def draw_step(record: "StepRecord", folder: Path) -> list[Path]:
+def draw_step(record: StepRecord, folder: Path) -> list[Path]:
     """Median milliseconds of every phase that takes at least a hundredth of the step, the longest on top."""
     shown = [phase for phase in record.phases if phase.time.median >= 0.01 * record.step.median]
     figure = Figure(figsize=(8.0, 1.3 + 0.34 * len(shown)), dpi=130, layout="constrained")

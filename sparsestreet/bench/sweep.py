@@ -14,10 +14,10 @@ from sparsestreet.bench.records import RecordFile, settings_entries
 from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.tile_sizes import build, with_tiles
 from sparsestreet.bench.timing import OpTimes, TimingBudget, leaves, time_op
-from sparsestreet.evaluation.strict_json import Json
 from sparsestreet.ops.backend import BACKENDS, resolve_backend
 from sparsestreet.ops.cpu.library import tile_size
 from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.records.strict_json import Json
 
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(64, 48, 400)
 """Sizes of a sweep, of a trial, and of the copies that the dense reference bears: there it is timed, and is the oracle

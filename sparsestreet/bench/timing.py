@@ -19,7 +19,7 @@ GROUPS = ("means", "quaternions", "scales", "opacities", "sh")
 
 
 @dataclass(frozen=True)
-class Spread:
+class TimeSpread:
     """Milliseconds of repeated runs."""
 
     median: float
@@ -33,14 +33,14 @@ class Spread:
         return f"{self.median:9.2f} ms, least {self.minimum:.2f}{spread}"
 
 
-def spread(seconds: Sequence[float]) -> Spread:
+def spread(seconds: Sequence[float]) -> TimeSpread:
     """Median, minimum and inter-quartile range (linear between samples)."""
     milliseconds = [1e3 * value for value in seconds]
     iqr = None
     if len(milliseconds) > 1:
         first, _, third = statistics.quantiles(milliseconds, n=4, method="inclusive")
         iqr = third - first
-    return Spread(statistics.median(milliseconds), min(milliseconds), iqr, len(milliseconds))
+    return TimeSpread(statistics.median(milliseconds), min(milliseconds), iqr, len(milliseconds))
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ class Cotangent:
 
 @dataclass(frozen=True)
 class OpTimes:
-    """Spread of each stage and of the whole op, and the work of its forward pass (None: the dense reference)."""
+    """TimeSpread of each stage and of the whole op, and the work of its forward pass (None: the dense reference)."""
 
-    stages: dict[str, Spread]
+    stages: dict[str, TimeSpread]
     """``forward`` and ``backward`` are the whole op; what the backend reports of its stages comes beside them."""
     pairs: int | None
     samples: int | None

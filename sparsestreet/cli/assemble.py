@@ -11,10 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.evaluation.configuration import config_hash, flat_config
-from sparsestreet.evaluation.provenance import this_machine, this_source
-from sparsestreet.evaluation.records import RunDescription
 from sparsestreet.evaluation.speed import device_name
+from sparsestreet.records.configuration import config_hash, flat_config
+from sparsestreet.records.provenance import this_machine, this_source
+from sparsestreet.records.run import RunDescription
 from sparsestreet.training.recipe import Recipe
 
 

@@ -10,7 +10,7 @@ import torch
 from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.cli.compose import override_problem
-from sparsestreet.evaluation.provenance import this_machine, this_source
+from sparsestreet.records.provenance import this_machine, this_source
 
 EXAMPLES = """\
 examples:
@@ -154,8 +154,8 @@ def trained_street(run: Path) -> BenchScene:
 
     Raises FileNotFoundError if the folder holds no scene or no views.
     """
-    from sparsestreet.export.views import FILE_NAME, read_views
     from sparsestreet.scene.storage import load_scene
+    from sparsestreet.scene.views import FILE_NAME, read_views
 
     stored = load_scene(run)
     views = read_views(run / FILE_NAME).all

@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 
 from sparsestreet.cli.report import report
-from sparsestreet.evaluation.compare import compare_runs
-from sparsestreet.evaluation.records import read_summary, summary_path
+from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.report.side_by_side import compare_runs
 from sparsestreet.scene.centers import node_legend
 
 USAGE = """\

@@ -9,13 +9,14 @@ from hydra.utils import instantiate
 
 from sparsestreet.cli.assemble import data_of, this_command
 from sparsestreet.cli.compose import load_run_config
-from sparsestreet.cli.further import FurtherLooks
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
-from sparsestreet.evaluation.history import draw_history
-from sparsestreet.evaluation.provenance import this_machine
-from sparsestreet.evaluation.records import RunDescription, read_run, run_path, summary_path
+from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene
+from sparsestreet.pictures.history import draw_history
+from sparsestreet.records.provenance import this_machine
+from sparsestreet.records.run import RunDescription, read_run, run_path
+from sparsestreet.records.summary import summary_path
 
 USAGE = """\
 sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true] [presets=fast,default,exact]
@@ -46,9 +47,9 @@ class Options:
     presets: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        self.looks(FurtherLooks())
+        self.looks(ExtraMetrics())
 
-    def looks(self, of_run: FurtherLooks) -> FurtherLooks:
+    def looks(self, of_run: ExtraMetrics) -> ExtraMetrics:
         """What is asked for, else what the run's configuration asks for."""
         asked = {name: getattr(self, name) for name in ("novel", "ramp", "presets")}
         return replace(of_run, **{name: value for name, value in asked.items() if value is not None})

@@ -76,7 +76,7 @@ def _render(request: RenderRequest) -> None:
     from sparsestreet.cli.progress import shown
     from sparsestreet.cli.scene import open_scene
     from sparsestreet.export.video import check_destination, path_pictures, write_pictures
-    from sparsestreet.export.views import FILE_NAME, read_views
+    from sparsestreet.scene.views import FILE_NAME, read_views
 
     started = time.perf_counter()
     check_destination(request.out)

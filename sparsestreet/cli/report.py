@@ -6,12 +6,12 @@ from pathlib import Path
 from rich.console import Console
 
 from sparsestreet.cli.sweep import sweep_name
-from sparsestreet.evaluation.report import collect, figure, markdown, sections, tables
-from sparsestreet.evaluation.report.arms import arms
-from sparsestreet.evaluation.report.figures_readme import time_figure
-from sparsestreet.evaluation.report.sweep import sweep_records, write_report
-from sparsestreet.evaluation.strict_json import RecordError
 from sparsestreet.metrics.protocols import DRIVESTUDIO, PROTOCOLS, Protocol
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.report import collect, figure, markdown, sections, tables
+from sparsestreet.report.arms import arms
+from sparsestreet.report.figures_readme import time_figure
+from sparsestreet.report.sweep import sweep_records, write_report
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]

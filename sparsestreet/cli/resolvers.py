@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.evaluation.records import read_summary, summary_path
+from sparsestreet.records.summary import read_summary, summary_path
 
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
@@ -16,19 +16,14 @@ def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     return values[_root_.capacity]
 
 
-def joined(*lists: Iterable[Any]) -> list[Any]:
+def concat(*lists: Iterable[Any]) -> list[Any]:
     """Of conf/assignment: all lists as one."""
     return [entry for entries in lists for entry in entries]
 
 
-def times(factor: float, rate: float) -> float:
+def mul(factor: float, rate: float) -> float:
     """Of conf/node: a rate of the schedule times a number."""
     return float(factor) * float(rate)
-
-
-def least(*numbers: int) -> int:
-    """Of conf/sparsify: the smallest number."""
-    return min(numbers)
 
 
 def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> Any:
@@ -57,5 +52,15 @@ def last_part(path: str) -> str:
     return Path(path).name
 
 
-for resolver in (by_capacity, joined, times, least, gaussians_of, by_drive, last_part):
-    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
+_RESOLVERS = {
+    "by_capacity": by_capacity,
+    "concat": concat,
+    "mul": mul,
+    "min": min,
+    "gaussians_of": gaussians_of,
+    "by_drive": by_drive,
+    "last_part": last_part,
+}
+
+for name, resolver in _RESOLVERS.items():
+    OmegaConf.register_new_resolver(name, resolver, replace=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.compose import load_run_config
-from sparsestreet.evaluation.configuration import IDENTITY_KEYS, flat_config, without
+from sparsestreet.records.configuration import IDENTITY_KEYS, flat_config, without
 
 
 def resumed_overrides(arguments: list[str]) -> list[str]:

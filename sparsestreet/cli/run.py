@@ -13,15 +13,16 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command, trainer_of
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.further import FurtherLooks
 from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.evaluation.costs import stage_costs, step_costs, update_costs
-from sparsestreet.evaluation.history import draw_history
+from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
-from sparsestreet.evaluation.records import RunSummary, read_run, run_path
 from sparsestreet.evaluation.run import evaluate_scene
 from sparsestreet.phases import StageRecorder, stage
+from sparsestreet.pictures.history import draw_history
+from sparsestreet.records.costs import stage_costs, step_costs, update_costs
+from sparsestreet.records.run import read_run, run_path
+from sparsestreet.records.summary import RunSummary
 from sparsestreet.training.callbacks import (
     Checkpoints,
     Clock,
@@ -70,7 +71,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float:
 
 
 def _train_and_evaluate(
-    cfg: DictConfig, recipe: Recipe, looks: FurtherLooks, recorder: StageRecorder, out: Path, command: str
+    cfg: DictConfig, recipe: Recipe, looks: ExtraMetrics, recorder: StageRecorder, out: Path, command: str
 ) -> tuple[RunSummary | None, torch.device]:
     """What was measured (None of a ``fast_dev_run``), and the device."""
     with stage("data"):

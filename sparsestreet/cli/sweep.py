@@ -13,10 +13,10 @@ from hydra.errors import InstantiationException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.evaluation.configuration import config_hash, flat_config, only
-from sparsestreet.evaluation.failures import FailedRun, failure_path, read_failures, write_failure
-from sparsestreet.evaluation.records import read_summary, summary_path
-from sparsestreet.evaluation.strict_json import RecordError
+from sparsestreet.records.configuration import config_hash, flat_config, only
+from sparsestreet.records.failures import FailedRun, failure_path, read_failures, write_failure
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.records.summary import read_summary, summary_path
 
 log = logging.getLogger(__name__)
 

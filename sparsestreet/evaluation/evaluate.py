@@ -17,11 +17,11 @@ from sparsestreet.evaluation.predictions import (
     restored,
     write_prediction,
 )
-from sparsestreet.evaluation.quality import FrameQuality, RegionQuality
 from sparsestreet.metrics import image as metrics
 from sparsestreet.metrics import ssim
 from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
 from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
+from sparsestreet.records.quality import FrameQuality, RegionQuality
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Frame, View

@@ -7,12 +7,12 @@ from operator import sub
 
 import torch
 
-from sparsestreet.evaluation.costs import NodeCost
-from sparsestreet.evaluation.noise import calibrate, noise_between
-from sparsestreet.evaluation.records import Noise
 from sparsestreet.evaluation.scene_parts import has_masks, without_masks, without_node, without_sky
 from sparsestreet.evaluation.speed import frame_image
+from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.records.costs import NodeCost
+from sparsestreet.records.run import Noise
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Camera, View

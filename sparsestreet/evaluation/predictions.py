@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt16
 
-from sparsestreet.whole_file import whole_file
+from sparsestreet.atomic import atomic_file
 
 LEVELS = 65535
 
@@ -47,7 +47,7 @@ def restored(pixels: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
 
 def write_prediction(path: Path, pixels: UInt16[np.ndarray, "h w 3"]) -> None:
     """Write one, the whole file or nothing. Raises OSError where it cannot be written."""
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         # OpenCV's order is BGR. Of 16 bits the lower are noise, which no effort compresses.
         done, data = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
         if not done:

@@ -10,14 +10,14 @@ import torch
 from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation.evaluate import frame_quality, screen_image
-from sparsestreet.evaluation.noise import calibrate, noise_between
 from sparsestreet.evaluation.predictions import quantized, restored
-from sparsestreet.evaluation.preset_record import PresetRecord, RenderedAs
-from sparsestreet.evaluation.quality import FrameQuality, summarize
 from sparsestreet.evaluation.speed import device_name, frame_image
 from sparsestreet.metrics.image import psnr
+from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import clock_of
+from sparsestreet.records.presets import PresetRecord, RenderedAs
+from sparsestreet.records.quality import FrameQuality, summarize
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View

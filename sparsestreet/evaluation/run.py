@@ -10,41 +10,34 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation.costs import update_costs
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
-from sparsestreet.evaluation.latency_csv import latency_path, write_latency
 from sparsestreet.evaluation.node_costs import measure_scene_costs
-from sparsestreet.evaluation.novel import novel_path
-from sparsestreet.evaluation.pictures import (
-    KINDS,
-    Picture,
-    draw_lidar_end,
-    error_picture,
-    write_picture,
-    write_png,
-)
 from sparsestreet.evaluation.predictions import clear_predictions, predictions_folder
-from sparsestreet.evaluation.preset_record import preset_path
-from sparsestreet.evaluation.provenance import this_machine, this_source
-from sparsestreet.evaluation.quality import FrameQuality, camera_means, summarize
-from sparsestreet.evaluation.quality_csv import quality_path, write_quality
-from sparsestreet.evaluation.records import (
-    HELD_OUT,
-    TRAINING,
-    Evaluation,
-    GuardCounts,
-    Latency,
-    RunDescription,
-    RunSummary,
-    summary_path,
-    write_summary,
-)
-from sparsestreet.evaluation.sheets import Legend, picture_sheet
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import Guards, guards
 from sparsestreet.phases import stage
+from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_picture, write_picture, write_png
+from sparsestreet.pictures.sheets import Legend, picture_sheet
+from sparsestreet.records.costs import update_costs
+from sparsestreet.records.latency_csv import latency_path, write_latency
+from sparsestreet.records.novel import novel_path
+from sparsestreet.records.presets import preset_path
+from sparsestreet.records.provenance import this_machine, this_source
+from sparsestreet.records.quality import FrameQuality, camera_means, summarize
+from sparsestreet.records.quality_csv import quality_path, write_quality
+from sparsestreet.records.run import RunDescription
+from sparsestreet.records.summary import (
+    HELD_OUT,
+    TRAINING,
+    Evaluation,
+    GuardCounts,
+    Latency,
+    RunSummary,
+    summary_path,
+    write_summary,
+)
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.graph import SceneGaussians
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians, View
-from sparsestreet.whole_file import whole_file
 
 _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
 """Nodes ask a view without indices for its time alone."""
@@ -44,7 +44,7 @@ def write_ply(path: Path | str, gaussians: Gaussians) -> int:
             f"all values of a ply must be finite, but {len(broken)} Gaussians have others, the first of them in row "
             f"{broken[0]} of those with an opacity: the scene is damaged, train it again"
         )
-    with whole_file(Path(path)) as temporary, temporary.open("wb") as file:
+    with atomic_file(Path(path)) as temporary, temporary.open("wb") as file:
         file.write(_header(len(table), gaussians.sh.shape[1]).encode("ascii"))
         file.write(table.tobytes())
     return len(table)

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from sparsestreet.atomic import atomic_file, atomic_folder
 from sparsestreet.export.path import CameraPath
 from sparsestreet.scene.storage import StoredScene
-from sparsestreet.whole_file import whole_file, whole_folder
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
 
@@ -63,9 +63,9 @@ def write_pictures(out: Path | str, pictures: Iterable[Picture], *, fps: float, 
     out = Path(out)
     check_destination(out)
     if out.suffix:
-        with whole_file(out) as temporary:
+        with atomic_file(out) as temporary:
             return _write_video(temporary, pictures, fps, quality)
-    with whole_folder(out) as temporary:
+    with atomic_folder(out) as temporary:
         return _write_pngs(temporary, pictures)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from sparsestreet.metrics.lpips import ALEX, VGG16, Lpips, LpipsWeights, Stage
-from sparsestreet.pickled import read_pickled
+from sparsestreet.safe_pickle import read_pickled
 
 FOLDER_VARIABLE = "SPARSESTREET_LPIPS"
 """The environment's name for a folder that holds the files, where the package is not installed."""

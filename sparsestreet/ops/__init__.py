@@ -2,7 +2,7 @@
 
 1. the signature: Gaussians and a camera in, a differentiable Rendering out (``splat``), its knobs (``settings``), what
    it demands of its inputs (``validate``), which rows it does not draw (``guards``), and that it is not compiled
-   (``eager``);
+   (``disable_compile``);
 2. the backends: which one runs (``backend``), what each hands back (``raster``), the truth (``reference``), C++
    (``cpu``), GPUs (``triton``); ``spherical_harmonics`` is the formula that all of them follow;
 3. steps around it, in torch and as one fused kernel (``fused`` chooses): from the rows of all nodes to Gaussians

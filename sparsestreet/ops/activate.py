@@ -1,67 +1,19 @@
 """From rows as nodes store them to rows as they are splatted: activated, masked, placed in the world, in one table."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.ops.eager import eager
+from sparsestreet.ops.compiling import disable_compile
 from sparsestreet.ops.fused import fused_backend
-from sparsestreet.ops.poses import Poses
+from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Placement, RawGaussians
 from sparsestreet.types import Gaussians
 
-OPACITY_LOGIT_LIMIT = 15.0
-"""sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
 
-INPUTS, LEARNED = 11, 9
-"""Tensors of a part, and how many of them, the first ones, are of real numbers and have gradients."""
-
-
-@dataclass(frozen=True)
-class Placement:
-    """In which instance's box each row lies, and where the boxes are."""
-
-    poses: Poses
-    instances: Int[Tensor, " n"]
-
-
-@dataclass(frozen=True)
-class RawGaussians:
-    """Gaussians as they are learned, in the world or in the boxes of their instances."""
-
-    means: Float[Tensor, "n 3"]
-    log_scales: Float[Tensor, "n 3"]
-    quaternions: Float[Tensor, "n 4"]
-    """wxyz, any non-zero length."""
-    opacity_logits: Float[Tensor, " n"]
-    sh_dc: Float[Tensor, "n 1 3"]
-    sh_rest: Float[Tensor, "n k 3"]
-    """The coefficients behind the first, k in {0, 3, 8, 15}."""
-    multipliers: Float[Tensor, " n"] | None = None
-    """Of opacities and scales (a mask's); None: 1."""
-    placement: Placement | None = None
-    """Moves means and quaternions from their boxes to the world; rows of an absent instance get opacity 0."""
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
-
-    def tensors(self) -> list[Tensor | None]:
-        """Six fields, multipliers, the poses' quaternions and translations, and then instances and presence."""
-        fields = [self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest]
-        if self.placement is None:
-            return [*fields, self.multipliers, None, None, None, None]
-        poses, instances = self.placement.poses, self.placement.instances
-        return [*fields, self.multipliers, poses.quaternions, poses.translations, instances, poses.present]
-
-    def terms(self, sh_degree: int) -> int:
-        """Coefficients in use up to a degree; rows that store fewer use what they have."""
-        return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])
-
-
-@eager
+@disable_compile
 def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "auto") -> Gaussians:
     """All parts one after the other: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
 

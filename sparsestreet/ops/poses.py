@@ -1,25 +1,13 @@
 """Where moving objects are at a time: keyframes with learned corrections, interpolated."""
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
 from sparsestreet.ops.fused import fused_backend
-
-
-@dataclass(frozen=True)
-class Poses:
-    """World-from-box pose of every instance at one time."""
-
-    quaternions: Float[Tensor, "i 4"]
-    """Unit, wxyz."""
-    translations: Float[Tensor, "i 3"]
-    """Box center in the world, meters."""
-    present: Bool[Tensor, " i"]
+from sparsestreet.ops.raw import Poses
 
 
 def poses_at(

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
+from sparsestreet.ops.compiling import disable_compile
 from sparsestreet.ops.cpu import sky as cpu
 from sparsestreet.ops.cube_map import colors_along
-from sparsestreet.ops.eager import eager
 from sparsestreet.ops.fused import fused_backend
 from sparsestreet.ops.validate import check_camera
 from sparsestreet.types import Camera
@@ -19,7 +19,7 @@ from sparsestreet.types import Camera
 BACKENDS = ("auto", "torch", "cpu", "triton")
 
 
-@eager
+@disable_compile
 def over_sky(
     rgb: Float[Tensor, "h w 3"],
     alpha: Float[Tensor, "h w"],

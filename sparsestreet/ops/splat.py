@@ -8,8 +8,8 @@ from torch import Tensor
 
 from sparsestreet.ops import reference
 from sparsestreet.ops.backend import resolve_backend
+from sparsestreet.ops.compiling import disable_compile
 from sparsestreet.ops.cpu import rasterizer as cpu
-from sparsestreet.ops.eager import eager
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_pixel_weights, check_structure
@@ -19,7 +19,7 @@ DEFAULT_SETTINGS = SplatSettings()
 _LEAST_ALPHA = 1e-6
 
 
-@eager
+@disable_compile
 def splat(
     gaussians: Gaussians,
     camera: Camera,
@@ -63,7 +63,7 @@ def splat(
         return _compose(raster, offsets, background)
 
 
-@eager
+@disable_compile
 def contribution(
     gaussians: Gaussians,
     camera: Camera,
@@ -81,7 +81,7 @@ def contribution(
         return _module(chosen).contribution(gaussians, camera, settings)
 
 
-@eager
+@disable_compile
 def leave_one_out(
     gaussians: Gaussians,
     camera: Camera,

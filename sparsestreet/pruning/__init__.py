@@ -7,7 +7,7 @@
 from sparsestreet.pruning.controls import OpacityRule, RandomRule
 from sparsestreet.pruning.floors import Floors, InstanceAreas
 from sparsestreet.pruning.importance import Importance, measure_importance
-from sparsestreet.pruning.rule import Look, PruningRule
+from sparsestreet.pruning.rule import PruningRule, RenderContext
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
 
@@ -17,10 +17,10 @@ __all__ = [
     "ImportanceRule",
     "InstanceAreas",
     "LeaveOneOutRule",
-    "Look",
     "OpacityRule",
     "PruningRule",
     "RandomRule",
+    "RenderContext",
     "keep_by_cost",
     "keep_by_importance",
     "keep_by_rank",

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.pruning.rule import Look, PruningRule
+from sparsestreet.pruning.rule import PruningRule, RenderContext
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.streams import stream
 from sparsestreet.types import Frame
 
 
@@ -33,9 +33,9 @@ class CountRule(PruningRule):
         """What a node's rows are ranked by."""
 
     @torch.no_grad()
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
         selections = {}
-        for name, floors in self.floors(scene, frames, how).items():
+        for name, floors in self.floors(scene, frames, context).items():
             scores = self.scores(name, scene.nodes[name].rows)
             unwanted = torch.ones_like(scores, dtype=torch.bool)
             # Of equals the lower row stays, as at the floors.
@@ -59,7 +59,7 @@ class RandomRule(CountRule):
 
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
         """Each node draws from a stream of its own; the same rows meet the same numbers."""
-        drawn = torch.rand(len(rows), generator=stream(self.seed, f"pruning {name}"))
+        drawn = torch.rand(len(rows), generator=named_generator(self.seed, f"pruning {name}"))
         return drawn.to(rows.means.device)
 
 

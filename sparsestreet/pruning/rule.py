@@ -16,7 +16,7 @@ from sparsestreet.types import Contribution, Frame
 
 
 @dataclass(frozen=True)
-class Look:
+class RenderContext:
     """How a rule looks at the scene: as training does."""
 
     state: SceneState = FINISHED
@@ -31,7 +31,7 @@ class PruningRule(ABC):
     """Names of the nodes that it may take from, if they are ``prunable``; None: of all these."""
 
     @abstractmethod
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
         """What stays of every node that the rule touches, by name: never less than its floors. Without gradients.
 
         ``frames`` are all training views; each is read when it is indexed.
@@ -45,14 +45,14 @@ class PruningRule(ABC):
         """Measures the floors of all nodes that the rule touches."""
         return InstanceAreas({name: node for name, node in scene.nodes.items() if self.touches(name, node.settings)})
 
-    def floors(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Floors]:
+    def floors(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Floors]:
         """Name of every node that the rule touches -> what must stay of it; renders only where instances have floors.
 
         A rule that goes through ``contributions`` anyway measures the ``areas`` on the way.
         """
         areas = self.areas(scene)
         if areas.needed:
-            for view, spans in contributions(scene, frames, how):
+            for view, spans in contributions(scene, frames, context):
                 areas.add(view, spans)
         return areas.floors()
 
@@ -63,12 +63,12 @@ def on_device(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
 
 
 def contributions(
-    scene: SceneGraph, frames: Sequence[Frame], how: Look
+    scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
 ) -> Iterator[tuple[Contribution, dict[str, slice]]]:
     """What every row of the whole scene adds to each view, and name of a node -> its rows."""
     for frame in on_device(scene, frames):
-        placed = scene.gaussians_at(frame, how.state)
-        options = how.options
+        placed = scene.gaussians_at(frame, context.state)
+        options = context.options
         yield (
             contribution(placed.gaussians, frame.camera, settings=options.settings, backend=options.backend),
             placed.spans,

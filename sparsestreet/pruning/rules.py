@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.importance import Importance
-from sparsestreet.pruning.rule import Look, PruningRule, contributions, on_device
+from sparsestreet.pruning.rule import PruningRule, RenderContext, contributions, on_device
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
@@ -38,9 +38,9 @@ class ImportanceRule(PruningRule):
             raise ValueError(f"remove must be a fraction in [0, 1] or a number of Gaussians, got {self.remove}")
 
     @torch.no_grad()
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
         importance, areas = Importance(self.gate), self.areas(scene)
-        for view, spans in contributions(scene, frames, how):
+        for view, spans in contributions(scene, frames, context):
             importance.add(view)
             areas.add(view, spans)
         every, floors = importance.scores(), areas.floors()
@@ -77,16 +77,16 @@ class LeaveOneOutRule(PruningRule):
             raise ValueError(f"noticeable must be >= 0 (images lie in [0, 1]), got {self.noticeable}")
 
     @torch.no_grad()
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
-        errors = sum(_squared_errors(scene, frame, how) for frame in on_device(scene, frames))
-        spans = scene.gaussians_at(frames[0], how.state).spans
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
+        errors = sum(_squared_errors(scene, frame, context) for frame in on_device(scene, frames))
+        spans = scene.gaussians_at(frames[0], context.state).spans
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
         for frame in on_device(scene, frames):
-            change = _without_each(scene, frame, errors, how)
+            change = _without_each(scene, frame, errors, context)
             largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         costs = torch.where(largest > self.noticeable, squared, 0.0)
-        floors = self.floors(scene, frames, how)
+        floors = self.floors(scene, frames, context)
         return keep_by_cost({name: costs[spans[name]] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
 
 
@@ -98,23 +98,23 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
     return torch.stack([everywhere, *marked]).float()
 
 
-def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], how: Look) -> LeaveOneOut:
+def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], context: RenderContext) -> LeaveOneOut:
     """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
     # Where there is no error left, any change is too dear. A region that no frame marks has no pixel to weigh.
     share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
     return leave_one_out(
-        scene.gaussians_at(frame, how.state).gaussians,
+        scene.gaussians_at(frame, context.state).gaussians,
         frame.camera,
         background=sky_image(scene, frame.camera),
         pixel_weights=weights,
-        settings=how.options.settings,
-        backend=how.options.backend,
+        settings=context.options.settings,
+        backend=context.options.backend,
     )
 
 
-def _squared_errors(scene: SceneGraph, frame: Frame, how: Look) -> Float64[Tensor, "3"]:
+def _squared_errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:
     """Sum over pixels and channels of the squared error of one frame, in each of its regions."""
-    image = render(scene, frame, how.state, how.options).rgb
+    image = render(scene, frame, context.state, context.options).rgb
     squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
     return (_regions(frame).double() * squared).sum((1, 2))

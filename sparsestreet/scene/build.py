@@ -8,11 +8,11 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import Assignment, assign_tracks
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.sky import Sky, SkySettings
-from sparsestreet.scene.streams import stream
 from sparsestreet.triangulation import ImagePointSettings, cached_street_points
 from sparsestreet.types import Track
 
@@ -49,7 +49,7 @@ def build_scene(
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
         data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed, points)
-        node = settings.build(data, stream(seed, name))
+        node = settings.build(data, named_generator(seed, name))
         if node is None:
             _log.warning("node %r has no instance in %s: the scene goes without it", name, log.name)
         else:

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sparsestreet.ops.activate import RawGaussians, activate
+from sparsestreet.ops.activate import activate
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
 from sparsestreet.scene.sky import Sky
@@ -64,7 +65,7 @@ class SceneGraph(nn.Module):
         return {
             f"{name}/{term}": value
             for name, node in self.nodes.items()
-            for term, value in node.all_regularizers(parts[name], drawn[name], state).items()
+            for term, value in node.regularizers(parts[name], drawn[name], state).items()
         }
 
     def learning_rates(self) -> dict[str, LearningRate]:

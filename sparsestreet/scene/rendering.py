@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import SplatSettings, over_sky, splat
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.sky import Sky

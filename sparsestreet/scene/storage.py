@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.scene.encoding import decode_as, encode
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
@@ -25,7 +26,6 @@ from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import View
-from sparsestreet.whole_file import whole_file
 
 VERSION = 2
 """Raised when an older program could not read the file."""
@@ -79,7 +79,7 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
     # safetensors refuses what shares memory or is not contiguous.
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in scene.state_dict().items()}
     try:
-        with whole_file(Path(path)) as temporary:
+        with atomic_file(Path(path)) as temporary:
             save_file(tensors, temporary, metadata={_KEY: json.dumps(header, allow_nan=False)})
     except SafetensorError as error:
         raise OSError(f"cannot write {path} ({error}): make room, or give another folder") from error

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.ops.activate import OPACITY_LOGIT_LIMIT
+from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT
 
 
 def displacements(velocities: Float[Tensor, "n 3"], ages: Float[Tensor, " n"], cycle: float) -> Float[Tensor, "n 3"]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sparsestreet.whole_file import whole_file
+from sparsestreet.atomic import atomic_file
 
 Rows = list[dict[str, str]]
 
@@ -40,5 +40,5 @@ def _write(path: Path, rows: Rows) -> None:
     writer = csv.DictWriter(buffer, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_text(buffer.getvalue())

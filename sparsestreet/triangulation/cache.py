@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.data.lazy import Frames
 from sparsestreet.triangulation.points import TriangulatedPoints
 from sparsestreet.triangulation.settings import ImagePointSettings
 from sparsestreet.triangulation.street import StreetPoints, street_points
 from sparsestreet.types import Track
-from sparsestreet.whole_file import whole_file
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ def cached_street_points(frames: Frames, moving: Sequence[Track], settings: Imag
     if path.is_file():
         log.info("points from images: taken from %s", path)
         return _read(path)
-    with whole_file(path) as unfinished:
+    with atomic_file(path) as unfinished:
         points = street_points(frames, moving, settings)
         _write(unfinished, points)
     return points

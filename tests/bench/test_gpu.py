@@ -15,7 +15,7 @@ from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.bench.gpu import GpuRecord
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import Spread, TimingBudget, leaves
+from sparsestreet.bench.timing import TimeSpread, TimingBudget, leaves
 from sparsestreet.ops import splat
 from sparsestreet.types import Camera, Gaussians
 from tests.bench.test_records import PROVENANCE
@@ -259,7 +259,7 @@ def test_device_time_of_the_stages_and_its_spread(monkeypatch):
 
 
 def test_a_line_has_medians_and_spreads():
-    value, single = Spread(1.25, 1.0, 0.125, 20), Spread(3.0, 3.0, None, 1)
+    value, single = TimeSpread(1.25, 1.0, 0.125, 20), TimeSpread(3.0, 3.0, None, 1)
     record = GpuRecord("sparsestreet triton", "a device", "random frustum", 7, 8, 9, forward=value, backward=single)
     record = dataclasses.replace(record, inference=value, stages={"sort": value, "other": single})
     text = gpu.line(record)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.evaluation.records import write_summary
 from sparsestreet.ops.cpu import library
+from sparsestreet.records.summary import write_summary
 from tests.evaluation.frames import make_summary
 from tests.ops import scenes
 

@@ -9,12 +9,12 @@ import pytest
 
 from sparsestreet.bench.figures import draw_pareto
 from sparsestreet.bench.records import Provenance, RecordFile, read_records, settings_entries
-from sparsestreet.evaluation.records import Machine, Source
-from sparsestreet.evaluation.strict_json import RecordError
 from sparsestreet.ops import SplatSettings
+from sparsestreet.records.run import CodeVersion, Machine
+from sparsestreet.records.strict_json import RecordError
 
 MACHINE = Machine(processor="a processor", cores=2, system="Linux", python="3.12", torch="2.13")
-PROVENANCE = Provenance("sparsestreet bench", 1, MACHINE, Source("abc", False))
+PROVENANCE = Provenance("sparsestreet bench", 1, MACHINE, CodeVersion("abc", False))
 COMMITTED = Path(__file__).parents[2] / "benchmarks"
 
 

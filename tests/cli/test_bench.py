@@ -7,9 +7,9 @@ import torch
 
 from sparsestreet.bench import gpu, scaling
 from sparsestreet.cli.bench import bench, trained_street
-from sparsestreet.export.views import read_views
 from sparsestreet.ops import splat
 from sparsestreet.scene.storage import load_scene
+from sparsestreet.scene.views import read_views
 
 
 def test_help_teaches_by_example(capsys):

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.cli.evaluate import Options, evaluate
-from sparsestreet.cli.further import FurtherLooks
+from sparsestreet.evaluation.extra import ExtraMetrics
 
 
 @pytest.mark.parametrize("words", [["novel=-1"], ["novel=1,0"], ["ramp=true"]])
@@ -20,9 +20,9 @@ def test_an_unknown_preset_is_named(tmp_path, capsys):
 
 
 def test_an_evaluation_measures_what_the_runs_configuration_asks_for_unless_it_is_told_otherwise():
-    of_run = FurtherLooks(novel=[1.5], presets=["fast"])
+    of_run = ExtraMetrics(novel=[1.5], presets=["fast"])
     assert Options(Path("run")).looks(of_run) == of_run
     told = Options(Path("run"), novel=(2.0,), ramp=True, presets=()).looks(of_run)
-    assert told == FurtherLooks(novel=(2.0,), ramp=True, presets=())
+    assert told == ExtraMetrics(novel=(2.0,), ramp=True, presets=())
     assert of_run.words() == ["novel=1.5", "presets=fast"]
     assert told.words() == ["novel=2", "ramp=true"]

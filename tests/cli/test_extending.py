@@ -17,13 +17,13 @@ from sparsestreet.cli.compose import configuration, override_problem
 from sparsestreet.cli.data import data
 from sparsestreet.cli.train import train
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.evaluation.records import read_run, run_path
-from sparsestreet.export.views import read_views
-from sparsestreet.pruning import Look
+from sparsestreet.pruning import RenderContext
+from sparsestreet.records.run import read_run, run_path
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import render
+from sparsestreet.scene.views import read_views
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.toy.loss import MeanColor
 from tests.cli.toy.mask import ProbitMask, ProbitMaskSettings
@@ -93,7 +93,7 @@ def test_a_rule():
     assert (pruning.at, pruning.rule, cfg.name) == ((0.6,), SizeRule(meters=1.0), "streetgs+size")
     node = background(20, min_gaussians=19)
     set_rows(node, "log_scales", {3: 1.0, 5: 2.0})
-    selection = pruning.rule.select(SceneGraph({"background": node}), [frame_at()], Look())["background"]
+    selection = pruning.rule.select(SceneGraph({"background": node}), [frame_at()], RenderContext())["background"]
     assert (~selection.keep).nonzero().tolist() == [[5]]
     assert selection.floor_hit
 

@@ -59,7 +59,7 @@ def test_objects_deformed_by_a_network(tiny_street, tmp_path):
         "method=3dgs",
         "node=[background,deformable]",
         "sparsify=masks",
-        "node.deformable.posed=null",
+        "node.deformable.has_body_pose=null",
         "node.deformable.deform_from=0.5",
         "node.deformable.points_per_instance=100",
         "node.deformable.min_gaussians=60",

@@ -16,7 +16,7 @@ from sparsestreet.cli.assemble import data_of
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.train import train
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, Look
+from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, RenderContext
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
@@ -95,7 +95,7 @@ def _prune_by_removal(stored: StoredScene, data: StreetData, rows: Rows, *, allo
     scene = stored.scene
     settings = replace(scene.nodes["background"].settings, min_gaussians=0)
     scene.nodes["background"] = Background(settings, rows)
-    look = Look(options=RenderOptions(stored.options.settings, "cpu"))
+    look = RenderContext(options=RenderOptions(stored.options.settings, "cpu"))
     return LeaveOneOutRule(allowed_db).select(scene, data.split.train, look)["background"].keep
 
 

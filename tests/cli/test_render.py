@@ -10,8 +10,8 @@ from PIL import Image
 from sparsestreet.cli.render import USAGE, RenderRequest, render
 from sparsestreet.export import video
 from sparsestreet.export.path import shifted
-from sparsestreet.export.views import read_views, write_views
 from sparsestreet.scene.storage import save_scene
+from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
 
 

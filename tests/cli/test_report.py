@@ -3,9 +3,9 @@
 import pytest
 
 from sparsestreet.cli.report import report
-from sparsestreet.evaluation.records import summary_path, write_summary
+from sparsestreet.records.summary import summary_path, write_summary
 from tests.evaluation.frames import make_summary
-from tests.evaluation.report.sweep_folder import write_sweep
+from tests.report.sweep_folder import write_sweep
 
 
 @pytest.fixture

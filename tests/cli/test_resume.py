@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from sparsestreet.cli.train import train
-from sparsestreet.evaluation.costs import cost_path, read_costs
+from sparsestreet.records.costs import cost_path, read_costs
 from sparsestreet.training.callbacks import RowLedger
 
 
@@ -134,7 +134,7 @@ def test_another_configuration_is_refused_and_nothing_is_touched(whole, change, 
 
 def test_an_interrupted_run_can_be_evaluated(tiny_street, tmp_path, monkeypatch):
     from sparsestreet.cli.evaluate import evaluate
-    from sparsestreet.evaluation.records import read_summary, summary_path
+    from sparsestreet.records.summary import read_summary, summary_path
 
     monkeypatch.setattr(RowLedger, "on_train_batch_start", _raises_at(7), raising=False)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")

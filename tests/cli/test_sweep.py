@@ -7,8 +7,8 @@ from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, sweep_name, sweep_problem
 from sparsestreet.cli.train import train
-from sparsestreet.evaluation.failures import read_failures
-from sparsestreet.evaluation.records import read_summary, summary_path, write_summary
+from sparsestreet.records.failures import read_failures
+from sparsestreet.records.summary import read_summary, summary_path, write_summary
 from tests.evaluation.frames import make_summary
 
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))

@@ -11,8 +11,8 @@ from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.report import report
 from sparsestreet.cli.train import train
-from sparsestreet.evaluation.records import read_summary, summary_path
-from sparsestreet.export.views import read_views
+from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.scene.views import read_views
 from tests.cli.toy.bobbing import Bobbing
 
 CONF = Path(__file__).parent / "toy" / "conf"

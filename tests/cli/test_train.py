@@ -16,14 +16,15 @@ from omegaconf import OmegaConf
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
-from sparsestreet.evaluation.costs import cost_path, read_costs
-from sparsestreet.evaluation.novel import novel_path, read_novel
-from sparsestreet.evaluation.preset_record import preset_path, read_presets
-from sparsestreet.evaluation.records import read_run, read_summary, run_path, summary_path
-from sparsestreet.export.views import read_views
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.metrics.protocols import PROTOCOLS
+from sparsestreet.records.costs import cost_path, read_costs
+from sparsestreet.records.novel import novel_path, read_novel
+from sparsestreet.records.presets import preset_path, read_presets
+from sparsestreet.records.run import read_run, run_path
+from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.scene.views import read_views
 from tests.cli.recompute import recompute
 from tests.conftest import unchecked
 from tests.metrics.networks import random_weights, write_weights
@@ -151,7 +152,7 @@ def test_the_scene_opens_by_itself_in_another_place(finished, tmp_path):
     code = (
         "import sys, numpy as np, sparsestreet\n"
         "from PIL import Image\n"
-        "from sparsestreet.export.views import read_views\n"
+        "from sparsestreet.scene.views import read_views\n"
         f"stored = sparsestreet.load_scene({str(folder)!r})\n"
         f"view = read_views({str(folder / 'views.json')!r}).held_out[0]\n"
         "image = (stored.render(view).rgb.clamp(0, 1) * 255).round().byte().numpy()\n"

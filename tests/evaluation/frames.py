@@ -2,9 +2,10 @@
 
 import torch
 
-from sparsestreet.evaluation.configuration import Setting, config_hash
-from sparsestreet.evaluation.quality import FrameQuality, MetricSummary, RegionQuality
-from sparsestreet.evaluation.records import (
+from sparsestreet.records.configuration import Setting, config_hash
+from sparsestreet.records.quality import FrameQuality, MetricSummary, RegionQuality
+from sparsestreet.records.run import CodeVersion, Machine, Noise, RunDescription
+from sparsestreet.records.summary import (
     FRAME,
     HELD_OUT,
     RASTER,
@@ -13,12 +14,8 @@ from sparsestreet.evaluation.records import (
     Evaluation,
     GuardCounts,
     Latency,
-    Machine,
-    Noise,
     Percentiles,
-    RunDescription,
     RunSummary,
-    Source,
 )
 from sparsestreet.types import Camera, Frame
 
@@ -39,7 +36,7 @@ def make_frame(
 
 MACHINE = Machine("test", 2, "Linux x86_64", "3.11", "2.13.0")
 NOISE = Noise(before=0.01, after=0.02, drift=-0.01, load_average=0.5, quiet=True)
-CLEAN = Source("0123456789abcdef", False)
+CLEAN = CodeVersion("0123456789abcdef", False)
 
 
 def make_run(
@@ -55,7 +52,7 @@ def make_run(
     threads: int = 2,
     steps: int = 60,
     caps: dict[str, int] | None = None,
-    source: Source = CLEAN,
+    source: CodeVersion = CLEAN,
     machine: Machine = MACHINE,
     command: str | None = None,
 ) -> RunDescription:

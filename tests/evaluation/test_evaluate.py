@@ -12,10 +12,10 @@ from skimage.metrics import structural_similarity
 from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.predictions import write_prediction
-from sparsestreet.evaluation.quality import RegionQuality, camera_means, summarize
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import ALEX, Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.ops import SplatSettings
+from sparsestreet.records.quality import RegionQuality, camera_means, summarize
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame, make_image
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene

@@ -8,9 +8,9 @@ import torch
 
 from sparsestreet.evaluation import node_costs
 from sparsestreet.evaluation.node_costs import measure_scene_costs
-from sparsestreet.evaluation.noise import Calibration
 from sparsestreet.evaluation.scene_parts import without_closed_rows, without_masks, without_node, without_sky
 from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.noise import Calibration
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render, sky_image
 from sparsestreet.types import Shutter

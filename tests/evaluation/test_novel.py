@@ -9,8 +9,9 @@ import torch
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import novel as novel_module
 from sparsestreet.evaluation.evaluate import screen_image
-from sparsestreet.evaluation.novel import evaluate_novel, novel_path, read_novel, shifted_views, write_novel
+from sparsestreet.evaluation.novel import evaluate_novel, shifted_views
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
+from sparsestreet.records.novel import novel_path, read_novel, write_novel
 from sparsestreet.types import Frame
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene

@@ -8,10 +8,10 @@ import pytest
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import presets as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.preset_record import preset_path, read_presets, write_presets
 from sparsestreet.evaluation.presets import ROUNDS, evaluate_presets
-from sparsestreet.evaluation.strict_json import RecordError
 from sparsestreet.ops import SplatSettings
+from sparsestreet.records.presets import preset_path, read_presets, write_presets
+from sparsestreet.records.strict_json import RecordError
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, small_scene

@@ -12,7 +12,6 @@ from PIL import Image
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.evaluate import evaluate_predictions
-from sparsestreet.evaluation.pictures import LIDAR_END, picture_path, read_pictures
 from sparsestreet.evaluation.predictions import (
     PredictionError,
     prediction_path,
@@ -20,21 +19,15 @@ from sparsestreet.evaluation.predictions import (
     read_prediction,
     write_prediction,
 )
-from sparsestreet.evaluation.quality import RegionQuality, summarize
-from sparsestreet.evaluation.quality_csv import quality_path, read_quality
-from sparsestreet.evaluation.records import (
-    HELD_OUT,
-    TRAINING,
-    read_run,
-    read_summary,
-    run_path,
-    summary_path,
-    write_run,
-)
 from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
+from sparsestreet.pictures.images import LIDAR_END, picture_path, read_pictures
+from sparsestreet.records.quality import RegionQuality, summarize
+from sparsestreet.records.quality_csv import quality_path, read_quality
+from sparsestreet.records.run import read_run, run_path, write_run
+from sparsestreet.records.summary import HELD_OUT, TRAINING, read_summary, summary_path
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View

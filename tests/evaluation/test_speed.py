@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from sparsestreet.evaluation import speed
-from sparsestreet.evaluation.latency_csv import latency_path, write_latency
-from sparsestreet.evaluation.noise import Calibration
-from sparsestreet.evaluation.records import FRAME, RASTER, RIG
 from sparsestreet.evaluation.speed import frame_image, instants, measure_latency
+from sparsestreet.noise import Calibration
+from sparsestreet.records.latency_csv import latency_path, write_latency
+from sparsestreet.records.summary import FRAME, RASTER, RIG
 from tests.evaluation.frames import make_frame, make_latency
 from tests.evaluation.scenes import OPTIONS, masked_scene, replace_render, small_scene
 

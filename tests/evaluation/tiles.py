@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sparsestreet.evaluation.pictures import Picture, error_picture
+from sparsestreet.pictures.images import Picture, error_picture
 
 COLORS = {"truth": (200, 10, 10), "render": (10, 200, 10), "centers": (10, 10, 200)}
 

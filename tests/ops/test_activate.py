@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.ops.activate import OPACITY_LOGIT_LIMIT, Placement, RawGaussians, activate
+from sparsestreet.ops.activate import activate
 from sparsestreet.ops.cpu import activate as fused
 from sparsestreet.ops.cpu.library import load_library
-from sparsestreet.ops.poses import Poses
+from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT, Placement, Poses, RawGaussians
 
 ROWS = 2500
 """More than two of the parts in which sums over rows are taken."""

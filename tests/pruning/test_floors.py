@@ -5,7 +5,7 @@ import torch
 
 import sparsestreet.pruning.rule as rule_module
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.pruning import ImportanceRule, InstanceAreas, LeaveOneOutRule, Look, OpacityRule, RandomRule
+from sparsestreet.pruning import ImportanceRule, InstanceAreas, LeaveOneOutRule, OpacityRule, RandomRule, RenderContext
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Rigid
@@ -13,7 +13,7 @@ from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Camera, Contribution, Frame
 from tests.scene.street import background, random_rows, rigid
 
-LOOK = Look(options=RenderOptions(backend="reference"))
+CONTEXT = RenderContext(options=RenderOptions(backend="reference"))
 NEAR, FAR, AWAY = 0, 1, 2
 RULES = [
     ImportanceRule(),
@@ -83,8 +83,8 @@ def test_no_object_is_thinned_to_nothing_and_a_far_one_keeps_less(rule):
     """The views miss nothing of what is drawn: each rule would take (almost) all."""
     scene = SceneGraph({"road": background(random_rows(20, 0)), "cars": objects()})
     views = [frame(), frame(offset=1.0)]
-    least = rule.floors(scene, views, LOOK)["cars"].instances.least
-    selection = rule.select(scene, views, LOOK)["cars"]
+    least = rule.floors(scene, views, CONTEXT)["cars"].instances.least
+    selection = rule.select(scene, views, CONTEXT)["cars"]
     kept = torch.bincount(scene.nodes["cars"].rows.instances[selection.keep], minlength=3)
     assert 2 <= int(least[FAR]) < int(least[NEAR]) < 30
     assert int(least[AWAY]) == 0
@@ -97,32 +97,32 @@ def test_no_object_is_thinned_to_nothing_and_a_far_one_keeps_less(rule):
 def test_the_largest_view_counts_and_the_floor_grows_with_the_image():
     rule = OpacityRule(keep=0.0)
     scene = SceneGraph({"cars": objects()})
-    small, large = rule.floors(scene, [frame(offset=2.0)], LOOK), rule.floors(scene, [frame()], LOOK)
-    both = rule.floors(scene, [frame(), frame(offset=2.0)], LOOK)
+    small, large = rule.floors(scene, [frame(offset=2.0)], CONTEXT), rule.floors(scene, [frame()], CONTEXT)
+    both = rule.floors(scene, [frame(), frame(offset=2.0)], CONTEXT)
     assert torch.equal(both["cars"].instances.least, large["cars"].instances.least)
     assert int(small["cars"].instances.least[NEAR]) < int(large["cars"].instances.least[NEAR])
 
 
 def test_k_min_comes_on_top_of_the_floors_of_instances():
     scene = SceneGraph({"cars": objects(min_gaussians=60)})
-    selection = OpacityRule(keep=0.0).select(scene, [frame()], LOOK)["cars"]
+    selection = OpacityRule(keep=0.0).select(scene, [frame()], CONTEXT)["cars"]
     assert int(selection.keep.sum()) == 60
 
 
 def test_without_floors_of_instances_nothing_is_rendered(monkeypatch):
     monkeypatch.setattr(rule_module, "contribution", None)
     scene = SceneGraph({"road": background(random_rows(20, 0)), "cars": objects(density=0.0)})
-    floors = OpacityRule(keep=0.5).floors(scene, [frame()], LOOK)
+    floors = OpacityRule(keep=0.5).floors(scene, [frame()], CONTEXT)
     assert {name: each.instances for name, each in floors.items()} == {"road": None, "cars": None}
     # A node without objects has no use for the setting.
     alone = SceneGraph({"road": background(random_rows(20, 0), min_instance_gaussians=5.0)})
-    assert OpacityRule(keep=0.5).floors(alone, [frame()], LOOK)["road"].instances is None
+    assert OpacityRule(keep=0.5).floors(alone, [frame()], CONTEXT)["road"].instances is None
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
 def test_a_node_whose_objects_have_no_rows(rule):
     scene = SceneGraph({"road": background(random_rows(20, 0)), "cars": objects(0)})
-    selection = rule.select(scene, [frame()], LOOK)["cars"]
+    selection = rule.select(scene, [frame()], CONTEXT)["cars"]
     assert (len(selection.keep), selection.removed, selection.floor_hit) == (0, 0, False)
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 
-from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, Look, PruningRule
+from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, PruningRule, RenderContext
 from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -16,7 +16,7 @@ from sparsestreet.types import Camera, Frame
 from tests.scene.street import background
 
 OPTIONS = RenderOptions(backend="reference")
-LOOK = Look(options=OPTIONS)
+CONTEXT = RenderContext(options=OPTIONS)
 
 
 def scene_of(
@@ -66,16 +66,16 @@ def test_a_budget_buys_the_cheapest_rows_and_no_more():
     ):
         allowed_db = float(10 * torch.log10(torch.tensor(1 + allowed / error)))
         rule = LeaveOneOutRule(allowed_db, noticeable=0.0)
-        assert rule.select(scene, [frame], LOOK)["background"].keep.tolist() == kept
+        assert rule.select(scene, [frame], CONTEXT)["background"].keep.tolist() == kept
 
 
 def test_without_a_budget_only_what_nobody_sees_goes():
     # Two discs behind an opaque one: 0.01 of the light gets through, and of that 0.3 and 0.7 * 0.5: 0.9 steps of 255.
     scene = scene_of([0.99, 0.3, 0.5], [2.0, 3.0, 4.0])
-    selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], LOOK)["background"]
+    selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], CONTEXT)["background"]
     assert selection.keep.tolist() == [True, False, False]
     strict = LeaveOneOutRule(0.0, noticeable=0.0)
-    assert strict.select(scene, [frame_of(scene, 5)], LOOK)["background"].removed == 0
+    assert strict.select(scene, [frame_of(scene, 5)], CONTEXT)["background"].removed == 0
 
 
 def test_a_row_seen_in_one_view_of_two_stays():
@@ -86,12 +86,12 @@ def test_a_row_seen_in_one_view_of_two_stays():
     pose[2, 3] = -2.5
     behind = replace(front, camera=replace(front.camera, camera_from_world=pose))
     rule = LeaveOneOutRule(0.0)
-    assert rule.select(scene, [front], LOOK)["background"].keep.tolist() == [True, False]
-    assert rule.select(scene, [front, behind], LOOK)["background"].removed == 0
+    assert rule.select(scene, [front], CONTEXT)["background"].keep.tolist() == [True, False]
+    assert rule.select(scene, [front, behind], CONTEXT)["background"].removed == 0
 
 
 def _selection(scene: SceneGraph, frame: Frame, rule: PruningRule) -> Selection:
-    return rule.select(scene, [frame], LOOK)["background"]
+    return rule.select(scene, [frame], CONTEXT)["background"]
 
 
 @pytest.mark.parametrize("region", ["vehicle", "human"])
@@ -120,7 +120,7 @@ def test_a_change_is_measured_over_the_sky():
         scene = scene_of([0.3], [2.0], sky=sky)
         with torch.no_grad():
             scene.nodes["background"].rows.sh_dc.fill_(sh_dc)
-        selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], LOOK)["background"]
+        selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], CONTEXT)["background"]
         assert selection.removed == removed
 
 
@@ -129,9 +129,9 @@ def test_only_prunable_nodes_are_asked_each_with_its_own_floor():
     rows = [scene_of([opacity], [depth]).nodes["background"].rows for opacity, depth in ((0.99, 2.0), (0.3, 3.0))]
     wall, hidden = background(rows[0], prunable=False), background(rows[1])
     scene = SceneGraph({"wall": wall, "hidden": hidden, "kept": background(rows[1], min_gaussians=1)})
-    assert ImportanceRule().floors(scene, [], LOOK) == {"hidden": Floors(0), "kept": Floors(1)}
+    assert ImportanceRule().floors(scene, [], CONTEXT) == {"hidden": Floors(0), "kept": Floors(1)}
     for rule in (LeaveOneOutRule(0.0), ImportanceRule()):
-        selections = rule.select(scene, [frame_of(scene, 5)], LOOK)
+        selections = rule.select(scene, [frame_of(scene, 5)], CONTEXT)
         assert {name: each.removed for name, each in selections.items()} == {"hidden": 1, "kept": 0}
         assert [each.floor_hit for each in selections.values()] == [False, True]
 
@@ -139,7 +139,7 @@ def test_only_prunable_nodes_are_asked_each_with_its_own_floor():
 def test_a_scene_in_which_nothing_may_be_pruned():
     scene = SceneGraph({"wall": background(scene_of([0.99], [2.0]).nodes["background"].rows, prunable=False)})
     for rule in (LeaveOneOutRule(1.0), ImportanceRule()):
-        assert rule.select(scene, [frame_of(scene, 5)], LOOK) == {}
+        assert rule.select(scene, [frame_of(scene, 5)], CONTEXT) == {}
 
 
 def test_a_scene_without_error_loses_nothing_that_is_seen():
@@ -149,13 +149,13 @@ def test_a_scene_without_error_loses_nothing_that_is_seen():
         scene.nodes["background"].rows.sh_dc.fill_(9.0)
     frame = frame_of(scene, 0)
     assert (frame.image == 255).all()
-    assert LeaveOneOutRule(0.1).select(scene, [frame], LOOK)["background"].removed == 0
+    assert LeaveOneOutRule(0.1).select(scene, [frame], CONTEXT)["background"].removed == 0
 
 
 def test_the_floor_holds():
     scene = scene_of([0.99, 0.3, 0.9], [2.0, 3.0, 4.0], min_gaussians=2)
     for rule in (LeaveOneOutRule(50.0), ImportanceRule()):
-        selection = rule.select(scene, [frame_of(scene, 5)], LOOK)["background"]
+        selection = rule.select(scene, [frame_of(scene, 5)], CONTEXT)["background"]
         assert int(selection.keep.sum()) == 2
         assert selection.floor_hit
         assert isinstance(rule, PruningRule)
@@ -172,13 +172,13 @@ def test_a_number_of_the_whole_scene_goes_whatever_nodes_it_may_take_from(remove
     frames = [frame_of(scene, 5)]
 
     def kept(nodes: list[str] | None) -> dict[str, list[bool]]:
-        chosen = ImportanceRule(gate=False, remove=remove, nodes=nodes).select(scene, frames, LOOK)
+        chosen = ImportanceRule(gate=False, remove=remove, nodes=nodes).select(scene, frames, CONTEXT)
         return {name: each.keep.tolist() for name, each in chosen.items()}
 
     assert kept(None) == {"mine": [True, False], "theirs": [True, False]}
     assert kept(["mine"]) == {"mine": [False, False]}
     with pytest.raises(ValueError, match="have 2"):
-        ImportanceRule(remove=3, nodes=["mine"]).select(scene, frames, LOOK)
+        ImportanceRule(remove=3, nodes=["mine"]).select(scene, frames, CONTEXT)
     with pytest.raises(ValueError, match="remove must be"):
         ImportanceRule(remove=-0.5)
 

@@ -3,7 +3,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.sky import Sky, SkySettings
@@ -84,7 +84,9 @@ def test_masks_are_those_of_masked_nodes_only():
 class Heavy(Background):
     """A node with two terms of its own."""
 
-    def regularizers(self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState) -> dict[str, torch.Tensor]:
+    def own_regularizers(
+        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+    ) -> dict[str, torch.Tensor]:
         return {"weight": self.rows.means.sum(), "age": torch.tensor(state.progress)}
 
 

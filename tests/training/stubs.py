@@ -13,8 +13,8 @@ from torch import Tensor
 from sparsestreet.data.datamodule import OrderedFrames
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Split
-from sparsestreet.evaluation.ledger import CountChange
 from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph

@@ -10,7 +10,7 @@ from lightning import Callback, Trainer
 from torch import Tensor
 
 from sparsestreet.ops import SplatSettings
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes import Background
@@ -77,7 +77,7 @@ class Watched(Background):
         self.asked.append(state)
         return super().raw_at(view, state)
 
-    def regularizers(self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState) -> dict[str, Tensor]:
+    def own_regularizers(self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState) -> dict[str, Tensor]:
         self.asked.append(state)
         return {"size": 0.25 * self.rows.log_scales.sum(), "nothing": torch.zeros(())}
 

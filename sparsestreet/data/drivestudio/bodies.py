@@ -14,7 +14,7 @@ from sparsestreet.data.drivestudio.poses import RIGIDITY_TOLERANCE, world_from_c
 from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import NUM_JOINTS
-from sparsestreet.pickled import read_pickled
+from sparsestreet.safe_pickle import read_pickled
 from sparsestreet.types import BodyPoses, Track
 
 _REMEDY = "write it as DriveStudio's human pose processing does, or say data.log.bodies=false"

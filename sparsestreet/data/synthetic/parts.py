@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sparsestreet.data.synthetic.shapes import Capsule, Shape
-from sparsestreet.data.synthetic.textures.look import Surface
+from sparsestreet.data.synthetic.textures.appearance import Surface
 
 BACKGROUND = -1
 """Object index of what is no annotated object."""

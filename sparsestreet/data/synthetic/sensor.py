@@ -13,7 +13,7 @@ class LidarSensor:
     """(lowest, highest) beam, degrees above the horizon; the others are evenly spread between them."""
     beams: int
     azimuth_steps: int
-    """Rays of one beam in a full turn; about 40 percent of them look where three cameras of 60 degrees look."""
+    """Rays of one beam in a full turn; about 40 percent of them look where three cameras of 60 degrees appearance."""
     max_range: float
     """Meters; what is farther away gives no return."""
     noise: float

@@ -6,7 +6,7 @@ from jaxtyping import Float32, UInt8
 from sparsestreet.data.synthetic.scene import Scene, SunView
 from sparsestreet.data.synthetic.shapes import Scalars, Vectors
 from sparsestreet.data.synthetic.sky import SUNLIGHT, Weather
-from sparsestreet.data.synthetic.textures.look import column, mix
+from sparsestreet.data.synthetic.textures.appearance import column, mix
 from sparsestreet.data.synthetic.tracer import NOTHING, Hits, Rays, sunlit
 
 _HAZE_LENGTH = 900.0
@@ -55,12 +55,12 @@ def _shade(
     local_directions, local_points = scene.turn_to_part(index, directions), scene.to_part(index, points)
     local_normals = part.shape.normals(local_points)
     footprints = _footprints(local_directions, local_normals, distances * np.float32(pixel_angle))
-    look = part.surface.look(local_points, local_normals, footprints)
+    appearance = part.surface.appearance(local_points, local_normals, footprints)
     normals = scene.turn_to_world(index, local_normals)
     lit = sunlit(scene, view, points, normals, index)
     slope = (normals * view.sun[:, None]).sum(0) * lit
     light = weather.ambient(normals) + column(SUNLIGHT) * slope
-    return look.albedo * light + _mirrored(weather, directions, normals, look.gloss, lit)
+    return appearance.albedo * light + _mirrored(weather, directions, normals, appearance.gloss, lit)
 
 
 def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vectors:

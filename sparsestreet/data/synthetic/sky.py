@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from sparsestreet.data.synthetic.noise import smooth_noise, stream
-from sparsestreet.data.synthetic.textures.look import Color, Scalars, Vectors, column, mix
+from sparsestreet.data.synthetic.textures.appearance import Color, Scalars, Vectors, column, mix
 
 SUNLIGHT = (2.55, 2.35, 2.0)
 SKY_AMBIENT = (0.52, 0.62, 0.80)

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.activate import INPUTS, LEARNED, RawGaussians
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
+from sparsestreet.ops.raw import INPUTS, LEARNED, RawGaussians
 from sparsestreet.phases import phase
 from sparsestreet.types import Gaussians
 
@@ -49,7 +49,7 @@ class _Activate(torch.autograd.Function):
         for rows, part, terms in _walk(tensors, call):
             status = native.load_library().splat_activate(
                 int(means.dtype == torch.float64), call.variant, byref(_rows(part, terms, call)),
-                byref(native.ActiveRows(*_pointers([output[rows] for output in outputs]))),
+                byref(native.CActiveRows(*_pointers([output[rows] for output in outputs]))),
             )  # fmt: skip
             _raise_for(status)
         ctx.save_for_backward(*tensors)
@@ -78,7 +78,7 @@ def _part_backward(part: list[Tensor | None], terms: int, call: _Call, cotangent
         gradients[FIELDS - 1] = None
     status = native.load_library().splat_activate_backward(
         int(part[0].dtype == torch.float64), call.variant, byref(_rows(part, terms, call)),
-        byref(native.ActiveRows(*_pointers(cotangents))), byref(native.RawGradients(*_pointers(gradients))),
+        byref(native.CActiveRows(*_pointers(cotangents))), byref(native.CRawGradients(*_pointers(gradients))),
     )  # fmt: skip
     _raise_for(status)
     if part[LEARNED] is None:
@@ -99,9 +99,9 @@ def _walk(tensors: list[Tensor | None], call: _Call) -> list[tuple[slice, list[T
     return found
 
 
-def _rows(part: list[Tensor | None], terms: int, call: _Call) -> native.RawRows:
+def _rows(part: list[Tensor | None], terms: int, call: _Call) -> native.CRawRows:
     *fields, multipliers, turns, shifts, instances, present = part
-    return native.RawRows(
+    return native.CRawRows(
         fields[0].shape[0], fields[-1].shape[1], terms, max(call.terms), call.logit_limit,
         *_pointers([*fields, multipliers, instances]), 0 if turns is None else turns.shape[0],
         *_pointers([turns, shifts, present]), native.thread_count(),

@@ -20,7 +20,7 @@ STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range
 STAGES = ("project", "bin", "blend", "blend_backward", "project_backward", "count")
 
 
-class View(ctypes.Structure):
+class CView(ctypes.Structure):
     """A camera and the settings of one rendering."""
 
     _fields_ = (
@@ -39,7 +39,7 @@ class View(ctypes.Structure):
     )
 
 
-class Rows(ctypes.Structure):
+class CRows(ctypes.Structure):
     """Pointers to the Gaussians' fields."""
 
     _fields_ = (
@@ -49,37 +49,37 @@ class Rows(ctypes.Structure):
     )
 
 
-class Layers(ctypes.Structure):
+class CLayers(ctypes.Structure):
     """Pointers to the layers of an image, or to their cotangents."""
 
     _fields_ = tuple((name, c_void_p) for name in ("rgb", "transmittance", "depth_sum"))
 
 
-class RowGradients(ctypes.Structure):
+class CRowGradients(ctypes.Structure):
     """Pointers to the gradients of the Gaussians' fields and of the screen offsets."""
 
     _fields_ = tuple((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "screen"))
 
 
-class Counters(ctypes.Structure):
+class CCounters(ctypes.Structure):
     """Pointers to the contribution counters."""
 
     _fields_ = tuple((name, c_void_p) for name in ("weight", "pixels", "dominant"))
 
 
-class Backdrop(ctypes.Structure):
+class CBackdrop(ctypes.Structure):
     """Pointers to what stands behind the splats and to how much each pixel counts; null: black, and 1."""
 
     _fields_ = tuple((name, c_void_p) for name in ("rgb", "pixel_weights"))
 
 
-class Changes(ctypes.Structure):
+class CChanges(ctypes.Structure):
     """Pointers to what the removal of each row changes."""
 
     _fields_ = tuple((name, c_void_p) for name in ("largest", "squared"))
 
 
-class Sky(ctypes.Structure):
+class CSky(ctypes.Structure):
     """A cube map behind an image and the camera that sees it."""
 
     _fields_ = (
@@ -90,7 +90,7 @@ class Sky(ctypes.Structure):
     )
 
 
-class RawRows(ctypes.Structure):
+class CRawRows(ctypes.Structure):
     """Pointers to rows as a node stores them; null: multipliers, instances."""
 
     _fields_ = (
@@ -104,13 +104,13 @@ class RawRows(ctypes.Structure):
     )
 
 
-class ActiveRows(ctypes.Structure):
+class CActiveRows(ctypes.Structure):
     """Pointers to activated rows, or to their gradients."""
 
     _fields_ = tuple((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh"))
 
 
-class RawGradients(ctypes.Structure):
+class CRawGradients(ctypes.Structure):
     """Pointers to the gradients of stored rows and of the poses of their instances."""
 
     _fields_ = (
@@ -119,7 +119,7 @@ class RawGradients(ctypes.Structure):
     )
 
 
-class Keyframes(ctypes.Structure):
+class CKeyframes(ctypes.Structure):
     """Pointers to the tables of trajectories and of their corrections, and the time that is asked for."""
 
     _fields_ = (
@@ -130,7 +130,7 @@ class Keyframes(ctypes.Structure):
     )
 
 
-class InstancePoses(ctypes.Structure):
+class CInstancePoses(ctypes.Structure):
     """Pointers to poses and to what their gradient needs."""
 
     _fields_ = (
@@ -139,7 +139,7 @@ class InstancePoses(ctypes.Structure):
     )
 
 
-class ImagePair(ctypes.Structure):
+class CImagePair(ctypes.Structure):
     """Pointers to two images, and the definition of their structural similarity."""
 
     _fields_ = (
@@ -151,7 +151,7 @@ class ImagePair(ctypes.Structure):
     )
 
 
-class Report(ctypes.Structure):
+class CReport(ctypes.Structure):
     """Number of (splat, tile) pairs and the rows with most of them."""
 
     _fields_ = (("pairs", c_int64), ("worst_rows", c_int64 * 3), ("worst_pairs", c_int64 * 3))
@@ -226,7 +226,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_forward": (c_int32, (c_void_p,) * 6),
         "splat_backward": (c_int32, (c_void_p,) * 6),
         "splat_contribution": (c_int32, (c_void_p,) * 5),
-        "splat_removal": (c_int32, (c_void_p,) * 6),
+        "splat_leave_one_out": (c_int32, (c_void_p,) * 6),
         "splat_over_sky": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
         "splat_over_sky_backward": (None, (c_int32, c_int32, *(c_void_p,) * 5)),
         "splat_activate": (c_int32, (c_int32, c_int32, c_void_p, c_void_p)),

@@ -46,7 +46,7 @@ class _Poses(torch.autograd.Function):
             int(rotation_deltas.dtype == torch.float64),
             variant,
             byref(
-                native.Keyframes(
+                native.CKeyframes(
                     instances, length, *(tensor.data_ptr() for tensor in tensors), time, max_gap, TIME_TOLERANCE
                 )
             ),
@@ -80,5 +80,5 @@ class _Poses(torch.autograd.Function):
         return rotation_deltas, translation_deltas, None, None, None, None
 
 
-def _pointers(*tensors: Tensor | None) -> native.InstancePoses:
-    return native.InstancePoses(*(None if tensor is None else tensor.data_ptr() for tensor in tensors))
+def _pointers(*tensors: Tensor | None) -> native.CInstancePoses:
+    return native.CInstancePoses(*(None if tensor is None else tensor.data_ptr() for tensor in tensors))

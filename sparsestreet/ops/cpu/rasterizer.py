@@ -51,10 +51,10 @@ def contribution(
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
     displacements = _moved(g)
-    lease, report = Lease(g.means.dtype, variant), native.Report()
+    lease, report = Lease(g.means.dtype, variant), native.CReport()
     weight = torch.empty(len(g), dtype=torch.float64)
     pixels, dominant = torch.empty(2, len(g), dtype=torch.int64)
-    counters = native.Counters(weight.data_ptr(), pixels.data_ptr(), dominant.data_ptr())
+    counters = native.CCounters(weight.data_ptr(), pixels.data_ptr(), dominant.data_ptr())
     status = native.load_library().splat_contribution(
         lease.workspace.handle,
         byref(_view(camera, settings)),
@@ -79,15 +79,15 @@ def leave_one_out(
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
     displacements = _moved(g)
-    lease, report = Lease(g.means.dtype, variant), native.Report()
+    lease, report = Lease(g.means.dtype, variant), native.CReport()
     largest, squared = torch.empty(2, len(g), dtype=torch.float64)
     behind = [None if layer is None else layer.detach().contiguous() for layer in (background, pixel_weights)]
-    status = native.load_library().splat_removal(
+    status = native.load_library().splat_leave_one_out(
         lease.workspace.handle,
         byref(_view(camera, settings)),
         byref(_rows(fields, displacements)),
-        byref(native.Backdrop(*(None if layer is None else layer.data_ptr() for layer in behind))),
-        byref(native.Changes(largest.data_ptr(), squared.data_ptr())),
+        byref(native.CBackdrop(*(None if layer is None else layer.data_ptr() for layer in behind))),
+        byref(native.CChanges(largest.data_ptr(), squared.data_ptr())),
         byref(report),
     )
     _raise_for(status, fields, displacements, report)
@@ -104,7 +104,7 @@ class _Blend(torch.autograd.Function):
         rgb = means.new_empty(view.height, view.width, 3)
         transmittance, depth_sum = means.new_empty(2, view.height, view.width)
         radii = means.new_empty(means.shape[0])
-        lease, report = Lease(means.dtype, variant), native.Report()
+        lease, report = Lease(means.dtype, variant), native.CReport()
         status = native.load_library().splat_forward(
             lease.workspace.handle,
             byref(view),
@@ -133,9 +133,9 @@ class _Blend(torch.autograd.Function):
                 byref(_rows(fields, displacements)),
                 transmittance.data_ptr(),
                 byref(_layers(*cotangents)),
-                byref(native.RowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
+                byref(native.CRowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
             )
-        _raise_for(status, fields, displacements, native.Report())
+        _raise_for(status, fields, displacements, native.CReport())
         return *gradients, screen, None, None, None
 
 
@@ -152,9 +152,9 @@ def _moved(gaussians: Gaussians) -> Tensor | None:
     return None if moved is None else moved.detach().contiguous()
 
 
-def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> native.View:
+def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> native.CView:
     pose, intrinsics = camera.camera_from_world.tolist(), camera.intrinsics.tolist()
-    view = native.View(
+    view = native.CView(
         rotation=(c_double * 9)(*(value for row in pose[:3] for value in row[:3])),
         position=(c_double * 3)(*exact_position(camera).tolist()),
         fx=intrinsics[0][0],
@@ -188,18 +188,18 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
     return view
 
 
-def _rows(fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None) -> native.Rows:
+def _rows(fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None) -> native.CRows:
     pointers = (field.data_ptr() for field in fields)
     moved = None if displacements is None else displacements.data_ptr()
-    return native.Rows(fields[0].shape[0], fields[4].shape[1], *pointers, moved)
+    return native.CRows(fields[0].shape[0], fields[4].shape[1], *pointers, moved)
 
 
-def _layers(*layers: Tensor | None) -> native.Layers:
-    return native.Layers(*(None if layer is None else layer.data_ptr() for layer in layers))
+def _layers(*layers: Tensor | None) -> native.CLayers:
+    return native.CLayers(*(None if layer is None else layer.data_ptr() for layer in layers))
 
 
 def _raise_for(
-    status: int, fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, report: native.Report
+    status: int, fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, report: native.CReport
 ) -> None:
     if status == native.STATUS_OK:
         return

@@ -61,8 +61,8 @@ class _OverSky(torch.autograd.Function):
             return v_out, v_alpha, v_texels, None, None, None
 
 
-def _sky(texels: Tensor, camera: Camera, transmittance_min: float, directions: Tensor | None) -> native.Sky:
-    return native.Sky(
+def _sky(texels: Tensor, camera: Camera, transmittance_min: float, directions: Tensor | None) -> native.CSky:
+    return native.CSky(
         rays=(c_double * 9)(*itertools.chain(*ray_matrix(camera))),
         transmittance_min=transmittance_min,
         width=camera.width,

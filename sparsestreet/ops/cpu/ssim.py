@@ -57,6 +57,6 @@ class _MeanSSIM(torch.autograd.Function):
         return v_image, None, None
 
 
-def _pair(image: Tensor, truth: Tensor) -> native.ImagePair:
+def _pair(image: Tensor, truth: Tensor) -> native.CImagePair:
     height, width, _ = image.shape
-    return native.ImagePair(image.data_ptr(), truth.data_ptr(), height, width, TAPS, C1, C2, native.thread_count())
+    return native.CImagePair(image.data_ptr(), truth.data_ptr(), height, width, TAPS, C1, C2, native.thread_count())

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from triton.runtime.jit import KernelInterface
 
-from sparsestreet.ops.activate import INPUTS, RawGaussians
+from sparsestreet.ops.raw import INPUTS, RawGaussians
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.quaternions import (

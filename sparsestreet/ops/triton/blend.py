@@ -1,8 +1,8 @@
 """Forward: each tile's splats, nearest first, into its 256 pixels.
 
-One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers, two of each quarter of the
-tile (quarters.py), and walks the splats one by one; every number of a splat is one load for all lanes. Of the next pair
-the row is fetched ahead. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
+One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers, two of each quadrant of
+the tile (quadrants.py), and walks the splats one by one; every number of a splat is one load for all lanes. Of the next
+pair the row is fetched ahead. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
 """
 
 from functools import partial
@@ -11,13 +11,13 @@ import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import (
+from sparsestreet.ops.triton.quadrants import (
     WARP,
     across,
     centers,
     load_splat,
     of_lines,
-    quarter_pixels,
+    quadrant_pixels,
     row_of,
     touches,
 )
@@ -53,9 +53,9 @@ def part_pixels(part):
 
 
 @jit
-def quarter_places(tile, width, height, tiles_x, QUARTER: tl.constexpr, PARTS: tl.constexpr):
-    """Where a quarter's pixels are written, in the image or in the layers of parts, and which of them; [64]."""
-    x, y = quarter_pixels(tile, tiles_x, QUARTER)
+def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr):
+    """Where a quadrant's pixels are written, in the image or in the layers of parts, and which of them; [64]."""
+    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
     at, inside = y * width + x, (x < width) & (y < height)
     if PARTS:
         # Pixels outside have a place too, and are written, for they are read.
@@ -103,12 +103,12 @@ def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE:
 
 
 @jit
-def open_quarter(
-    tile, products, firsts, first_pair, width, height, tiles_x, QUARTER: tl.constexpr, PARTS: tl.constexpr
+def open_quadrant(
+    tile, products, firsts, first_pair, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr
 ):
-    """A quarter before its first splat: the light that reaches its pixels (none of those outside the image), no color,
+    """A quadrant before its first splat: the light that reaches its pixels (none of those outside the image), no color,
     no depth, and the index after the last pair that each pixel was open to."""
-    x, y = quarter_pixels(tile, tiles_x, QUARTER)
+    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
     passed = tl.where((x < width) & (y < height), 1.0, 0.0)
     if PARTS:
         part = tl.program_id(0)
@@ -119,12 +119,12 @@ def open_quarter(
 
 
 @jit
-def blend_quarter(
-    touched, quarter, x, line, RIGHT: tl.constexpr, splat, k, alpha_max, transmittance_min,
+def blend_quadrant(
+    touched, quadrant, x, line, RIGHT: tl.constexpr, splat, k, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
 ):  # fmt: skip
-    """A quarter behind a splat, which it may touch."""
-    passed, red, green, blue, depth, last = quarter
+    """A quadrant behind a splat, which it may touch."""
+    passed, red, green, blue, depth, last = quadrant
     if touched:
         geometry, ends, light = splat
         _, a = across(x, geometry, line, RIGHT)
@@ -147,12 +147,12 @@ def any_open(upper_left, upper_right, lower_left, lower_right, transmittance_min
 
 
 @jit
-def store_quarter(
-    quarter, tile, rgb, transmittance, depth_sum, lasts, width, height, tiles_x,
-    QUARTER: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr,
+def store_quadrant(
+    quadrant, tile, rgb, transmittance, depth_sum, lasts, width, height, tiles_x,
+    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
-    passed, red, green, blue, depth, last = quarter
-    at, inside = quarter_places(tile, width, height, tiles_x, QUARTER, PARTS)
+    passed, red, green, blue, depth, last = quadrant
+    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, PARTS)
     tl.store(rgb + 3 * at, red, inside)
     tl.store(rgb + 3 * at + 1, green, inside)
     tl.store(rgb + 3 * at + 2, blue, inside)
@@ -180,10 +180,10 @@ def blend_tiles(
     k, end = pairs_of(tile, begins, ends, PARTS)
     written = (k < end) | (not PARTS)
     limit = transmittance_min
-    q0 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 0, PARTS)
-    q1 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 1, PARTS)
-    q2 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 2, PARTS)
-    q3 = open_quarter(tile, products, firsts, k, width, height, tiles_x, 3, PARTS)
+    q0 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 0, PARTS)
+    q1 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 1, PARTS)
+    q2 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 2, PARTS)
+    q3 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 3, PARTS)
     x, y = centers(tile, tiles_x)
     unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     pair = tl.load(pair_rows + k, k < end, 0)
@@ -194,18 +194,18 @@ def blend_tiles(
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(y, splat[0], splat[1][0], 0)
-            q0 = blend_quarter(touches(touched, 0), q0, x, line, 0, *more)
-            q1 = blend_quarter(touches(touched, 1), q1, x, line, 1, *more)
+            q0 = blend_quadrant(touches(touched, 0), q0, x, line, 0, *more)
+            q1 = blend_quadrant(touches(touched, 1), q1, x, line, 1, *more)
             line = of_lines(y, splat[0], splat[1][0], 1)
-            q2 = blend_quarter(touches(touched, 2), q2, x, line, 0, *more)
-            q3 = blend_quarter(touches(touched, 3), q3, x, line, 1, *more)
+            q2 = blend_quadrant(touches(touched, 2), q2, x, line, 0, *more)
+            q3 = blend_quadrant(touches(touched, 3), q3, x, line, 1, *more)
         k = stop
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     if written:
         # Volatile: the compiler must compute places anew instead of holding registers for them through the loop.
         tile = tl.load(order + tl.program_id(0), volatile=True)
         to, size = (rgb, transmittance, depth_sum, lasts), (width, height, tiles_x)
-        store_quarter(q0, tile, *to, *size, 0, DEPTH, LASTS, PARTS)
-        store_quarter(q1, tile, *to, *size, 1, DEPTH, LASTS, PARTS)
-        store_quarter(q2, tile, *to, *size, 2, DEPTH, LASTS, PARTS)
-        store_quarter(q3, tile, *to, *size, 3, DEPTH, LASTS, PARTS)
+        store_quadrant(q0, tile, *to, *size, 0, DEPTH, LASTS, PARTS)
+        store_quadrant(q1, tile, *to, *size, 1, DEPTH, LASTS, PARTS)
+        store_quadrant(q2, tile, *to, *size, 2, DEPTH, LASTS, PARTS)
+        store_quadrant(q3, tile, *to, *size, 3, DEPTH, LASTS, PARTS)

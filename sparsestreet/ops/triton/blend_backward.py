@@ -12,9 +12,9 @@ from functools import partial
 
 import triton.language as tl
 
-from sparsestreet.ops.triton.blend import pairs_of, quarter_places
+from sparsestreet.ops.triton.blend import pairs_of, quadrant_places
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import (
+from sparsestreet.ops.triton.quadrants import (
     WARP,
     across,
     centers,
@@ -99,14 +99,14 @@ def light_behind(part_rgb, part_depth, nexts, v, at, DEPTH: tl.constexpr):
 
 
 @jit
-def last_quarter(
+def last_quadrant(
     tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin,
     nexts, part_rgb, part_depth, part_transmittance, part_lasts, width, height, tiles_x,
-    QUARTER: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr,
+    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
-    """A quarter behind its last splat: the light that is left and the light behind against the cotangents; then what
+    """A quadrant behind its last splat: the light that is left and the light behind against the cotangents; then what
     stays the same, the cotangents of color and depth and the index after the last pair of each pixel."""
-    at, inside = quarter_places(tile, width, height, tiles_x, QUARTER, False)
+    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, False)
     red = tl.load(v_rgb + 3 * at, inside, 0.0)
     green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
     blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
@@ -114,7 +114,7 @@ def last_quarter(
     passed = tl.load(transmittance + at, inside, 0.0)
     behind = passed * tl.load(v_transmittance + at, inside, 0.0)
     if PARTS:
-        at, inside = quarter_places(tile, width, height, tiles_x, QUARTER, True)
+        at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, True)
         behind += light_behind(part_rgb, part_depth, nexts, v, at, DEPTH)
         passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
     else:
@@ -123,13 +123,13 @@ def last_quarter(
 
 
 @jit
-def differentiate_quarter(
-    touched, quarter, v, last, sums, x, line, RIGHT: tl.constexpr, splat, k, alpha_max,
+def differentiate_quadrant(
+    touched, quadrant, v, last, sums, x, line, RIGHT: tl.constexpr, splat, k, alpha_max,
     DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr,
 ):  # fmt: skip
-    """The quarter before a splat, and the splat's sums with those over this quarter: within a lane, whose pixels share
-    y, all that x changes."""
-    passed, behind = quarter
+    """The quadrant before a splat, and the splat's sums with those over this quadrant: within a lane, whose pixels
+    share y, all that x changes."""
+    passed, behind = quadrant
     s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = sums
     if touched:
         geometry, ends, light = splat
@@ -177,10 +177,10 @@ def blend_tiles_backward(
     given = (tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin)
     part = (nexts, part_rgb, part_depth, part_transmittance, part_lasts)
     size = (width, height, tiles_x)
-    q0, v0, last0 = last_quarter(*given, *part, *size, 0, DEPTH, PARTS)
-    q1, v1, last1 = last_quarter(*given, *part, *size, 1, DEPTH, PARTS)
-    q2, v2, last2 = last_quarter(*given, *part, *size, 2, DEPTH, PARTS)
-    q3, v3, last3 = last_quarter(*given, *part, *size, 3, DEPTH, PARTS)
+    q0, v0, last0 = last_quadrant(*given, *part, *size, 0, DEPTH, PARTS)
+    q1, v1, last1 = last_quadrant(*given, *part, *size, 1, DEPTH, PARTS)
+    q2, v2, last2 = last_quadrant(*given, *part, *size, 2, DEPTH, PARTS)
+    q3, v3, last3 = last_quadrant(*given, *part, *size, 3, DEPTH, PARTS)
     x, y = centers(tile, tiles_x)
     latest = tl.max(tl.maximum(tl.maximum(last0, last1), tl.maximum(last2, last3)))
     # Of a split tile no pair is this program's: its ``lasts`` are those of the parts put together. Of a part that is
@@ -197,10 +197,10 @@ def blend_tiles_backward(
         s = s + s
         more = (splat, k, alpha_max, DEPTH, ABSOLUTE)
         line = of_lines(y, splat[0], splat[1][0], 0)
-        q0, s = differentiate_quarter(touches(touched, 0), q0, v0, last0, s, x, line, 0, *more)
-        q1, s = differentiate_quarter(touches(touched, 1), q1, v1, last1, s, x, line, 1, *more)
+        q0, s = differentiate_quadrant(touches(touched, 0), q0, v0, last0, s, x, line, 0, *more)
+        q1, s = differentiate_quadrant(touches(touched, 1), q1, v1, last1, s, x, line, 1, *more)
         line = of_lines(y, splat[0], splat[1][0], 1)
-        q2, s = differentiate_quarter(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more)
-        q3, s = differentiate_quarter(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more)
+        q2, s = differentiate_quadrant(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more)
+        q3, s = differentiate_quadrant(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more)
         store_sums(slots + tl.load(pair_slots + k) * SLOT, s)
         k -= 1

@@ -7,7 +7,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import LOOK, blend_one, pixels_of, whitened
 from sparsestreet.ops.triton.blend_backward import zero_slots
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import row_of
+from sparsestreet.ops.triton.quadrants import row_of
 
 COUNTER_COUNT = 3
 COUNTERS = constant(COUNTER_COUNT)

@@ -8,7 +8,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import pixels_of, whitened
 from sparsestreet.ops.triton.blend_backward import alpha_behind, zero_slots
 from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.quarters import row_of
+from sparsestreet.ops.triton.quadrants import row_of
 
 CHANGE_COUNT = 2
 CHANGES = constant(CHANGE_COUNT)

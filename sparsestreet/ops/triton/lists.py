@@ -18,10 +18,10 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.parts import Parts, part_length, split_tiles
-from sparsestreet.ops.triton.quarters import MOST_ROWS, QUARTER_SHIFT, WARP, half_spans, touched_quarters
+from sparsestreet.ops.triton.quadrants import MOST_ROWS, QUADRANT_SHIFT, WARP, half_spans, touched_quadrants
 from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
-from sparsestreet.ops.triton.view import View
+from sparsestreet.ops.triton.view import KernelView
 
 PAIR_LIMIT = 1 << 28
 """(splat, tile) pairs of one rendering. Each takes 34 bytes while they are sorted (torch 2.11, H100; 40 above 32,768
@@ -43,7 +43,7 @@ class Lists:
     first_pairs: Int[Tensor, " v"]
     tile_counts: Int[Tensor, " v"]
     pair_rows: Int[Tensor, " p"]
-    """Rows of the pairs tile by tile, nearest first, and the quarters of the tile that each touches (quarters.py)."""
+    """Rows of the pairs tile by tile, nearest first, and the quadrants of the tile that each touches (quadrants.py)."""
     slots: Int[Tensor, " p"]
     """Number of each of those pairs before it was sorted by tile."""
     begins: Int[Tensor, " t"]
@@ -55,13 +55,13 @@ class Lists:
 
     @property
     def rows_of_pairs(self) -> Int[Tensor, " p"]:
-        """``pair_rows`` without the quarters."""
+        """``pair_rows`` without the quadrants."""
         return self.pair_rows & (MOST_ROWS - 1)
 
     @property
-    def quarters_of_pairs(self) -> Int[Tensor, " p"]:
-        """A bit for each quarter of the tile."""
-        return self.pair_rows >> QUARTER_SHIFT & 15
+    def quadrants_of_pairs(self) -> Int[Tensor, " p"]:
+        """A bit for each quadrant of the tile."""
+        return self.pair_rows >> QUADRANT_SHIFT & 15
 
 
 @partial(jit, do_not_specialize=["row_count"])
@@ -111,7 +111,7 @@ def list_splats(
         begin = at + tl.cumsum(count, 1) - count
         for j in range(tl.max(count)):
             tl.store(keys + begin + j, line * tiles_x + left + j, j < count)
-            tl.store(pair_rows + begin + j, row | touched_quarters(spans, left + j, BOUNDED), j < count)
+            tl.store(pair_rows + begin + j, row | touched_quadrants(spans, left + j, BOUNDED), j < count)
         at += tl.sum(count, 1)[:, None]
 
 
@@ -120,7 +120,7 @@ def list_pairs(
     records, rows, counts, first_pairs, keys, pair_rows, visible, width, height, tiles_x,
     BOUNDED: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tile of each pair, and its row with the quarters it touches (quarters.py): pair i of a row lies in the i-th
+    """The tile of each pair, and its row with the quadrants it touches (quadrants.py): pair i of a row lies in the i-th
     tile of its splat, counted row of tiles by row. Giants get a warp each: nobody else is to wait for them."""
     lane = tl.arange(0, LANES)[None, :]
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None] + 0 * lane
@@ -172,7 +172,9 @@ def bound_tiles(
         tl.store(classes + tile, length_class(length, whole), tile < tiles)
 
 
-def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: View) -> Lists:
+def list_tiles(
+    records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: KernelView
+) -> Lists:
     """Sort rows and pairs; ``visible`` and ``pairs`` are the numbers of both, already checked.
 
     The device has nothing else to do meanwhile: every call between two kernels of ours is a gap.
@@ -202,7 +204,7 @@ def list_tiles(records: Tensor, tile_counts: Tensor, places: Tensor, visible: in
 
 
 def _rows_by_depth(
-    records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: View
+    records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, view: KernelView
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Visible rows, nearest first, the number of pairs of each, and its first pair."""
     keys, unsorted, rows, counts = (tile_counts.new_empty(visible) for _ in range(4))

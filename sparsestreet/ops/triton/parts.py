@@ -21,7 +21,7 @@ from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.quarters import row_of
+from sparsestreet.ops.triton.quadrants import row_of
 from sparsestreet.ops.triton.search import first_at_least
 
 PART_LENGTH = 256

@@ -9,7 +9,7 @@ from sparsestreet.ops.triton import blend, blend_backward
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.parts import PartLayers, merge_parts, thin_parts
 from sparsestreet.ops.triton.screen import Screen, given_or
-from sparsestreet.ops.triton.view import View
+from sparsestreet.ops.triton.view import KernelView
 
 ONE_WARP = {"num_warps": 1}
 
@@ -42,7 +42,7 @@ class Cotangents:
     depth_sum: Float[Tensor, "h w"] | None
 
 
-def blend_view(screen: Screen, view: View, lasts: bool) -> Layers:
+def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
     """Blend all tiles; ``lasts``: whether a backward pass will follow."""
     lists, shape, limit = screen.lists, (view.camera.height, view.camera.width), view.transmittance_min
     rgb = screen.records.new_empty(*shape, 3)
@@ -79,7 +79,9 @@ def blend_view(screen: Screen, view: View, lasts: bool) -> Layers:
     return Layers(rgb, depth_sum, Ends(transmittance, last, part))
 
 
-def differentiate_view(screen: Screen, view: View, ends: Ends, v: Cotangents, absolute: bool) -> Float[Tensor, "p 12"]:
+def differentiate_view(
+    screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
+) -> Float[Tensor, "p 12"]:
     """A slot of gradients for each pair; ``absolute``: those of the screen means' magnitudes as well."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
     slots = passed.new_empty(len(lists.slots), blend_backward.SLOT_LENGTH)
@@ -105,6 +107,6 @@ def differentiate_view(screen: Screen, view: View, ends: Ends, v: Cotangents, ab
     return slots
 
 
-def pixel_arguments(view: View) -> tuple[int, int, int, float]:
+def pixel_arguments(view: KernelView) -> tuple[int, int, int, float]:
     """Width, height, columns of tiles, and the largest alpha."""
     return view.camera.width, view.camera.height, view.tiles[0], view.settings.alpha_max

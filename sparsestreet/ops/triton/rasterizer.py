@@ -24,9 +24,9 @@ from sparsestreet.ops.triton.pixels import (
     differentiate_view,
     pixel_arguments,
 )
-from sparsestreet.ops.triton.quarters import MOST_ROWS
+from sparsestreet.ops.triton.quadrants import MOST_ROWS
 from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
-from sparsestreet.ops.triton.view import View
+from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 
@@ -38,14 +38,14 @@ def rasterize(
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*fields, screen_offsets))
-    return Raster(*_Blend.apply(*fields, screen_offsets, g.displacements, View(camera, settings), differentiated))
+    return Raster(*_Blend.apply(*fields, screen_offsets, g.displacements, KernelView(camera, settings), differentiated))
 
 
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
     _check(gaussians)
-    view = View(camera, settings)
+    view = KernelView(camera, settings)
     screen = project(gaussians, view)
     lists = screen.lists
     counters = screen.records.new_empty(len(lists.slots), count.COUNTER_COUNT)
@@ -70,7 +70,7 @@ def leave_one_out(
 ) -> LeaveOneOut:
     """How far the view moves when each row alone is taken away, over a background (None: black)."""
     _check(gaussians)
-    view = View(camera, settings)
+    view = KernelView(camera, settings)
     screen = project(gaussians, view)
     lists, layers = screen.lists, blend_view(screen, view, lasts=True)
     changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)

@@ -31,7 +31,7 @@ from sparsestreet.ops.triton.view import (
     NEAR,
     ROTATION,
     SIZE,
-    View,
+    KernelView,
     in_camera,
     load_matrix,
 )
@@ -39,7 +39,7 @@ from sparsestreet.ops.triton.view import (
 HALF_LARGEST = constant(65504.0)
 
 
-def block_of(view: View) -> int:
+def block_of(view: KernelView) -> int:
     """Rows of a program: fewer where a lane holds the eight points of a distorted row."""
     return 32 if view.distorted else 128
 

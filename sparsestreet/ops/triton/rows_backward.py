@@ -22,10 +22,10 @@ from sparsestreet.ops.triton.shape import (
 from sparsestreet.ops.triton.shutter import roll, roll_backward, velocity, velocity_backward
 from sparsestreet.ops.triton.unscented import unscented, unscented_backward
 from sparsestreet.ops.triton.vectors import load_row, plus, store_row, times, transposed_times
-from sparsestreet.ops.triton.view import ROTATION, View, in_camera, load_matrix
+from sparsestreet.ops.triton.view import ROTATION, KernelView, in_camera, load_matrix
 
 
-def block_of(view: View) -> int:
+def block_of(view: KernelView) -> int:
     """Rows of a program: as many lanes hold the eight points of a distorted row, so that none spills registers."""
     return 16 if view.distorted else 128
 

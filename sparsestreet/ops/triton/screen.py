@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.ops.triton import records, rows
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.lists import Lists, check_pairs, list_tiles
-from sparsestreet.ops.triton.view import View
+from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.ops.validate import check_values
 from sparsestreet.types import Gaussians
 
@@ -26,7 +26,7 @@ class Screen:
     lists: Lists
 
 
-def project(gaussians: Gaussians, view: View) -> Screen:
+def project(gaussians: Gaussians, view: KernelView) -> Screen:
     """Project all rows; waits for the device once, for the numbers of rows and of pairs.
 
     Raises ValueError for bad values, PairLimitError.
@@ -71,6 +71,6 @@ def given_or(tensor: Tensor | None, other: Tensor) -> Tensor:
     return other if tensor is None else tensor
 
 
-def effects(view: View, displacements: Tensor | None) -> dict[str, Any]:
+def effects(view: KernelView, displacements: Tensor | None) -> dict[str, Any]:
     """The switches of the row kernels."""
     return {"DISTORTED": view.distorted, "ROLLING": view.rolling, "DISPLACED": displacements is not None}

@@ -50,7 +50,7 @@ def in_camera(view, rotation, mean):
 
 
 @dataclass(frozen=True)
-class View:
+class KernelView:
     """One camera and the settings, with the switches that kernels are compiled for."""
 
     camera: Camera

@@ -7,9 +7,9 @@ from torch.nn.functional import pad
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton.blend import LOOK_LENGTH
 from sparsestreet.ops.triton.pixels import blend_view
-from sparsestreet.ops.triton.quarters import QUARTER_PIXELS
+from sparsestreet.ops.triton.quadrants import QUADRANT_PIXELS
 from sparsestreet.ops.triton.screen import project
-from sparsestreet.ops.triton.view import TILE_SIZE, View
+from sparsestreet.ops.triton.view import TILE_SIZE, KernelView
 from sparsestreet.types import Camera, Gaussians
 
 
@@ -18,22 +18,22 @@ def count_work(gaussians: Gaussians, camera: Camera, settings: SplatSettings) ->
     """(splat, tile) pairs of one view and (splat, pixel) samples that its forward pass computes.
 
     The walk over a tile is counted up to the 32 pairs in which its last pixel is open to a splat, and of each pair the
-    quarters that it touches. Long tiles are counted as if they were in one piece: that the light through their parts is
-    computed twice is not in the number.
+    quadrants that it touches. Long tiles are counted as if they were in one piece: that the light through their parts
+    is computed twice is not in the number.
     """
-    view = View(camera, settings)
+    view = KernelView(camera, settings)
     screen = project(gaussians, view)
     lists = screen.lists
     counts, seen = lists.ends - lists.begins, _last_of_tiles(blend_view(screen, view, lasts=True).ends.lasts, view)
     seen = torch.where(counts > 0, seen - lists.begins, 0)
     walked = torch.minimum(-(-seen // LOOK_LENGTH) * LOOK_LENGTH, counts)
-    touched = (lists.quarters_of_pairs[:, None] >> torch.arange(4, device=counts.device) & 1).sum(1)
+    touched = (lists.quadrants_of_pairs[:, None] >> torch.arange(4, device=counts.device) & 1).sum(1)
     before = torch.nn.functional.pad(touched.cumsum(0), (1, 0))
-    quarters = before[(lists.begins + walked).long()] - before[lists.begins.long()]
-    return len(lists.slots), int(quarters.sum()) * QUARTER_PIXELS
+    quadrants = before[(lists.begins + walked).long()] - before[lists.begins.long()]
+    return len(lists.slots), int(quadrants.sum()) * QUADRANT_PIXELS
 
 
-def _last_of_tiles(lasts: Tensor, view: View) -> Tensor:
+def _last_of_tiles(lasts: Tensor, view: KernelView) -> Tensor:
     columns, rows = view.tiles
     padded = pad(lasts, (0, columns * TILE_SIZE - lasts.shape[1], 0, rows * TILE_SIZE - lasts.shape[0]))
     return padded.view(rows, TILE_SIZE, columns, TILE_SIZE).amax((1, 3)).flatten()

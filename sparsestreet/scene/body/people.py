@@ -69,7 +69,7 @@ def trained_poses(track: Track, held_out: frozenset[int]) -> Bool[Tensor, " f"]:
 def _body(track: Track) -> BodyPoses:
     if track.body is None:
         raise ValueError(
-            f"track {track.name!r} has no body poses: give it to a node for objects without (posed: false)"
+            f"track {track.name!r} has no body poses: give it to a node for objects without (has_body_pose: false)"
         )
     return track.body
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 
 from sparsestreet.geometry.skeleton import NUM_JOINTS, PARENTS
-from sparsestreet.pickled import read_pickled
+from sparsestreet.safe_pickle import read_pickled
 from sparsestreet.scene.body.template import Body, BodyTemplate
 
 _NUM_SHAPES = 10

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.coverage import Coverage, coverage
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.sources import PointSource, Seeds
@@ -17,7 +18,6 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.state import SceneState
-from sparsestreet.scene.streams import stream
 from sparsestreet.types import View
 
 _log = logging.getLogger(__name__)
@@ -63,7 +63,9 @@ class BackgroundSettings(NodeSettings):
         """What the sources give. Raises ValueError if there is not a single point."""
         seen = coverage(data)
         drawn = {
-            name: source.draw(round(self.num_points * source.share(seen)), data, stream(generator.initial_seed(), name))
+            name: source.draw(
+                round(self.num_points * source.share(seen)), data, named_generator(generator.initial_seed(), name)
+            )
             for name, source in self.sources.items()
         }
         _log.info(

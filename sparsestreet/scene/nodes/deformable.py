@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.geometry.quaternions import normalized
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
@@ -78,7 +78,7 @@ class Deformable(Tracked):
             log_scales=scales,
         )
 
-    def regularizers(
+    def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         """``out_of_box`` in place of a cull: arms and legs may leave a box for a moment."""

@@ -10,15 +10,15 @@ from torch import Tensor
 
 from sparsestreet.geometry.cameras import distance_to_view
 from sparsestreet.geometry.quaternions import normalized
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings
 from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
 from sparsestreet.scene.state import SceneState
-from sparsestreet.scene.streams import stream
 from sparsestreet.types import View
 
 _MARGIN = 0.25
@@ -137,5 +137,5 @@ class Field(Node):
         """From the step alone, so that a resumed run draws what the uninterrupted one does."""
         settings = self.settings
         left = max(1 - state.progress / settings.time_noise_until, 0.0) if settings.time_noise_until > 0 else 0.0
-        normal = torch.randn((), generator=stream(self.seed, f"time noise {state.progress}")).item()
+        normal = torch.randn((), generator=named_generator(self.seed, f"time noise {state.progress}")).item()
         return normal * left * settings.time_noise / max(self.num_frames - 1, 1)

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from sparsestreet.ops.activate import RawGaussians, activate
+from sparsestreet.ops.activate import activate
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.density import DensityStrategy
 from sparsestreet.scene.gaussians import Rows, drop_parameter
 from sparsestreet.scene.initialize.gaussians import init_gaussians
@@ -37,7 +38,7 @@ class NodeSettings(ABC):
     """Class names of the log whose tracks the node takes."""
     min_path_length: float = 0.0
     """Meters; a track that travels no farther is left to the static nodes."""
-    posed: bool | None = None
+    has_body_pose: bool | None = None
     """True: only tracks that come with body poses; False: only those without; None: both."""
     min_gaussians: int
     """K_min of the paper: neither masks nor pruning leave fewer Gaussians in the node class."""
@@ -86,7 +87,7 @@ class NodeSettings(ABC):
 
     def takes(self, track: Track) -> bool:
         """Whether the node claims a track of the log."""
-        fits = self.posed is None or self.posed == (track.body is not None)
+        fits = self.has_body_pose is None or self.has_body_pose == (track.body is not None)
         return fits and track.class_name in self.classes and track.path_length > self.min_path_length
 
     @property
@@ -184,7 +185,7 @@ class Node(nn.Module, ABC):
         """The node's Gaussians in the world, activated, with the mask applied."""
         return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)
 
-    def regularizers(
+    def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         """Terms of the loss that concern the node alone, by name, each with its weight.
@@ -195,7 +196,7 @@ class Node(nn.Module, ABC):
         """
         return {}
 
-    def all_regularizers(
+    def regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         """``regularizers``, and the terms that every node has whose settings give them a weight."""
@@ -204,7 +205,7 @@ class Node(nn.Module, ABC):
         if settings.sharp_shape > 0:
             # The mask is applied at activation: what it hides has its shape here.
             shape["sharp_shape"] = settings.sharp_shape * sharp_shape(self.rows.log_scales, settings.max_axis_ratio)
-        return shape | self.regularizers(raw, drawn, state)
+        return shape | self.own_regularizers(raw, drawn, state)
 
     def outside(self) -> Bool[Tensor, " n"] | None:
         """Rows that left the bounds of their instance; None for a node without bounds."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool
 from torch import Tensor
 
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
 from sparsestreet.scene.state import SceneState

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.body import Body, BodyTemplate, BuiltinBody, surface
 from sparsestreet.scene.body.people import People, people_of, trained_poses
 from sparsestreet.scene.gaussians import Rows
@@ -41,7 +41,7 @@ _APART = 100.0
 class SmplSettings(TrackedSettings):
     """Starts with one Gaussian at each vertex of a body, in the color of what was measured near it in the box."""
 
-    posed: bool | None = True
+    has_body_pose: bool | None = True
     initial_opacity: float = 0.99
     body: Body = field(default_factory=BuiltinBody)
     """The surface, and which joints move it."""
@@ -56,8 +56,10 @@ class SmplSettings(TrackedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.posed:
-            raise ValueError(f"a node of bodies takes only tracks with body poses, got posed={self.posed}: say true")
+        if not self.has_body_pose:
+            raise ValueError(
+                f"a node of bodies takes only tracks with body poses, got has_body_pose={self.has_body_pose}: say true"
+            )
         if self.neighbors < 2:
             raise ValueError(f"neighbors counts the Gaussian itself, so it must be at least 2, got {self.neighbors}")
 
@@ -230,7 +232,7 @@ class Smpl(Tracked):
         pelvis[..., 0] = 1
         return torch.cat((pelvis, turned), 1)
 
-    def regularizers(
+    def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         """``neighbors``, ``scale`` and ``smoothness``, those that have a weight."""

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.ops.activate import Placement, RawGaussians
-from sparsestreet.ops.poses import Poses, poses_at
+from sparsestreet.ops.poses import poses_at
+from sparsestreet.ops.raw import Placement, Poses, RawGaussians
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_boxes
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
@@ -180,10 +180,10 @@ class Tracked(Node):
         """Pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
-    def all_regularizers(
+    def regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        terms, weight = super().all_regularizers(raw, drawn, state), self.settings.temporal_smooth
+        terms, weight = super().regularizers(raw, drawn, state), self.settings.temporal_smooth
         if weight > 0:
             learned = self.keyframe_translations + self.translation_deltas
             terms["temporal_smooth"] = weight * temporal_smoothness(self.keyframe_times, learned, self.keyframe_valid)

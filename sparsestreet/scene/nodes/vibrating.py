@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.state import SceneState
-from sparsestreet.scene.streams import stream
 from sparsestreet.scene.vibration import displacements, faded_logits, mean_velocities
 from sparsestreet.types import View
 
@@ -58,7 +58,7 @@ class VibratingSettings(BackgroundSettings):
         """Raises ValueError if there is not a single point to start from."""
         seed, num_frames = generator.initial_seed(), data.log.num_frames
         seeds = self.seeds(data, generator)
-        anywhere = torch.rand(len(seeds), generator=stream(seed, "life peaks"))
+        anywhere = torch.rand(len(seeds), generator=named_generator(seed, "life peaks"))
         peaks = torch.where(seeds.times.isnan(), anywhere, seeds.times) * self.frame_time * (num_frames - 1)
         columns = {
             "velocities": torch.zeros(len(seeds), 3),
@@ -105,7 +105,7 @@ class Vibrating(Node):
         """By which a row moves on average, meters per unit of the node's time."""
         return mean_velocities(self.rows.velocities, self.rows.log_life_spans, self.settings.cycle)
 
-    def regularizers(
+    def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         """``velocity`` holds still what need not move."""
@@ -119,7 +119,7 @@ class Vibrating(Node):
         """From the view's time to that from which its rows are taken; from the step alone, so that a resumed run
         draws what the uninterrupted one does."""
         settings = self.settings
-        chance, place = torch.rand(2, generator=stream(self.seed, f"smoothing {state.progress}")).tolist()
+        chance, place = torch.rand(2, generator=named_generator(self.seed, f"smoothing {state.progress}")).tolist()
         if chance >= settings.smoothing_probability:
             return 0.0
         return (2 * place - 1) * settings.smoothing_frames * settings.frame_time

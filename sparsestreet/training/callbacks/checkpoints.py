@@ -5,9 +5,9 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
 from sparsestreet.training.callbacks.graceful_stop import TornStop
-from sparsestreet.whole_file import whole_file
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class Checkpoints(Callback):
         return True
 
     def _save(self, trainer: Trainer, name: str) -> None:
-        with stage("save"), whole_file(self.folder / name) as temporary:
+        with stage("save"), atomic_file(self.folder / name) as temporary:
             trainer.save_checkpoint(temporary, weights_only=False)
 
 

@@ -3,8 +3,8 @@
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.evaluation.ledger import CountChange
 from sparsestreet.phases import phase
+from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowListener, resize_rows

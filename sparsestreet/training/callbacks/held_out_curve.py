@@ -6,8 +6,8 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.training.callbacks.clock import Clock
-from sparsestreet.whole_file import whole_file
 
 COLUMNS = {"psnr_full": "val/psnr", "psnr_human": "val/psnr_human", "psnr_vehicle": "val/psnr_vehicle"}
 """Column of the file -> what validation logs."""
@@ -48,5 +48,5 @@ class HeldOutCurve(Callback):
         for seconds, step, *values in self.rows:
             writer.writerow((f"{seconds:.3f}", step, *("" if value is None else f"{value:.4f}" for value in values)))
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(self.path) as temporary:
+        with atomic_file(self.path) as temporary:
             temporary.write_text(buffer.getvalue())

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import PhaseRecorder, clock_of
-from sparsestreet.whole_file import whole_file
 
 LOOP = "loop"
 """What is in no phase: Lightning, and callbacks that have nothing to do in a step."""
@@ -75,5 +75,5 @@ class PhaseTimes(Callback):
         writer.writerow(("step", "phase", "milliseconds"))
         writer.writerows((step, name, f"{value:.4f}") for step, name, value in self.rows)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(self.path) as temporary:
+        with atomic_file(self.path) as temporary:
             temporary.write_text(buffer.getvalue())

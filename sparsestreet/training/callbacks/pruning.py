@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.phases import stage
-from sparsestreet.pruning import Look, PruningRule
+from sparsestreet.pruning import PruningRule, RenderContext
 from sparsestreet.training.callbacks.resizing import resize_rows
 from sparsestreet.training.schedule import milestone
 
@@ -37,8 +37,8 @@ class Pruning(Callback):
 
     def _prune(self, trainer: Trainer, pl_module: LightningModule) -> None:
         frames = trainer.datamodule.split.train
-        look = Look(pl_module.state(), pl_module.options)
-        for name, selection in self.rule.select(pl_module.scene, frames, look).items():
+        context = RenderContext(pl_module.state(), pl_module.options)
+        for name, selection in self.rule.select(pl_module.scene, frames, context).items():
             log.info(
                 "step %d: pruning takes %d of %d Gaussians of %r%s",
                 trainer.global_step, selection.removed, len(selection.keep), name,

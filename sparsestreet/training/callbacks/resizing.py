@@ -4,7 +4,7 @@ import logging
 
 from lightning import Trainer
 
-from sparsestreet.evaluation.ledger import CountChange
+from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.system import StreetSystem
 

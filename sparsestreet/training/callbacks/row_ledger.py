@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.evaluation.ledger import CountChange, write_changes
+from sparsestreet.records.ledger import CountChange, write_changes
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowListener
 

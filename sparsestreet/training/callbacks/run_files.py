@@ -5,11 +5,11 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.evaluation.ledger import CountChange
-from sparsestreet.evaluation.noise import Calibration, calibrate, noise_between
-from sparsestreet.evaluation.records import RunDescription, run_path, write_run
-from sparsestreet.export import views
+from sparsestreet.noise import Calibration, calibrate, noise_between
 from sparsestreet.phases import stage
+from sparsestreet.records.ledger import CountChange
+from sparsestreet.records.run import RunDescription, run_path, write_run
+from sparsestreet.scene import views
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
 from sparsestreet.training.callbacks.clock import Clock

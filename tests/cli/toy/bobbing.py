@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sparsestreet.ops.activate import RawGaussians
+from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.points import Points
@@ -65,7 +65,7 @@ class Bobbing(Node):
         height = torch.tanh(self.lift(torch.tensor([view.time], device=local.means.device)))
         return replace(local, means=local.means + torch.cat((torch.zeros_like(height).expand(2), height)))
 
-    def regularizers(
+    def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         return {"stillness": self.settings.stillness * self.lift[2].weight.square().sum()}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from sparsestreet.pruning import Look, PruningRule
+from sparsestreet.pruning import PruningRule, RenderContext
 from sparsestreet.scene.gaussians import Selection, keep_best
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import Frame
@@ -18,9 +18,9 @@ class SizeRule(PruningRule):
     meters: float
 
     @torch.no_grad()
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: RenderContext) -> dict[str, Selection]:
         selections = {}
-        for name, floors in self.floors(scene, frames, how).items():
+        for name, floors in self.floors(scene, frames, context).items():
             sizes = scene.nodes[name].rows.log_scales.amax(1).exp()
             selections[name] = keep_best(-sizes, sizes > self.meters, *floors)
         return selections

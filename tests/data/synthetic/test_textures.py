@@ -84,14 +84,14 @@ def test_looks_are_colors_and_flatten_with_distance(name):
     normals = part.shape.normals(points)
     spread = []
     for width in (0.002, 50.0):
-        look = part.surface.look(points, normals, np.full_like(points, width))
-        assert np.isfinite(look.albedo).all()
-        assert look.albedo.min() >= 0
-        assert look.albedo.max() <= 1.2
-        assert ((look.gloss >= 0) & (look.gloss <= 1)).all()
+        appearance = part.surface.appearance(points, normals, np.full_like(points, width))
+        assert np.isfinite(appearance.albedo).all()
+        assert appearance.albedo.min() >= 0
+        assert appearance.albedo.max() <= 1.2
+        assert ((appearance.gloss >= 0) & (appearance.gloss <= 1)).all()
         top = normals[2] > 0.5
-        chosen = look.albedo[:, ~top] if (~top).any() else look.albedo
+        chosen = appearance.albedo[:, ~top] if (~top).any() else appearance.albedo
         spread.append(chosen.std(1).max())
     assert spread[1] <= spread[0] + 1e-3
-    nothing = part.surface.look(points[:, :0], normals[:, :0], points[:, :0])
+    nothing = part.surface.appearance(points[:, :0], normals[:, :0], points[:, :0])
     assert nothing.albedo.shape == (3, 0)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.ops.activate import Placement, activate
-from sparsestreet.ops.poses import Poses
+from sparsestreet.ops.activate import activate
+from sparsestreet.ops.raw import Placement, Poses
 from sparsestreet.ops.triton import activate as fused
 from tests.ops.scenes import device_of, fill_buffers_with_nan
 from tests.ops.test_activate import (

@@ -8,7 +8,7 @@ import torch
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.triton import parts
 from sparsestreet.ops.triton.screen import Screen, project
-from sparsestreet.ops.triton.view import View
+from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.scenes import camera, cast, device_of, front_camera, one_gaussian, random_gaussians
 
@@ -74,7 +74,7 @@ def ellipses() -> Gaussians:
 def projected() -> tuple[Screen, Camera]:
     view = front_camera(WIDTH, HEIGHT, 400.0)
     scene = cast(ellipses(), torch.float32, device=DEVICE)
-    return project(scene, View(view, SplatSettings())), view
+    return project(scene, KernelView(view, SplatSettings())), view
 
 
 def test_no_touched_tile_is_missing_and_hardly_one_is_listed_in_vain(projected):
@@ -93,13 +93,15 @@ def test_no_touched_tile_is_missing_and_hardly_one_is_listed_in_vain(projected):
     assert listed(screen) <= needed(0.05)
 
 
-def test_no_touched_quarter_is_missing_and_hardly_one_is_listed_in_vain(projected):
+def test_no_touched_quadrant_is_missing_and_hardly_one_is_listed_in_vain(projected):
     screen, _ = projected
     lists, marked, tiles = screen.lists, set(), set()
     for tile in range(COLUMNS * ROWS):
         pairs = slice(int(lists.begins[tile]), int(lists.ends[tile]))
         line, column = divmod(tile, COLUMNS)
-        for row, bits in zip(lists.rows_of_pairs[pairs].tolist(), lists.quarters_of_pairs[pairs].tolist(), strict=True):
+        for row, bits in zip(
+            lists.rows_of_pairs[pairs].tolist(), lists.quadrants_of_pairs[pairs].tolist(), strict=True
+        ):
             tiles.add((row, column, line))
             marked |= {(row, 2 * column + k % 2, 2 * line + k // 2) for k in range(4) if bits >> k & 1}
 
@@ -112,7 +114,7 @@ def test_no_touched_quarter_is_missing_and_hardly_one_is_listed_in_vain(projecte
 
 def test_tiles_are_walked_nearest_first():
     view = camera(WIDTH, HEIGHT)
-    screen = project(cast(random_gaussians(40, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
+    screen = project(cast(random_gaussians(40, view), torch.float32, device=DEVICE), KernelView(view, SplatSettings()))
     lists, depths = screen.lists, screen.records[:, DEPTH]
     for begin, end in zip(lists.begins.tolist(), lists.ends.tolist(), strict=True):
         order = depths[lists.rows_of_pairs[begin:end].long()]
@@ -123,7 +125,9 @@ def test_tiles_are_walked_nearest_first():
 def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_each_other(rows, monkeypatch):
     monkeypatch.setattr(parts, "PART_LENGTH", 3)
     view = camera(WIDTH, HEIGHT)
-    screen = project(cast(random_gaussians(rows, view), torch.float32, device=DEVICE), View(view, SplatSettings()))
+    screen = project(
+        cast(random_gaussians(rows, view), torch.float32, device=DEVICE), KernelView(view, SplatSettings())
+    )
     lists, whole = screen.lists, 2 * parts.part_length(len(screen.lists.slots))
     lengths = (lists.ends - lists.begins).tolist()
 
@@ -137,7 +141,7 @@ def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_ea
 
 def test_more_pairs_than_tiles():
     scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, 2 + 0.01 * k]]) for k in range(300)])
-    screen = project(cast(scene, torch.float32, device=DEVICE), View(front_camera(9, 5, 20.0), SplatSettings()))
+    screen = project(cast(scene, torch.float32, device=DEVICE), KernelView(front_camera(9, 5, 20.0), SplatSettings()))
     assert screen.lists.rows_of_pairs.tolist() == list(range(300))
 
 
@@ -149,7 +153,7 @@ def test_a_splat_that_ends_on_a_pixel_center_is_listed(edge, distance):
     view.intrinsics[:2, 2] = 24.5
     sigma = distance * (1 - 1e-6) / math.sqrt(2 * math.log(0.8 * 255))
     scene = one_gaussian(scales=[[sigma * 2 / 1000] * 3])
-    screen = project(cast(scene, torch.float32, device=DEVICE), View(view, SplatSettings(eps2d=1e-9)))
+    screen = project(cast(scene, torch.float32, device=DEVICE), KernelView(view, SplatSettings(eps2d=1e-9)))
     assert (0, {"left": 3, "right": 5, "top": 1, "bottom": 7}[edge]) in listed(screen)
 
 
@@ -158,11 +162,11 @@ def test_culling_by_tiles_changes_no_bit(settings, monkeypatch):
     view = camera(35, 19)
     scene = cast(random_gaussians(12, view), torch.float32, device=DEVICE)
     culled = splat(scene, view, settings=settings, backend="triton")
-    monkeypatch.setattr(View, "bounded", False)  # every splat in every tile; the cut-offs of alpha stay
+    monkeypatch.setattr(KernelView, "bounded", False)  # every splat in every tile; the cut-offs of alpha stay
     everywhere = splat(scene, view, settings=settings, backend="triton")
     for name in ("rgb", "alpha", "depth"):
         assert torch.equal(getattr(culled, name), getattr(everywhere, name)), name
-    pairs = [len(project(scene, View(view, settings)).lists.slots)]
+    pairs = [len(project(scene, KernelView(view, settings)).lists.slots)]
     monkeypatch.undo()
-    pairs.append(len(project(scene, View(view, settings)).lists.slots))
+    pairs.append(len(project(scene, KernelView(view, settings)).lists.slots))
     assert pairs[0] > pairs[1]

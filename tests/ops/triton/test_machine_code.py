@@ -3,9 +3,9 @@
 What training launches is compiled for sm_90 by ``make test``; every switch, for both, by ``make test-all``.
 
 Budgets are what was measured with Triton 3.7.1; 3.6.0 makes pixel kernels of the same registers and instructions. The
-instructions of a (splat, pixel) sample are those of a splat that touches all four quarters of its tile: the dearest. Of
-one that touches two it is a third less for the pair, where a kernel that took the tile as a whole had 154 forward and
-487 backward whatever it touched.
+instructions of a (splat, pixel) sample are those of a splat that touches all four quadrants of its tile: the
+costliest. Of one that touches two it is a third less for the pair, where a kernel that took the tile as a whole had 154
+forward and 487 backward whatever it touched.
 """
 
 import dataclasses

@@ -27,7 +27,7 @@ def test_an_open_tile_is_walked_to_its_end():
     assert work(layers(40, 0.01), 9, 5) == (40, 40 * 256)
 
 
-def test_tiles_and_quarters_without_splats_are_no_work():
-    # Tiles of 16 pixels: the splat, 1 px wide, is in the middle one of three, and in its upper left quarter.
+def test_tiles_and_quadrants_without_splats_are_no_work():
+    # Tiles of 16 pixels: the splat, 1 px wide, is in the middle one of three, and in its upper left quadrant.
     assert work([one_gaussian(scales=[[0.01] * 3])], 41, 5) == (1, 64)
     assert work([one_gaussian(opacities=[0.0])], 41, 5) == (0, 0)

@@ -148,7 +148,7 @@ def test_the_regularizer_is_what_deformed_rows_lie_outside():
     half = SIZES[torch.arange(24) % 2].double() / 2
     beyond = (raw.means.detach().double().abs() - half).clamp(min=0)
     assert 0.1 < float((beyond > 0).double().mean()) < 0.9
-    term = node.regularizers(raw, torch.ones(24, dtype=torch.bool), FINISHED)["out_of_box"]
+    term = node.own_regularizers(raw, torch.ones(24, dtype=torch.bool), FINISHED)["out_of_box"]
     assert float(term.detach()) == pytest.approx(0.5 * float(beyond.sum()) / 72, rel=1e-6)
     term.backward()
     assert node.network.last.weight.grad.any()
@@ -178,7 +178,7 @@ def test_rows_come_and_go():
     empty = objects(0)
     raw = empty.raw_at(view_at(LATER), FINISHED)
     assert len(raw) == 0
-    assert float(empty.regularizers(raw, torch.zeros(0, dtype=torch.bool), FINISHED)["out_of_box"].detach()) == 0.0
+    assert float(empty.own_regularizers(raw, torch.zeros(0, dtype=torch.bool), FINISHED)["out_of_box"].detach()) == 0.0
 
 
 def test_a_node_without_instances():

@@ -35,7 +35,7 @@ def in_box(track: Track, frame: int, means: torch.Tensor) -> torch.Tensor:
 def terms(node: Smpl, time: float = 0.5, drawn: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
     """As if all rows were drawn, unless said."""
     drawn = torch.ones(len(node.rows), dtype=torch.bool) if drawn is None else drawn
-    return node.regularizers(node.raw_at(view_at(time), FINISHED), drawn, FINISHED)
+    return node.own_regularizers(node.raw_at(view_at(time), FINISHED), drawn, FINISHED)
 
 
 def test_terms_are_of_rows_that_are_drawn():
@@ -285,7 +285,7 @@ def test_a_checkpoint_of_fewer_rows_fits():
 
 
 def test_what_no_node_of_people_can_be_is_refused():
-    with pytest.raises(ValueError, match="posed=False"):
-        smpl_settings(posed=False)
+    with pytest.raises(ValueError, match="has_body_pose=False"):
+        smpl_settings(has_body_pose=False)
     with pytest.raises(ValueError, match="at least 2, got 1"):
         smpl_settings(neighbors=1)

@@ -166,11 +166,11 @@ def test_the_regularizer_is_the_mean_length_of_the_mean_velocities():
     columns = {name: value.detach().double() for name, value in node.rows.columns().items()}
     lengths = columns["velocities"].norm(dim=1) * torch.exp(-2.5 * columns["log_life_spans"].exp())
     drawn = torch.arange(len(lengths)) % 2 == 0
-    term = node.regularizers(raw, drawn, FINISHED)["velocity"]
+    term = node.own_regularizers(raw, drawn, FINISHED)["velocity"]
     assert float(term.detach()) == pytest.approx(0.5 * float(lengths[drawn].mean()), rel=1e-6)
     with torch.no_grad():
         node.rows.velocities.zero_()  # where it starts, and where a norm has no derivative
-    node.regularizers(raw, drawn, FINISHED)["velocity"].backward()
+    node.own_regularizers(raw, drawn, FINISHED)["velocity"].backward()
     assert node.rows.velocities.grad.isfinite().all()
 
 
@@ -216,7 +216,7 @@ def test_a_node_without_rows():
     node = vibrating(0, smoothing_probability=1.0)
     raw = node.raw_at(view_at(0.3), training(0.1))
     assert len(raw) == 0
-    assert float(node.regularizers(raw, torch.zeros(0, dtype=torch.bool), FINISHED)["velocity"].detach()) == 0.0
+    assert float(node.own_regularizers(raw, torch.zeros(0, dtype=torch.bool), FINISHED)["velocity"].detach()) == 0.0
 
 
 def test_its_columns_follow_the_rows():

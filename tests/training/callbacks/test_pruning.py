@@ -8,7 +8,7 @@ import torch
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
-from sparsestreet.pruning import ImportanceRule, Look, PruningRule
+from sparsestreet.pruning import ImportanceRule, PruningRule, RenderContext
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
@@ -22,11 +22,11 @@ class AskedRule(PruningRule):
     """Writes down what it is asked, and answers what it was told to."""
 
     def __init__(self, answer: dict[str, Selection] | None = None) -> None:
-        self.asked: list[tuple[SceneGraph, Sequence[Frame], Look]] = []
+        self.asked: list[tuple[SceneGraph, Sequence[Frame], RenderContext]] = []
         self.answer = answer or {}
 
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: Look) -> dict[str, Selection]:
-        self.asked.append((scene, frames, how))
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
+        self.asked.append((scene, frames, context))
         return self.answer
 
 
@@ -53,7 +53,7 @@ def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_t
         assert [frame.frame_index for frame in frames] == [0, 2, 3, 5, 6]
         assert frames == data.split.train
     states = [SceneState(0.2, 0), SceneState(0.55, 1), SceneState(1.0, 3)]
-    assert [how for _, _, how in rule.asked] == [Look(state, options) for state in states]
+    assert [context for _, _, context in rule.asked] == [RenderContext(state, options) for state in states]
 
 
 def test_the_rows_that_the_rule_names_go_with_their_moments(caplog):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 
-from sparsestreet.evaluation.ledger import read_changes
+from sparsestreet.records.ledger import read_changes
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.masks import StaticMaskSettings

@@ -7,12 +7,12 @@ import torch
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.evaluation.records import read_run, run_path
-from sparsestreet.export.views import read_views
 from sparsestreet.ops import SplatSettings
+from sparsestreet.records.run import read_run, run_path
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import load_scene
+from sparsestreet.scene.views import read_views
 from sparsestreet.training.callbacks import Clock, RunFiles
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.callbacks.resizing import resize_rows

@@ -6,8 +6,8 @@ import numpy as np
 
 from sparsestreet.data.synthetic.parts import Part, at, axis_along_y
 from sparsestreet.data.synthetic.shapes import Cylinder, extrusion
+from sparsestreet.data.synthetic.textures.appearance import Color
 from sparsestreet.data.synthetic.textures.car import BodyPaint, Cabin, Wheel, metallic
-from sparsestreet.data.synthetic.textures.look import Color
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import numpy as np
 
 from sparsestreet.data.synthetic.parts import Part, Point, at, axis_along_y, limb
 from sparsestreet.data.synthetic.shapes import Cylinder, Ellipsoid
+from sparsestreet.data.synthetic.textures.appearance import Color
 from sparsestreet.data.synthetic.textures.car import Wheel
-from sparsestreet.data.synthetic.textures.look import Color
 from sparsestreet.data.synthetic.textures.plain import Grainy, Plain
 
 

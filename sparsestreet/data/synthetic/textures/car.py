@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsestreet.data.synthetic.coverage import beyond, strip
 from sparsestreet.data.synthetic.shapes import Polytope
-from sparsestreet.data.synthetic.textures.look import Color, Look, Scalars, Vectors, column, mix
+from sparsestreet.data.synthetic.textures.appearance import Appearance, Color, Scalars, Vectors, column, mix
 
 PLASTIC = (0.025, 0.025, 0.028)
 CAR_GLASS = (0.02, 0.025, 0.03)
@@ -31,14 +31,14 @@ class BodyPaint:
     seams: tuple[float, ...]
     """x of the door edges."""
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         albedo = np.repeat(column(self.color), points.shape[1], axis=1)
         gloss = np.full(points.shape[1], 0.35, np.float32)
         side, front, rear = np.abs(normals[1]) > 0.7, normals[0] > 0.6, normals[0] < -0.6
         for place, paint in ((side, self._side), (front, self._front), (rear, self._rear)):
             if place.any():
                 albedo[:, place], gloss[place] = paint(albedo[:, place], points[:, place], footprints[:, place])
-        return Look(albedo, gloss)
+        return Appearance(albedo, gloss)
 
     def _side(self, albedo: Vectors, points: Vectors, footprints: Vectors) -> tuple[Vectors, Scalars]:
         x, _, z = points
@@ -88,7 +88,7 @@ class Cabin:
     posts: tuple[float, ...]
     """x of the posts between side windows."""
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         # The smallest depth is that of the point's own face; the second smallest is the way to the nearest edge.
         rim = np.partition(self.shape.depths(points), 1, axis=0)[1]
         pane = beyond(rim, self.pillar, footprints.max(0))
@@ -97,7 +97,7 @@ class Cabin:
             pane = pane * (1 - on_side * strip(points[0], post - 0.05, post + 0.05, footprints[0]))
         pane = np.where(normals[2] < 0.86, pane, 0).astype(np.float32)
         albedo = mix(column(self.color), column(CAR_GLASS), pane)
-        return Look(albedo, np.float32(0.35) + np.float32(0.45) * pane)
+        return Appearance(albedo, np.float32(0.35) + np.float32(0.45) * pane)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Wheel:
     angle: float
     rim: Color
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         x, y, _ = points
         width = footprints[:2].max(0)
         radius = np.hypot(x, y)
@@ -118,7 +118,7 @@ class Wheel:
         rim = np.maximum(strip(radius, self.radius * 0.56, self.radius * 0.66, width), spoke * inside)
         rim = np.maximum(rim, 1 - beyond(radius, self.radius * 0.18, width)) * (np.abs(normals[2]) > 0.5)
         albedo = mix(column((0.018, 0.018, 0.018)), column(self.rim), rim.astype(np.float32))
-        return Look(albedo, (np.float32(0.25) * rim).astype(np.float32))
+        return Appearance(albedo, (np.float32(0.25) * rim).astype(np.float32))
 
 
 def metallic(rng: np.random.Generator) -> Color:

@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from sparsestreet.data.synthetic.coverage import beyond, strip, stripes
 from sparsestreet.data.synthetic.noise import cell_random, smooth_noise
-from sparsestreet.data.synthetic.textures.look import Color, Look, Scalars, Vectors, column, mix
+from sparsestreet.data.synthetic.textures.appearance import Appearance, Color, Scalars, Vectors, column, mix
 
 GLASS = (0.035, 0.045, 0.06)
 ROOF = (0.16, 0.14, 0.13)
@@ -56,7 +56,7 @@ class Facade:
     half_extent: tuple[float, float, float]
     style: FacadeStyle
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         face = self._face(points, normals, footprints)
         albedo = self._wall(face)
         s, fs = face.u / face.width * face.cells, face.fu / face.width * face.cells
@@ -70,7 +70,7 @@ class Facade:
         glass = glass_upper * above + glass_lower * (1 - above)
         roof = normals[2] > 0.5
         albedo = np.where(roof, column(ROOF), albedo)
-        return Look(albedo, np.where(roof, 0, glass).astype(np.float32) * np.float32(0.8))
+        return Appearance(albedo, np.where(roof, 0, glass).astype(np.float32) * np.float32(0.8))
 
     def _face(self, points: Vectors, normals: Vectors, footprints: Vectors) -> _Face:
         hx, hy, hz = (np.float32(h) for h in self.half_extent)

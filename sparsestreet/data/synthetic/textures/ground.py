@@ -6,7 +6,7 @@ import numpy as np
 
 from sparsestreet.data.synthetic.coverage import beyond, strip, stripes
 from sparsestreet.data.synthetic.noise import cell_random, smooth_noise
-from sparsestreet.data.synthetic.textures.look import Color, Look, Scalars, Vectors, column, mix
+from sparsestreet.data.synthetic.textures.appearance import Appearance, Color, Scalars, Vectors, column, mix
 
 WHITE = (0.72, 0.72, 0.70)
 
@@ -35,14 +35,14 @@ class Asphalt:
     offset: float
     grass: Color = (0.10, 0.16, 0.05)
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         x, y, _ = points
         fx, fy, _ = footprints
         road = column(self.color) * self._tone(x, y, np.maximum(fx, fy))
         albedo = mix(road, column(WHITE), self._paint(x, y, fx, fy) * np.float32(0.9))
         on_road = strip(y, self.lines.curb_right - 0.5, self.lines.curb_left + 0.5, fy)
         albedo = mix(column(self.grass), albedo, on_road)
-        return Look(albedo, np.zeros(len(x), np.float32))
+        return Appearance(albedo, np.zeros(len(x), np.float32))
 
     def _tone(self, x: Scalars, y: Scalars, width: Scalars) -> Scalars:
         shift = np.float32(self.offset)
@@ -76,7 +76,7 @@ class Footway:
     curb_side: int
     offset: float
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         x, y, _ = points
         fx, fy, _ = footprints
         slab_x, slab_y = np.floor(x / 0.9), np.floor(y / 0.6)
@@ -89,4 +89,4 @@ class Footway:
         curb = beyond(y * np.float32(self.curb_side), self.half_width - 0.22, fy)
         gaps = stripes(x, 1.0, 0.0, 0.025, fx) * np.float32(0.5)
         stone = column((0.46, 0.45, 0.43)) * (1 - gaps)
-        return Look(mix(slabs, stone, curb), np.zeros(len(x), np.float32))
+        return Appearance(mix(slabs, stone, curb), np.zeros(len(x), np.float32))

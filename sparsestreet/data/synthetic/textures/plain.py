@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sparsestreet.data.synthetic.noise import smooth_noise
-from sparsestreet.data.synthetic.textures.look import Color, Look, Vectors, column
+from sparsestreet.data.synthetic.textures.appearance import Appearance, Color, Vectors, column
 
 
 @dataclass(frozen=True)
@@ -15,9 +15,9 @@ class Plain:
     color: Color
     gloss: float = 0.0
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         albedo = np.repeat(column(self.color), points.shape[1], axis=1)
-        return Look(albedo, np.full(points.shape[1], self.gloss, np.float32))
+        return Appearance(albedo, np.full(points.shape[1], self.gloss, np.float32))
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Grainy:
     offset: float = 0.0
     """Shifts the pattern, so that copies differ, meters."""
 
-    def look(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Look:
+    def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
         # Each point takes the section of the noise that its surface faces most: no section is seen edge-on.
         x, y, z = points + np.float32(self.offset)
         facing = np.abs(normals).argmax(0)
@@ -41,4 +41,4 @@ class Grainy:
         grain = smooth_noise(u, v, self.coarse, width)
         grain += np.float32(0.6) * smooth_noise(u + v, u - v, self.coarse / 3, width)
         albedo = column(self.color) * np.maximum(1 + np.float32(self.contrast) * grain, np.float32(0.15))
-        return Look(np.minimum(albedo, np.float32(0.95)), np.zeros(points.shape[1], np.float32))
+        return Appearance(np.minimum(albedo, np.float32(0.95)), np.zeros(points.shape[1], np.float32))

@@ -150,7 +150,7 @@ SPLAT_API int32_t splat_contribution(Handle* h, const View* view, const Rows* ro
   });
 }
 
-SPLAT_API int32_t splat_removal(Handle* h, const View* view, const Rows* rows, const Backdrop* sky_image,
+SPLAT_API int32_t splat_leave_one_out(Handle* h, const View* view, const Rows* rows, const Backdrop* sky_image,
                                 const Changes* changes, Report* report) {
   return guarded([&]() -> int32_t {
     const Status status = h->rows().prepare(h->workspace, *view, *rows, nullptr, *report);

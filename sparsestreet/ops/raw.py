@@ -1,0 +1,65 @@
+"""Gaussians as nodes store them: raw parameters, mask multipliers and the boxes they stand in."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+OPACITY_LOGIT_LIMIT = 15.0
+"""sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
+
+
+INPUTS, LEARNED = 11, 9
+"""Tensors of a part, and how many of them, the first ones, are of real numbers and have gradients."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """World-from-box pose of every instance at one time."""
+
+    quaternions: Float[Tensor, "i 4"]
+    """Unit, wxyz."""
+    translations: Float[Tensor, "i 3"]
+    """Box center in the world, meters."""
+    present: Bool[Tensor, " i"]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """In which instance's box each row lies, and where the boxes are."""
+
+    poses: Poses
+    instances: Int[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class RawGaussians:
+    """Gaussians as they are learned, in the world or in the boxes of their instances."""
+
+    means: Float[Tensor, "n 3"]
+    log_scales: Float[Tensor, "n 3"]
+    quaternions: Float[Tensor, "n 4"]
+    """wxyz, any non-zero length."""
+    opacity_logits: Float[Tensor, " n"]
+    sh_dc: Float[Tensor, "n 1 3"]
+    sh_rest: Float[Tensor, "n k 3"]
+    """The coefficients behind the first, k in {0, 3, 8, 15}."""
+    multipliers: Float[Tensor, " n"] | None = None
+    """Of opacities and scales (a mask's); None: 1."""
+    placement: Placement | None = None
+    """Moves means and quaternions from their boxes to the world; rows of an absent instance get opacity 0."""
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def tensors(self) -> list[Tensor | None]:
+        """Six fields, multipliers, the poses' quaternions and translations, and then instances and presence."""
+        fields = [self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest]
+        if self.placement is None:
+            return [*fields, self.multipliers, None, None, None, None]
+        poses, instances = self.placement.poses, self.placement.instances
+        return [*fields, self.multipliers, poses.quaternions, poses.translations, instances, poses.present]
+
+    def terms(self, sh_degree: int) -> int:
+        """Coefficients in use up to a degree; rows that store fewer use what they have."""
+        return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])

@@ -1,0 +1,124 @@
+"""A tile's four quadrants of 8x8 pixels: top left, top right, bottom left, bottom right.
+
+Splats are smaller than tiles more often than not, so each pair says which quadrants of its tile the splat can touch,
+and pixel kernels pass over the others. A warp holds two pixels of each quadrant in a lane, both in one line, so that
+what only y changes is computed once.
+"""
+
+import triton.language as tl
+
+from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.tiles import lines_span
+from sparsestreet.ops.triton.view import TILE
+
+SIDE = constant(8)
+QUADRANT_PIXELS = 64
+PIXELS = constant(QUADRANT_PIXELS)
+WARP = constant(32)
+QUADRANT_SHIFT = 28
+MOST_ROWS = 1 << QUADRANT_SHIFT
+"""Rows that a pair has room for beside its quadrants, in 32 bits."""
+ROW = constant(MOST_ROWS - 1)
+SHIFT = constant(QUADRANT_SHIFT)
+ALL = constant(15)
+
+
+@jit
+def row_of(pair):
+    """The row of a pair."""
+    return pair & ROW
+
+
+@jit
+def touches(pair, QUADRANT: tl.constexpr):
+    """Whether the pair's splat can touch a quadrant."""
+    return ((pair >> (SHIFT + QUADRANT)) & 1) != 0
+
+
+@jit
+def half_spans(splat, reach, tile_y, BOUNDED: tl.constexpr):
+    """The least and the largest x of the ellipse (tiles.py) in the upper and in the lower half of a row of tiles, and
+    whether it comes there at all; nothing where nothing ends it."""
+    spans = ()
+    if BOUNDED:
+        x, y, l11, l21, l22 = splat
+        for half in tl.static_range(2):
+            spans += (lines_span(x, y, l11, l21, l22, reach, tile_y * TILE + half * SIDE, SIDE),)
+    return spans
+
+
+@jit
+def touched_quadrants(spans, tile_x, BOUNDED: tl.constexpr):
+    """Bits of the quadrants of a tile that hold a pixel center of the ellipse, as a pair carries them."""
+    bits = tl.zeros_like(tile_x) + ALL
+    if BOUNDED:
+        bits = tl.zeros_like(tile_x)
+        middle = (tile_x * TILE + SIDE).to(tl.float32)
+        for half in tl.static_range(2):
+            low, high, reached = spans[half]
+            left = reached & (low <= middle - 0.5) & (high >= middle - (SIDE - 0.5))
+            right = reached & (high >= middle + 0.5) & (low <= middle + (SIDE - 0.5))
+            bits = bits | (left.to(tl.int32) << (2 * half)) | (right.to(tl.int32) << (2 * half + 1))
+    return bits << SHIFT
+
+
+@jit
+def quadrant_pixels(tile, tiles_x, QUADRANT: tl.constexpr):
+    """Columns and lines of a quadrant's pixels [64]. Of 32 neighbors each lane gets one: its two are four apart."""
+    p = tl.arange(0, PIXELS)
+    x = (tile % tiles_x) * TILE + QUADRANT % 2 * SIDE + p // WARP * 4 + p % WARP // SIDE
+    y = (tile // tiles_x) * TILE + QUADRANT // 2 * SIDE + p % SIDE
+    return x, y
+
+
+@jit
+def centers(tile, tiles_x):
+    """Centers of the pixels of the upper left quadrant. Others lie SIDE farther: kernels move the splat."""
+    x, y = quadrant_pixels(tile, tiles_x, 0)
+    return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
+
+
+@jit
+def lane_sum(values):
+    """Sums over the two pixels of each lane [32]."""
+    return tl.sum(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+
+
+@jit
+def of_lane(values):
+    """What the two pixels of each lane share [32]."""
+    return tl.max(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
+
+
+@jit
+def load_splat(records, row):
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth."""
+    s = record.record_of(records, row)
+    geometry = (
+        tl.load(s + record.X), tl.load(s + record.Y),
+        tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
+    )  # fmt: skip
+    ends = tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF)
+    return geometry, ends, (
+        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
+        tl.load(s + record.DEPTH),
+    )  # fmt: skip
+
+
+@jit
+def of_lines(y, geometry, log2_opacity, LOWER: tl.constexpr):
+    """What a line of pixels shares: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1.
+
+    LOWER: of the lower quadrants.
+    """
+    dy = y - (geometry[1] - LOWER * SIDE)
+    b = geometry[4] * dy
+    return dy, geometry[3] * dy, b, log2_opacity - b * b
+
+
+@jit
+def across(x, geometry, line, RIGHT: tl.constexpr):
+    """dx and (L d)_1 of a quadrant's pixels; RIGHT: of a right one."""
+    dx = x - (geometry[0] - RIGHT * SIDE)
+    return dx, geometry[2] * dx + line[1]

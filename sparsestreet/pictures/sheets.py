@@ -1,0 +1,168 @@
+"""Sheets of pictures: one run's, or several runs' beside each other (no torch).
+
+The scale of the errors is written on every sheet.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from sparsestreet.pictures.images import ERROR_SCALE, LIDAR_END, TILE_WIDTH, Picture, color_map
+
+Legend = Mapping[str, tuple[int, int, int]]
+"""Node -> RGB in [0, 255] of its centers."""
+
+_INK, _PAPER, _QUIET = (235, 235, 235), (24, 24, 27), (160, 160, 165)
+_GAP, _HEADING, _MARGIN = 6, 26, 10
+
+
+@dataclass(frozen=True)
+class SheetColumn:
+    """One run of a comparison: its pictures and what is written above them."""
+
+    label: str
+    """Above its renders, such as "streetgs+paper, 31.31 dB"."""
+    size: str
+    """Above its centers, such as "45,781 Gaussians (33 %)"."""
+    pictures: Sequence[Picture]
+    psnr: Sequence[float]
+    """Of each picture, dB."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One image of a sheet and what is written above it."""
+
+    heading: str
+    image: UInt8[np.ndarray, "h w 3"]
+
+
+def picture_sheet(
+    pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
+) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
+    """A sheet with one line per picture and the columns truth, render, error, centers.
+
+    Args:
+        pictures: at least one.
+        title: printed on top, e.g. method, scene and PSNR.
+        legend: node -> its color in the centers, drawn at the foot.
+        tile_width: pixels of each column; images are scaled to it.
+    """
+    headings = ("render", "error", "Gaussian centers")
+    lines = [
+        [
+            Tile(f"truth: {_view(picture)}", picture.truth),
+            *(Tile(*pair) for pair in zip(headings, _outcome(picture), strict=True)),
+        ]
+        for picture in pictures
+    ]
+    return _sheet(lines, title, legend or {}, tile_width, any(picture.shows_lidar_end for picture in pictures))
+
+
+def comparison_sheet(
+    columns: Sequence[SheetColumn], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
+) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
+    """Runs on the same images, one column each: for every picture a line of renders beside the truth, one of errors,
+    one of centers, so that what is to be compared stands side by side.
+
+    Raises ValueError for fewer than two runs, or if they show different images.
+    """
+    if len(columns) < 2:
+        raise ValueError(f"a comparison needs at least two runs, got {len(columns)}")
+    views = [[(picture.frame, picture.camera) for picture in column.pictures] for column in columns]
+    if any(shown != views[0] for shown in views):
+        raise ValueError(f"the runs show different images, (frame, camera) {views}: evaluate them alike")
+    lines: list[list[Tile | None]] = []
+    for index, first in enumerate(columns[0].pictures):
+        pictures = [column.pictures[index] for column in columns]
+        both = list(zip(columns, pictures, strict=True))
+        truth = Tile(f"truth: {_view(first)}", first.truth)
+        lines.append([truth, *(Tile(column.label, picture.render) for column, picture in both)])
+        lines.append(
+            [None, *(Tile(f"error: {one.psnr[index]:.2f} dB in this image", picture.error) for one, picture in both)]
+        )
+        lines.append([None, *(Tile(column.size, picture.centers) for column, picture in both)])
+    lidar_end = any(picture.shows_lidar_end for picture in columns[0].pictures)
+    return _sheet(lines, title, legend or {}, tile_width, lidar_end)
+
+
+def _view(picture: Picture) -> str:
+    return f"frame {picture.frame}, camera {picture.camera}"
+
+
+def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return picture.render, picture.error, picture.centers
+
+
+def _sheet(
+    lines: list[list[Tile | None]], title: str, legend: Legend, tile_width: int, lidar_end: bool
+) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
+    """Lay tiles out on dark paper under their headings; the title on top, scale and legend at the foot."""
+    if not lines:
+        raise ValueError("a sheet needs at least one picture")
+    heights = [max(_fitted(tile.image, tile_width).height for tile in line if tile) for line in lines]
+    width = max(len(line) for line in lines) * (tile_width + _GAP) - _GAP + 2 * _MARGIN
+    paper = Image.new("RGB", (width, _HEADING + sum(heights) + (len(lines) + (3 if legend else 2)) * _HEADING), _PAPER)
+    draw = ImageDraw.Draw(paper)
+    _write(draw, (_MARGIN, 5), title, _INK, 16, width - 2 * _MARGIN)
+    top = _HEADING
+    for line, height in zip(lines, heights, strict=True):
+        for column, tile in enumerate(line):
+            if tile is not None:
+                x = _MARGIN + column * (tile_width + _GAP)
+                _write(draw, (x, top + 6), tile.heading, _INK, 14, tile_width)
+                paper.paste(_fitted(tile.image, tile_width), (x, top + _HEADING))
+        top += _HEADING + height
+    _draw_scale(paper, draw, _MARGIN, top + 14, lidar_end)
+    _draw_legend(draw, legend, _MARGIN, top + 14 + _HEADING)
+    return np.asarray(paper)
+
+
+def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, lidar_end: bool) -> None:
+    """The error colors with their values, and what the line in them is."""
+    x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
+    bar = color_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
+    paper.paste(Image.fromarray(bar), (x, y))
+    draw.rectangle((x - 1, y - 1, x + 160, y + 16), outline=_QUIET)
+    x = _write(draw, (x + 168, y), f"{ERROR_SCALE:g} or more", _QUIET, 13) + 20
+    if lidar_end:
+        draw.line((x, y + 8, x + 20, y + 8), fill=LIDAR_END)
+        _write(draw, (x + 28, y), "where the lidar ends", _QUIET, 13)
+
+
+def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:
+    """The nodes in the colors of their centers."""
+    if legend:
+        x = _write(draw, (x, y), "centers:", _QUIET, 13) + 12
+    for name, color in legend.items():
+        draw.rectangle((x, y + 3, x + 10, y + 13), fill=color)
+        x = _write(draw, (x + 16, y), name, _QUIET, 13) + 20
+
+
+def _fitted(image: UInt8[np.ndarray, "h w 3"], width: int) -> Image.Image:
+    """Scaled to the tile's width; small images keep hard pixels so that nobody takes blur for the render's."""
+    height = max(round(image.shape[0] * width / image.shape[1]), 1)
+    filter_ = Image.Resampling.LANCZOS if width < image.shape[1] else Image.Resampling.NEAREST
+    return Image.fromarray(image).resize((width, height), filter_)
+
+
+def _write(
+    draw: ImageDraw.ImageDraw,
+    position: tuple[int, int],
+    text: str,
+    color: tuple[int, int, int],
+    size: int,
+    room: int | None = None,
+) -> int:
+    """Write a line and return where it ends; short of room the type shrinks (not below 8 pixels)."""
+    while room is not None and size > 8 and draw.textlength(text, font=_font(size)) > room:
+        size -= 1
+    draw.text(position, text, fill=color, font=_font(size))
+    return position[0] + round(draw.textlength(text, font=_font(size)))
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)

@@ -1,0 +1,169 @@
+"""What identifies a run and what was measured of it, for other programs as for our report (no torch import).
+
+``RUN/run.json`` is written once, by training: what made the run. ``RUN/records/summary.json`` is written by each
+evaluation and holds the first unchanged. Both are written whole or not at all.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.records.quality import MetricSummary
+from sparsestreet.records.run import CodeVersion, Machine, Noise, RunDescription
+from sparsestreet.records.strict_json import read_json, version, write_json
+
+FORMAT = 4
+"""Version of ``summary.json``; raised when a key changes its meaning."""
+
+HELD_OUT, TRAINING = "held_out", "training"
+"""The splits whose views a record speaks of."""
+
+
+RASTER, FRAME, RIG = "raster", "frame", "rig"
+"""What the clocks of a latency hold: the splat op alone; all from a time and a pose to uint8 on the device; that for
+all cameras of an instant."""
+
+
+@dataclass(frozen=True)
+class Percentiles:
+    """Of repeated times, milliseconds."""
+
+    p50: float
+    p90: float
+    p99: float
+    repeats: int
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Milliseconds by three clocks under the protocol of ``speed.measure_latency``."""
+
+    clocks: dict[str, Percentiles]
+    """``RASTER``, ``FRAME`` and ``RIG`` of the scene as it is stored; Gaussians that a mask closes are masked."""
+    removed: dict[str, Percentiles]
+    """The same with the Gaussians taken out that the masks close at the time of the view; empty without masks."""
+    warmup: int
+    views: int
+    """Number of different views the repeats cycle through."""
+    device: str
+    threads: int
+    noise: Noise
+
+    def __post_init__(self) -> None:
+        if set(self.clocks) != {RASTER, FRAME, RIG} or set(self.removed) not in (set(), set(self.clocks)):
+            raise ValueError(
+                f"a latency has the clocks {RASTER}, {FRAME}, {RIG}, got {sorted(self.clocks)} and, of removed "
+                f"Gaussians, {sorted(self.removed)}: evaluate again"
+            )
+
+    @property
+    def p50(self) -> float:
+        """Median of a frame."""
+        return self.clocks[FRAME].p50
+
+    @property
+    def protocol(self) -> str:
+        """How the median of a frame was taken, in words."""
+        return (
+            f"{self.clocks[FRAME].repeats} renders cycling through {self.views} views after {self.warmup} warm-up "
+            "renders, batch 1, device synchronized, scene assembly to uint8, without loading and metrics"
+        )
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What measured a run."""
+
+    command: str
+    machine: Machine
+    source: CodeVersion
+    device: str
+    threads: int
+
+
+@dataclass(frozen=True)
+class GuardCounts:
+    """How many Gaussians the guards of the splat op acted on (``sparsestreet.ops.Guards``), summed over views."""
+
+    rows: dict[str, int]
+    """Name of a guard -> Gaussians, 0 included."""
+    alarms: dict[str, int]
+    """Those that a clean scene never needs and that acted; empty where all is well."""
+
+    def __post_init__(self) -> None:
+        for name, count in self.alarms.items():
+            if count < 1 or self.rows.get(name) != count:
+                raise ValueError(f"alarms holds {name}: {count}, rows has {self.rows.get(name)}: evaluate again")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """The content of ``summary.json``."""
+
+    format: int = version(FORMAT, "evaluate again")
+    run: RunDescription
+    evaluated: Evaluation
+    images: dict[str, int]
+    """Split ("held_out", "training") -> number of its images that were evaluated; a split without views is absent."""
+    resolutions: tuple[str, ...]
+    """"WIDTHxHEIGHT" of the evaluated images, each once."""
+    quality: dict[str, dict[str, MetricSummary]]
+    """Split -> id of a metric -> its summary over the split's images."""
+    by_camera: dict[str, dict[str, dict[str, float | None]]]
+    """Split -> number of a camera -> id of a metric -> its mean over the split's images of that camera."""
+    definitions: dict[str, str]
+    """Id of a metric -> what it is, in words."""
+    absent: dict[str, str]
+    """Quantity that could not be measured, such as "lpips_alex" -> why, and what to do about it."""
+    gaussians: dict[str, int]
+    """Node -> Gaussians, all instances, visible or not."""
+    gaussians_total: int
+    bytes_by_part: dict[str, int]
+    bytes_total: int
+    latency: Latency
+    """Over the views of ``main_split``, on the device it names."""
+    latency_protocol: str
+    guards: GuardCounts
+    """Over the views of ``main_split``."""
+
+    def __post_init__(self) -> None:
+        splits = [sorted(part) for part in (self.quality, self.by_camera, self.images)]
+        if splits[0] not in ([HELD_OUT], [TRAINING], [HELD_OUT, TRAINING]) or splits != 3 * splits[:1]:
+            raise ValueError(
+                f"quality speaks of the splits {splits[0]}, by_camera of {splits[1]} and images of {splits[2]}, "
+                f"expected {HELD_OUT}, {TRAINING} or both in all: evaluate again"
+            )
+        for name, parts, total in (
+            ("gaussians", self.gaussians, self.gaussians_total),
+            ("bytes", self.bytes_by_part, self.bytes_total),
+        ):
+            if sum(parts.values()) != total:
+                raise ValueError(f"{name}_total is {total}, its parts sum to {sum(parts.values())}: {parts}")
+
+    @property
+    def main_split(self) -> str:
+        """The held-out views, or the training views of a run that holds out none."""
+        return HELD_OUT if HELD_OUT in self.quality else TRAINING
+
+    def mean(self, metric: str, split: str | None = None) -> float | None:
+        """Mean of a metric over the images of a split (of ``main_split``); None where it was not measured."""
+        found = self.quality.get(split or self.main_split, {}).get(metric)
+        return None if found is None else found.mean
+
+    def camera_mean(self, metric: str, camera: str) -> float | None:
+        """Mean of a metric over the images of one camera of ``main_split``; None where it was not measured."""
+        return self.by_camera[self.main_split].get(camera, {}).get(metric)
+
+
+def summary_path(run: Path) -> Path:
+    """Where a run keeps its summary."""
+    return run / "records" / "summary.json"
+
+
+def write_summary(path: Path, summary: RunSummary) -> None:
+    """Write ``summary.json`` atomically. Raises RecordError for values that JSON has no number for."""
+    write_json(path, summary)
+
+
+def read_summary(path: Path) -> RunSummary:
+    """Read ``summary.json``. Raises RecordError naming the file and the entry that is wrong."""
+    return read_json(path, RunSummary)

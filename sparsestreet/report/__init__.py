@@ -1,0 +1,22 @@
+"""Tables and a figure of many runs, from their records alone (no torch import)."""
+
+from sparsestreet.report.collect import RunRecord, collect
+from sparsestreet.report.drawing import figure, markdown, tables
+from sparsestreet.report.sections import Row, Section, sections
+from sparsestreet.report.spread import Spread, spread
+from sparsestreet.report.variants import Variant, variants
+
+__all__ = [
+    "Row",
+    "RunRecord",
+    "Section",
+    "Spread",
+    "Variant",
+    "collect",
+    "figure",
+    "markdown",
+    "sections",
+    "spread",
+    "tables",
+    "variants",
+]

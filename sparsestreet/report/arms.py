@@ -1,0 +1,155 @@
+"""The arms of a sweep: runs that may be averaged, and those that an arm is compared with."""
+
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from sparsestreet.records.configuration import config_hash, differing_options, only, without
+from sparsestreet.records.summary import RunSummary
+from sparsestreet.report.collect import RunRecord
+from sparsestreet.report.variants import CLIP_KEYS, CONTROLS, in_few_words, log_config, variants
+
+Value = Callable[[RunSummary], float | None]
+Unit = tuple[tuple[str, str], int]
+"""A scene (and the part of its log), and a seed."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Repeats on one or more scenes: one configuration, data, device, number of threads and commit."""
+
+    name: str
+    label: str
+    method: str
+    sparsify: str
+    place: tuple[str, ...]
+    """Device, threads, commit; and where a sweep has several: data of one scene, options of the log, splits."""
+    records: tuple[RunRecord, ...]
+    """Of both kinds: trained without held-out views, and on all."""
+
+    @property
+    def control(self) -> bool:
+        """Whether it has the size of another arm, and is no way to get small."""
+        return self.sparsify in CONTROLS
+
+    @property
+    def title(self) -> str:
+        """The name in a table."""
+        return f"control: {self.name}" if self.control else self.name
+
+    @property
+    def plain_label(self) -> str:
+        """The label of what it is compared with."""
+        return self.label.partition("+")[0]
+
+    def units(self, value: Value, whole: bool = False) -> dict[Unit, float]:
+        """Scene and seed -> the value of its run (the mean of several); those trained on all views, or the others."""
+        found: dict[Unit, list[float]] = {}
+        for record in self.records:
+            run = record.summary
+            if (run.run.split == "none") == whole and (number := value(run)) is not None:
+                found.setdefault(unit_of(run), []).append(number)
+        return {unit: statistics.fmean(numbers) for unit, numbers in found.items()}
+
+    def mean(self, value: Value, whole: bool = False) -> float | None:
+        """Mean over scenes of the mean over each one's seeds; None where no run has the value."""
+        return mean_over_scenes(self.units(value, whole))
+
+
+def unit_of(run: RunSummary) -> Unit:
+    """What pairs runs of two arms."""
+    return (run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))), run.run.seed
+
+
+def mean_over_scenes(units: dict[Unit, float]) -> float | None:
+    """Each scene counts once."""
+    values = list(by_scene(units).values())
+    return statistics.fmean(values) if values else None
+
+
+def by_scene(units: dict[Unit, float]) -> dict[tuple[str, str], float]:
+    """Scene -> mean over its seeds."""
+    scenes: dict[tuple[str, str], list[float]] = {}
+    for (scene, _), value in units.items():
+        scenes.setdefault(scene, []).append(value)
+    return {scene: statistics.fmean(values) for scene, values in scenes.items()}
+
+
+def arms(records: Sequence[RunRecord]) -> list[Arm]:
+    """The runs of a sweep in arms, those of a method together, plain before pruned before controls."""
+    folder_of = {id(record.summary): record for record in records}
+    of_log, of_split = _logs_in_words(records), _splits_in_words(records)
+    places = {
+        key: (*_place(record.summary, records), of_log[key], of_split[key])
+        for key, record in ((id(record.summary), record) for record in records)
+    }
+    columns = list(zip(*places.values(), strict=True))
+    told = [index for index, column in enumerate(columns) if len(set(column)) > 1]
+    found = []
+    for variant in variants([record.summary for record in records]):
+        groups: dict[tuple[str, ...], list[RunRecord]] = {}
+        for run in variant.runs:
+            groups.setdefault(places[id(run)], []).append(folder_of[id(run)])
+        for place, group in groups.items():
+            words = ", ".join(place[index] for index in told)
+            run = group[0].summary.run
+            name = f"{variant.name} ({words})" if words else variant.name
+            found.append(Arm(name, variant.label, run.method, run.sparsify, place, tuple(group)))
+    return sorted(found, key=lambda arm: (arm.plain_label, arm.control, arm.sparsify != "none", arm.name))
+
+
+def plain_of(arm: Arm, among: Iterable[Arm]) -> Arm | None:
+    """The plain arm of the same method, made at the same place; None where there is none, or several."""
+    plain = [
+        other
+        for other in among
+        if other.sparsify == "none" and other.label == arm.plain_label and other.place == arm.place
+    ]
+    return plain[0] if len(plain) == 1 else None
+
+
+def why_apart(found: Sequence[Arm]) -> list[str]:
+    """Notes on what keeps runs of this page from being averaged or compared."""
+    if not found:
+        return []
+    said = []
+    names = ("devices", "numbers of threads", "commits", "data of one name", "options of the log", "splits")
+    for name, column in zip(names, zip(*(arm.place for arm in found), strict=True), strict=True):
+        if len(set(column)) > 1:
+            said.append(f"runs differ in {name} ({', '.join(sorted(set(column)))}): shown apart, never averaged")
+    labels = [arm.label for arm in found]
+    several = sorted({label for label in labels if labels.count(label) > 1})
+    if several:
+        said.append(f"{', '.join(several)}: runs of one label that differ are rows of their own, never averaged")
+    dirty = sorted({arm.name for arm in found for record in arm.records if record.summary.run.source.dirty})
+    if dirty:
+        said.append(f"made by code with uncommitted changes: {', '.join(dirty)}")
+    return said
+
+
+def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
+    made, measured = run.run, run.evaluated
+    device = made.device if made.device == measured.device else f"{made.device}, measured on {measured.device}"
+    threads = f"{made.threads} thread{'s' if made.threads != 1 else ''}"
+    threads += f", measured with {measured.threads}" if made.threads != measured.threads else ""
+    return device, threads, (made.source.commit or "no commit")[:9], _edition(run, records)
+
+
+def _logs_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
+    """Run (its id) -> the options of how its log is read, the part that is read aside, in which runs differ."""
+    logs = {id(record.summary): without(log_config(record.summary), CLIP_KEYS) for record in records}
+    distinct = {config_hash(log): log for log in logs.values()}
+    words = dict(zip(distinct, differing_options(list(distinct.values())), strict=True))
+    return {key: in_few_words(words[config_hash(log)], config_hash(log)) for key, log in logs.items()}
+
+
+def _splits_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
+    """Run (its id) -> what it holds out, where runs that hold views out differ in it; else nothing."""
+    splits = {id(record.summary): record.summary.run.split for record in records}
+    return splits if len(set(splits.values()) - {"none"}) > 1 else dict.fromkeys(splits, "")
+
+
+def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:
+    """The hash of the data where one scene occurs with several; else nothing."""
+    alike = {record.summary.run.data_hash for record in records if unit_of(record.summary)[0] == unit_of(run)[0]}
+    return f"data {run.run.data_hash[:6]}" if len(alike) > 1 else ""

@@ -1,0 +1,81 @@
+"""What was measured beside the recorded path (``records/novel.json``): distances to real images, and to the truth."""
+
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from sparsestreet.records.strict_json import Json, RecordError, parsed
+from sparsestreet.report.arms import Arm, Unit, mean_over_scenes, unit_of
+from sparsestreet.report.grid import Cell, Grid
+
+TRUTH = {
+    "psnr_full": "PSNR to the truth, dB",
+    "psnr_human": "PSNR of people, dB",
+    "psnr_vehicle": "PSNR of vehicles, dB",
+}
+_PSNR = {title: place for place, title in enumerate(TRUTH.values())}
+
+
+def shifts_of(run: Path) -> dict[float, dict[str, float]]:
+    """Meters beside the path -> name of a number -> its mean over both sides; empty where a run has no such record.
+
+    Raises RecordError naming the file and what it lacks.
+    """
+    path = run / "records" / "novel.json"
+    if not path.is_file():
+        return {}
+    record = parsed(path.read_text(encoding="utf-8"), str(path))
+    sides: dict[float, dict[str, list[float]]] = {}
+    try:
+        for shift in record["shifts"]:
+            found = sides.setdefault(abs(float(shift["offset"])), {})
+            for name, value in _numbers(shift).items():
+                found.setdefault(name, []).append(value)
+    except (KeyError, TypeError) as error:
+        raise RecordError(f"{path}: lacks {error}; evaluate again with novel=...") from error
+    return {meters: {name: statistics.fmean(some) for name, some in found.items()} for meters, found in sides.items()}
+
+
+def _numbers(shift: dict[str, Json]) -> dict[str, float]:
+    truth = {TRUTH[name]: float(value) for name, value in shift["truth"].items()}
+    return {name: float(value) for name, value in shift["distances"].items()} | truth
+
+
+def mean_beside(arm: Arm, meters: float, name: str) -> float | None:
+    """The mean of an arm, each scene once; None where no run has it."""
+    return _mean(arm, lambda run: shifts_of(run).get(meters, {}).get(name))
+
+
+def _mean(arm: Arm, value: Callable[[Path], float | None]) -> float | None:
+    found: dict[Unit, float] = {}
+    for record in arm.records:
+        number = value(record.folder)
+        if number is not None:
+            found[unit_of(record.summary)] = number
+    return mean_over_scenes(found)
+
+
+def beside_the_path(arms: Sequence[Arm]) -> Grid | None:
+    """PSNR to the truth and every distance that a run recorded, by meters; None where none did."""
+    measured = [shifts_of(record.folder) for arm in arms for record in arm.records]
+    found = {(name, meters) for shifts in measured for meters, numbers in shifts.items() for name in numbers}
+    columns = sorted(found, key=lambda column: (column[0] not in _PSNR, _PSNR.get(column[0], 0), column))
+    if not columns:
+        return None
+    rows = []
+    for arm in arms:
+        runs = tuple(record.folder.name for record in arm.records)
+        means = [mean_beside(arm, meters, name) for name, meters in columns]
+        texts = [None if mean is None else _text(name, mean) for (name, _), mean in zip(columns, means, strict=True)]
+        cells = [Cell() if text is None else Cell(text, runs=runs) for text in texts]
+        rows.append((Cell(arm.title, runs=runs), *cells))
+    header = (("", "arm"), *((name, f"{meters:g} m") for name, meters in columns))
+    notes = (
+        "mean of both sides; a distance of image sets is biased by their number, so that it compares arms of one sweep "
+        "and says nothing by its level; only that of Inception's features is the published FID",
+    )
+    return Grid("beside", "Beside the recorded path", header, tuple(rows), notes)
+
+
+def _text(name: str, mean: float) -> str:
+    return f"{mean:.2f}" if name in _PSNR else f"{mean:.4g}"

@@ -1,0 +1,39 @@
+"""Finds the records of finished runs."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.records.summary import RunSummary, read_summary, summary_path
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run's folder and what its summary says."""
+
+    folder: Path
+    summary: RunSummary
+
+
+def collect(roots: Iterable[Path]) -> list[RunRecord]:
+    """Every run below the given folders, sorted by path, each once.
+
+    Raises FileNotFoundError for a root without records, RecordError (naming the file) for a malformed one.
+    """
+    folders: set[Path] = set()
+    for root in roots:
+        found = {path.parents[1] for path in root.rglob("records/summary.json")}
+        if not found:
+            raise FileNotFoundError(f"{root} holds no records/summary.json: train and evaluate a run there first")
+        folders |= {folder.resolve() for folder in found}
+    return [RunRecord(folder, read_summary(summary_path(folder))) for folder in sorted(folders)]
+
+
+def check_definitions(records: Sequence[RunRecord]) -> None:
+    """Raises ValueError if two records mean different things by one metric."""
+    seen: dict[str, tuple[str, Path]] = {}
+    for record in records:
+        for name, definition in record.summary.definitions.items():
+            known, folder = seen.setdefault(name, (definition, record.folder))
+            if known != definition:
+                raise ValueError(f"{name} means different things in {folder} and {record.folder}: evaluate one again")

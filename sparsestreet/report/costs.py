@@ -1,0 +1,65 @@
+"""What each arm costs, in absolute numbers (``records/summary.json`` and ``records/cost.json``)."""
+
+import statistics
+from collections.abc import Callable, Sequence
+
+from sparsestreet.records.costs import PRUNE, CostRecord, cost_path, read_costs
+from sparsestreet.report.arms import Arm
+from sparsestreet.report.collect import RunRecord
+from sparsestreet.report.grid import ABSENT, Cell, Grid
+
+_FORWARD = ("scene", "splat", "sky", "losses", "regularizers")
+
+_COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] = (
+    ("", "Gaussians", "{:,.0f}", lambda record: float(record.summary.gaussians_total)),
+    ("", "MB", "{:.2f}", lambda record: record.summary.bytes_total / 1e6),
+    ("", "ms/frame", "{:.2f}", lambda record: record.summary.latency.p50),
+    ("", "train s", "{:.1f}", lambda record: record.summary.run.training_seconds),
+    ("seconds", "pruning", "{:.1f}", lambda record: _of(record, lambda costs: costs.phases.get(PRUNE, 0.0))),
+    ("seconds", "whole command", "{:.0f}", lambda record: _of(record, lambda costs: costs.wall_seconds)),
+    ("ms of a step", "forward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, *_FORWARD))),
+    ("ms of a step", "backward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, "backward"))),
+    ("ms of a step", "optimizer", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, "optimizer"))),
+    ("peak MB", "host", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_host_mb)),
+    ("peak MB", "GPU", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_device_mb)),
+)
+
+
+def costs_of(record: RunRecord) -> CostRecord | None:
+    """What a run's ``cost.json`` says; None where it has none. Raises RecordError for a malformed one."""
+    path = cost_path(record.folder)
+    return read_costs(path) if path.is_file() else None
+
+
+def what_arms_cost(arms: Sequence[Arm]) -> Grid:
+    """Size, speed, time and memory of every arm: means over its runs."""
+    shown = [column for column in _COLUMNS if any(_mean(arm, column[3]) is not None for arm in arms)]
+    rows = []
+    for arm in arms:
+        runs = tuple(record.folder.name for record in arm.records)
+        means = [(form, _mean(arm, value)) for _, _, form, value in shown]
+        cells = [Cell(ABSENT if mean is None else form.format(mean), runs=runs) for form, mean in means]
+        rows.append((Cell(arm.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
+    header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _, _ in shown))
+    notes = [
+        "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import "
+        "of torch to the pictures; a step: medians over the steps that records/phases.csv notes"
+    ]
+    if not all(record.summary.latency.noise.quiet for arm in arms for record in arm.records):
+        notes.append("some milliseconds are of a machine that was not quiet, as their records say")
+    return Grid("costs", "What each arm costs", header, tuple(rows), tuple(notes))
+
+
+def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:
+    costs = costs_of(record)
+    return None if costs is None else value(costs)
+
+
+def _step(costs: CostRecord, *parts: str) -> float | None:
+    found = [costs.step_ms[part] for part in parts if part in costs.step_ms]
+    return sum(found) if found else None
+
+
+def _mean(arm: Arm, value: Callable[[RunRecord], float | None]) -> float | None:
+    found = [number for record in arm.records if (number := value(record)) is not None]
+    return statistics.fmean(found) if found else None

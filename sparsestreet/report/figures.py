@@ -1,0 +1,178 @@
+"""Figures of a sweep: their style, and quality against each cost (matplotlib without a display)."""
+
+import io
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.report.arms import Arm, Value, plain_of
+
+# Okabe and Ito's palette, its blue a little lighter: distinguishable with any color vision, on white and on black.
+COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+GREY = "#8c8c8c"
+_MARKERS = {"none": "o", "paper": "s", "removal": "D", "masks": "^", "importance": "v", "random": "x", "opacity": "+"}
+_INK = "#010203"
+"""Stands for the color of the page's text."""
+
+_STYLE = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 9,
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _INK),
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "grid.color": GREY,
+}
+
+LEGEND = {"frameon": False, "labelcolor": _INK, "fontsize": 8}
+"""Style of every legend."""
+
+COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
+    ("gaussians", "Gaussians", lambda run: float(run.gaussians_total)),
+    ("megabytes", "MB", lambda run: run.bytes_total / 1e6),
+    ("frame", "milliseconds a frame", lambda run: run.latency.p50),
+    ("training", "training minutes", lambda run: run.run.training_seconds and run.run.training_seconds / 60),
+)
+"""Name, axis and value of what quality is drawn against."""
+
+
+def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
+    """A figure with panels beside each other."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(width * columns, height), layout="constrained")
+        figure.patch.set_alpha(0)
+        axes = list(figure.subplots(1, columns, squeeze=False)[0])
+    for one in axes:
+        one.patch.set_alpha(0)
+    return figure, axes
+
+
+def write_svg(figure: Figure, path: Path) -> None:
+    """The figure as SVG whose ink is that of the page around it, the same bytes from the same numbers."""
+    buffer = io.StringIO()
+    with matplotlib.rc_context(_STYLE | {"svg.hashsalt": path.stem}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Title": path.stem})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].replace(_INK, "currentColor")
+    # Names of groups, which several figures of one page would share; references are to definitions, named by content.
+    text = re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", text)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def colors(arms: Sequence[Arm]) -> dict[str, str]:
+    """Label of a plain method -> its color."""
+    labels = list(dict.fromkeys(arm.plain_label for arm in arms))
+    return {label: COLORS[index % len(COLORS)] for index, label in enumerate(labels)}
+
+
+def of_sparsify(arm: Arm) -> str:
+    """The color of what was done to get small, where arms of one method are drawn."""
+    known = ("none", "paper", "removal", "masks", "importance")
+    return COLORS[known.index(arm.sparsify) if arm.sparsify in known else len(known)]
+
+
+def short(value: float) -> str:
+    """12000 -> 12k, 1500000 -> 1.5M."""
+    unit, size = next(((unit, size) for unit, size in (("M", 1e6), ("k", 1e3)) if value >= size), ("", 1.0))
+    return f"{value / size:g}{unit}"
+
+
+def marker(arm: Arm) -> str:
+    """Of its sparsification."""
+    return _MARKERS.get(arm.sparsify, "P")
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points that no other beats in both: no more cost (first) and more quality (second), by cost."""
+    best: list[tuple[float, float]] = []
+    for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):
+        if not best or quality > best[-1][1]:
+            best.append((cost, quality))
+    return best
+
+
+def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
+    """Quality of the full image, people and vehicles against one cost; whether there was anything to draw.
+
+    Every run is a small mark, every arm's mean a large one, with an arrow from plain to pruned; the front is that of
+    the means, controls are grey and in no front.
+    """
+    wanted = {"full image": protocol.psnr, "people": protocol.human[0], "vehicles": protocol.vehicle[0]}
+    regions = {name: _held_out(metric) for name, metric in wanted.items()}
+    regions = {name: value for name, value in regions.items() if any(arm.mean(value) is not None for arm in arms)}
+    if not regions or all(arm.mean(cost[2]) is None for arm in arms):
+        return False
+    figure, axes = panels(len(regions))
+    for index, (one, (name, value)) in enumerate(zip(axes, regions.items(), strict=True)):
+        _pareto_panel(one, arms, cost[2], value)
+        one.set_title(name, fontsize=10)
+        one.set_xlabel(cost[1])
+        if index == 0:
+            one.set_ylabel("held-out PSNR, dB")
+    figure.legend(handles=_legend(arms), loc="outside lower center", ncols=4, **LEGEND)
+    write_svg(figure, path)
+    return True
+
+
+def _held_out(metric: str) -> Value:
+    return lambda run: run.mean(metric, HELD_OUT)
+
+
+def _pareto_panel(axes: Axes, arms: Sequence[Arm], cost: Value, quality: Value) -> None:
+    color = colors(arms)
+    means: dict[str, tuple[float, float]] = {}
+    for arm in arms:
+        paint = GREY if arm.control else color[arm.plain_label]
+        costs, qualities = arm.units(cost), arm.units(quality)
+        shared = sorted(costs.keys() & qualities.keys())
+        axes.scatter(
+            [costs[unit] for unit in shared], [qualities[unit] for unit in shared], s=9, alpha=0.45, color=paint,
+            marker=marker(arm), linewidths=0.8,
+        )  # fmt: skip
+        x, y = arm.mean(cost), arm.mean(quality)
+        if x is None or y is None:
+            continue
+        means[arm.name] = x, y
+        axes.scatter([x], [y], s=48, color=paint, marker=marker(arm), zorder=3, linewidths=1.6)
+    for arm in arms:
+        plain = plain_of(arm, arms)
+        if plain is not None and plain is not arm and not arm.control and {arm.name, plain.name} <= means.keys():
+            arrow = {"arrowstyle": "->", "color": color[arm.plain_label], "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
+            axes.annotate("", means[arm.name], means[plain.name], arrowprops=arrow)
+    best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control])
+    axes.plot(*zip(*best, strict=True), color=_INK, linewidth=0.9, linestyle="--", zorder=1)
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 10 * low else MaxNLocator(4))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _legend(arms: Sequence[Arm]) -> list[Line2D]:
+    dots = [Line2D([], [], color=paint, marker="o", linestyle="", label=name) for name, paint in colors(arms).items()]
+    kinds = {arm.sparsify: arm for arm in arms}
+    shapes = [
+        Line2D(
+            [],
+            [],
+            color=GREY if arm.control else _INK,
+            marker=marker(arm),
+            linestyle="",
+            markerfacecolor="none",
+            label=f"control: {name}" if arm.control else {"none": "plain"}.get(name, name),
+        )
+        for name, arm in kinds.items()
+    ]
+    return [*dots, *shapes, Line2D([], [], color=_INK, linestyle="--", linewidth=0.9, label="front of the means")]

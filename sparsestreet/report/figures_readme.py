@@ -1,0 +1,83 @@
+"""One figure of a sweep for a README: quality against the time of training, and against the time of a frame."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.report.arms import Arm, Value, mean_over_scenes
+from sparsestreet.report.curves import QualityCurve, curves_of
+from sparsestreet.report.figures import LEGEND, colors, marker, of_sparsify, panels
+
+_DASHES = {"none": "-", "paper": "--", "removal": ":"}
+
+
+def time_figure(arms: Sequence[Arm], protocol: Protocol, path: Path) -> None:
+    """Write a PNG: held-out PSNR over training seconds and over milliseconds a frame, controls left out.
+
+    Curves are means over scenes and seeds at each look; without curves, the end of training is drawn alone. Raises
+    ValueError where no run has a held-out PSNR.
+    """
+    shown = [arm for arm in arms if not arm.control and arm.mean(_psnr(protocol)) is not None]
+    if not shown:
+        raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
+    figure, (training, frame) = panels(2, width=4.6, height=4.0)
+    for arm in shown:
+        _over_training(training, arm, shown, protocol)
+        _points(frame, arm, shown, lambda run: run.latency.p50, protocol)
+    training.set_xlabel("training seconds")
+    frame.set_xlabel("milliseconds a frame")
+    training.set_ylabel("held-out PSNR, dB")
+    handles, names = training.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4, **LEGEND)
+    FigureCanvasAgg(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None})
+
+
+def _psnr(protocol: Protocol) -> Value:
+    return lambda run: run.mean(protocol.psnr, HELD_OUT)
+
+
+def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protocol) -> None:
+    curves = list(curves_of(arm).values())
+    if not curves:
+        _points(axes, arm, shown, _seconds, protocol)
+        return
+    seconds, psnr = mean_curve(curves)
+    style = {"color": _paint(arm, shown), "linestyle": _DASHES.get(arm.sparsify, "-."), "marker": marker(arm)}
+    axes.plot(seconds, psnr, **style, markevery=[len(seconds) - 1], label=arm.name)
+
+
+def _paint(arm: Arm, shown: Sequence[Arm]) -> str:
+    """A color a method; where there is one only, a color for each way to get small."""
+    of_method = colors(shown)
+    return of_method[arm.plain_label] if len(of_method) > 1 else of_sparsify(arm)
+
+
+def mean_curve(curves: Sequence[QualityCurve]) -> tuple[list[float], list[float]]:
+    """Mean seconds and mean dB at each look that all curves have."""
+    looks = min(len(curve.seconds) for curve in curves)
+    seconds = [statistics.fmean(curve.seconds[look] for curve in curves) for look in range(looks)]
+    psnr = [statistics.fmean(curve.psnr[look] for curve in curves) for look in range(looks)]
+    return seconds, psnr
+
+
+def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: Protocol) -> None:
+    """The mean, and every run small and pale."""
+    costs, qualities = arm.units(cost), arm.units(_psnr(protocol))
+    units = sorted(costs.keys() & qualities.keys())
+    if not units:
+        return
+    paint = _paint(arm, shown)
+    axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
+    mean = [mean_over_scenes({unit: values[unit] for unit in units}) for values in (costs, qualities)]
+    axes.scatter(*([value] for value in mean), s=44, color=paint, marker=marker(arm), label=arm.name, zorder=3)
+
+
+def _seconds(run: RunSummary) -> float | None:
+    return run.run.training_seconds

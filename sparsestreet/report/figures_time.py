@@ -1,0 +1,120 @@
+"""Figures of a sweep over time: held-out quality, counts, and what a frame's milliseconds are spent on."""
+
+import statistics
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
+
+from sparsestreet.pictures.history import count_curves, marks
+from sparsestreet.records.ledger import ledger_path, read_changes
+from sparsestreet.report.arms import Arm
+from sparsestreet.report.costs import costs_of
+from sparsestreet.report.curves import curves_of
+from sparsestreet.report.figures import COLORS, GREY, LEGEND, of_sparsify, panels, short, write_svg
+
+
+def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
+    """Held-out PSNR against training seconds, a panel a method, a line a run; whether any run has a curve."""
+    found = {arm.name: curves_of(arm) for arm in arms}
+    drawn = [arm for arm in arms if found[arm.name]]
+    if not drawn:
+        return False
+    methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
+    figure, axes = panels(len(methods))
+    for one, method in zip(axes, methods, strict=True):
+        for arm in _of(drawn, method):
+            for curve in found[arm.name].values():
+                one.plot(curve.seconds, curve.psnr, **_line(arm), marker=".", markersize=3)
+        _finish(one, method, "training seconds")
+    axes[0].set_ylabel("held-out PSNR, dB")
+    write_svg(figure, path)
+    return True
+
+
+def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
+    """All Gaussians over the steps, a panel a method, a line a run, with dots where masks or passes took some."""
+    drawn = [arm for arm in arms if any(ledger_path(record.folder).is_file() for record in arm.records)]
+    if not drawn:
+        return False
+    methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
+    figure, axes = panels(len(methods))
+    for one, method in zip(axes, methods, strict=True):
+        for arm in _of(drawn, method):
+            for record in arm.records:
+                if ledger_path(record.folder).is_file():
+                    _counts(one, arm, record.folder)
+        one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+        _finish(one, method, "step")
+    axes[0].set_ylabel("Gaussians")
+    write_svg(figure, path)
+    return True
+
+
+def _counts(axes: Axes, arm: Arm, folder: Path) -> None:
+    changes = read_changes(ledger_path(folder))
+    steps, nodes = count_curves(changes)
+    total = [sum(values) for values in zip(*nodes.values(), strict=True)]
+    axes.plot(steps, total, drawstyle="steps-post", **_line(arm))
+    at = dict(zip(steps, total, strict=True))
+    taken = sorted({step for step, _ in marks(changes)})
+    axes.plot(taken, [at[step] for step in taken], ".", markersize=4, color=_line(arm)["color"], label="_")
+
+
+def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
+    """What a frame takes longer with each node class and effect, a bar an arm; whether any run recorded it."""
+    costs = {arm.name: _frame_costs(arm) for arm in arms}
+    drawn = [arm for arm in arms if costs[arm.name]]
+    if not drawn:
+        return False
+    parts = list(dict.fromkeys(part for arm in drawn for part in costs[arm.name]))
+    figure, (axes,) = panels(1, width=7.4, height=1.1 + 0.34 * len(drawn))
+    for row, arm in enumerate(drawn):
+        left = 0.0
+        for part, ms in costs[arm.name].items():
+            index = parts.index(part)
+            hatch = "//" if part.startswith("effect") else None
+            axes.barh(row, ms, left=left, height=0.62, color=COLORS[index % len(COLORS)], hatch=hatch,
+                      edgecolor="white", linewidth=0.4, label="_")  # fmt: skip
+            left += ms
+    for index, part in enumerate(parts):
+        hatch = "//" if part.startswith("effect") else None
+        axes.barh([0], [0], color=COLORS[index % len(COLORS)], hatch=hatch, edgecolor="white", label=part)
+    axes.set_yticks(range(len(drawn)), [textwrap.fill(arm.title, 40) for arm in drawn])
+    axes.invert_yaxis()
+    axes.axvline(0, color=GREY, linewidth=0.8)
+    axes.set_xlabel("milliseconds that a frame takes longer with it")
+    figure.legend(loc="outside lower center", ncols=5, **LEGEND)
+    write_svg(figure, path)
+    return True
+
+
+def _frame_costs(arm: Arm) -> dict[str, float]:
+    """Node or effect -> mean milliseconds over the runs that recorded it."""
+    found: dict[str, list[float]] = {}
+    for costs in filter(None, map(costs_of, arm.records)):
+        parts = {name: node.ms for name, node in costs.nodes.items()}
+        for part, ms in (parts | {f"effect: {name}": ms for name, ms in costs.effects.items()}).items():
+            found.setdefault(part, []).append(ms)
+    return {part: statistics.fmean(values) for part, values in found.items()}
+
+
+def _of(arms: Sequence[Arm], method: str) -> list[Arm]:
+    return [arm for arm in arms if arm.plain_label == method]
+
+
+def _line(arm: Arm) -> dict[str, str | float]:
+    dashes = {"capped": ":", "random": "--", "opacity": "-."}.get(arm.sparsify, "-")
+    paint = GREY if arm.control else of_sparsify(arm)
+    name = f"control: {arm.sparsify}" if arm.control else {"none": "plain"}.get(arm.sparsify, arm.sparsify)
+    return {"color": paint, "linestyle": dashes, "linewidth": 1.2, "alpha": 0.85, "label": name}
+
+
+def _finish(axes: Axes, title: str, x_label: str) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(x_label)
+    handles, names = axes.get_legend_handles_labels()
+    once = dict(zip(names, handles, strict=True))
+    axes.legend(once.values(), once.keys(), **LEGEND)

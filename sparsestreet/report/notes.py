@@ -1,0 +1,180 @@
+"""What stands below a table: what its numbers are, and where they are not alike."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+from sparsestreet.metrics.definitions import LIDAR_REACH
+from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.records.run import CodeVersion, Machine
+from sparsestreet.records.summary import TRAINING, RunSummary
+from sparsestreet.report.variants import Variant
+
+CAPPED = "†"
+"""Marks counts that a node's ``max_gaussians`` held down."""
+
+
+def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) -> list[str]:
+    """The notes of one table, the general ones first, then what a reader must know of these runs."""
+    runs = [run for variant in variants for run in variant.runs]
+    return [
+        *_general(runs, over_scenes, protocol),
+        *_absent(runs, protocol),
+        *_timing(runs),
+        *_training(runs),
+        *(_scenes(variants) if over_scenes else ()),
+        *_long_names(variants),
+        *_repeated_seeds(variants),
+        *_unfinished(variants),
+        *_caps(variants),
+        _guards(variants),
+    ]
+
+
+def camera_notes(variants: Sequence[Variant]) -> list[str]:
+    """The notes of a table by camera; the others stand below the table that it goes with."""
+    runs = [run for variant in variants for run in variant.runs]
+    return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
+
+
+def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) -> list[str]:
+    alone = "n=1 has no spread and proves nothing below the noise of runs"
+    mean = (
+        "each scene counts once, with the mean of its runs; ± is the sample sd over scenes"
+        if over_scenes
+        else f"mean ± sample sd over runs; {alone}"
+    )
+    return [
+        mean,
+        f"of {_views(runs)}, protocol {protocol.name}: PSNR {protocol.psnr}, in dB; SSIM {protocol.ssim}; masked: "
+        f"{', '.join((*protocol.vehicle, *protocol.human))} (images without the mask skipped); definitions in each "
+        "summary.json",
+        *_lidar(runs),
+        f"MB: 10^6 bytes of parameters; ms/frame: median, {runs[0].latency.protocol}",
+    ]
+
+
+def _absent(runs: Sequence[RunSummary], protocol: Protocol) -> list[str]:
+    """Why a metric of the protocol is not there, once for each reason."""
+    reasons = {
+        (quantity, reason)
+        for run in runs
+        for quantity, reason in run.absent.items()
+        if any(metric.startswith(quantity) for metric in protocol.metrics)
+    }
+    return [f"{quantity} n/a in some runs: {reason}" for quantity, reason in sorted(reasons)]
+
+
+def _views(runs: Sequence[RunSummary]) -> str:
+    return "training views (none is held out)" if all(run.main_split == TRAINING for run in runs) else "held-out views"
+
+
+def _lidar(runs: Sequence[RunSummary]) -> list[str]:
+    """What near and beyond are, where a run has either."""
+    names = ("psnr_near_lidar", "psnr_beyond_lidar")
+    if all(run.mean(name) is None for run in runs for name in names):
+        return []
+    return [
+        f"near: psnr_near_lidar, of pixels with a lidar return within {100 * LIDAR_REACH:g} % of the longer image "
+        "side; beyond: psnr_beyond_lidar, of the others; sky left out"
+    ]
+
+
+def _timing(runs: Sequence[RunSummary]) -> list[str]:
+    """Where and with what the clock of ms/frame ran."""
+    places = _places((run.latency.device, run.latency.threads, run.evaluated.machine) for run in runs)
+    said = [("ms/frame are not comparable, measured on: " if len(places) > 1 else "measured on ") + "; ".join(places)]
+    if len({run.latency.protocol for run in runs}) > 1:
+        said.append("ms/frame were taken with different numbers of renders; see each summary.json")
+    return said + _commits("measured", [run.evaluated.source for run in runs])
+
+
+def _training(runs: Sequence[RunSummary]) -> list[str]:
+    """Where the clock of train s ran."""
+    places = _places((run.run.device, run.run.threads, run.run.machine) for run in runs)
+    said = [("train s are not comparable, trained on: " if len(places) > 1 else "trained on ") + "; ".join(places)]
+    return said + _commits("trained", [run.run.source for run in runs])
+
+
+def _places(clocks: Iterable[tuple[str, int, Machine]]) -> list[str]:
+    """What a time depends on beside the code, each once."""
+    return sorted(
+        {
+            f"{device}, {threads} thread{'s' if threads != 1 else ''}, {host.cores} cores, torch {host.torch}"
+            for device, threads, host in clocks
+        }
+    )
+
+
+def _commits(done: str, sources: Sequence[CodeVersion]) -> list[str]:
+    said = []
+    commits = sorted({(source.commit or "no commit")[:9] for source in sources})
+    if len(commits) > 1:
+        said.append(f"runs were {done} by different commits: {', '.join(commits)}")
+    if any(source.dirty for source in sources):
+        said.append(f"some runs were {done} by code with uncommitted changes")
+    return said
+
+
+def _long_names(variants: Sequence[Variant]) -> list[str]:
+    return [
+        f"{variant.name}: {', '.join(variant.options)}"
+        for variant in variants
+        if not all(option in variant.name for option in variant.options)
+    ]
+
+
+def _repeated_seeds(variants: Sequence[Variant]) -> list[str]:
+    """The same run twice counts twice, but is no independent repeat."""
+    said = []
+    for variant in variants:
+        times = Counter((run.run.scene, run.run.seed) for run in variant.runs)
+        twice = [f"seed {seed} {count} times" for (_, seed), count in sorted(times.items()) if count > 1]
+        if twice:
+            said.append(f"{variant.name}: {', '.join(twice)}; equal runs of one seed are no independent repeats")
+    return said
+
+
+def _unfinished(variants: Sequence[Variant]) -> list[str]:
+    return [
+        f"{_run(variant, run)} stopped at step {run.run.steps:,} of {run.run.max_steps:,}"
+        for variant in variants
+        for run in variant.runs
+        if run.run.steps < run.run.max_steps
+    ]
+
+
+def _scenes(variants: Sequence[Variant]) -> list[str]:
+    """Which scenes a mean is over, and whose mean is over fewer."""
+    every = sorted({run.run.scene for variant in variants for run in variant.runs})
+    said = [f"scenes: {', '.join(every)}"]
+    for variant in variants:
+        lacking = [scene for scene in every if scene not in {run.run.scene for run in variant.runs}]
+        if lacking:
+            said.append(f"{variant.name} has no run of {', '.join(lacking)}: compare differences, not means")
+    return said
+
+
+def _caps(variants: Sequence[Variant]) -> list[str]:
+    """Counts that a limit held down say little of what a scene needs, and shares of them less."""
+    said = []
+    for variant in variants:
+        caps = sorted({(node, cap) for run in variant.runs for node, cap in run.run.caps.items()})
+        reached = ", ".join(f"{node} reached its cap of {cap:,} Gaussians" for node, cap in caps)
+        if reached:
+            said.append(f"{CAPPED} {variant.name}: {reached}")
+    return said
+
+
+def _guards(variants: Sequence[Variant]) -> str:
+    """The alarms of every run that has any."""
+    fired = [
+        f"{_run(variant, run)} " + ", ".join(f"{name} {count:,}" for name, count in run.guards.alarms.items())
+        for variant in variants
+        for run in variant.runs
+        if run.guards.alarms
+    ]
+    return "guards: " + ("; ".join(fired) or "none fired")
+
+
+def _run(variant: Variant, run: RunSummary) -> str:
+    return f"{variant.name} (seed {run.run.seed})"

@@ -1,0 +1,146 @@
+"""The report of a sweep: tables, figures and one page, from records alone (no torch)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.records.failures import FailedRun, failure_path, read_failures
+from sparsestreet.records.strict_json import write_atomically
+from sparsestreet.report.arms import Arm, arms, why_apart
+from sparsestreet.report.beside import beside_the_path
+from sparsestreet.report.collect import RunRecord, check_definitions, collect
+from sparsestreet.report.comparison import comparison_data
+from sparsestreet.report.costs import what_arms_cost
+from sparsestreet.report.curves import time_to_quality
+from sparsestreet.report.figures import COSTS, pareto
+from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
+from sparsestreet.report.grid import Grid, comma_separated, latex, markdown
+from sparsestreet.report.layouts import paper_table
+from sparsestreet.report.page import Page, html
+from sparsestreet.report.presets import rendered_otherwise
+from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality
+
+
+@dataclass(frozen=True)
+class SweepReport:
+    """What was written."""
+
+    folder: Path
+    grids: tuple[Grid, ...]
+    notes: tuple[str, ...]
+
+
+def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIVESTUDIO) -> SweepReport:
+    """Write ``sweep/report/``: tables.md, tables.tex, tables.csv, figures/ and index.html.
+
+    Args:
+        sweep: the folder of a sweep; runs that failed stand in it as ``failed.json``.
+        name: which of conf/sweep it is of, for the layout and the published figures; None: another one.
+        protocol: chooses the metrics.
+
+    Raises FileNotFoundError where no run has a record, RecordError for a malformed one, ValueError where two records
+    mean different things by one metric.
+    """
+    failures = read_failures(sweep)
+    records = sweep_records(sweep)
+    found = arms(records)
+    grids = _grids(found, failures, protocol, name)
+    folder = sweep / "report"
+    figures, absent = _figures(found, protocol, folder / "figures")
+    notes = [*why_apart(found), *_caps(found), *_unfinished(records), *absent]
+    write_atomically(folder / "tables.md", markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes))
+    write_atomically(folder / "tables.tex", latex(grids))
+    write_atomically(folder / "tables.csv", comma_separated(grids))
+    page = Page(
+        title=f"Sweep {name or sweep.resolve().name}: what getting smaller costs",
+        notes=notes,
+        grids=grids,
+        figures=figures,
+        pictures=comparison_data(found),
+        records=records,
+        failures=failures,
+    )
+    write_atomically(folder / "index.html", html(page))
+    return SweepReport(folder, tuple(grids), tuple(notes))
+
+
+def sweep_records(sweep: Path) -> list[RunRecord]:
+    """The records of the runs of a sweep that did not fail. Raises as ``write_report``."""
+    # A folder that says it failed may hold the record of an earlier configuration.
+    records = [record for record in collect([sweep]) if not failure_path(record.folder).is_file()]
+    if not records:
+        raise FileNotFoundError(f"{sweep} holds no run that did not fail: run the sweep again")
+    check_definitions(records)
+    return records
+
+
+def _grids(
+    found: Sequence[Arm], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, name: str | None
+) -> list[Grid]:
+    grids = [
+        paper_table(found, failures, protocol, name),
+        what_arms_cost(found),
+        differences(found, protocol),
+        matched_quality(found, protocol),
+        matched_budget(found, protocol),
+        time_to_quality(found),
+        beside_the_path(found),
+        rendered_otherwise(found, protocol),
+    ]
+    return [grid for grid in grids if grid is not None and grid.rows]
+
+
+def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Caption and SVG of each figure, and notes on those that the records do not hold."""
+    drawn, absent = [], []
+
+    def take(written: bool, name: str, caption: str, lacking: str) -> None:
+        if written:
+            drawn.append((caption, (folder / f"{name}.svg").read_text(encoding="utf-8")))
+        else:
+            (folder / f"{name}.svg").unlink(missing_ok=True)
+            absent.append(lacking)
+
+    for cost in COSTS:
+        name = f"pareto_{cost[0]}"
+        take(
+            pareto(found, protocol, cost, folder / f"{name}.svg"),
+            name,
+            f"Held-out PSNR against {cost[1]}: every run small, every arm's mean large, arrows from plain to pruned, "
+            "the front of the means dashed, controls grey.",
+            f"no figure of quality against {cost[1]}: no run has both",
+        )
+    take(
+        held_out_over_time(found, folder / "held_out.svg"),
+        "held_out",
+        "PSNR of a fixed probe of held-out views over the seconds of training, evaluation left out; a line a run.",
+        "no curves of held-out PSNR over seconds: no run has curves/held_out.csv",
+    )
+    take(
+        counts_over_time(found, folder / "counts.svg"),
+        "counts",
+        "Gaussians over the steps, a line a run; dots where masks or passes of pruning took some.",
+        "no counts over time: no run has records/counts.csv",
+    )
+    take(
+        frame_waterfall(found, folder / "waterfall.svg"),
+        "waterfall",
+        "What a frame takes longer with each node class and effect, mean over an arm's runs; nodes that hide each "
+        "other cost less together than the sum.",
+        "no milliseconds by node and effect: no run has records/cost.json",
+    )
+    return drawn, absent
+
+
+def _caps(found: Sequence[Arm]) -> list[str]:
+    held = sorted({arm.title for arm in found for record in arm.records if record.summary.run.caps})
+    return [f"counts held down by max_gaussians, so that shares of them say little: {', '.join(held)}"] if held else []
+
+
+def _unfinished(records: Sequence[RunRecord]) -> list[str]:
+    return [
+        f"{record.folder.name} stopped at step {record.summary.run.steps:,} of {record.summary.run.max_steps:,}"
+        for record in records
+        if record.summary.run.steps < record.summary.run.max_steps
+    ]

@@ -1,0 +1,173 @@
+"""What getting smaller costs: paired differences, and the best of a sweep at one quality or one size."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
+from sparsestreet.report.grid import Cell, Grid
+from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
+
+LOSSES = (0.1, 0.3, 0.5)
+"""dB of held-out PSNR, full image, that a smaller arm may lose."""
+SHARES = (0.25, 0.5, 0.75)
+"""Of the plain arm's Gaussians that a smaller one may have."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A column of differences."""
+
+    heading: str
+    value: Value
+    text: str
+    relative: bool
+    """In per cent of the plain run's."""
+
+
+def measures(protocol: Protocol) -> tuple[Measure, ...]:
+    """Quality by a protocol, and what it costs."""
+    quality = (
+        ("PSNR full", protocol.psnr, "{:+.2f}"),
+        ("PSNR human", protocol.human[0], "{:+.2f}"),
+        ("PSNR vehicle", protocol.vehicle[0], "{:+.2f}"),
+        ("SSIM full", protocol.ssim, "{:+.4f}"),
+        *((f"LPIPS {name.split('_')[1]}", name, "{:+.4f}") for name in protocol.lpips),
+    )
+    return (
+        *(Measure(heading, _held_out(metric), text, False) for heading, metric, text in quality),
+        Measure("Gaussians", lambda run: float(run.gaussians_total), "{:+.1f}", True),
+        Measure("MB", lambda run: run.bytes_total / 1e6, "{:+.1f}", True),
+        Measure("ms/frame", lambda run: run.latency.p50, "{:+.1f}", True),
+        Measure("train s", lambda run: run.run.training_seconds, "{:+.1f}", True),
+    )
+
+
+def _held_out(metric: str) -> Value:
+    return lambda run: run.mean(metric, HELD_OUT)
+
+
+def paired(arm: Arm, plain: Arm, value: Value, relative: bool = False) -> ConfidenceInterval | None:
+    """The difference to the plain arm over the pairs of scene and seed that both have."""
+    ours, theirs = arm.units(value), plain.units(value)
+    differences = {
+        unit: 100 * (ours[unit] / theirs[unit] - 1) if relative else ours[unit] - theirs[unit]
+        for unit in ours.keys() & theirs.keys()
+        if not relative or theirs[unit]
+    }
+    return interval_over_scenes(differences)
+
+
+def interval_over_scenes(values: dict[Unit, float]) -> ConfidenceInterval | None:
+    """Each scene counts once, with the mean of its seeds; with a single scene each seed does."""
+    scenes = by_scene(values)
+    return t_interval(list((scenes if len(scenes) > 1 else values).values()))
+
+
+def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
+    """Every arm against the plain one of its method, at the same place."""
+    shown = [one for one in measures(protocol) if any(arm.mean(one.value) is not None for arm in arms)]
+    rows, alone = [], []
+    for arm in arms:
+        plain = plain_of(arm, arms)
+        if arm.sparsify == "none":
+            continue
+        if plain is None:
+            alone.append(arm.name)
+            continue
+        runs = tuple(record.folder.name for one in (arm, plain) for record in one.records)
+        found = [paired(arm, plain, one.value, one.relative) for one in shown]
+        n = max((interval.n for interval in found if interval), default=0)
+        cells = [difference_cell(interval, one.text, n, runs) for interval, one in zip(found, shown, strict=True)]
+        rows.append((Cell(f"{arm.title} - {plain.name}", runs=runs), Cell(str(n), runs=runs), *cells))
+    notes = [
+        f"differences paired by scene and seed, mean [{100 * CONFIDENCE:.0f} % t interval]; n: scenes, each the mean "
+        "of its seeds, or the seeds of a single scene; bold where the interval excludes 0, never with n = 1",
+        "no correction for the number of comparisons: of twenty intervals without effect one excludes 0",
+    ]
+    if alone:
+        notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
+    header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
+    return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
+
+
+def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
+    """Mean and interval, bold where it excludes 0; says its own n where that is not the row's."""
+    if interval is None:
+        return Cell()
+    text = form.format(interval.mean)
+    if interval.low is not None:
+        text += f" [{form.format(interval.low)}, {form.format(interval.high)}]"
+    return Cell(text if interval.n == n else f"{text} (n={interval.n})", interval.proven, runs=runs)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    arm: Arm
+    loss: float
+    """dB, positive where it is worse."""
+    share: float
+    """Of the plain arm's Gaussians."""
+
+
+def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Candidate]:
+    found = []
+    for arm in arms:
+        if plain_of(arm, arms) is not plain:
+            continue
+        loss = paired(arm, plain, _held_out(protocol.psnr))
+        share = paired(arm, plain, lambda run: float(run.gaussians_total), relative=True)
+        if loss is not None and share is not None:
+            found.append(_Candidate(arm, -loss.mean, 1 + share.mean / 100))
+    return found
+
+
+def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
+    """The fewest Gaussians that lose no more than so much."""
+    rows = []
+    for plain in (arm for arm in arms if arm.sparsify == "none"):
+        for most in LOSSES:
+            allowed = [one for one in _candidates(plain, arms, protocol) if one.loss <= most]
+            best = min(allowed, key=lambda one: one.share, default=None)
+            rows.append((Cell(f"{plain.name}, at most {most:g} dB"), *_chosen(best)))
+    notes = ("of the arms of this sweep as they were run: nothing is interpolated; plain counts as its own candidate",)
+    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), notes)
+
+
+def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
+    """The best held-out PSNR with no more than so many Gaussians."""
+    rows = []
+    for plain in (arm for arm in arms if arm.sparsify == "none"):
+        for share in SHARES:
+            allowed = [one for one in _candidates(plain, arms, protocol) if one.share <= share]
+            best = min(allowed, key=lambda one: one.loss, default=None)
+            rows.append((Cell(f"{plain.name}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
+    notes = ("of the arms of this sweep as they were run: nothing is interpolated",)
+    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), notes)
+
+
+_CHOSEN = tuple(
+    ("", heading)
+    for heading in ("allowed", "arm", "PSNR full, dB", "share, %", "Gaussians", "MB", "ms/frame", "train minutes")
+)
+
+
+def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
+    if best is None:
+        return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
+    runs = tuple(record.folder.name for record in best.arm.records)
+    minutes = best.arm.mean(_minutes)
+    numbers = (
+        f"{-best.loss:+.2f}",
+        f"{100 * best.share:.0f}",
+        f"{best.arm.mean(lambda run: float(run.gaussians_total)):,.0f}",
+        f"{best.arm.mean(lambda run: run.bytes_total / 1e6):.2f}",
+        f"{best.arm.mean(lambda run: run.latency.p50):.2f}",
+        "-" if minutes is None else f"{minutes:.2f}",
+    )
+    return (Cell(best.arm.title, runs=runs), *(Cell(number, runs=runs) for number in numbers))
+
+
+def _minutes(run: RunSummary) -> float | None:
+    return None if run.run.training_seconds is None else run.run.training_seconds / 60

@@ -1,0 +1,150 @@
+"""``views.json``: from where and when a log was seen. A scene beside it can be rendered without the log."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.records.strict_json import EXACT, json_line, read_json, version, write_atomically
+from sparsestreet.types import Camera, Shutter, View
+
+FORMAT = 1
+FILE_NAME = "views.json"
+"""Name of the file in a run's folder."""
+
+Numbers = tuple[float, ...]
+Matrix = tuple[Numbers, ...]
+
+
+@dataclass(frozen=True)
+class RecordedViews:
+    """The views of a log, each with both of its indices."""
+
+    training: tuple[View, ...]
+    held_out: tuple[View, ...]
+    frames_per_second: float | None = None
+    """Of the log; None: not known."""
+
+    @property
+    def all(self) -> tuple[View, ...]:
+        """Training and held-out views in order of time, those of one instant in order of their cameras."""
+        return tuple(sorted((*self.training, *self.held_out), key=lambda view: (view.time, view.camera_index)))
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One view as JSON."""
+
+    split: str
+    frame_index: int
+    camera_index: int
+    time: float = field(metadata=EXACT)
+    width: int
+    height: int
+    camera_from_world: Matrix = field(metadata=EXACT)
+    intrinsics: Matrix = field(metadata=EXACT)
+    distortion: Numbers | None = field(default=None, metadata=EXACT)
+    shutter_translation: Numbers | None = field(default=None, metadata=EXACT)
+    shutter_rotation: Numbers | None = field(default=None, metadata=EXACT)
+
+
+@dataclass(frozen=True)
+class _File:
+    frames_per_second: float | None
+    views: tuple[_Entry, ...]
+    format: int = version(FORMAT, "update the program, or write the views anew by training")
+
+
+def write_views(
+    path: Path | str,
+    training: Sequence[View],
+    held_out: Sequence[View],
+    frames_per_second: float | None = None,
+) -> None:
+    """Write the cameras, times and indices of views, the whole file or nothing. A Frame's pixels are not touched.
+
+    Poses are written as float32. Raises ValueError for a view without frame or camera index, or with a number that is
+    not finite.
+    """
+    path = Path(path)
+    entries = [_entry("training", view) for view in training] + [_entry("held_out", view) for view in held_out]
+    # A view a line: short enough to read, and a diff shows which view changed.
+    lines = ",\n".join(json_line(entry, f"{path}: view {index}") for index, entry in enumerate(entries))
+    head = json_line({"format": FORMAT, "frames_per_second": frames_per_second}, str(path)).removesuffix("}")
+    write_atomically(path, f'{head}, "views": [\n{lines}\n]}}\n')
+
+
+def read_views(path: Path | str) -> RecordedViews:
+    """Read what ``write_views`` wrote.
+
+    Raises FileNotFoundError where there is no such file, ValueError, naming file and entry, for one that is damaged
+    or of another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {path}: training writes a {FILE_NAME} into the folder of its run")
+    file = read_json(path, _File)
+    views: dict[str, list[View]] = {"training": [], "held_out": []}
+    for index, entry in enumerate(file.views):
+        if entry.split not in views:
+            raise ValueError(f"{path}: view {index} has split {entry.split!r}, which is none of {', '.join(views)}")
+        views[entry.split].append(_view(entry, f"{path}: view {index}"))
+    return RecordedViews(tuple(views["training"]), tuple(views["held_out"]), file.frames_per_second)
+
+
+def _entry(split: str, view: View) -> _Entry:
+    camera = view.camera
+    if view.frame_index is None or view.camera_index is None:
+        raise ValueError(
+            f"a recorded view has a frame and a camera index, got {view.frame_index} and {view.camera_index}"
+        )
+    return _Entry(
+        split=split,
+        frame_index=view.frame_index,
+        camera_index=view.camera_index,
+        time=view.time,
+        width=camera.width,
+        height=camera.height,
+        camera_from_world=_matrix(camera.camera_from_world),
+        intrinsics=_matrix(camera.intrinsics),
+        distortion=None if camera.distortion is None else _numbers(camera.distortion),
+        shutter_translation=None if camera.shutter is None else _numbers(camera.shutter.translation),
+        shutter_rotation=None if camera.shutter is None else _numbers(camera.shutter.rotation),
+    )
+
+
+def _view(entry: _Entry, where: str) -> View:
+    shutter = None
+    if entry.shutter_translation is not None and entry.shutter_rotation is not None:
+        shutter = Shutter(
+            _tensor(entry.shutter_translation, (3,), where, "shutter_translation"),
+            _tensor(entry.shutter_rotation, (3,), where, "shutter_rotation"),
+        )
+    camera = Camera(
+        _tensor(entry.camera_from_world, (4, 4), where, "camera_from_world"),
+        _tensor(entry.intrinsics, (3, 3), where, "intrinsics"),
+        entry.width,
+        entry.height,
+        None if entry.distortion is None else _tensor(entry.distortion, (5,), where, "distortion"),
+        shutter,
+    )
+    return View(camera, entry.time, entry.frame_index, entry.camera_index)
+
+
+def _matrix(values: Float[Tensor, "r c"]) -> Matrix:
+    return tuple(_numbers(row) for row in values)
+
+
+def _numbers(values: Float[Tensor, " n"]) -> Numbers:
+    # The shortest decimal that is this float32: 0.1, not 0.10000000149011612.
+    return tuple(float(str(value)) for value in values.detach().float().cpu().numpy())
+
+
+def _tensor(values: Numbers | Matrix, shape: tuple[int, ...], where: str, name: str) -> Tensor:
+    lengths = {len(row) for row in values} if len(shape) == 2 else {0}
+    if len(values) != shape[0] or (len(shape) == 2 and lengths != {shape[1]}):
+        raise ValueError(f"{where}: {name} must be {' x '.join(map(str, shape))} numbers, got {values}")
+    return torch.tensor(values)

@@ -1,0 +1,170 @@
+"""Sheets: what is where, and what is written on them."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparsestreet.pictures import sheets
+from sparsestreet.pictures.images import LIDAR_END, Picture, write_picture
+from sparsestreet.pictures.sheets import SheetColumn, comparison_sheet, picture_sheet
+from sparsestreet.records.quality_csv import quality_path, write_quality
+from sparsestreet.records.summary import HELD_OUT, TRAINING, summary_path, write_summary
+from sparsestreet.report.side_by_side import compare_runs
+from tests.evaluation.frames import make_image, make_summary
+from tests.evaluation.tiles import COLORS, flat, make_picture
+
+LEGEND = {"rigid": (250, 150, 40)}
+
+
+def order_of(sheet: np.ndarray, row: int) -> list[tuple[int, int, int]]:
+    """Colors met along a row of pixels, without repeats and without the paper between tiles."""
+    paper = tuple(int(value) for value in sheet[-1, -1])
+    colors = [tuple(int(value) for value in pixel) for pixel in sheet[row]]
+    met = [color for index, color in enumerate(colors) if index == 0 or color != colors[index - 1]]
+    return [color for color in met if color != paper]
+
+
+def row_within(sheet: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Middle row of the rows in which a color fills a tile."""
+    rows = np.flatnonzero((sheet == color).all(-1).sum(1) >= 100)
+    return int(rows[len(rows) // 2])
+
+
+def error_of(picture: Picture) -> tuple[int, int, int]:
+    return tuple(int(value) for value in picture.error[0, 0])
+
+
+@pytest.fixture
+def written(monkeypatch) -> list[str]:
+    """The texts on the sheets that a test draws."""
+    texts = []
+    write = sheets._write
+
+    def remember(draw, position, text, *rest):
+        texts.append(text)
+        return write(draw, position, text, *rest)
+
+    monkeypatch.setattr(sheets, "_write", remember)
+    return texts
+
+
+def test_sheet_columns_are_truth_render_error_centers():
+    sheet = picture_sheet([make_picture()], title="a title", tile_width=120)
+    expected = [COLORS["truth"], COLORS["render"], error_of(make_picture()), COLORS["centers"]]
+    assert order_of(sheet, row_within(sheet, COLORS["truth"])) == expected
+
+
+def test_images_of_several_sizes_share_a_sheet():
+    tall = Picture(4, 0, *(flat(COLORS[kind], 40) for kind in ("truth", "render", "render", "centers")))
+    one = picture_sheet([make_picture()], title="t", tile_width=120)
+    both = picture_sheet([make_picture(), tall], title="t", tile_width=120)
+    assert both.shape[1] == one.shape[1]
+    assert both.shape[0] > one.shape[0] + 40 * 120 // 13
+    with pytest.raises(ValueError, match="at least one picture"):
+        picture_sheet([], title="t")
+
+
+def test_the_line_at_the_lidars_end_is_named_where_it_is_drawn(written):
+    other, lined = make_picture(), make_picture(4)
+    picture_sheet([other], title="t", tile_width=120)
+    assert "where the lidar ends" not in written
+    lined.error[4] = LIDAR_END
+    picture_sheet([other, lined], title="t", tile_width=120)
+    assert written.count("where the lidar ends") == 1
+    comparison_sheet([SheetColumn(name, "s", [lined], [20.5]) for name in "ab"], title="t", tile_width=120)
+    assert written.count("where the lidar ends") == 2
+
+
+def column(label: str, color: tuple[int, int, int], frame: int = 3) -> SheetColumn:
+    return SheetColumn(label, f"{label} size", [make_picture(frame, render=color)], [20.5])
+
+
+def test_comparison_has_a_column_for_each_run_and_lines_of_renders_errors_and_centers(written):
+    colors = [(200, 40, 10), (200, 70, 10), (200, 100, 10)]  # 10, 20 and 30 levels from the truth on average
+    columns = [column(f"run{index}", color) for index, color in enumerate(colors)]
+    sheet = comparison_sheet(columns, title="t", legend=LEGEND, tile_width=120)
+    errors = [error_of(one.pictures[0]) for one in columns]
+    assert len(set(errors)) == 3
+    rows = [row_within(sheet, color) for color in (COLORS["truth"], errors[0], COLORS["centers"])]
+    assert rows == sorted(rows)
+    assert order_of(sheet, rows[0]) == [COLORS["truth"], *colors]
+    assert order_of(sheet, rows[1]) == errors
+    assert (sheet[rows[2]] == COLORS["centers"]).all(-1).sum() == 3 * 120
+    assert (sheet == LEGEND["rigid"]).all(-1).sum() >= 100
+    for text in (
+        "t",
+        "truth: frame 3, camera 1",
+        "run0",
+        "run2",
+        "error: 20.50 dB in this image",
+        "run1 size",
+        "rigid",
+    ):
+        assert text in written
+
+
+def test_only_runs_of_the_same_images_are_compared():
+    same = column("plain", COLORS["render"])
+    with pytest.raises(ValueError, match=r"different images, \(frame, camera\) \[\[\(3, 1\)\], \[\(4, 1\)\]\]"):
+        comparison_sheet([same, column("plain", COLORS["render"], frame=4)], title="t")
+    with pytest.raises(ValueError, match="at least two runs, got 1"):
+        comparison_sheet([same], title="t")
+
+
+def write_run(folder, color, psnr, split=HELD_OUT, **summary):
+    views = {"psnr": psnr} if split == HELD_OUT else {"psnr": None, "training_psnr": psnr}
+    write_summary(summary_path(folder), make_summary(**views, **summary))
+    quality = [make_image(3, 1, psnr=psnr + 1)]
+    write_quality(quality_path(folder, split), quality)
+    write_picture(folder / "pictures", make_picture(render=color))
+    return folder
+
+
+def test_run_folders_make_a_sheet(tmp_path, written):
+    """Each run shows its own renders, PSNR and size; shares are of the first run."""
+    colors = {"plain": (10, 200, 10), "paper": (60, 180, 60), "removal": (10, 120, 10)}
+    runs = [
+        write_run(tmp_path / "plain", colors["plain"], 25.0, label="plain", caps={"background": 1000}),
+        write_run(tmp_path / "paper", colors["paper"], 24.0, label="paper", gaussians={"background": 600}),
+        write_run(tmp_path / "removal", colors["removal"], 24.5, label="removal", gaussians={"background": 300}),
+    ]
+    compare_runs(runs, tmp_path / "sheets" / "comparison.png", legend=LEGEND)
+    with Image.open(tmp_path / "sheets" / "comparison.png") as image:
+        sheet = np.asarray(image)
+    assert sheet.shape[1] > 4 * 480
+    assert order_of(sheet, row_within(sheet, colors["plain"])) == [COLORS["truth"], *colors.values()]
+    for text in (
+        *("street: PSNR over 6 held-out images", "plain, 25.00 dB", "paper, 24.00 dB", "removal, 24.50 dB"),
+        *("error: 26.00 dB in this image", "error: 25.00 dB in this image", "error: 25.50 dB in this image"),
+        *("1,200 Gaussians, held down by a cap", "600 Gaussians, 50 % of plain", "300 Gaussians, 25 % of plain"),
+    ):
+        assert text in written
+
+
+def test_runs_of_one_label_are_told_apart(tmp_path, written):
+    by_option = [
+        write_run(tmp_path / str(value), COLORS["render"], 25.0, label="m", config={"x": value}) for value in (1, 2)
+    ]
+    compare_runs(by_option, tmp_path / "sheet.png")
+    assert {"m x=1, 25.00 dB", "m x=2, 25.00 dB"} < set(written)
+    by_seed = [write_run(tmp_path / str(seed), COLORS["render"], 25.0, label="m", seed=seed) for seed in (1, 2)]
+    compare_runs(by_seed, tmp_path / "sheet.png")
+    assert {"m (seed 1), 25.00 dB", "m (seed 2), 25.00 dB"} < set(written)
+
+
+def test_runs_without_held_out_views_show_training_views(tmp_path, written):
+    runs = [write_run(tmp_path / name, COLORS["render"], 30.0, TRAINING, label=name) for name in ("plain", "ours")]
+    compare_runs(runs, tmp_path / "sheet.png")
+    assert "street: PSNR over 6 training images" in written
+    assert "plain, 30.00 dB" in written
+    assert "error: 31.00 dB in this image" in written
+
+
+def test_what_cannot_be_compared_is_named(tmp_path):
+    plain = write_run(tmp_path / "plain", COLORS["render"], 25.0)
+    other = write_run(tmp_path / "other", COLORS["render"], 25.0, scene="kitti")
+    with pytest.raises(ValueError, match="different scenes, kitti, street: compare runs of one scene"):
+        compare_runs([plain, other], tmp_path / "sheet.png")
+    write_quality(quality_path(other), [])
+    with pytest.raises(ValueError, match=r"pictures of \(frame, camera\) \[\(3, 1\)\] and no quality of them"):
+        compare_runs([other, other], tmp_path / "sheet.png")

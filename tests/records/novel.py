@@ -1,0 +1,15 @@
+"""A record of what was measured beside a path."""
+
+from pathlib import Path
+
+from sparsestreet.records.novel import NovelRecord, NovelShift, novel_path, write_novel
+
+
+def write_beside(run: Path, distances: dict[float, float], name: str = "fid", psnr: float | None = None) -> None:
+    """Write ``novel.json`` with one distance at each offset."""
+    truth = {} if psnr is None else {"psnr_full": psnr}
+    shifts = tuple(
+        NovelShift(offset=offset, views=6, distances={name: value}, truth=truth, true_views=6 if truth else 0)
+        for offset, value in distances.items()
+    )
+    write_novel(novel_path(run), NovelRecord(command="evaluate", ramp=False, real_views=6, absent=None, shifts=shifts))

@@ -1,0 +1,115 @@
+"""cost.json: round trip, who writes what, and what is made of stages and noted steps."""
+
+import json
+import mmap
+
+import pytest
+import torch
+
+from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
+from sparsestreet.records.costs import (
+    CostRecord,
+    NodeCost,
+    cost_path,
+    read_costs,
+    stage_costs,
+    step_costs,
+    update_costs,
+    write_costs,
+)
+from sparsestreet.records.strict_json import RecordError
+from tests.evaluation.frames import NOISE
+
+COSTS = CostRecord(
+    wall_seconds=100.0,
+    phases={"data": 30.0, "train": 69.5, "other": 0.5},
+    step_ms={"splat": 3.5},
+    passes={"ImportanceRule at step 28000": 2.5},
+    peak_host_mb=812.5,
+    frame_ms={"splat": 2.0, "output": 0.5},
+    nodes={"background": NodeCost(1000, 0.236, 0.75, 1.75)},
+    effects={"sky": 0.25},
+    noise=NOISE,
+)
+
+
+def test_round_trip(tmp_path):
+    write_costs(cost_path(tmp_path), COSTS)
+    assert cost_path(tmp_path) == tmp_path / "records" / "cost.json"
+    assert read_costs(cost_path(tmp_path)) == COSTS
+
+
+def test_another_format_is_named(tmp_path):
+    path = cost_path(tmp_path)
+    write_costs(path, COSTS)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0}))
+    with pytest.raises(RecordError, match="format 0, this version reads 1: train the run again"):
+        read_costs(path)
+
+
+@pytest.mark.parametrize("wall", [97.0, 103.0])
+def test_phases_that_are_not_the_wall_clock_are_refused(tmp_path, wall):
+    path = cost_path(tmp_path)
+    write_costs(path, COSTS)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"wall_seconds": wall}))
+    with pytest.raises(RecordError, match=f"the phases are 100 s of {wall:g} s of wall clock"):
+        read_costs(path)
+
+
+def test_training_and_evaluation_keep_each_others_parts(tmp_path):
+    update_costs(tmp_path, nodes=COSTS.nodes, effects=COSTS.effects, frame_ms=COSTS.frame_ms, noise=NOISE)
+    alone = read_costs(cost_path(tmp_path))
+    assert (alone.nodes, alone.wall_seconds, alone.phases) == (COSTS.nodes, None, {})
+    update_costs(
+        tmp_path,
+        wall_seconds=100.0,
+        phases=COSTS.phases,
+        step_ms=COSTS.step_ms,
+        passes=COSTS.passes,
+        peak_host_mb=COSTS.peak_host_mb,
+    )
+    assert read_costs(cost_path(tmp_path)) == COSTS
+
+
+def test_stages_become_phases_and_passes():
+    seconds = {"train": 5.0, "prune/Rule at step 7": 1.0, "prune/Rule at step 9": 2.0, "other": 0.25}
+    phases, passes = stage_costs(seconds)
+    assert phases == {"train": 5.0, "prune": 3.0, "other": 0.25}
+    assert passes == {"Rule at step 7": 1.0, "Rule at step 9": 2.0}
+
+
+def test_steps_are_medians_of_parts(tmp_path):
+    """Losses and backward passes are sums within a step; a part counts in the steps that have it."""
+    path = tmp_path / "phases.csv"
+    assert step_costs(path) == {}
+    rows = [
+        *((1, name, ms) for name, ms in (("loss l1", 1), ("loss sky", 2), ("backward", 4), ("splat backward", 8))),
+        *((1, name, ms) for name, ms in (("loop", 0.5), ("logging", 0.25), ("density statistics", 16))),
+        *((2, name, ms) for name, ms in (("loss l1", 5), ("backward", 14), ("loop", 0.25))),
+    ]
+    path.write_text("step,phase,milliseconds\n" + "".join(f"{step},{name},{ms}\n" for step, name, ms in rows))
+    assert step_costs(path) == {"losses": 4.0, "backward": 13.0, "loop": 0.5, "density": 16.0}
+
+
+def test_a_peak_is_seen_and_forgotten():
+    """Pages of the system's: an allocator may keep what is freed (``keep_freed_memory`` asks it to)."""
+    forget_peaks()
+    before, on_device = peak_megabytes(torch.device("cpu"))
+    with mmap.mmap(-1, 400_000_000) as pages:
+        for page in range(0, len(pages), mmap.PAGESIZE):
+            pages[page] = 1
+        during = peak_megabytes(torch.device("cpu"))[0]
+    assert on_device is None
+    assert 380 < during - before < 420  # the kernel counts pages in batches for each thread
+    forget_peaks()
+    after = peak_megabytes(torch.device("cpu"))[0]
+    assert after < during - 380 or not _peaks_can_be_forgotten()
+
+
+def _peaks_can_be_forgotten() -> bool:
+    try:
+        with open("/proc/self/clear_refs", "w") as file:
+            file.write("5")
+    except OSError:
+        return False
+    return True

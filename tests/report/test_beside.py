@@ -1,0 +1,62 @@
+"""Numbers beside the recorded path."""
+
+import json
+
+import pytest
+
+from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.report import collect
+from sparsestreet.report.arms import arms
+from sparsestreet.report.beside import TRUTH, beside_the_path, shifts_of
+from sparsestreet.report.layouts import paper_table
+from tests.evaluation.frames import make_summary
+from tests.records.novel import write_beside
+from tests.report.sweep_folder import record, write_sweep
+
+
+def test_both_sides_count_alike(tmp_path):
+    write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0, 2.0: 60.0}, psnr=20.0)
+    true = TRUTH["psnr_full"]
+    assert shifts_of(tmp_path) == {1.0: {"fid": 42.0, true: 20.0}, 2.0: {"fid": 60.0, true: 20.0}}
+
+
+def test_an_arm_is_the_mean_of_its_scenes(tmp_path):
+    sweep = write_sweep(tmp_path)
+    for seed in range(3):
+        write_beside(sweep / f"streetgs_seed{seed}", {1.0: 40.0 + seed, -1.0: 40.0 + seed})
+    grid = beside_the_path(arms(collect([sweep])))
+    assert grid.header == (("", "arm"), ("fid", "1 m"))
+    assert [row[1].text for row in grid.rows] == ["41", "-", "-"]
+
+
+def test_the_truth_comes_before_distances(tmp_path):
+    sweep = write_sweep(tmp_path)
+    write_beside(sweep / "streetgs_seed0", {1.0: 41.25, -1.0: 41.25, 2.0: 50.0}, name="a_distance", psnr=20.4)
+    grid = beside_the_path(arms(collect([sweep])))
+    names = [TRUTH["psnr_full"]] * 2 + ["a_distance"] * 2
+    assert grid.header[1:] == tuple(zip(names, ["1 m", "2 m"] * 2, strict=True))
+    assert [cell.text for cell in grid.rows[0][1:]] == ["20.40", "20.40", "41.25", "50"]
+
+
+def test_table_4_holds_the_inception_distance_alone(tmp_path):
+    summary = make_summary("omnire", scene="023")
+    object.__setattr__(summary.run, "method", "omnire")
+    write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0})
+    (arm,) = arms([record(summary, str(tmp_path))])
+    grid = paper_table([arm], [], DRIVESTUDIO, "table4_novel")
+    assert [cell.text for cell in grid.rows[0]] == ["omnire", "1", "42.00", "43.62", "-", "61.56", "-", "75.14"]
+    write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0}, name="frechet_alexnet")
+    assert paper_table([arm], [], DRIVESTUDIO, "table4_novel").rows[0][2].text == "-"
+
+
+def test_none_recorded_no_table(tmp_path):
+    assert beside_the_path(arms(collect([write_sweep(tmp_path)]))) is None
+
+
+def test_what_a_record_lacks_is_named(tmp_path):
+    path = tmp_path / "records" / "novel.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps({"shifts": [{"offset": 1.0}]}))
+    with pytest.raises(RecordError, match=r"novel\.json: lacks 'truth'"):
+        shifts_of(tmp_path)

@@ -1,0 +1,37 @@
+"""Records are found, once each, and what is wrong is named."""
+
+import subprocess
+import sys
+
+import pytest
+
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.records.summary import summary_path, write_summary
+from sparsestreet.report import collect
+from tests.evaluation.frames import make_summary
+
+
+def test_collect_finds_each_run_once(tmp_path):
+    for name in ("a/run", "b"):
+        write_summary(summary_path(tmp_path / name), make_summary(name))
+    found = collect([tmp_path, tmp_path / "a", tmp_path / "a" / ".." / "b"])
+    assert [record.summary.run.label for record in found] == ["a/run", "b"]
+    assert found[1].folder == (tmp_path / "b").resolve()
+    assert collect([tmp_path / "b"])[0].summary.run.label == "b"  # the run's folder itself
+
+
+def test_collect_names_what_is_wrong(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"holds no records/summary\.json"):
+        collect([tmp_path])
+    write_summary(summary_path(tmp_path / "good"), make_summary())
+    broken = summary_path(tmp_path / "broken")
+    broken.parent.mkdir(parents=True)
+    broken.write_text("{}")
+    with pytest.raises(RecordError, match=r"broken/records/summary\.json"):
+        collect([tmp_path])
+
+
+def test_a_report_imports_no_torch():
+    """What import contracts cannot see: imports inside of functions, and the command."""
+    code = "import sys, sparsestreet.cli.report; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

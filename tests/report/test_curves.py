@@ -1,0 +1,36 @@
+"""Time to quality from curves of known shape."""
+
+import pytest
+
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.report import collect
+from sparsestreet.report.arms import arms
+from sparsestreet.report.curves import QualityCurve, read_curve, seconds_to, time_to_quality
+from tests.report.sweep_folder import write_sweep
+
+
+def test_the_first_look_that_is_good_enough():
+    curve = QualityCurve((10.0, 20.0, 30.0), (20.0, 22.0, 21.5))
+    assert seconds_to(curve, 21.5) == 20.0  # nothing between two looks
+    assert seconds_to(curve, 22.1) is None
+
+
+def test_seconds_to_the_plain_runs_quality(tmp_path):
+    """Curves end at -3, -0.8, -0.3 and 0 dB; removal ends 0.2, 0.3 and 0.4 dB lower, the control 2 dB."""
+    grid = time_to_quality(arms(collect([write_sweep(tmp_path)])))
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in grid.rows}
+    assert rows["streetgs"] == ["20.0 s", "30.0 s", "40.0 s"]
+    # Within 1 dB: at -0.8 - 0.2 (20 s), else 30 s. Within 0.5: -0.3 - 0.2 at 30 s, else 40 s.
+    assert rows["streetgs+removal"] == ["30.0 s", "40.0 s", "not reached"]
+    assert rows["control: streetgs+random"] == ["not reached"] * 3
+
+
+def test_no_curve_no_table(tmp_path):
+    assert time_to_quality(arms(collect([write_sweep(tmp_path, curves=False)]))) is None
+
+
+def test_a_malformed_curve_is_named(tmp_path):
+    path = tmp_path / "held_out.csv"
+    path.write_text("seconds,psnr_full\nsoon,20.0\n")
+    with pytest.raises(RecordError, match=r"held_out\.csv: could not convert"):
+        read_curve(path)

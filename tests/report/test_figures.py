@@ -1,0 +1,73 @@
+"""What figures draw, and that their ink is the page's."""
+
+import re
+
+import pytest
+
+from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.report import collect
+from sparsestreet.report.arms import arms
+from sparsestreet.report.figures import COSTS, GREY, front, pareto, short
+from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
+from tests.report.sweep_folder import write_sweep
+
+
+def test_the_front_is_what_nothing_beats():
+    points = [(1.0, 20.0), (2.0, 19.0), (2.0, 22.0), (3.0, 22.0), (4.0, 23.0)]
+    assert front(points) == [(1.0, 20.0), (2.0, 22.0), (4.0, 23.0)]
+
+
+def test_short_numbers():
+    assert [short(value) for value in (0.5, 200.0, 12_000.0, 1.5e6)] == ["0.5", "200", "12k", "1.5M"]
+
+
+@pytest.fixture
+def found(tmp_path):
+    return arms(collect([write_sweep(tmp_path / "sweep", failed=False)]))
+
+
+def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
+    path = tmp_path / "pareto.svg"
+    assert pareto(found, DRIVESTUDIO, COSTS[0], path)
+    text = path.read_text()
+    titles = [name for name in ("full image", "people", "vehicles") if f">{name}<" in text]
+    assert titles == ["full image", "vehicles"]  # no run measured people
+    # 3 runs and a mean, of 2 plain or pruned arms and a grey one, in 2 panels; and one in the legend.
+    assert len(re.findall(r"<use [^>]*fill: #1f86c9", text)) == 2 * 2 * 4 + 1
+    assert len(re.findall(rf"<use [^>]*stroke: {GREY}", text)) >= 2 * 4
+    assert "control: random" in text
+
+
+def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
+    first, second = tmp_path / "a.svg", tmp_path / "b.svg"
+    pareto(found, DRIVESTUDIO, COSTS[0], first)
+    pareto(found, DRIVESTUDIO, COSTS[1], second)
+    one, other = first.read_text(), second.read_text()
+    assert "currentColor" in one
+    assert "#010203" not in one
+    ids = [set(re.findall(r'id="([^"]+)"', text)) for text in (one, other)]
+    assert not ids[0] & ids[1]
+    assert set(re.findall(r"#([a-z0-9]+)[\")]", one.replace("&quot;", '"'))) <= ids[0] | {"8c8c8c", "1f86c9"}
+    pareto(found, DRIVESTUDIO, COSTS[0], tmp_path / "again" / "a.svg")
+    assert (tmp_path / "again" / "a.svg").read_text() == one
+
+
+def test_figures_over_time(found, tmp_path):
+    for draw, word in ((held_out_over_time, "training seconds"), (counts_over_time, "step"), (frame_waterfall, "sky")):
+        assert draw(found, tmp_path / "some.svg")
+        assert word in (tmp_path / "some.svg").read_text()
+
+
+def test_what_was_not_recorded_is_not_drawn(tmp_path):
+    found = arms(collect([write_sweep(tmp_path / "sweep", curves=False)]))
+    for draw in (held_out_over_time, frame_waterfall):
+        assert not draw(found, tmp_path / "some.svg")
+    assert not (tmp_path / "some.svg").exists()
+
+
+def test_costs_of_another_format_are_named(found, tmp_path):
+    path = found[0].records[0].folder / "records" / "cost.json"
+    path.write_text("{}")
+    with pytest.raises(RecordError, match=r"cost\.json: .*has format None"):
+        frame_waterfall(found, tmp_path / "some.svg")

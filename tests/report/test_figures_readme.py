@@ -1,0 +1,37 @@
+"""The figure of quality against time."""
+
+import pytest
+
+from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.report import collect
+from sparsestreet.report.arms import arms
+from sparsestreet.report.curves import QualityCurve
+from sparsestreet.report.figures_readme import _paint, mean_curve, time_figure
+from tests.evaluation.frames import make_summary
+from tests.report.sweep_folder import record, write_sweep
+
+
+def test_the_mean_is_over_looks_that_all_curves_have():
+    curves = [QualityCurve((10.0, 20.0), (20.0, 22.0)), QualityCurve((12.0, 24.0, 36.0), (21.0, 24.0, 25.0))]
+    assert mean_curve(curves) == ([11.0, 22.0], [20.5, 23.0])
+
+
+@pytest.mark.parametrize("curves", [True, False])
+def test_it_is_written_with_and_without_curves(tmp_path, curves):
+    found = arms(collect([write_sweep(tmp_path / "sweep", curves=curves)]))
+    time_figure(found, DRIVESTUDIO, tmp_path / "figures" / "time.png")
+    assert (tmp_path / "figures" / "time.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_without_held_out_views_there_is_none(tmp_path):
+    found = arms([record(make_summary(psnr=None, training_psnr=20.0, split="none"))])
+    with pytest.raises(ValueError, match="no run was evaluated on held-out views"):
+        time_figure(found, DRIVESTUDIO, tmp_path / "time.png")
+
+
+def test_arms_of_one_method_differ_in_color_and_those_of_several_by_method():
+    one = arms([record(make_summary(label)) for label in ("a", "a+paper")])
+    assert len({_paint(arm, one) for arm in one}) == 2
+    several = [*one, *arms([record(make_summary("b"))])]
+    assert len({_paint(arm, several) for arm in one}) == 1
+    assert len({_paint(arm, several) for arm in several}) == 2

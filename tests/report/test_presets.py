@@ -1,0 +1,59 @@
+"""Trained one way, rendered another: rows, means over scenes, differences to the way that training rendered."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.records.presets import PresetRecord, RenderedAs, preset_path, write_presets
+from sparsestreet.report import collect
+from sparsestreet.report.arms import arms
+from sparsestreet.report.presets import rendered_otherwise
+from tests.evaluation.frames import NOISE
+from tests.report.sweep_folder import write_sweep
+
+
+def write_rendered(run: Path, loss: float) -> None:
+    """As it was trained (30 dB, 20 ms) and faster, for so many dB."""
+    rendered = tuple(
+        RenderedAs(
+            preset=name,
+            trained=not lost,
+            quality={"psnr_full": 30.0 - lost},
+            psnr_to_exact=50.0 - lost,
+            frame_ms=milliseconds,
+            repeats=12,
+        )
+        for name, lost, milliseconds in (("default", 0.0, 20.0), ("fast", loss, 12.0))
+    )
+    record = PresetRecord(command="c", device="cpu: x", threads=1, views=3, noise=NOISE, rendered=rendered)
+    write_presets(preset_path(run), record)
+
+
+def test_a_row_for_each_arm_and_preset(tmp_path):
+    """Losses of 0.1, 0.2 and 0.3 dB: mean 0.2, half width of the t interval 4.3027 x 0.1 / sqrt(3) = 0.2484."""
+    sweep = write_sweep(tmp_path)
+    for seed in range(3):
+        write_rendered(sweep / f"streetgs_seed{seed}", 0.1 * (seed + 1))
+    found = arms(collect([sweep]))
+    grid = rendered_otherwise(found, DRIVESTUDIO)
+    texts = [[cell.text for cell in row] for row in grid.rows]
+    assert texts == [
+        ["streetgs", "default, as trained", "3", "30.00", "-", "-", "-", "-", "-", "50.0", "20.00"],
+        ["streetgs", "fast", "3", "29.80", "-0.20 [-0.45, +0.05]", "-", "-", "-", "-", "49.8", "12.00"],
+    ]
+    assert not any("quiet" in note for note in grid.notes)
+    assert rendered_otherwise(found, STRICT).rows[1][3].text == "-"  # its metric was not recorded
+
+
+def test_arms_of_one_label_are_told_apart_by_how_they_were_trained(tmp_path):
+    sweep = write_sweep(tmp_path, failed=False)
+    for seed in range(3):
+        write_rendered(sweep / f"streetgs_seed{seed}", 0.1)
+    (plain, *_) = arms(collect([sweep]))
+    other = replace(plain, name="streetgs render.settings.alpha_min=0.1")
+    grid = rendered_otherwise([plain, other], DRIVESTUDIO)
+    assert [row[0].text for row in grid.rows] == ["streetgs, default"] * 4
+
+
+def test_none_recorded_no_table(tmp_path):
+    assert rendered_otherwise(arms(collect([write_sweep(tmp_path)])), DRIVESTUDIO) is None

@@ -1,0 +1,281 @@
+"""Tables from hand-made records, against numbers worked out by hand."""
+
+from pathlib import Path
+
+import pytest
+
+from sparsestreet.report import RunRecord, Spread, sections, spread
+from tests.evaluation.frames import make_summary
+
+
+def records(*summaries):
+    return [RunRecord(Path(f"run{index}"), summary) for index, summary in enumerate(summaries)]
+
+
+PLAIN_AND_OURS = records(
+    make_summary("plain", 0, psnr=25.0, gaussians={"background": 1000, "rigid": 200}, training_seconds=100.0),
+    make_summary("plain", 1, psnr=27.0, gaussians={"background": 1400, "rigid": 200}, training_seconds=120.0),
+    make_summary("ours", 0, psnr=24.9, gaussians={"background": 300, "rigid": 100}, milliseconds=20.0),
+    make_summary("ours", 1, psnr=26.6, gaussians={"background": 340, "rigid": 60}, milliseconds=30.0),
+)
+
+
+def cells(row, section):
+    return dict(zip([quantity.heading for quantity in section.quantities], row.cells, strict=True))
+
+
+def by_label(section):
+    return {row.label: row for row in section.rows}
+
+
+def test_rows_hold_mean_spread_and_number_of_runs():
+    (section,) = sections(PLAIN_AND_OURS, "plain")
+    plain, ours, difference = section.rows
+    assert [row.label for row in section.rows] == ["plain", "ours", "ours against plain"]
+    found = cells(plain, section)
+    assert (found["PSNR"].mean, found["PSNR"].n) == (26.0, 2)
+    assert found["PSNR"].sd == pytest.approx(2**0.5)
+    assert found["Gaussians"].mean == 1400.0
+    assert found["Gaussians"].sd == pytest.approx(200 * 2**0.5)
+    assert found["background"].mean == 1200.0
+    assert found["MB"].mean == pytest.approx(4 * 59 * 1400 / 1e6)
+    assert found["train s"].mean == 110.0
+    assert cells(ours, section)["ms/frame"].mean == 25.0
+    assert "vehicle SSIM" not in found  # no run has it
+
+    found = cells(difference, section)
+    assert found["PSNR"].mean == pytest.approx((-0.1 - 0.4) / 2)  # paired by seed
+    assert found["PSNR"].sd == pytest.approx(0.3 / 2**0.5)
+    assert found["Gaussians"].mean == pytest.approx((400 / 1200 + 400 / 1600) / 2 * 100)  # per cent kept
+    assert found["ms/frame"].mean == pytest.approx((50 + 75) / 2)
+    assert [row.runs for row in section.rows] == ["n=2 (seed 0,1)"] * 3
+
+
+def test_two_runs_that_differ_in_one_option_stand_apart():
+    (section,) = sections(
+        records(
+            make_summary("streetgs+removal", psnr=30.0, config={"schedule.removal_db": 0.1}),
+            make_summary("streetgs+removal", psnr=31.0, config={"schedule.removal_db": 0.2}),
+        )
+    )
+    assert [(row.label, row.n, row.cells[0].mean) for row in section.rows] == [
+        ("streetgs+removal schedule.removal_db=0.1", 1, 30.0),
+        ("streetgs+removal schedule.removal_db=0.2", 1, 31.0),
+    ]
+
+
+def test_three_repeats_are_one_row():
+    (section,) = sections(records(*(make_summary("m", seed, psnr=20.0 + seed) for seed in (2, 0, 1))))
+    (row,) = section.rows
+    assert (row.n, row.runs, row.cells[0]) == (3, "n=3 (seed 0,1,2)", Spread(21.0, 1.0, 3))
+
+
+def test_only_shared_seeds_are_paired():
+    (section,) = sections(
+        records(make_summary("plain", 0), make_summary("ours", 1), make_summary("mask", 0, psnr=26.0)), "plain"
+    )
+    rows = by_label(section)
+    assert rows["ours against plain"].cells[0] is None
+    assert rows["ours against plain"].runs == "no shared seed"
+    assert rows["mask against plain"].cells[0] == Spread(1.0, None, 1)
+
+
+def test_runs_of_one_seed_count_as_their_mean_in_a_pair():
+    (section,) = sections(
+        records(make_summary("plain", 0), make_summary("ours", 0, psnr=25.5), make_summary("ours", 0, psnr=26.5)),
+        "plain",
+    )
+    assert section.rows[1].runs == "n=2 (seed 0,0)"
+    assert section.rows[2].cells[0] == Spread(1.0, None, 1)
+
+
+def test_a_difference_needs_a_number_to_be_a_share_of():
+    (section,) = sections(
+        records(make_summary("plain", gaussians={"a": 5, "b": 0}), make_summary("ours", gaussians={"a": 4, "b": 3})),
+        "plain",
+    )
+    found = cells(section.rows[2], section)
+    assert (found["a"].mean, found["b"]) == (80.0, None)
+
+
+def test_other_scenes_splits_and_clips_get_tables_of_their_own():
+    found = sections(
+        records(
+            make_summary(),
+            make_summary(scene="kitti"),
+            make_summary(split="every 5th frame from 0"),
+            make_summary(config={"data.log.first_frame": 50}),
+        ),
+        "plain",
+    )
+    assert {section.title for section in found if not section.over_scenes} == {
+        "kitti (64x48; held out: every 10th frame from 0)",
+        "street (64x48; held out: every 10th frame from 0): data.log.first_frame=null",
+        "street (64x48; held out: every 10th frame from 0): data.log.first_frame=50",
+        "street (64x48; held out: every 5th frame from 0)",
+    }
+
+
+STREETS = (  # label, scene and seed, PSNR, Gaussians
+    *(("plain", 0, 30.0, 100), ("plain", 1, 32.0, 200), ("plain", 2, 31.0, 300)),
+    *(("ours", 0, 29.0, 50), ("ours", 1, 32.5, 50), ("ours", 2, 30.0, 150)),
+)
+
+
+def street(label, seed, psnr, gaussians, **run):
+    return make_summary(label, seed, psnr=psnr, gaussians={"a": gaussians}, scene=f"320x192_seed{seed}", **run)
+
+
+def test_runs_over_three_streets_have_a_mean_over_scenes():
+    *scenes, mean = sections(records(*(street(*values) for values in STREETS)), "plain")
+    assert [section.over_scenes for section in scenes] == [False] * 3
+    assert mean.over_scenes
+    assert mean.title == "mean over scenes (64x48; held out: every 10th frame from 0)"
+    plain, ours, difference = mean.rows
+    assert (plain.label, plain.runs, plain.cells[0]) == ("plain", "3 scenes, n=3", Spread(31.0, 1.0, 3))
+    assert ours.cells[0].mean == pytest.approx(30.5)
+    assert difference.cells[0].mean == pytest.approx((-1 + 0.5 - 1) / 3)  # paired by scene
+    assert cells(difference, mean)["Gaussians"].mean == pytest.approx((50 + 25 + 50) / 3)  # mean of the shares
+    assert difference.runs == "3 scenes, n=3"
+
+
+def test_each_scene_counts_once():
+    """Three runs of one scene weigh as much as the one of the other; pairs need scene and seed."""
+    mean = sections(
+        records(
+            *(make_summary("plain", seed, psnr=20.0 + seed, scene="a") for seed in (0, 1, 2)),
+            make_summary("plain", 1, psnr=31.0, scene="b"),
+            *(make_summary("ours", seed, psnr=25.0, scene="a") for seed in (1, 2)),
+            make_summary("ours", 1, psnr=30.0, scene="b"),
+            make_summary("ours", 7, psnr=99.0, scene="b"),
+        ),
+        "plain",
+    )[-1]
+    plain, ours, difference = mean.rows
+    assert (plain.runs, plain.cells[0]) == ("2 scenes, n=4", Spread(26.0, 50**0.5, 2))
+    assert ours.cells[0].mean == (25.0 + (30.0 + 99.0) / 2) / 2
+    assert (difference.runs, difference.cells[0].mean) == ("2 scenes, n=3", ((4 + 3) / 2 - 1.0) / 2)
+
+
+def test_no_mean_over_scenes_of_one_scene_or_of_different_configurations():
+    assert not any(section.over_scenes for section in sections(records(make_summary(seed=0), make_summary(seed=1))))
+    options = {"schedule.removal_db": 0.1}, {"schedule.removal_db": 0.2}
+    apart = [make_summary("m", config=config, scene=scene) for config, scene in zip(options, "ab", strict=True)]
+    assert not any(section.over_scenes for section in sections(records(*apart)))
+    logs = {"data.log.width": 640}, {"data.log.width": 320}
+    apart = [make_summary("m", config=config, scene=scene) for config, scene in zip(logs, "ab", strict=True)]
+    assert not any(section.over_scenes for section in sections(records(*apart)))
+
+
+def test_a_mean_over_scenes_takes_clips_of_any_length():
+    clips = [
+        make_summary("m", config={"data.log.last_frame": last}, scene=scene) for last, scene in ((9, "a"), (7, "b"))
+    ]
+    mean = sections(records(*clips))[-1]
+    assert mean.over_scenes
+    assert mean.rows[0].runs == "2 scenes, n=2"
+
+
+def test_a_mean_over_scenes_leaves_out_who_has_one_scene_only():
+    runs = [make_summary("m", scene="a"), make_summary("m", scene="b"), make_summary("other", scene="a")]
+    assert [row.label for row in sections(records(*runs))[-1].rows] == ["m"]
+
+
+def test_runs_without_held_out_views_show_their_training_views():
+    run = make_summary(psnr=None, training_psnr=33.0, split="none")
+    (section,) = sections(records(run))
+    assert section.title == "street (64x48; held out: none)"
+    found = cells(section.rows[0], section)
+    assert found["train-view PSNR"].mean == 33.0
+    assert {"train-view SSIM", "train-view vehicle PSNR"} < set(found)
+    assert "PSNR" not in found
+    (section,) = sections(records(make_summary(training_psnr=33.0)))
+    found = cells(section.rows[0], section)
+    assert (found["PSNR"].mean, found["train-view PSNR"].mean) == (25.0, 33.0)
+    assert "train-view SSIM" not in found
+
+
+def rig(front, back, **summary):
+    """A run with a front camera 1, of full, near and beyond PSNR, and one behind, 10, that has no lidar."""
+    metrics = dict(zip(("psnr_full", "psnr_near_lidar", "psnr_beyond_lidar"), front, strict=True))
+    return make_summary(cameras={"1": metrics, "10": {"psnr_full": back, "psnr_near_lidar": None}}, **summary)
+
+
+def test_several_cameras_get_a_table_of_their_own():
+    found = sections(
+        records(
+            rig((25.0, 28.0, 22.0), 24.0, label="plain", seed=0),
+            rig((27.0, 29.0, 24.0), 26.0, label="plain", seed=1),
+            rig((24.0, 27.5, 20.0), 24.5, label="ours", seed=0),
+        ),
+        "plain",
+    )
+    whole, cameras = found
+    assert [section.by_camera for section in found] == [False, True]
+    assert cameras.title == f"PSNR by camera, {whole.title}"
+    assert [row.label for row in cameras.rows] == [row.label for row in whole.rows]
+    plain, ours, difference = (cells(row, cameras) for row in cameras.rows)
+    assert list(plain) == ["camera 1", "camera 1 near", "camera 1 beyond", "camera 10"]
+    assert (plain["camera 1"].mean, plain["camera 1 near"].mean, plain["camera 10"].mean) == (26.0, 28.5, 25.0)
+    assert plain["camera 1 beyond"].sd == pytest.approx(2**0.5)
+    assert ours["camera 1 beyond"] == Spread(20.0, None, 1)
+    assert (difference["camera 1 beyond"].mean, difference["camera 10"].mean) == (-2.0, 0.5)
+    assert cameras.notes == (
+        "PSNR in dB of held-out views, the mean over the images of each camera; the rest as above",
+    )
+
+
+def test_one_camera_gets_no_table_of_its_own():
+    """Over scenes several logs of one camera each are one camera still."""
+    found = sections(records(make_summary(scene="a"), make_summary(scene="b")))
+    assert [(section.over_scenes, section.by_camera) for section in found] == 2 * [(False, False)] + [(True, False)]
+
+
+def test_cameras_have_means_over_scenes():
+    found = sections(records(*(rig((psnr, 28.0, 22.0), 24.0, scene=name) for name, psnr in (("a", 24.0), ("b", 26.0)))))
+    assert [(section.over_scenes, section.by_camera) for section in found[-2:]] == [(True, False), (True, True)]
+    assert cells(found[-1].rows[0], found[-1])["camera 1"] == Spread(25.0, 2**0.5, 2)
+
+
+BOTH = [make_summary("m", config={"x": value}, psnr=20.0 + value) for value in (1, 2)]
+
+
+def test_the_baseline_may_be_the_name_of_a_column():
+    (section,) = sections(records(*BOTH, make_summary("other")), "m x=2")
+    assert [row.label for row in section.rows][:3] == ["m x=2", "m x=1", "other"]
+    assert by_label(section)["m x=1 against m x=2"].cells[0].mean == -1.0
+    with pytest.raises(ValueError, match=r"baseline 'm' has 2 configurations: choose one of \['m x=1', 'm x=2'\]"):
+        sections(records(*BOTH), "m")
+    with pytest.raises(ValueError, match=r"no run has the baseline 'none': choose one of \['m x=1', 'm x=2'\]"):
+        sections(records(*BOTH), "none")
+
+
+def test_nothing_is_said_of_differences_where_there_are_none():
+    (section,) = sections(records(make_summary()), "plain")
+    assert not [note for note in section.notes if "differences" in note]
+
+
+def test_a_label_is_a_baseline_in_tables_where_it_has_one_configuration():
+    """Whatever it is called for the sake of other tables."""
+    runs = [make_summary("m", config={"x": value}, scene=scene) for value, scene in ((1, "a"), (2, "b"))]
+    found = sections(records(*runs, make_summary("other", scene="a")), "m")
+    assert [row.label for row in found[0].rows] == ["m x=1", "other", "other against m x=1"]
+
+
+def test_a_section_without_the_baseline_says_so():
+    found = sections(records(make_summary(), make_summary("ours", scene="kitti")), "plain")
+    assert "no run of the baseline plain here, so no differences" in found[0].notes
+    assert [row.difference for row in found[0].rows] == [False]
+
+
+def test_two_meanings_of_one_metric_do_not_meet_in_a_table():
+    first, second = make_summary(), make_summary("ours")
+    second.definitions["psnr_full"] = "something else"
+    with pytest.raises(ValueError, match="psnr_full means different things in run0 and run1"):
+        sections(records(first, second))
+
+
+def test_spread():
+    assert spread([]) is None
+    assert spread([3.0]) == Spread(3.0, None, 1)
+    assert spread([1.0, 2.0, 6.0]).sd == pytest.approx(7**0.5)

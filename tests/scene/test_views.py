@@ -1,0 +1,104 @@
+"""The cameras of a log as ``views.json``."""
+
+import json
+
+import pytest
+import torch
+
+from sparsestreet.scene.views import read_views, write_views
+from sparsestreet.types import Camera, Frame, Shutter, View
+from tests.export.street import street_views
+
+
+def odd_view(frame: int = 3) -> View:
+    """Numbers that no short decimal has, a lens and a rolling shutter."""
+    generator = torch.Generator().manual_seed(frame)
+
+    def numbers(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator) * torch.logspace(-6, 6, shape[-1])
+
+    camera = Camera(numbers(4, 4), numbers(3, 3), 97, 61, numbers(5), Shutter(numbers(3), numbers(3)))
+    return View(camera, frame / 7, frame, 2)
+
+
+def same(a: View, b: View) -> None:
+    assert (a.time, a.frame_index, a.camera_index) == (b.time, b.frame_index, b.camera_index)
+    assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+    assert torch.equal(a.camera.camera_from_world, b.camera.camera_from_world)
+    assert torch.equal(a.camera.intrinsics, b.camera.intrinsics)
+
+
+def test_views_come_back_bit_for_bit(tmp_path):
+    path = tmp_path / "run" / "views.json"
+    plain, odd = street_views(), [odd_view(3), odd_view(4)]
+    write_views(path, odd, plain, frames_per_second=12.5)
+    views = read_views(path)
+    for written, read in zip([*odd, *plain], [*views.training, *views.held_out], strict=True):
+        same(written, read)
+    assert views.frames_per_second == 12.5
+    assert views.held_out[0].camera.distortion is None
+    assert views.held_out[0].camera.shutter is None
+    for written, read in zip(odd, views.training, strict=True):
+        assert torch.equal(written.camera.distortion, read.camera.distortion)
+        assert torch.equal(written.camera.shutter.translation, read.camera.shutter.translation)
+        assert torch.equal(written.camera.shutter.rotation, read.camera.shutter.rotation)
+    assert [entry.name for entry in path.parent.iterdir()] == ["views.json"]
+
+
+def test_all_views_are_in_order_of_time_and_camera(tmp_path):
+    views = street_views()
+    write_views(tmp_path / "views.json", views[8:12], [*views[12:], *views[:8]])
+    order = [(view.frame_index, view.camera_index) for view in read_views(tmp_path / "views.json").all]
+    assert order == [(view.frame_index, view.camera_index) for view in views]
+
+
+def test_an_unknown_frame_rate_is_none(tmp_path):
+    write_views(tmp_path / "views.json", street_views(), [])
+    assert read_views(tmp_path / "views.json").frames_per_second is None
+
+
+def test_pixels_are_not_touched(tmp_path):
+    """A frame whose image raises when it is read, as one would that loads it from disk."""
+    view = street_views()[0]
+    frame = object.__new__(Frame)
+    for name in ("camera", "time", "frame_index", "camera_index"):
+        object.__setattr__(frame, name, getattr(view, name))
+    with pytest.raises(AttributeError):
+        _ = frame.image
+    write_views(tmp_path / "views.json", [frame], [])
+    same(read_views(tmp_path / "views.json").training[0], view)
+
+
+def test_a_view_that_nobody_recorded_is_refused_and_leaves_the_old_file(tmp_path):
+    path = tmp_path / "views.json"
+    write_views(path, street_views(), [])
+    before = path.read_text()
+    with pytest.raises(ValueError, match="frame and a camera index, got None and 0"):
+        write_views(path, [View(street_views()[0].camera, 0.5, None, 0)], [])
+    assert path.read_text() == before
+
+
+def test_a_file_that_is_not_there_says_who_writes_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no .*views\.json: training writes"):
+        read_views(tmp_path / "views.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda file: file.update(format=2), "format 2, this version reads 1"),
+        (lambda file: file["views"][1].update(split="test"), "view 1 has split 'test'"),
+        (lambda file: file["views"][2]["camera_from_world"].pop(), "view 2: camera_from_world must be 4 x 4"),
+        (lambda file: file["views"][2]["intrinsics"][1].pop(), "view 2: intrinsics must be 3 x 3"),
+        (lambda file: file["views"][0].pop("time"), r"views\[0\].* lacks the keys \['time'\]"),
+        (lambda file: file["views"][0].update(distortion=[0.1]), "view 0: distortion must be 5 numbers"),
+    ],
+)
+def test_a_damaged_file_names_the_place(tmp_path, change, said):
+    path = tmp_path / "views.json"
+    write_views(path, street_views(), [])
+    file = json.loads(path.read_text())
+    change(file)
+    path.write_text(json.dumps(file))
+    with pytest.raises(ValueError, match=said):
+        read_views(path)

@@ -1,0 +1,76 @@
+import pytest
+
+from sparsestreet.atomic import atomic_file, atomic_folder
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
+    path = tmp_path / "new" / "a.txt"
+    with atomic_file(path) as temporary:
+        temporary.write_text("one")
+        assert temporary.suffix == ".txt"
+        assert not path.exists()
+    assert path.read_text() == "one"
+    assert names(path.parent) == ["a.txt"]
+
+
+def test_a_file_may_be_read_by_whom_the_user_lets_read(tmp_path):
+    (tmp_path / "plain").write_text("")
+    with atomic_file(tmp_path / "a.txt") as temporary:
+        temporary.unlink()
+        temporary.touch(mode=0o600)
+    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+@pytest.mark.parametrize("stopped_by", [RuntimeError, KeyboardInterrupt])
+def test_a_failure_leaves_the_old_file(tmp_path, stopped_by):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail() -> None:
+        with atomic_file(path) as temporary:
+            temporary.write_text("half")
+            raise stopped_by
+
+    with pytest.raises(stopped_by):
+        fail()
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_where_nothing_can_be_written_is_said_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "a.txt", tmp_path):
+        with pytest.raises(OSError, match="cannot be written"), atomic_file(path):
+            pytest.fail("the block must not run")
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_folder_takes_its_place_when_it_is_whole(tmp_path):
+    with atomic_folder(tmp_path / "out") as temporary:
+        (temporary / "a").write_text("one")
+        assert names(tmp_path) == [temporary.name]
+    assert names(tmp_path) == ["out"]
+    assert (tmp_path / "out" / "a").read_text() == "one"
+
+
+def test_a_failure_leaves_no_folder(tmp_path):
+    def fail() -> None:
+        with atomic_folder(tmp_path / "out") as temporary:
+            (temporary / "a").write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_holds_something_is_left_alone(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").write_text("")
+    with pytest.raises(OSError, match="no empty folder"), atomic_folder(tmp_path / "out"):
+        pytest.fail("the block must not run")
+    assert names(tmp_path / "out") == ["mine"]
