@@ -18,7 +18,7 @@ class SizeRule(PruningRule):
     meters: float
 
     @torch.no_grad()
-    def select(self, scene: SceneGraph, frames: Sequence[Frame], how: RenderContext) -> dict[str, Selection]:
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
         selections = {}
         for name, floors in self.floors(scene, frames, context).items():
             sizes = scene.nodes[name].rows.log_scales.amax(1).exp()
