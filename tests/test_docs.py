@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-HISTORY = ("CHANGELOG.md", "results.md")
-"""Pages that also name what has been."""
-PAGES = [page for page in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]) if page.name not in HISTORY]
+EVERY_PAGE = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+PAGES = [page for page in EVERY_PAGE if page.name != "CHANGELOG.md" and page.parent.name != "results"]
+"""Without those that also name what has been."""
 ROOMS = (ROOT, ROOT / "sparsestreet", ROOT / "tests", ROOT / "conf")
 WRITTEN = {"outputs", "build", "records", "pictures"}
 """Folders that a build or a run writes."""
@@ -21,6 +21,17 @@ def test_every_file_that_is_named_is_there(page):
     named = re.findall(r"(?<![\w/.$-])(?:[\w.-]+/)+(?:[\w*.-]*\w)?", page.read_text())
     named = {name for name in named if name.partition("/")[0] in TOPS}
     assert [name for name in named if not any(list(room.glob(name.rstrip("/"))) for room in ROOMS)] == []
+
+
+@pytest.mark.parametrize("page", EVERY_PAGE, ids=lambda page: page.name)
+def test_every_link_leads_to_a_file(page):
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text())
+    assert [link for link in links if not (page.parent / link).is_file()] == []
+
+
+def test_every_page_of_results_is_linked():
+    linked = set(re.findall(r"\(results/(\w+\.md)\)", (ROOT / "docs" / "results.md").read_text()))
+    assert linked == {page.name for page in (ROOT / "docs" / "results").glob("*.md")}
 
 
 def test_the_floors_are_those_of_the_import_contract():
