@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from sparsestreet import __version__
+
 ROOT = Path(__file__).parents[1]
 EVERY_PAGE = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 PAGES = [page for page in EVERY_PAGE if page.name != "CHANGELOG.md" and page.parent.name != "results"]
@@ -32,6 +34,11 @@ def test_every_link_leads_to_a_file(page):
 def test_every_page_of_results_is_linked():
     linked = set(re.findall(r"\(results/(\w+\.md)\)", (ROOT / "docs" / "results.md").read_text()))
     assert linked == {page.name for page in (ROOT / "docs" / "results").glob("*.md")}
+
+
+def test_the_last_release_of_the_changelog_is_the_version():
+    releases = re.findall(r"^## (\d\S*) - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), flags=re.M)
+    assert releases[0] == __version__
 
 
 def test_the_floors_are_those_of_the_import_contract():

@@ -1,7 +1,8 @@
 """Useless Gaussians planted in a trained street.
 
 Pruning by removal finds them and spares what is visible. The paper's stages do not do both at once: gentle masks spare
-what is visible and leave half of the planted, the importance gate takes rows that would be missed (docs/results/ideal_lidar.md).
+what is visible and leave half of the planted; the importance gate takes rows that would be missed
+(docs/results/ideal_lidar.md).
 """
 
 from dataclasses import replace
