@@ -87,9 +87,9 @@ class Camera:
     width: int
     height: int
     distortion: Float[Tensor, "5"] | None = None
-    """Brown-Conrady k1, k2, p1, p2, k3 as OpenCV orders them; None: none, and none is paid for."""
+    """Brown-Conrady k1, k2, p1, p2, k3 as OpenCV orders them; None: a pinhole, at no cost."""
     shutter: Shutter | None = None
-    """None: all rows are exposed at once, and nothing is paid for."""
+    """None: all rows are exposed at once, at no cost."""
 
     @property
     def position(self) -> Float[Tensor, "3"]:

@@ -66,7 +66,7 @@ def _fits(value: Tree, hint: typing.Any) -> bool:
 
 
 def _item_fits(item: Tree, count: int, hint: typing.Any) -> bool:
-    """In a list or tuple (YAML has lists only) of its like: of one of any length beartype looks at some item only."""
+    """Beartype checks one random item of a variadic tuple or list, so each item is checked in a sequence of copies."""
     return _any_fits((kind([one] * count) for one in _meant(item) for kind in (list, tuple)), hint)
 
 

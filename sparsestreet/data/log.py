@@ -44,7 +44,7 @@ class DrivingLog:
     notes: tuple[str, ...] = ()
     """What is absent, and what a run does without it, one sentence each."""
     truth: Truth | None = None
-    """Of views beside the recorded path; None: nobody knows it, as of all recorded drives."""
+    """What a camera off the recorded path would see; None: unknown, as for any recorded drive."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", Frames.of(self.frames))

@@ -24,7 +24,7 @@ _FACES = torch.tensor(
 def colors_along(texels: Float[Tensor, "6 r r 3"], directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
     """Color seen along directions of any non-zero length; gradients go to the texels only."""
     corners, weights = _corners(directions.detach().to(texels.dtype), texels.shape[1])
-    # gather, because of the ways to read rows its backward is the fast one on the CPU.
+    # gather has the fastest backward pass on the CPU among the ways to read rows.
     index = corners.reshape(-1, 1).expand(-1, 3)
     values = texels.reshape(-1, 3).gather(0, index).reshape(-1, 4, 3)
     return (values * weights[..., None]).sum(1)

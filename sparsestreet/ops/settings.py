@@ -30,8 +30,8 @@ class SplatSettings:
     max_sigma: float = inf
     """A splat ends this many standard deviations from its mean, > 0, besides at ``alpha_min`` (gsplat: 3.33)."""
     depth_bits: int = 32
-    """Upper bits of the float32 depth that are sorted, 9 to 32 (9: powers of two of the depth); fewer order near ties
-    by row."""
+    """Upper bits of the float32 depth that are sorted, 9 to 32 (9: powers of two of the depth). With fewer bits, rows
+    of nearly equal depth are sorted by index."""
     half_colors: bool = False
     """Round colors to float16 before blending (gradient as if not rounded)."""
     antialias: bool = False

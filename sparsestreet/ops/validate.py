@@ -71,8 +71,8 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
 def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) -> None:
     """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value.
 
-    Rows of opacity 0 are not looked at: they are culled before anything else of them is read. ``drawn``: the rows whose
-    harmonics are read; None, where one of them is known to be bad: any bad one is named.
+    Rows of opacity 0 are not checked, because they are culled before anything else of them is read. ``drawn``: the rows
+    whose harmonics are read; None where one of them is known to be bad, and then any bad one is named.
     """
     opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
     masked = opacities == 0
@@ -80,7 +80,7 @@ def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) 
         field, unread = getattr(gaussians, name).detach(), masked
         if name == "sh" and drawn is not None:
             unread = ~drawn
-        _raise_at(name, field, torch.isfinite(field), unread, "must be finite", "find the step that made it")
+        _raise_at(name, field, torch.isfinite(field), unread, "must be finite", "check what computed it")
     inside = (opacities >= 0) & (opacities <= 1)
     _raise_at("opacities", opacities, inside, masked, "must lie in [0, 1]", "apply the sigmoid")
     _raise_at("scales", scales, scales >= 0, masked, "must be >= 0 meters", "apply the exponential")
@@ -99,7 +99,7 @@ def _raise_in_image(name: str, image: Tensor, holds: Tensor, invariant: str) -> 
         return
     place = (~holds).nonzero()[0].tolist()
     value = image[tuple(place)].item()
-    raise ValueError(f"{name} {invariant}, but at {place} it is {value}: find the step that made it")
+    raise ValueError(f"{name} {invariant}, but at {place} it is {value}: check what computed it")
 
 
 def _check_size(camera: Camera) -> None:

@@ -1,4 +1,4 @@
-"""What every pruning rule is: which nodes it may take from, and what it answers."""
+"""Interface of the pruning rules: which nodes they may take from, and which rows they keep."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence

@@ -100,7 +100,7 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
 
 def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], context: RenderContext) -> LeaveOneOut:
     """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
-    # Where there is no error left, any change is too dear. A region that no frame marks has no pixel to weigh.
+    # Where no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
     share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
     return leave_one_out(

@@ -26,9 +26,8 @@ def keep_by_cost(
 ) -> dict[str, Selection]:
     """Drop the cheapest rows of all nodes together, as long as their costs add up to ``allowed`` at most.
 
-    ``costs`` and ``floors``: by name of the node. At a floor the dearest rows stay and, among equals, the lower row;
-    what they would have cost is not spent on others. Raises ValueError for costs that are NaN or negative, or a
-    negative floor.
+    ``costs`` and ``floors``: by name of the node. At a floor the most expensive rows stay and, among equals, the lower
+    row; their cost is not spent on others. Raises ValueError for costs that are NaN or negative, or a negative floor.
     """
     if not costs:
         return {}

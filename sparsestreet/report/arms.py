@@ -29,7 +29,7 @@ class Arm:
 
     @property
     def control(self) -> bool:
-        """Whether it has the size of another arm, and is no way to get small."""
+        """Whether this is a control, sized to match another arm."""
         return self.sparsify in CONTROLS
 
     @property

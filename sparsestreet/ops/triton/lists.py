@@ -31,7 +31,7 @@ _BLOCK = 256
 _LANES = 2
 """Lanes of a splat where pairs are listed: most reach one or two rows of tiles."""
 GIANT = constant(32)
-"""Tiles from which on a splat gets a warp there."""
+"""Splats that cover at least this many tiles get a warp each."""
 
 
 @dataclass(frozen=True)

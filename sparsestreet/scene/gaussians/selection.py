@@ -38,7 +38,7 @@ def keep_best(
     min_gaussians: int,
     instances: InstanceFloors | None = None,
 ) -> Selection:
-    """Keep all that is wanted, and of the unwanted only what the floors call for.
+    """Drop the unwanted rows, but keep enough of them to meet the floors.
 
     Each instance first fills up to its own floor, then the best of what is left fill up to ``min_gaussians``. The
     highest scores stay and, among rows of equal score, the lower row. Raises ValueError for scores that are NaN or a

@@ -1,6 +1,6 @@
-"""What the scene is made of; each node class is one module: what is said about it, how it starts, what it answers.
+"""The nodes of a scene. Each node class is one module with its settings, its initialization and its interface.
 
-``node`` is what all have in common. Of a whole street: ``background`` stands still, the Gaussians of ``vibrating``
+``node`` is the interface shared by all. Of a whole street: ``background`` stands still, the Gaussians of ``vibrating``
 swing and fade, those of ``field`` are deformed by a ``network``. Of objects: ``rigid`` moves them along their tracks
 (``tracked``) without changing their shape, ``deformable`` with a network that changes it, ``smpl`` moves people by
 their skeletons.

@@ -1,4 +1,4 @@
-"""Everything that does not move: where it starts, and what it answers."""
+"""The node of everything that does not move."""
 
 import logging
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What every node class of the scene graph has in common: what is said about it, and what it answers."""
+"""Settings and interface shared by all node classes of the scene graph."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,5 @@
-"""The Triton kernels against the float64 reference: images, radii and all gradients, at sizes the interpreter bears."""
+"""The Triton kernels against the float64 reference: images, radii and all gradients, small enough for the
+interpreter."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The fused SSIM and its gradient against torch in float64, at sizes the interpreter bears."""
+"""The fused SSIM and its gradient against torch in float64, small enough for the interpreter."""
 
 import pytest
 import torch
