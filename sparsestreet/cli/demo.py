@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from sparsestreet.cli.report import report
-from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report.side_by_side import compare_runs
 from sparsestreet.scene.centers import node_legend
 
@@ -39,7 +39,7 @@ def demo(arguments: list[str]) -> int:
         if status:
             return status
     runs = [out / sparsify for sparsify in SPARSIFY]
-    plain = read_summary(summary_path(runs[0]))
+    plain = SUMMARY.read(runs[0])
     compare_runs(runs, out / "comparison.png", legend=node_legend(plain.gaussians))
     status = report([*map(str, runs), f"baseline={plain.run.label}", f"markdown={out / 'table.md'}"])
     print(

@@ -15,8 +15,8 @@ from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene
 from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.provenance import this_machine
-from sparsestreet.records.run import RunDescription, read_run, run_path
-from sparsestreet.records.summary import summary_path
+from sparsestreet.records.run import RUN, RunDescription
+from sparsestreet.records.summary import SUMMARY
 
 USAGE = """\
 sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true] [presets=fast,default,exact]
@@ -62,7 +62,7 @@ def evaluate(arguments: list[str]) -> int:
 
 def _evaluate(options: Options) -> None:
     run = options.run
-    cfg, description = load_run_config(run), read_run(run_path(run))
+    cfg, description = load_run_config(run), RUN.read(run)
     if "evaluation" not in cfg:
         raise ValueError(f"{run} is of an earlier version, its configuration lacks 'evaluation': train it again")
     # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
@@ -86,7 +86,7 @@ def _evaluate(options: Options) -> None:
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
     latency = summary.latency
     steady = "" if latency.noise.quiet else " on a machine that was not quiet"
-    print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {summary_path(run)}")
+    print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {SUMMARY.path(run)}")
     looks.take(stored.scene, data, stored.options, out=run, command=command, say=print)
 
 

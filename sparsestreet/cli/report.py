@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
+from omegaconf import OmegaConf
 from rich.console import Console
 
-from sparsestreet.cli.sweep import sweep_name
 from sparsestreet.metrics.protocols import DRIVESTUDIO, PROTOCOLS, Protocol
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect, figure, markdown, sections, tables
@@ -94,3 +94,9 @@ def _report_sweep(folder: Path, protocol: Protocol, picture: str | None) -> int:
         print(note)
     print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
     return 0
+
+
+def sweep_name(folder: Path) -> str | None:
+    """Which of conf/sweep a folder is of; None for any other sweep."""
+    path = folder / "multirun.yaml"
+    return OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None

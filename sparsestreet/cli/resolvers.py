@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.records.summary import SUMMARY
 
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
@@ -33,11 +33,11 @@ def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> An
     """
     if run is None:
         return otherwise
-    if not summary_path(Path(run)).is_file():
+    if not SUMMARY.exists(Path(run)):
         raise FileNotFoundError(
             f"count_of={run}: that run has no record, and a control has its count from it; make it first"
         )
-    gaussians = read_summary(summary_path(Path(run))).gaussians
+    gaussians = SUMMARY.read(Path(run)).gaussians
     return gaussians if node is None else gaussians[node]
 
 

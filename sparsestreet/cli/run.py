@@ -21,7 +21,7 @@ from sparsestreet.evaluation.run import evaluate_scene
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.costs import stage_costs, step_costs, update_costs
-from sparsestreet.records.run import read_run, run_path
+from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.training.callbacks import (
     Checkpoints,
@@ -92,7 +92,7 @@ def _train_and_evaluate(
             system.scene,
             data.split.held_out,
             data.split.train,
-            run=read_run(run_path(out)),
+            run=RUN.read(out),
             options=system.options,
             out=out,
             command=command,
@@ -112,7 +112,7 @@ def _write_costs(out: Path, recorder: StageRecorder, device: torch.device) -> No
         wall_seconds=sum(seconds.values()),
         phases=phases,
         passes=passes,
-        step_ms=step_costs(out / "records" / "phases.csv"),
+        step_ms=step_costs(out),
         peak_host_mb=host,
         peak_device_mb=on_device,
     )
@@ -123,7 +123,7 @@ def _train(
 ) -> Trainer:
     """Fit to the end, or end the program as the signal wants that came."""
     clock, stop, checkpoint = Clock(), GracefulStop(), _checkpoint(cfg)
-    curve = HeldOutCurve(out / "curves" / "held_out.csv", clock)
+    curve = HeldOutCurve(out, clock)
     trainer = trainer_of(cfg, [clock, *callbacks, curve, TrainingProgress()], out)
     with stage("data"):  # its files are read for a hash
         description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
@@ -132,7 +132,7 @@ def _train(
     resume = {} if checkpoint is None else {"ckpt_path": checkpoint, "weights_only": False}
     at = None if checkpoint is None else torch.load(checkpoint, map_location="cpu", weights_only=False)["global_step"]
     try:
-        with kept_curves(out / "curves" / "metrics.csv", at):
+        with kept_curves(out, at):
             trainer.fit(system, datamodule=data, **resume)
     except SystemExit:
         sys.exit(stop.exit_status or 1)

@@ -14,9 +14,9 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.records.configuration import config_hash, flat_config, only
-from sparsestreet.records.failures import FailedRun, failure_path, read_failures, write_failure
+from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
-from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.records.summary import SUMMARY
 
 log = logging.getLogger(__name__)
 
@@ -87,18 +87,18 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float]) -> float:
         log.exception("%s failed", out)
         command = this_command(["train", *HydraConfig.get().overrides.task])
         trace = "".join(traceback.format_exception(error))
-        write_failure(
+        FAILURE.write(
             out, FailedRun(label=cfg.name, seed=cfg.seed, command=command, error=sentence(error), trace=trace)
         )
         return math.nan
-    failure_path(out).unlink(missing_ok=True)
+    FAILURE.remove(out)
     return done
 
 
 def finished(cfg: DictConfig, out: Path) -> float | None:
     """The PSNR of a folder that holds the complete record of this very job; None where it has to be trained."""
     try:
-        summary = read_summary(summary_path(out))
+        summary = SUMMARY.read(out)
     except RecordError:
         return None
     config = flat_config(OmegaConf.to_container(cfg, resolve=True))
@@ -106,12 +106,6 @@ def finished(cfg: DictConfig, out: Path) -> float | None:
     if not same or summary.run.steps < summary.run.max_steps:
         return None
     return summary.mean("psnr_full")
-
-
-def sweep_name(folder: Path) -> str | None:
-    """Which of conf/sweep a folder is of; None for any other sweep."""
-    path = folder / "multirun.yaml"
-    return OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
 
 
 def sentence(error: BaseException) -> str:

@@ -13,8 +13,8 @@ from sparsestreet.metrics.extractors import LastLayer
 from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import stage
-from sparsestreet.records.novel import NovelRecord, novel_path, write_novel
-from sparsestreet.records.presets import PresetRecord, preset_path, write_presets
+from sparsestreet.records.novel import NOVEL, NovelRecord
+from sparsestreet.records.presets import PRESETS, PresetRecord
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 
@@ -60,14 +60,14 @@ class ExtraMetrics:
         if self.novel:
             with stage("novel"):
                 record = self._beside(scene, views, options, data.driving_log.truth, command)
-                write_novel(novel_path(out), record)
+                NOVEL.write(out, record)
             for line in _of_shifts(record):
                 say(line)
         if self.presets:
             ways = {name: RenderOptions(SplatSettings.preset(name)) for name in self.presets}
             with stage("presets"):
                 rendered = evaluate_presets(scene, views, ways, options, command=command)
-                write_presets(preset_path(out), rendered)
+                PRESETS.write(out, rendered)
             for line in _of_presets(rendered):
                 say(line)
 

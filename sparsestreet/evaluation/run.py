@@ -21,23 +21,13 @@ from sparsestreet.phases import stage
 from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_picture, write_picture, write_png
 from sparsestreet.pictures.sheets import Legend, picture_sheet
 from sparsestreet.records.costs import update_costs
-from sparsestreet.records.latency_csv import latency_path, write_latency
-from sparsestreet.records.novel import novel_path
-from sparsestreet.records.presets import preset_path
+from sparsestreet.records.latency import LATENCY, Latency, clock_rows
+from sparsestreet.records.novel import NOVEL
+from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.provenance import this_machine, this_source
-from sparsestreet.records.quality import FrameQuality, camera_means, summarize
-from sparsestreet.records.quality_csv import quality_path, write_quality
+from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, FrameQuality, camera_means, summarize
 from sparsestreet.records.run import RunDescription
-from sparsestreet.records.summary import (
-    HELD_OUT,
-    TRAINING,
-    Evaluation,
-    GuardCounts,
-    Latency,
-    RunSummary,
-    summary_path,
-    write_summary,
-)
+from sparsestreet.records.summary import SUMMARY, Evaluation, GuardCounts, RunSummary
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
@@ -89,8 +79,8 @@ def evaluate_scene(
     lpips, absent = open_lpips(scene.device)
     for split in (HELD_OUT, TRAINING):
         clear_predictions(predictions_folder(out, split))
-    for path in (novel_path(out), preset_path(out)):
-        path.unlink(missing_ok=True)  # of an earlier evaluation, perhaps of an earlier scene
+    for file in (NOVEL, PRESETS):
+        file.remove(out)  # of an earlier evaluation, perhaps of an earlier scene
     quality = {
         split: list(
             evaluate_frames(
@@ -112,12 +102,12 @@ def evaluate_scene(
         chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
         _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
     for split in (HELD_OUT, TRAINING):
-        quality_path(out, split).unlink(missing_ok=True)  # of an earlier evaluation, perhaps on more views
+        QUALITY[split].remove(out)  # of an earlier evaluation, perhaps on more views
     for split, images in quality.items():
-        write_quality(quality_path(out, split), images)
-    write_latency(latency_path(out), latency)
+        QUALITY[split].write(out, images)
+    LATENCY.write(out, clock_rows(latency))
     update_costs(out, **vars(costs))
-    write_summary(summary_path(out), summary)
+    SUMMARY.write(out, summary)
     return summary
 
 

@@ -1,11 +1,13 @@
-"""Curves of one training, drawn from the files it left (no torch)."""
+"""Curves of one training, drawn from the files it left."""
 
-import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from sparsestreet.pictures.plots import plot_counts, plot_psnr
-from sparsestreet.records.ledger import MASK, PRUNING, CountChange, ledger_path, read_changes
+from sparsestreet.records.held_out import HELD_OUT_CURVE
+from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
+from sparsestreet.records.logged import LOGGED
 
 MARKED = (MASK, PRUNING)
 """Reasons of changes that the curves mark."""
@@ -22,19 +24,17 @@ def draw_history(run: Path) -> None:
     """Write ``counts.png``, ``psnr.png`` and ``held_out.png`` in ``curves``, from ``records/counts.csv`` and, beside
     them, ``metrics.csv`` and ``held_out.csv``.
 
-    A file that the run was configured not to write leaves its picture out. Raises RecordError for a malformed ledger.
+    A file that the run was configured not to write leaves its picture out. Raises RecordError for a malformed one.
     """
-    ledger, metrics, held_out = ledger_path(run), run / "curves" / "metrics.csv", run / "curves" / "held_out.csv"
-    events: list[tuple[int, str]] = []
-    if ledger.is_file():
-        changes = read_changes(ledger)
-        events = marks(changes)
+    changes = LEDGER.find(run)
+    events = marks(changes or ())
+    if changes is not None:
         steps, counts = count_curves(changes)
         plot_counts(run / "curves" / "counts.png", steps, counts, events)
-    curves = psnr_curves(metrics, PSNR_COLUMNS, "step") if metrics.is_file() else {}
+    curves = psnr_curves(LOGGED.rows(run), PSNR_COLUMNS, "step")
     if curves:
         plot_psnr(run / "curves" / "psnr.png", curves, events)
-    curves = psnr_curves(held_out, HELD_OUT_COLUMNS, "seconds") if held_out.is_file() else {}
+    curves = psnr_curves([asdict(look) for look in HELD_OUT_CURVE.find(run) or ()], HELD_OUT_COLUMNS, "seconds")
     if curves:
         title = "Held-out PSNR over training time, without evaluation"
         plot_psnr(run / "curves" / "held_out.png", curves, (), title, "seconds")
@@ -60,14 +60,12 @@ def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
 
 
 def psnr_curves(
-    path: Path, columns: Mapping[str, str], along: str
+    rows: Sequence[Mapping[str, str | float | None]], columns: Mapping[str, str], along: str
 ) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
-    """Name of a curve -> (steps or seconds, dB), from the rows of a table that hold it."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    """Name of a curve -> (steps or seconds, dB), from the rows that hold it."""
     curves = {}
     for label, column in columns.items():
-        points = [(float(row[along]), float(row[column])) for row in rows if row.get(column)]
+        points = [(float(row[along]), float(row[column])) for row in rows if row.get(column) not in (None, "")]
         if points:
             curves[label] = tuple(zip(*points, strict=True))
     return curves

@@ -1,4 +1,4 @@
-"""A run's resolved configuration as a flat mapping: what identifies a run, and in which options runs differ (no torch).
+"""A run's resolved configuration as a flat mapping: what identifies a run, and in which options runs differ.
 
 Keys are dotted (``schedule.max_steps``), values are JSON scalars or lists.
 """

@@ -1,17 +1,18 @@
-"""``records/cost.json``: where the time and the memory of a run went (no torch).
+"""``records/cost.json``: where the time and the memory of a run went.
 
 Training and evaluation each write their part and keep the other's.
 """
 
-import csv
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from sparsestreet.records.file import JsonFile
 from sparsestreet.records.run import Noise
-from sparsestreet.records.strict_json import read_json, version, write_json
+from sparsestreet.records.step_phases import STEP_PHASES
+from sparsestreet.records.strict_json import version
 
 FORMAT = 1
 """Version of ``cost.json``; raised when a key changes its meaning."""
@@ -78,26 +79,13 @@ class CostRecord:
             )
 
 
-def cost_path(run: Path) -> Path:
-    """Where a run keeps its costs."""
-    return run / "records" / "cost.json"
-
-
-def write_costs(path: Path, costs: CostRecord) -> None:
-    """Write ``cost.json`` atomically. Raises RecordError for values that JSON has no number for."""
-    write_json(path, costs)
-
-
-def read_costs(path: Path) -> CostRecord:
-    """Read ``cost.json``. Raises RecordError naming the file and the entry that is wrong."""
-    return read_json(path, CostRecord)
+COSTS = JsonFile("records/cost.json", CostRecord)
 
 
 def update_costs(run: Path, **parts: object) -> None:
     """Write some fields of a run's costs anew; the others stay, or are empty where nobody wrote them."""
-    path = cost_path(run)
     empty = CostRecord(phases={}, step_ms={}, passes={}, frame_ms={}, nodes={}, effects={})
-    write_costs(path, replace(read_costs(path) if path.is_file() else empty, **parts))
+    COSTS.write(run, replace(COSTS.find(run) or empty, **parts))
 
 
 def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
@@ -112,14 +100,11 @@ def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[st
     return dict(phases), passes
 
 
-def step_costs(path: Path) -> dict[str, float]:
-    """``step_ms`` of what ``phases.csv`` noted; empty without the file."""
-    if not path.is_file():
-        return {}
-    steps: defaultdict[tuple[str, str], float] = defaultdict(float)
-    with path.open(newline="") as file:
-        for row in csv.DictReader(file):
-            steps[_part(row["phase"]), row["step"]] += float(row["milliseconds"])
+def step_costs(run: Path) -> dict[str, float]:
+    """``step_ms`` of what a run's ``phases.csv`` noted; empty without the file."""
+    steps: defaultdict[tuple[str, int], float] = defaultdict(float)
+    for row in STEP_PHASES.find(run) or ():
+        steps[_part(row.phase), row.step] += row.milliseconds
     by_part: defaultdict[str, list[float]] = defaultdict(list)
     for (part, _), value in steps.items():
         by_part[part].append(value)

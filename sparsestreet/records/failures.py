@@ -1,9 +1,10 @@
-"""``RUN/failed.json``: why a job of a sweep has no record (no torch)."""
+"""``RUN/failed.json``: why a job of a sweep has no record."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.records.strict_json import read_json, version, write_json
+from sparsestreet.records.file import JsonFile
+from sparsestreet.records.strict_json import version
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,16 +23,9 @@ class FailedRun:
     """Where: Python's trace."""
 
 
-def failure_path(run: Path) -> Path:
-    """Where a job says that it failed."""
-    return run / "failed.json"
-
-
-def write_failure(run: Path, failure: FailedRun) -> None:
-    """Write ``failed.json`` atomically, creating the folder."""
-    write_json(failure_path(run), failure)
+FAILURE = JsonFile("failed.json", FailedRun)
 
 
 def read_failures(sweep: Path) -> list[tuple[Path, FailedRun]]:
     """Folder and reason of every job that failed below a folder, sorted. Raises RecordError for a malformed one."""
-    return [(path.parent, read_json(path, FailedRun)) for path in sorted(sweep.rglob("failed.json"))]
+    return [(run, FAILURE.read(run)) for run in FAILURE.runs(sweep)]

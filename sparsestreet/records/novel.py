@@ -1,13 +1,15 @@
 """``records/novel.json``: what a scene shows beside the recorded path."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from statistics import fmean
 
-from sparsestreet.records.strict_json import read_json, version, write_json
+from sparsestreet.records.file import JsonFile
+from sparsestreet.records.strict_json import version
 
 FORMAT = 2
 """Version of ``novel.json``; raised when a key changes its meaning."""
+
+TRUTH = ("psnr_full", "psnr_human", "psnr_vehicle")
+"""What an image is compared with the true one by: all pixels, people, vehicles."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +23,15 @@ class NovelShift:
     distances: dict[str, float]
     """Name of a distance, such as "frechet_alexnet" -> its value; empty where it could not be measured."""
     truth: dict[str, float]
-    """"psnr_full", "psnr_human", "psnr_vehicle" -> dB, mean over the true images that have such pixels; empty where
+    """Some of ``TRUTH`` -> dB, mean over the true images that have such pixels; empty where
     nobody knows the truth."""
     true_views: int
     """Number of true images: views whose camera would sit in something have none."""
+
+    def __post_init__(self) -> None:
+        unknown = sorted(self.truth.keys() - set(TRUTH))
+        if unknown:
+            raise ValueError(f"truth holds {', '.join(unknown)}, expected {', '.join(TRUTH)} alone: evaluate again")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,23 +48,5 @@ class NovelRecord:
     """Why there are no distances, and what to do about it; None: there are."""
     shifts: tuple[NovelShift, ...]
 
-    def mean(self, meters: float, distance: str) -> float | None:
-        """A distance at so many meters, mean over both sides; None where it was not measured."""
-        values = [one.distances.get(distance) for one in self.shifts if abs(one.offset) == meters]
-        found = [value for value in values if value is not None]
-        return fmean(found) if found else None
 
-
-def novel_path(run: Path) -> Path:
-    """Where a run keeps what was measured beside its path."""
-    return run / "records" / "novel.json"
-
-
-def write_novel(path: Path, record: NovelRecord) -> None:
-    """Write ``novel.json`` atomically. Raises RecordError for values that JSON has no number for."""
-    write_json(path, record)
-
-
-def read_novel(path: Path) -> NovelRecord:
-    """Read ``novel.json``. Raises RecordError naming the file and the entry that is wrong."""
-    return read_json(path, NovelRecord)
+NOVEL = JsonFile("records/novel.json", NovelRecord)

@@ -1,10 +1,10 @@
-"""``records/presets.json``: a trained scene, rendered in other ways than it was trained (no torch)."""
+"""``records/presets.json``: a trained scene, rendered in other ways than it was trained."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
+from sparsestreet.records.file import JsonFile
 from sparsestreet.records.run import Noise
-from sparsestreet.records.strict_json import read_json, version, write_json
+from sparsestreet.records.strict_json import version
 
 FORMAT = 1
 """Version of ``presets.json``; raised when a key changes its meaning."""
@@ -42,16 +42,4 @@ class PresetRecord:
     rendered: tuple[RenderedAs, ...]
 
 
-def preset_path(run: Path) -> Path:
-    """Where a run keeps how it looks otherwise."""
-    return run / "records" / "presets.json"
-
-
-def write_presets(path: Path, record: PresetRecord) -> None:
-    """Write ``presets.json`` atomically. Raises RecordError for values that JSON has no number for."""
-    write_json(path, record)
-
-
-def read_presets(path: Path) -> PresetRecord:
-    """Read ``presets.json``. Raises RecordError naming the file and the entry that is wrong."""
-    return read_json(path, PresetRecord)
+PRESETS = JsonFile("records/presets.json", PresetRecord)

@@ -1,4 +1,4 @@
-"""On what and from which code a run was made (no torch import)."""
+"""On what and from which code a run was made."""
 
 import os
 import platform

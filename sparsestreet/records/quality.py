@@ -1,13 +1,19 @@
-"""How good images are: one value per frame and camera, and their summary over a split (no torch).
+"""How good images are: one value per frame and camera, their summary over a split, and the rows of ``quality.csv``.
 
 The summary takes means over images, never over pixels; see ``metrics.definitions``.
 """
 
+import math
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, REGIONS, metric_id, quantities_of
+from sparsestreet.records.file import CsvFile
+from sparsestreet.records.strict_json import significant
+
+HELD_OUT, TRAINING = "held_out", "training"
+"""The splits whose views a record speaks of."""
 
 
 @dataclass(frozen=True)
@@ -93,3 +99,51 @@ def _summary(values: list[float], capped: int) -> MetricSummary:
     mean = statistics.fmean(values) if values else None
     sd = statistics.stdev(values) if len(values) > 1 else None
     return MetricSummary(mean, sd, len(values), capped)
+
+
+_COLUMNS = (
+    *("frame", "camera", "width", "height"),
+    *(metric_id(quantity, region) for region in REGIONS for quantity in ("pixels", *quantities_of(region))),
+)
+
+
+def _cells(image: FrameQuality) -> Sequence[object]:
+    """A region's cells are blank where the data has no such mask or no lidar, and its metrics are blank where the
+    region is empty (0 pixels)."""
+    regions = [cell for region in REGIONS for cell in _region_cells(region, image)]
+    return image.frame, image.camera, image.width, image.height, *regions
+
+
+def _region_cells(region: str, image: FrameQuality) -> list[object]:
+    names = quantities_of(region)
+    found = image.regions.get(region)
+    if found is None:
+        return [None] * (1 + len(names))
+    values = [getattr(found, name) for name in names]
+    where = f"frame {image.frame}"
+    return [found.pixels, *(None if value is None else significant(value, where) for value in values)]
+
+
+def _image(cells: Sequence[str]) -> FrameQuality:
+    named = dict(zip(_COLUMNS, cells, strict=True))
+    numbers = (int(cell) for cell in cells[:4])
+    regions = {region: _region(region, named) for region in REGIONS if named[metric_id("pixels", region)]}
+    image = FrameQuality(*numbers, regions)
+    if "full" not in regions:
+        raise ValueError("the metrics of the full image are missing")
+    return image
+
+
+def _region(region: str, cells: Mapping[str, str]) -> RegionQuality:
+    texts = {name: cells[metric_id(name, region)] for name in quantities_of(region)}
+    values = {name: float(text) if text else None for name, text in texts.items()}
+    if any(value is not None and not math.isfinite(value) for value in values.values()):
+        raise ValueError(f"a metric is not a finite number: {list(texts.values())}")
+    return RegionQuality(int(cells[metric_id("pixels", region)]), **values)
+
+
+QUALITY = {
+    split: CsvFile(f"records/{name}", _COLUMNS, _cells, _image, "evaluate the run")
+    for split, name in ((HELD_OUT, "quality.csv"), (TRAINING, "quality_train.csv"))
+}
+"""Split -> the file of its images, a row each."""

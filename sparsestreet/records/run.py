@@ -1,10 +1,10 @@
 """``RUN/run.json``: what identifies a run and what made it; training writes it once."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from sparsestreet.records.configuration import Setting
-from sparsestreet.records.strict_json import EXACT, read_json, version, write_json
+from sparsestreet.records.file import JsonFile
+from sparsestreet.records.strict_json import EXACT, version
 
 RUN_FORMAT = 2
 """Version of ``run.json``; raised when a key changes its meaning."""
@@ -85,16 +85,4 @@ class RunDescription:
     source: CodeVersion
 
 
-def run_path(run: Path) -> Path:
-    """Where a run says what it is."""
-    return run / "run.json"
-
-
-def write_run(path: Path, run: RunDescription) -> None:
-    """Write ``run.json`` atomically. Raises RecordError for values that JSON has no number for."""
-    write_json(path, run)
-
-
-def read_run(path: Path) -> RunDescription:
-    """Read ``run.json``. Raises RecordError naming the file and the entry that is wrong."""
-    return read_json(path, RunDescription)
+RUN = JsonFile("run.json", RunDescription)

@@ -1,4 +1,4 @@
-"""Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only (no torch).
+"""Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only.
 
 Only a field with a default may be missing: it is newer than some records. A field made with ``version`` is the number
 of the format; a record of another one is refused before its keys are looked at.

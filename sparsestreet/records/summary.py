@@ -1,72 +1,19 @@
-"""What identifies a run and what was measured of it, for other programs as for our report (no torch import).
+"""What identifies a run and what was measured of it, for other programs as for our report.
 
 ``RUN/run.json`` is written once, by training: what made the run. ``RUN/records/summary.json`` is written by each
 evaluation and holds the first unchanged. Both are written whole or not at all.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from sparsestreet.records.quality import MetricSummary
-from sparsestreet.records.run import CodeVersion, Machine, Noise, RunDescription
-from sparsestreet.records.strict_json import read_json, version, write_json
+from sparsestreet.records.file import JsonFile
+from sparsestreet.records.latency import Latency
+from sparsestreet.records.quality import HELD_OUT, TRAINING, MetricSummary
+from sparsestreet.records.run import CodeVersion, Machine, RunDescription
+from sparsestreet.records.strict_json import version
 
 FORMAT = 4
 """Version of ``summary.json``; raised when a key changes its meaning."""
-
-HELD_OUT, TRAINING = "held_out", "training"
-"""The splits whose views a record speaks of."""
-
-
-RASTER, FRAME, RIG = "raster", "frame", "rig"
-"""What the clocks of a latency hold: the splat op alone; all from a time and a pose to uint8 on the device; that for
-all cameras of an instant."""
-
-
-@dataclass(frozen=True)
-class Percentiles:
-    """Of repeated times, milliseconds."""
-
-    p50: float
-    p90: float
-    p99: float
-    repeats: int
-
-
-@dataclass(frozen=True)
-class Latency:
-    """Milliseconds by three clocks under the protocol of ``speed.measure_latency``."""
-
-    clocks: dict[str, Percentiles]
-    """``RASTER``, ``FRAME`` and ``RIG`` of the scene as it is stored; Gaussians that a mask closes are masked."""
-    removed: dict[str, Percentiles]
-    """The same with the Gaussians taken out that the masks close at the time of the view; empty without masks."""
-    warmup: int
-    views: int
-    """Number of different views the repeats cycle through."""
-    device: str
-    threads: int
-    noise: Noise
-
-    def __post_init__(self) -> None:
-        if set(self.clocks) != {RASTER, FRAME, RIG} or set(self.removed) not in (set(), set(self.clocks)):
-            raise ValueError(
-                f"a latency has the clocks {RASTER}, {FRAME}, {RIG}, got {sorted(self.clocks)} and, of removed "
-                f"Gaussians, {sorted(self.removed)}: evaluate again"
-            )
-
-    @property
-    def p50(self) -> float:
-        """Median of a frame."""
-        return self.clocks[FRAME].p50
-
-    @property
-    def protocol(self) -> str:
-        """How the median of a frame was taken, in words."""
-        return (
-            f"{self.clocks[FRAME].repeats} renders cycling through {self.views} views after {self.warmup} warm-up "
-            "renders, batch 1, device synchronized, scene assembly to uint8, without loading and metrics"
-        )
 
 
 @dataclass(frozen=True)
@@ -154,16 +101,4 @@ class RunSummary:
         return self.by_camera[self.main_split].get(camera, {}).get(metric)
 
 
-def summary_path(run: Path) -> Path:
-    """Where a run keeps its summary."""
-    return run / "records" / "summary.json"
-
-
-def write_summary(path: Path, summary: RunSummary) -> None:
-    """Write ``summary.json`` atomically. Raises RecordError for values that JSON has no number for."""
-    write_json(path, summary)
-
-
-def read_summary(path: Path) -> RunSummary:
-    """Read ``summary.json``. Raises RecordError naming the file and the entry that is wrong."""
-    return read_json(path, RunSummary)
+SUMMARY = JsonFile("records/summary.json", RunSummary)

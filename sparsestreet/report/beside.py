@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sparsestreet.records.strict_json import Json, RecordError, parsed
+from sparsestreet.records.novel import NOVEL
 from sparsestreet.report.arms import Arm, Unit, mean_over_scenes, unit_of
 from sparsestreet.report.grid import Cell, Grid
 
@@ -19,26 +19,15 @@ _PSNR = {title: place for place, title in enumerate(TRUTH.values())}
 def shifts_of(run: Path) -> dict[float, dict[str, float]]:
     """Meters beside the path -> name of a number -> its mean over both sides; empty where a run has no such record.
 
-    Raises RecordError naming the file and what it lacks.
+    Raises RecordError naming the file and the entry that is wrong.
     """
-    path = run / "records" / "novel.json"
-    if not path.is_file():
-        return {}
-    record = parsed(path.read_text(encoding="utf-8"), str(path))
+    record = NOVEL.find(run)
     sides: dict[float, dict[str, list[float]]] = {}
-    try:
-        for shift in record["shifts"]:
-            found = sides.setdefault(abs(float(shift["offset"])), {})
-            for name, value in _numbers(shift).items():
-                found.setdefault(name, []).append(value)
-    except (KeyError, TypeError) as error:
-        raise RecordError(f"{path}: lacks {error}; evaluate again with novel=...") from error
+    for shift in () if record is None else record.shifts:
+        found = sides.setdefault(abs(shift.offset), {})
+        for name, value in (shift.distances | {TRUTH[name]: psnr for name, psnr in shift.truth.items()}).items():
+            found.setdefault(name, []).append(value)
     return {meters: {name: statistics.fmean(some) for name, some in found.items()} for meters, found in sides.items()}
-
-
-def _numbers(shift: dict[str, Json]) -> dict[str, float]:
-    truth = {TRUTH[name]: float(value) for name, value in shift["truth"].items()}
-    return {name: float(value) for name, value in shift["distances"].items()} | truth
 
 
 def mean_beside(arm: Arm, meters: float, name: str) -> float | None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.records.summary import RunSummary, read_summary, summary_path
+from sparsestreet.records.summary import SUMMARY, RunSummary
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ def collect(roots: Iterable[Path]) -> list[RunRecord]:
     """
     folders: set[Path] = set()
     for root in roots:
-        found = {path.parents[1] for path in root.rglob("records/summary.json")}
+        found = SUMMARY.runs(root)
         if not found:
-            raise FileNotFoundError(f"{root} holds no records/summary.json: train and evaluate a run there first")
+            raise FileNotFoundError(f"{root} holds no {SUMMARY.name}: train and evaluate a run there first")
         folders |= {folder.resolve() for folder in found}
-    return [RunRecord(folder, read_summary(summary_path(folder))) for folder in sorted(folders)]
+    return [RunRecord(folder, SUMMARY.read(folder)) for folder in sorted(folders)]
 
 
 def check_definitions(records: Sequence[RunRecord]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 
 from sparsestreet.pictures.images import picture_path
-from sparsestreet.records.quality_csv import quality_path, read_quality
+from sparsestreet.records.quality import QUALITY
 from sparsestreet.report.arms import Arm
 from sparsestreet.report.collect import RunRecord
 
@@ -67,10 +67,8 @@ def _view(
 
 
 def _psnr(record: RunRecord, key: tuple[int, int]) -> str:
-    path = quality_path(record.folder, record.summary.main_split)
-    if not path.is_file():
-        return ""
-    found = [image.regions["full"].psnr for image in read_quality(path) if (image.frame, image.camera) == key]
+    images = QUALITY[record.summary.main_split].find(record.folder) or ()
+    found = [image.regions["full"].psnr for image in images if (image.frame, image.camera) == key]
     return f"{found[0]:.2f} dB, " if found else ""
 
 

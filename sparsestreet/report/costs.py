@@ -3,7 +3,7 @@
 import statistics
 from collections.abc import Callable, Sequence
 
-from sparsestreet.records.costs import PRUNE, CostRecord, cost_path, read_costs
+from sparsestreet.records.costs import COSTS, PRUNE, CostRecord
 from sparsestreet.report.arms import Arm
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import ABSENT, Cell, Grid
@@ -23,12 +23,6 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] 
     ("peak MB", "host", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_host_mb)),
     ("peak MB", "GPU", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_device_mb)),
 )
-
-
-def costs_of(record: RunRecord) -> CostRecord | None:
-    """What a run's ``cost.json`` says; None where it has none. Raises RecordError for a malformed one."""
-    path = cost_path(record.folder)
-    return read_costs(path) if path.is_file() else None
 
 
 def what_arms_cost(arms: Sequence[Arm]) -> Grid:
@@ -51,7 +45,7 @@ def what_arms_cost(arms: Sequence[Arm]) -> Grid:
 
 
 def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:
-    costs = costs_of(record)
+    costs = COSTS.find(record.folder)
     return None if costs is None else value(costs)
 
 

@@ -1,12 +1,10 @@
 """Held-out PSNR over the seconds of training, and how long each arm takes to a quality."""
 
-import csv
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from sparsestreet.records.strict_json import RecordError
+from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.report.arms import Arm, Unit, plain_of, unit_of
 from sparsestreet.report.grid import Cell, Grid
 
@@ -24,31 +22,18 @@ class QualityCurve:
     """Full image, dB."""
 
 
-def curve_path(run: Path) -> Path:
-    """Where a run keeps its curve."""
-    return run / "curves" / "held_out.csv"
-
-
-def read_curve(path: Path) -> QualityCurve:
-    """Read ``held_out.csv``. Raises RecordError naming the file and what is wrong."""
-    with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row.get("psnr_full")]
-    try:
-        return QualityCurve(
-            tuple(float(row["seconds"]) for row in rows), tuple(float(row["psnr_full"]) for row in rows)
-        )
-    except (KeyError, ValueError) as error:
-        raise RecordError(f"{path}: {error}; train the run again") from error
-
-
 def curves_of(arm: Arm) -> dict[Unit, QualityCurve]:
     """Scene and seed -> curve, of the runs that hold views out and have one."""
     return {
         unit_of(record.summary): curve
         for record in arm.records
-        if record.summary.run.split != "none" and curve_path(record.folder).is_file()
-        if (curve := read_curve(curve_path(record.folder))).seconds
+        if record.summary.run.split != "none" and (curve := _curve(HELD_OUT_CURVE.find(record.folder) or ())).seconds
     }
+
+
+def _curve(looks: Sequence[HeldOutLook]) -> QualityCurve:
+    points = [(look.seconds, look.psnr_full) for look in looks if look.psnr_full is not None]
+    return QualityCurve(tuple(at for at, _ in points), tuple(psnr for _, psnr in points))
 
 
 def seconds_to(curve: QualityCurve, psnr: float) -> float | None:

@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sparsestreet.pictures.plots import plot_runs
-from sparsestreet.records.summary import HELD_OUT
+from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.notes import CAPPED
 from sparsestreet.report.quantities import Quantity

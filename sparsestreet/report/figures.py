@@ -13,7 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.records.quality import HELD_OUT
+from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Value, plain_of
 
 # Okabe and Ito's palette, its blue a little lighter: distinguishable with any color vision, on white and on black.

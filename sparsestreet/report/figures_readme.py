@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.records.quality import HELD_OUT
+from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Value, mean_over_scenes
 from sparsestreet.report.curves import QualityCurve, curves_of
 from sparsestreet.report.figures import LEGEND, colors, marker, of_sparsify, panels

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
 
 from sparsestreet.pictures.history import count_curves, marks
-from sparsestreet.records.ledger import ledger_path, read_changes
+from sparsestreet.records.costs import COSTS
+from sparsestreet.records.ledger import LEDGER
 from sparsestreet.report.arms import Arm
-from sparsestreet.report.costs import costs_of
 from sparsestreet.report.curves import curves_of
 from sparsestreet.report.figures import COLORS, GREY, LEGEND, of_sparsify, panels, short, write_svg
 
@@ -36,7 +36,7 @@ def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
 
 def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
     """All Gaussians over the steps, a panel a method, a line a run, with dots where masks or passes took some."""
-    drawn = [arm for arm in arms if any(ledger_path(record.folder).is_file() for record in arm.records)]
+    drawn = [arm for arm in arms if any(LEDGER.exists(record.folder) for record in arm.records)]
     if not drawn:
         return False
     methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
@@ -44,7 +44,7 @@ def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
     for one, method in zip(axes, methods, strict=True):
         for arm in _of(drawn, method):
             for record in arm.records:
-                if ledger_path(record.folder).is_file():
+                if LEDGER.exists(record.folder):
                     _counts(one, arm, record.folder)
         one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
         _finish(one, method, "step")
@@ -54,7 +54,7 @@ def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
 
 
 def _counts(axes: Axes, arm: Arm, folder: Path) -> None:
-    changes = read_changes(ledger_path(folder))
+    changes = LEDGER.read(folder)
     steps, nodes = count_curves(changes)
     total = [sum(values) for values in zip(*nodes.values(), strict=True)]
     axes.plot(steps, total, drawstyle="steps-post", **_line(arm))
@@ -94,7 +94,7 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
 def _frame_costs(arm: Arm) -> dict[str, float]:
     """Node or effect -> mean milliseconds over the runs that recorded it."""
     found: dict[str, list[float]] = {}
-    for costs in filter(None, map(costs_of, arm.records)):
+    for costs in filter(None, (COSTS.find(record.folder) for record in arm.records)):
         parts = {name: node.ms for name, node in costs.nodes.items()}
         for part, ms in (parts | {f"effect: {name}": ms for name, ms in costs.effects.items()}).items():
             found.setdefault(part, []).append(ms)

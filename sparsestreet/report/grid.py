@@ -1,10 +1,10 @@
 """Tables as plain cells, and as Markdown, LaTeX and CSV."""
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
+
+from sparsestreet.records.file import csv_text
 
 ABSENT = "-"
 
@@ -91,13 +91,11 @@ def _escaped(text: str) -> str:
 
 def comma_separated(grids: Sequence[Grid]) -> str:
     """All of them in one file, a line a cell: table, row, column, value, whether published, whether proven, runs."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(("table", "row", "column", "value", "published", "bold", "runs"))
+    lines = []
     for grid in grids:
         for row in grid.rows:
             for (group, heading), cell in zip(grid.header[1:], row[1:], strict=True):
                 column = f"{group} {heading}".strip()
                 marks = (int(cell.published), int(cell.bold), " ".join(cell.runs))
-                writer.writerow((grid.name, row[0].text, column, cell.text, *marks))
-    return buffer.getvalue()
+                lines.append((grid.name, row[0].text, column, cell.text, *marks))
+    return csv_text(("table", "row", "column", "value", "published", "bold", "runs"), lines)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.failures import FailedRun
-from sparsestreet.records.summary import HELD_OUT, TRAINING
+from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.report.arms import Arm, Value
 from sparsestreet.report.beside import mean_beside
 from sparsestreet.report.grid import ABSENT, Cell, Grid

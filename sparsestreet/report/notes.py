@@ -5,8 +5,9 @@ from collections.abc import Iterable, Sequence
 
 from sparsestreet.metrics.definitions import LIDAR_REACH
 from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.records.quality import TRAINING
 from sparsestreet.records.run import CodeVersion, Machine
-from sparsestreet.records.summary import TRAINING, RunSummary
+from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.variants import Variant
 
 CAPPED = "†"

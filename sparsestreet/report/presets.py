@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.presets import PresetRecord, RenderedAs, preset_path, read_presets
+from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report.arms import Arm, Unit, mean_over_scenes, unit_of
 from sparsestreet.report.grid import ABSENT, Cell, Grid
 from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
@@ -41,8 +41,8 @@ def rendered_otherwise(arms: Sequence[Arm], protocol: Protocol) -> Grid | None:
 
 
 def _records(arm: Arm) -> dict[Unit, PresetRecord]:
-    paths = {unit_of(run.summary): preset_path(run.folder) for run in arm.records}
-    return {unit: read_presets(path) for unit, path in paths.items() if path.is_file()}
+    found = {unit_of(run.summary): PRESETS.find(run.folder) for run in arm.records}
+    return {unit: record for unit, record in found.items() if record is not None}
 
 
 def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:

@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
-from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
+from sparsestreet.records.quality import HELD_OUT, TRAINING
+from sparsestreet.records.summary import RunSummary
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from sparsestreet.pictures.images import read_pictures, write_png
 from sparsestreet.pictures.sheets import Legend, SheetColumn, comparison_sheet
-from sparsestreet.records.quality_csv import quality_path, read_quality
-from sparsestreet.records.summary import HELD_OUT, RunSummary, read_summary, summary_path
+from sparsestreet.records.quality import HELD_OUT, QUALITY
+from sparsestreet.records.summary import SUMMARY, RunSummary
 from sparsestreet.report.variants import variants
 
 
@@ -20,7 +20,7 @@ def compare_runs(runs: Sequence[Path], sheet: Path, *, legend: Legend | None = N
 
     Raises RecordError for malformed records, ValueError if the runs are of different scenes or show different images.
     """
-    summaries = [read_summary(summary_path(run)) for run in runs]
+    summaries = [SUMMARY.read(run) for run in runs]
     scenes = {summary.run.scene for summary in summaries}
     if len(scenes) > 1:
         raise ValueError(f"the runs show different scenes, {', '.join(sorted(scenes))}: compare runs of one scene")
@@ -48,9 +48,7 @@ def _column(run: Path, summary: RunSummary, name: str, first: str, gaussians: in
     share = f", {100 * summary.gaussians_total / max(gaussians, 1):.0f} % of {first}" if name != first else ""
     capped = ", held down by a cap" if summary.run.caps else ""
     pictures = read_pictures(run / "pictures")
-    psnr = {
-        (one.frame, one.camera): one.regions["full"].psnr for one in read_quality(quality_path(run, summary.main_split))
-    }
+    psnr = {(one.frame, one.camera): one.regions["full"].psnr for one in QUALITY[summary.main_split].read(run)}
     missing = [(picture.frame, picture.camera) for picture in pictures if (picture.frame, picture.camera) not in psnr]
     if missing:
         raise ValueError(f"{run} has pictures of (frame, camera) {missing} and no quality of them: evaluate it again")

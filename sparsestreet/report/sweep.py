@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
-from sparsestreet.records.failures import FailedRun, failure_path, read_failures
+from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import write_atomically
 from sparsestreet.report.arms import Arm, arms, why_apart
 from sparsestreet.report.beside import beside_the_path
@@ -68,7 +68,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
 def sweep_records(sweep: Path) -> list[RunRecord]:
     """The records of the runs of a sweep that did not fail. Raises as ``write_report``."""
     # A folder that says it failed may hold the record of an earlier configuration.
-    records = [record for record in collect([sweep]) if not failure_path(record.folder).is_file()]
+    records = [record for record in collect([sweep]) if not FAILURE.exists(record.folder)]
     if not records:
         raise FileNotFoundError(f"{sweep} holds no run that did not fail: run the sweep again")
     check_definitions(records)

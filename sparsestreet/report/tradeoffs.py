@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.records.quality import HELD_OUT
+from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
 from sparsestreet.report.grid import Cell, Grid
 from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval

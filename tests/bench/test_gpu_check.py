@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.ops.cpu import library
-from sparsestreet.records.summary import write_summary
+from sparsestreet.records.strict_json import write_json
 from tests.evaluation.frames import make_summary
 from tests.ops import scenes
 
@@ -219,7 +219,7 @@ def test_files_without_their_packages_are_left_out_and_named(tmp_path):
 
 
 def test_the_line_about_the_training_is_of_todays_records(tmp_path, capsys):
-    write_summary(tmp_path / "train.json", make_summary())
+    write_json(tmp_path / "train.json", make_summary())
     runpy.run_path(str(SCRIPTS / "gpu_says.py"))["training"](tmp_path / "train.json")
     assert capsys.readouterr().out == "100.0 s of training, held-out PSNR 25.00 dB\n"
 

@@ -18,7 +18,7 @@ from sparsestreet.cli.data import data
 from sparsestreet.cli.train import train
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.pruning import RenderContext
-from sparsestreet.records.run import read_run, run_path
+from sparsestreet.records.run import RUN
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.masks import StaticMask
@@ -141,7 +141,7 @@ def test_they_train_together(run):
         pruned = [row for row in csv.DictReader(file) if row["reason"] == "pruning"]
     assert [row["node"] for row in pruned] == ["background", "rigid"]
     assert all(int(row["after"]) < int(row["before"]) for row in pruned)
-    description = read_run(run_path(run))
+    description = RUN.read(run)
     assert (description.label, description.steps) == ("no_lidar+size", 2)
     assert description.config["loss.mean_color.weight"] == 0.1
 

@@ -3,7 +3,7 @@
 import pytest
 
 from sparsestreet.cli.report import report
-from sparsestreet.records.summary import summary_path, write_summary
+from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import write_sweep
 
@@ -17,7 +17,7 @@ def runs(tmp_path):
         "removal_db=0.1": make_summary("ours", scene="a", config={"schedule.removal_db": 0.1}),
         "removal_db=0.2": make_summary("ours", scene="a", config={"schedule.removal_db": 0.2}),
     }.items():
-        write_summary(summary_path(tmp_path / name), summary)
+        SUMMARY.write(tmp_path / name, summary)
     return tmp_path
 
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from sparsestreet.cli.train import train
-from sparsestreet.records.costs import cost_path, read_costs
+from sparsestreet.records.costs import COSTS
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.training.callbacks import RowLedger
 
 
@@ -59,7 +60,7 @@ def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, tiny_street, tmp
     before = curve(part)
     started = time.perf_counter()
     assert train([f"resume={part}"]) == 0
-    assert read_costs(cost_path(part)).wall_seconds > time.perf_counter() - started  # what was spent before counts
+    assert COSTS.read(part).wall_seconds > time.perf_counter() - started  # what was spent before counts
     assert_equal(whole, part)
     # The curve of before is still there, and the ledger is that of the whole run.
     assert [row for row in curve(part) if row in before] == before
@@ -134,12 +135,11 @@ def test_another_configuration_is_refused_and_nothing_is_touched(whole, change, 
 
 def test_an_interrupted_run_can_be_evaluated(tiny_street, tmp_path, monkeypatch):
     from sparsestreet.cli.evaluate import evaluate
-    from sparsestreet.records.summary import read_summary, summary_path
 
     monkeypatch.setattr(RowLedger, "on_train_batch_start", _raises_at(7), raising=False)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(RuntimeError, match="stopped by the test"):
         train([*tiny_street, *ALL_STAGES, f"out={tmp_path}"])
     assert evaluate([f"run={tmp_path}"]) == 0
-    run = read_summary(summary_path(tmp_path)).run
+    run = SUMMARY.read(tmp_path).run
     assert (run.steps, run.max_steps) == (7, 60)

@@ -5,10 +5,11 @@ from hydra import compose
 
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, configuration, override_problem
-from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, sweep_name, sweep_problem
+from sparsestreet.cli.report import sweep_name
+from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, sweep_problem
 from sparsestreet.cli.train import train
 from sparsestreet.records.failures import read_failures
-from sparsestreet.records.summary import read_summary, summary_path, write_summary
+from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary
 
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
@@ -30,9 +31,8 @@ def jobs(name: str) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_every_job_of_a_sweep_can_be(name, tmp_path):
-    write_summary(
-        summary_path(tmp_path), make_summary(gaussians={"background": 20_000, "rigid": 2000})
-    )  # the run that controls have their count from
+    # The run that controls have their count from.
+    SUMMARY.write(tmp_path, make_summary(gaussians={"background": 20_000, "rigid": 2000}))
     drive = [f"data.root={tmp_path}"] if name in NEED_DRIVES else []
     for job in jobs(name):
         cfg = composed(*job, *drive, f"count_of={tmp_path}")
@@ -55,7 +55,7 @@ def test_drives_are_read_where_the_authors_read_them():
 
 
 def test_a_control_keeps_what_the_other_run_ended_with(tmp_path):
-    write_summary(summary_path(tmp_path), make_summary(gaussians={"background": 20_000, "rigid": 2000}))
+    SUMMARY.write(tmp_path, make_summary(gaussians={"background": 20_000, "rigid": 2000}))
     capped = composed("sparsify=capped", f"count_of={tmp_path}").node.background
     assert (capped.num_points, capped.max_gaussians) == (20_000, 20_000)
     rule = composed("sparsify=random", f"count_of={tmp_path}").callback.pruning.rule
@@ -109,18 +109,18 @@ def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, caps
     assert "that run has no record" in failure.error
     assert "sparsify=random" in failure.command
     assert sweep_name(tmp_path) == "tiny"
-    pruned = summary_path(tmp_path / "streetgs+removal_seed0")
-    made = pruned.stat().st_mtime_ns
+    pruned = tmp_path / "streetgs+removal_seed0"
+    made = SUMMARY.path(pruned).stat().st_mtime_ns
 
     assert train(command) == 0
     assert not read_failures(tmp_path)
-    assert pruned.stat().st_mtime_ns == made  # skipped
-    kept = read_summary(summary_path(folder)).run.config["callback.pruning.rule.keep.background"]
-    assert kept == read_summary(pruned).gaussians["background"]
+    assert SUMMARY.path(pruned).stat().st_mtime_ns == made  # skipped
+    kept = SUMMARY.read(folder).run.config["callback.pruning.rule.keep.background"]
+    assert kept == SUMMARY.read(pruned).gaussians["background"]
 
     # Another configuration in the same folder is another job.
     assert train([word.replace("random,removal", "removal").replace("=20", "=10") for word in command]) == 0
-    assert pruned.stat().st_mtime_ns > made
+    assert SUMMARY.path(pruned).stat().st_mtime_ns > made
 
 
 def test_a_slip_in_a_sweep_is_one_line(capsys):

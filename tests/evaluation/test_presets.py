@@ -10,7 +10,7 @@ from sparsestreet.evaluation import presets as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.presets import ROUNDS, evaluate_presets
 from sparsestreet.ops import SplatSettings
-from sparsestreet.records.presets import preset_path, read_presets, write_presets
+from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame
@@ -61,14 +61,13 @@ def test_what_is_slow_is_timed_once_a_view(monkeypatch):
 
 def test_a_record_is_read_back(tmp_path):
     record = evaluated({"default": RenderOptions()})
-    path = preset_path(tmp_path)
-    path.parent.mkdir()
-    write_presets(path, record)
-    again = read_presets(path)
+    path = PRESETS.path(tmp_path)
+    PRESETS.write(tmp_path, record)
+    again = PRESETS.read(tmp_path)
     assert again.rendered[0].psnr_to_exact == pytest.approx(record.rendered[0].psnr_to_exact, rel=1e-5)
     path.write_text(path.read_text().replace("psnr_to_exact", "psnr_to_nothing"))
     with pytest.raises(RecordError, match=r"presets\.json"):
-        read_presets(path)
+        PRESETS.read(tmp_path)
 
 
 def test_without_presets_there_is_nothing_to_measure():

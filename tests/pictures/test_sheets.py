@@ -7,8 +7,8 @@ from PIL import Image
 from sparsestreet.pictures import sheets
 from sparsestreet.pictures.images import LIDAR_END, Picture, write_picture
 from sparsestreet.pictures.sheets import SheetColumn, comparison_sheet, picture_sheet
-from sparsestreet.records.quality_csv import quality_path, write_quality
-from sparsestreet.records.summary import HELD_OUT, TRAINING, summary_path, write_summary
+from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report.side_by_side import compare_runs
 from tests.evaluation.frames import make_image, make_summary
 from tests.evaluation.tiles import COLORS, flat, make_picture
@@ -113,9 +113,9 @@ def test_only_runs_of_the_same_images_are_compared():
 
 def write_run(folder, color, psnr, split=HELD_OUT, **summary):
     views = {"psnr": psnr} if split == HELD_OUT else {"psnr": None, "training_psnr": psnr}
-    write_summary(summary_path(folder), make_summary(**views, **summary))
+    SUMMARY.write(folder, make_summary(**views, **summary))
     quality = [make_image(3, 1, psnr=psnr + 1)]
-    write_quality(quality_path(folder, split), quality)
+    QUALITY[split].write(folder, quality)
     write_picture(folder / "pictures", make_picture(render=color))
     return folder
 
@@ -165,6 +165,6 @@ def test_what_cannot_be_compared_is_named(tmp_path):
     other = write_run(tmp_path / "other", COLORS["render"], 25.0, scene="kitti")
     with pytest.raises(ValueError, match="different scenes, kitti, street: compare runs of one scene"):
         compare_runs([plain, other], tmp_path / "sheet.png")
-    write_quality(quality_path(other), [])
+    QUALITY[HELD_OUT].write(other, [])
     with pytest.raises(ValueError, match=r"pictures of \(frame, camera\) \[\(3, 1\)\] and no quality of them"):
         compare_runs([other, other], tmp_path / "sheet.png")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sparsestreet.records.novel import NovelRecord, NovelShift, novel_path, write_novel
+from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
 
 
 def write_beside(run: Path, distances: dict[float, float], name: str = "fid", psnr: float | None = None) -> None:
@@ -12,4 +12,4 @@ def write_beside(run: Path, distances: dict[float, float], name: str = "fid", ps
         NovelShift(offset=offset, views=6, distances={name: value}, truth=truth, true_views=6 if truth else 0)
         for offset, value in distances.items()
     )
-    write_novel(novel_path(run), NovelRecord(command="evaluate", ramp=False, real_views=6, absent=None, shifts=shifts))
+    NOVEL.write(run, NovelRecord(command="evaluate", ramp=False, real_views=6, absent=None, shifts=shifts))

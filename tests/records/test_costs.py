@@ -7,20 +7,12 @@ import pytest
 import torch
 
 from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
-from sparsestreet.records.costs import (
-    CostRecord,
-    NodeCost,
-    cost_path,
-    read_costs,
-    stage_costs,
-    step_costs,
-    update_costs,
-    write_costs,
-)
+from sparsestreet.records.costs import COSTS, CostRecord, NodeCost, stage_costs, step_costs, update_costs
+from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
 from sparsestreet.records.strict_json import RecordError
 from tests.evaluation.frames import NOISE
 
-COSTS = CostRecord(
+MEASURED = CostRecord(
     wall_seconds=100.0,
     phases={"data": 30.0, "train": 69.5, "other": 0.5},
     step_ms={"splat": 3.5},
@@ -34,41 +26,41 @@ COSTS = CostRecord(
 
 
 def test_round_trip(tmp_path):
-    write_costs(cost_path(tmp_path), COSTS)
-    assert cost_path(tmp_path) == tmp_path / "records" / "cost.json"
-    assert read_costs(cost_path(tmp_path)) == COSTS
+    COSTS.write(tmp_path, MEASURED)
+    assert COSTS.path(tmp_path) == tmp_path / "records" / "cost.json"
+    assert COSTS.read(tmp_path) == MEASURED
 
 
 def test_another_format_is_named(tmp_path):
-    path = cost_path(tmp_path)
-    write_costs(path, COSTS)
+    path = COSTS.path(tmp_path)
+    COSTS.write(tmp_path, MEASURED)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0}))
     with pytest.raises(RecordError, match="format 0, this version reads 1: train the run again"):
-        read_costs(path)
+        COSTS.read(tmp_path)
 
 
 @pytest.mark.parametrize("wall", [97.0, 103.0])
 def test_phases_that_are_not_the_wall_clock_are_refused(tmp_path, wall):
-    path = cost_path(tmp_path)
-    write_costs(path, COSTS)
+    path = COSTS.path(tmp_path)
+    COSTS.write(tmp_path, MEASURED)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"wall_seconds": wall}))
     with pytest.raises(RecordError, match=f"the phases are 100 s of {wall:g} s of wall clock"):
-        read_costs(path)
+        COSTS.read(tmp_path)
 
 
 def test_training_and_evaluation_keep_each_others_parts(tmp_path):
-    update_costs(tmp_path, nodes=COSTS.nodes, effects=COSTS.effects, frame_ms=COSTS.frame_ms, noise=NOISE)
-    alone = read_costs(cost_path(tmp_path))
-    assert (alone.nodes, alone.wall_seconds, alone.phases) == (COSTS.nodes, None, {})
+    update_costs(tmp_path, nodes=MEASURED.nodes, effects=MEASURED.effects, frame_ms=MEASURED.frame_ms, noise=NOISE)
+    alone = COSTS.read(tmp_path)
+    assert (alone.nodes, alone.wall_seconds, alone.phases) == (MEASURED.nodes, None, {})
     update_costs(
         tmp_path,
         wall_seconds=100.0,
-        phases=COSTS.phases,
-        step_ms=COSTS.step_ms,
-        passes=COSTS.passes,
-        peak_host_mb=COSTS.peak_host_mb,
+        phases=MEASURED.phases,
+        step_ms=MEASURED.step_ms,
+        passes=MEASURED.passes,
+        peak_host_mb=MEASURED.peak_host_mb,
     )
-    assert read_costs(cost_path(tmp_path)) == COSTS
+    assert COSTS.read(tmp_path) == MEASURED
 
 
 def test_stages_become_phases_and_passes():
@@ -80,15 +72,15 @@ def test_stages_become_phases_and_passes():
 
 def test_steps_are_medians_of_parts(tmp_path):
     """Losses and backward passes are sums within a step; a part counts in the steps that have it."""
-    path = tmp_path / "phases.csv"
-    assert step_costs(path) == {}
+    assert step_costs(tmp_path) == {}
     rows = [
         *((1, name, ms) for name, ms in (("loss l1", 1), ("loss sky", 2), ("backward", 4), ("splat backward", 8))),
         *((1, name, ms) for name, ms in (("loop", 0.5), ("logging", 0.25), ("density statistics", 16))),
         *((2, name, ms) for name, ms in (("loss l1", 5), ("backward", 14), ("loop", 0.25))),
     ]
-    path.write_text("step,phase,milliseconds\n" + "".join(f"{step},{name},{ms}\n" for step, name, ms in rows))
-    assert step_costs(path) == {"losses": 4.0, "backward": 13.0, "loop": 0.5, "density": 16.0}
+    STEP_PHASES.write(tmp_path, [StepPhase(step, name, float(ms)) for step, name, ms in rows])
+    assert STEP_PHASES.path(tmp_path).read_text().splitlines()[:2] == ["step,phase,milliseconds", "1,loss l1,1.0000"]
+    assert step_costs(tmp_path) == {"losses": 4.0, "backward": 13.0, "loop": 0.5, "density": 16.0}
 
 
 def test_a_peak_is_seen_and_forgotten():

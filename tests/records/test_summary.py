@@ -7,14 +7,13 @@ import os
 
 import pytest
 
-from sparsestreet.records.quality import FrameQuality, MetricSummary, RegionQuality
-from sparsestreet.records.quality_csv import quality_path, read_quality, write_quality
-from sparsestreet.records.run import read_run, run_path, write_run
+from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, FrameQuality, MetricSummary, RegionQuality
+from sparsestreet.records.run import RUN
 from sparsestreet.records.strict_json import RecordError, significant, write_atomically
-from sparsestreet.records.summary import HELD_OUT, TRAINING, GuardCounts, read_summary, write_summary
+from sparsestreet.records.summary import SUMMARY, GuardCounts
 from tests.evaluation.frames import make_image, make_run, make_summary
 
-QUALITY = [
+IMAGES = [
     FrameQuality(0, 1, 12, 9, {"full": RegionQuality(108, 0.00123456, 29.0849, 0.912345)}),
     FrameQuality(
         10,
@@ -36,8 +35,8 @@ def test_summary_round_trip(tmp_path):
     cameras = {"0": {"psnr_full": 25.0, "psnr_near_lidar": None}, "10": {"psnr_full": 24.0, "psnr_near_lidar": 23.5}}
     summary = make_summary(training_seconds=None, vehicle_psnr=None, cameras=cameras)
     path = tmp_path / "records" / "summary.json"
-    write_summary(path, summary)
-    assert read_summary(path) == summary
+    SUMMARY.write(tmp_path, summary)
+    assert SUMMARY.read(tmp_path) == summary
     assert json.loads(path.read_text())["latency"]["clocks"]["frame"]["p90"] == 60.0
     assert json.loads(path.read_text())["by_camera"] == {HELD_OUT: cameras}
     assert (summary.camera_mean("psnr_near_lidar", "10"), summary.camera_mean("psnr_full", "3")) == (23.5, None)
@@ -46,19 +45,19 @@ def test_summary_round_trip(tmp_path):
 def test_run_description_round_trip(tmp_path):
     config = {"loss.weight": 0.012345678901, "node": ["background", "rigid"], "data.width": None, "sky.on": True}
     run = make_run("streetgs+paper", config=config, caps={"background": 130000}, training_seconds=12.5)
-    path = run_path(tmp_path / "run")
-    write_run(path, run)
-    assert path == tmp_path / "run" / "run.json"
-    assert read_run(path) == run  # settings with all their digits, ints as ints
-    assert [type(value) for value in read_run(path).config.values()] == [type(value) for value in run.config.values()]
+    RUN.write(tmp_path / "run", run)
+    assert RUN.path(tmp_path / "run") == tmp_path / "run" / "run.json"
+    again = RUN.read(tmp_path / "run")
+    assert again == run  # settings with all their digits, ints as ints
+    assert [type(value) for value in again.config.values()] == [type(value) for value in run.config.values()]
 
 
 def test_a_summary_holds_the_run_unchanged(tmp_path):
     summary = make_summary(config={"loss.weight": 0.012345678901})
-    write_summary(tmp_path / "summary.json", summary)
-    write_run(tmp_path / "run.json", summary.run)
-    entries = json.loads((tmp_path / "summary.json").read_text())["run"]
-    assert entries == json.loads((tmp_path / "run.json").read_text())
+    SUMMARY.write(tmp_path, summary)
+    RUN.write(tmp_path, summary.run)
+    entries = json.loads(SUMMARY.path(tmp_path).read_text())["run"]
+    assert entries == json.loads(RUN.path(tmp_path).read_text())
     assert (entries["format"], entries["label"], entries["sparsify"]) == (2, "plain", "none")
 
 
@@ -85,36 +84,37 @@ def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("write", "read", "value", "remedy"),
+    ("file", "value", "remedy"),
     [
-        (write_run, read_run, make_run(), "format 0, this version reads 2: train the run again"),
-        (write_summary, read_summary, make_summary(), "format 0, this version reads 4: evaluate again"),
+        (RUN, make_run(), "format 0, this version reads 2: train the run again"),
+        (SUMMARY, make_summary(), "format 0, this version reads 4: evaluate again"),
     ],
+    ids=["run", "summary"],
 )
-def test_another_format_is_named_before_its_keys(tmp_path, write, read, value, remedy):
-    path = tmp_path / "record.json"
-    write(path, value)
+def test_another_format_is_named_before_its_keys(tmp_path, file, value, remedy):
+    path = file.path(tmp_path)
+    file.write(tmp_path, value)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0, "new key": 1}))
     with pytest.raises(RecordError, match=remedy):
-        read(path)
+        file.read(tmp_path)
     path.write_text("{}")
     with pytest.raises(RecordError, match="format None"):
-        read(path)
+        file.read(tmp_path)
 
 
 def test_floats_are_written_with_six_digits(tmp_path):
     summary = make_summary(psnr=25.123456789)
-    write_summary(tmp_path / "summary.json", summary)
-    assert '"mean": 25.1235,' in (tmp_path / "summary.json").read_text()
+    SUMMARY.write(tmp_path, summary)
+    assert '"mean": 25.1235,' in SUMMARY.path(tmp_path).read_text()
     assert significant(1234567.0, "x") == 1234570.0
     assert significant(1.23456789e-5, "x") == 1.23457e-5
 
 
 def test_quality_round_trip_and_plain_csv(tmp_path):
-    path = tmp_path / "quality.csv"
-    write_quality(path, QUALITY)
-    assert read_quality(path) == QUALITY
-    with path.open(newline="") as stream:
+    quality = QUALITY[HELD_OUT]
+    quality.write(tmp_path, IMAGES)
+    assert quality.read(tmp_path) == IMAGES
+    with quality.path(tmp_path).open(newline="") as stream:
         first, second = csv.DictReader(stream)
     assert (first["frame"], first["camera"], first["psnr_full"]) == ("0", "1", "29.0849")
     assert (second["psnr8_full"], second["lpips_alex_full"], second["lpips_vgg_full"]) == ("60.5", "0.125", "0.25")
@@ -123,9 +123,9 @@ def test_quality_round_trip_and_plain_csv(tmp_path):
     assert (second["pixels_human"], second["psnr_human"], second["ssim_uniform7_vehicle"]) == ("0", "", "-0.25")
     assert (second["psnr_near_lidar"], second["pixels_beyond_lidar"], second["mse_beyond_lidar"]) == ("9.0309", "0", "")
     assert first["pixels_near_lidar"] == ""
-    write_quality(path, [])
-    assert read_quality(path) == []
-    names = [quality_path(tmp_path, split).relative_to(tmp_path).as_posix() for split in (HELD_OUT, TRAINING)]
+    quality.write(tmp_path, [])
+    assert quality.read(tmp_path) == []
+    names = [QUALITY[split].path(tmp_path).relative_to(tmp_path).as_posix() for split in (HELD_OUT, TRAINING)]
     assert names == ["records/quality.csv", "records/quality_train.csv"]
 
 
@@ -134,9 +134,9 @@ def test_no_record_holds_a_number_that_is_none(tmp_path, value):
     summary = make_summary()
     broken = dataclasses.replace(summary, quality={HELD_OUT: {"psnr_full": MetricSummary(value, None, 1, 0)}})
     with pytest.raises(RecordError, match=r"summary\.json: quality: held_out: psnr_full: mean is (nan|inf)"):
-        write_summary(tmp_path / "summary.json", broken)
+        SUMMARY.write(tmp_path, broken)
     with pytest.raises(RecordError, match=r"quality\.csv: frame 3 is (nan|inf)"):
-        write_quality(tmp_path / "quality.csv", [make_image(3, vehicle=RegionQuality(64, value, 20.0, 0.5))])
+        QUALITY[HELD_OUT].write(tmp_path, [make_image(3, vehicle=RegionQuality(64, value, 20.0, 0.5))])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -192,22 +192,22 @@ def drop(entries, key):
     ],
 )
 def test_a_malformed_summary_names_file_and_entry(tmp_path, damage, message):
-    path = tmp_path / "summary.json"
-    write_summary(path, make_summary())
+    path = SUMMARY.path(tmp_path)
+    SUMMARY.write(tmp_path, make_summary())
     entries = json.loads(path.read_text())
     damage(entries)
     path.write_text(json.dumps(entries))
     with pytest.raises(RecordError, match=r"summary\.json.*" + message):
-        read_summary(path)
+        SUMMARY.read(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", "\x00"])
 def test_a_broken_summary_names_the_file(tmp_path, text):
-    (tmp_path / "summary.json").write_text(text)
+    write_atomically(SUMMARY.path(tmp_path), text)
     with pytest.raises(RecordError, match=r"summary\.json"):
-        read_summary(tmp_path / "summary.json")
-    with pytest.raises(RecordError, match=r"absent\.json: cannot be read"):
-        read_summary(tmp_path / "absent.json")
+        SUMMARY.read(tmp_path)
+    with pytest.raises(RecordError, match=r"absent/records/summary\.json: cannot be read"):
+        SUMMARY.read(tmp_path / "absent")
 
 
 @pytest.mark.parametrize(
@@ -220,19 +220,19 @@ def test_a_broken_summary_names_the_file(tmp_path, text):
     ],
 )
 def test_a_malformed_quality_names_file_and_line(tmp_path, line, message):
-    path = tmp_path / "quality.csv"
-    write_quality(path, QUALITY[:1])
+    QUALITY[HELD_OUT].write(tmp_path, IMAGES[:1])
+    path = QUALITY[HELD_OUT].path(tmp_path)
     path.write_text(path.read_text() + line + "\n")
     with pytest.raises(RecordError, match=r"quality\.csv, " + message):
-        read_quality(path)
+        QUALITY[HELD_OUT].read(tmp_path)
 
 
 def test_quality_with_another_header_is_refused(tmp_path):
-    (tmp_path / "quality.csv").write_text("frame,psnr\n0,20\n")
-    with pytest.raises(RecordError, match=r"quality\.csv: the header"):
-        read_quality(tmp_path / "quality.csv")
-    with pytest.raises(RecordError, match="does not exist"):
-        read_quality(tmp_path / "absent.csv")
+    write_atomically(QUALITY[HELD_OUT].path(tmp_path), "frame,psnr\n0,20\n")
+    with pytest.raises(RecordError, match=r"quality\.csv: the header .* evaluate the run again"):
+        QUALITY[HELD_OUT].read(tmp_path)
+    with pytest.raises(RecordError, match=r"quality_train\.csv: does not exist; evaluate the run first"):
+        QUALITY[TRAINING].read(tmp_path)
 
 
 def test_a_crash_while_writing_leaves_the_old_file_alone(tmp_path, monkeypatch):

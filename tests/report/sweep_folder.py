@@ -6,9 +6,10 @@ import numpy as np
 
 from sparsestreet.pictures.images import KINDS, picture_path, write_png
 from sparsestreet.records.costs import NodeCost, update_costs
-from sparsestreet.records.failures import FailedRun, write_failure
-from sparsestreet.records.ledger import CountChange, ledger_path, write_changes
-from sparsestreet.records.summary import RunSummary, summary_path, write_summary
+from sparsestreet.records.failures import FAILURE, FailedRun
+from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.ledger import LEDGER, CountChange
+from sparsestreet.records.summary import SUMMARY, RunSummary
 from sparsestreet.report import RunRecord
 from tests.evaluation.frames import make_summary
 
@@ -46,8 +47,8 @@ def write_sweep(folder: Path, *, curves: bool = True, failed: bool = True) -> Pa
     """All files that the report reads."""
     for name, summary in street_runs().items():
         run = folder / name
-        write_summary(summary_path(run), summary)
-        write_changes(ledger_path(run), _ledger(summary))
+        SUMMARY.write(run, summary)
+        LEDGER.write(run, _ledger(summary))
         for kind in KINDS:
             image = np.full((30, 48, 3), 40 + 60 * KINDS.index(kind), dtype=np.uint8)
             write_png(picture_path(run / "pictures", 5, 0, kind), image)
@@ -58,7 +59,7 @@ def write_sweep(folder: Path, *, curves: bool = True, failed: bool = True) -> Pa
             update_costs(run, nodes=nodes, effects={"sky": 0.5}, step_ms=steps, phases={"train": 9.0, "prune": 0.25})
     if failed:
         failure = FailedRun(label="streetgs+paper", seed=0, command="train x", error="no <memory>", trace="Trace ...")
-        write_failure(folder / "streetgs+paper_seed0", failure)
+        FAILURE.write(folder / "streetgs+paper_seed0", failure)
     return folder
 
 
@@ -70,7 +71,5 @@ def _ledger(summary: RunSummary) -> list[CountChange]:
 
 
 def _write_curve(run: Path, end: float) -> None:
-    path = run / "curves" / "held_out.csv"
-    path.parent.mkdir(parents=True)
-    rows = [f"{10.0 * step},{step},{end - drop},20.0," for step, drop in enumerate((3.0, 0.8, 0.3, 0.0), start=1)]
-    path.write_text("\n".join(["seconds,step,psnr_full,psnr_human,psnr_vehicle", *rows]) + "\n")
+    drops = enumerate((3.0, 0.8, 0.3, 0.0), start=1)
+    HELD_OUT_CURVE.write(run, [HeldOutLook(10.0 * step, step, end - drop, 20.0, None) for step, drop in drops])

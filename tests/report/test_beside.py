@@ -5,6 +5,7 @@ import json
 import pytest
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.records.novel import NOVEL
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
@@ -55,8 +56,17 @@ def test_none_recorded_no_table(tmp_path):
 
 
 def test_what_a_record_lacks_is_named(tmp_path):
-    path = tmp_path / "records" / "novel.json"
-    path.parent.mkdir()
-    path.write_text(json.dumps({"shifts": [{"offset": 1.0}]}))
-    with pytest.raises(RecordError, match=r"novel\.json: lacks 'truth'"):
+    write_beside(tmp_path, {1.0: 40.0}, psnr=20.0)
+    path = NOVEL.path(tmp_path)
+    entries = json.loads(path.read_text())
+    (shift,) = entries["shifts"]
+    path.write_text(json.dumps(entries | {"shifts": [shift | {"truth": {"psnr_sky": 20.0}}]}))
+    with pytest.raises(RecordError, match=r"novel\.json: shifts\[0\]: truth holds psnr_sky, expected psnr_full, "):
+        shifts_of(tmp_path)
+    del shift["truth"]
+    path.write_text(json.dumps(entries | {"shifts": [shift]}))
+    with pytest.raises(RecordError, match=r"novel\.json: shifts\[0\]: NovelShift lacks the keys \['truth'\]"):
+        shifts_of(tmp_path)
+    path.write_text(json.dumps(entries | {"format": 1}))
+    with pytest.raises(RecordError, match=r"format 1, this version reads 2: evaluate again with novel"):
         shifts_of(tmp_path)

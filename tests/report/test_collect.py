@@ -6,14 +6,14 @@ import sys
 import pytest
 
 from sparsestreet.records.strict_json import RecordError
-from sparsestreet.records.summary import summary_path, write_summary
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report import collect
 from tests.evaluation.frames import make_summary
 
 
 def test_collect_finds_each_run_once(tmp_path):
     for name in ("a/run", "b"):
-        write_summary(summary_path(tmp_path / name), make_summary(name))
+        SUMMARY.write(tmp_path / name, make_summary(name))
     found = collect([tmp_path, tmp_path / "a", tmp_path / "a" / ".." / "b"])
     assert [record.summary.run.label for record in found] == ["a/run", "b"]
     assert found[1].folder == (tmp_path / "b").resolve()
@@ -23,8 +23,8 @@ def test_collect_finds_each_run_once(tmp_path):
 def test_collect_names_what_is_wrong(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"holds no records/summary\.json"):
         collect([tmp_path])
-    write_summary(summary_path(tmp_path / "good"), make_summary())
-    broken = summary_path(tmp_path / "broken")
+    SUMMARY.write(tmp_path / "good", make_summary())
+    broken = SUMMARY.path(tmp_path / "broken")
     broken.parent.mkdir(parents=True)
     broken.write_text("{}")
     with pytest.raises(RecordError, match=r"broken/records/summary\.json"):

@@ -2,10 +2,11 @@
 
 import pytest
 
+from sparsestreet.records.held_out import HELD_OUT_CURVE
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
-from sparsestreet.report.curves import QualityCurve, read_curve, seconds_to, time_to_quality
+from sparsestreet.report.curves import QualityCurve, seconds_to, time_to_quality
 from tests.report.sweep_folder import write_sweep
 
 
@@ -30,7 +31,8 @@ def test_no_curve_no_table(tmp_path):
 
 
 def test_a_malformed_curve_is_named(tmp_path):
-    path = tmp_path / "held_out.csv"
-    path.write_text("seconds,psnr_full\nsoon,20.0\n")
-    with pytest.raises(RecordError, match=r"held_out\.csv: could not convert"):
-        read_curve(path)
+    run = write_sweep(tmp_path) / "streetgs_seed0"
+    path = HELD_OUT_CURVE.path(run)
+    path.write_text(path.read_text() + "soon,5,20.0,,\n")
+    with pytest.raises(RecordError, match=r"held_out\.csv, line 6: could not convert .*soon.*; train the run again"):
+        time_to_quality(arms(collect([tmp_path])))

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
-from sparsestreet.records.presets import PresetRecord, RenderedAs, preset_path, write_presets
+from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
 from sparsestreet.report.presets import rendered_otherwise
@@ -26,7 +26,7 @@ def write_rendered(run: Path, loss: float) -> None:
         for name, lost, milliseconds in (("default", 0.0, 20.0), ("fast", loss, 12.0))
     )
     record = PresetRecord(command="c", device="cpu: x", threads=1, views=3, noise=NOISE, rendered=rendered)
-    write_presets(preset_path(run), record)
+    PRESETS.write(run, record)
 
 
 def test_a_row_for_each_arm_and_preset(tmp_path):

@@ -4,8 +4,7 @@ import dataclasses
 
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
-from sparsestreet.records.quality import MetricSummary
-from sparsestreet.records.summary import HELD_OUT
+from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report import sections
 from tests.evaluation.frames import make_summary
 from tests.report.test_sections import cells, records

@@ -1,13 +1,12 @@
 """Where the steps of a run spend their time, noted now and then."""
 
-import csv
-import io
+from dataclasses import astuple
 from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
 
 LOOP = "loop"
 """What is in no phase: Lightning, and callbacks that have nothing to do in a step."""
@@ -26,7 +25,7 @@ class PhaseTimes(Callback):
             raise ValueError(f"phases are noted every so many steps, at least 1, got {every}")
         self.path = Path(path)
         self.every = every
-        self.rows: list[tuple[int, str, float]] = []
+        self.rows: list[StepPhase] = []
         self._recorder: PhaseRecorder | None = None
 
     def on_train_batch_end(
@@ -52,14 +51,14 @@ class PhaseTimes(Callback):
         self._forget()
 
     def state_dict(self) -> dict[str, object]:
-        return {"rows": self.rows}
+        return {"rows": [astuple(row) for row in self.rows]}
 
     def load_state_dict(self, state_dict: dict[str, object]) -> None:
-        self.rows = list(state_dict["rows"])
+        self.rows = [StepPhase(*row) for row in state_dict["rows"]]
 
     def _note(self, step: int) -> None:
         if self._recorder is not None:
-            self.rows += [(step, name, 1e3 * seconds) for name, seconds in self._recorder.stop().items()]
+            self.rows += [StepPhase(step, name, 1e3 * seconds) for name, seconds in self._recorder.stop().items()]
             self._recorder = None
 
     def _forget(self) -> None:
@@ -68,12 +67,5 @@ class PhaseTimes(Callback):
             self._recorder = None
 
     def _write(self, trainer: Trainer) -> None:
-        if not trainer.is_global_zero:
-            return
-        buffer = io.StringIO()
-        writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(("step", "phase", "milliseconds"))
-        writer.writerows((step, name, f"{value:.4f}") for step, name, value in self.rows)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(self.path) as temporary:
-            temporary.write_text(buffer.getvalue())
+        if trainer.is_global_zero:
+            STEP_PHASES.write_to(self.path, self.rows)

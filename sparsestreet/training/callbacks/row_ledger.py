@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.records.ledger import CountChange, write_changes
+from sparsestreet.records.ledger import LEDGER, CountChange
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowListener
 
@@ -41,4 +41,4 @@ class RowLedger(Callback, RowListener):
 
     def _write(self, trainer: Trainer) -> None:
         if trainer.is_global_zero:
-            write_changes(self.path, self.changes)
+            LEDGER.write_to(self.path, self.changes)

@@ -8,7 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.noise import Calibration, calibrate, noise_between
 from sparsestreet.phases import stage
 from sparsestreet.records.ledger import CountChange
-from sparsestreet.records.run import RunDescription, run_path, write_run
+from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.scene import views
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
@@ -71,7 +71,7 @@ class RunFiles(Callback, RowListener):
         with stage("save"):
             save_scene(self.folder / FILE_NAME, stored)
             views.write_views(self.folder / views.FILE_NAME, split.train.views, split.held_out.views)
-            write_run(run_path(self.folder), description)
+            RUN.write(self.folder, description)
         return description
 
     def state_dict(self) -> dict[str, object]:

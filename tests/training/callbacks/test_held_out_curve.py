@@ -12,18 +12,17 @@ from sparsestreet.training.callbacks import Clock, HeldOutCurve, StageTimes
 from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system
 
 
-def rows_of(path):
-    with path.open() as file:
+def rows_of(run):
+    with (run / "curves" / "held_out.csv").open() as file:
         return list(csv.DictReader(file))
 
 
 def validated(tmp_path, callbacks, frame):
-    path = tmp_path / "curves" / "held_out.csv"
     clock = Clock()
     system = make_system({"background": background(5)})
-    callbacks = [clock, *callbacks, HeldOutCurve(path, clock)]
+    callbacks = [clock, *callbacks, HeldOutCurve(tmp_path, clock)]
     fit(system, callbacks, 4, frame, limit_val_batches=1, val_check_interval=2, check_val_every_n_epoch=None)
-    return rows_of(path), system, clock
+    return rows_of(tmp_path), system, clock
 
 
 def test_every_validation_is_a_row_of_seconds_step_and_regions(tmp_path):
@@ -47,20 +46,20 @@ def test_every_validation_is_a_row_of_seconds_step_and_regions(tmp_path):
 def test_a_run_that_goes_on_keeps_its_rows_and_its_seconds(tmp_path):
     clock = Clock()
     clock.load_state_dict({"seconds": 50.0})
-    curve = HeldOutCurve(tmp_path / "held_out.csv", clock)
+    curve = HeldOutCurve(tmp_path, clock)
     trainer = StubTrainer(make_system({"background": background(5)}), [clock, curve])
     trainer.callback_metrics = {"val/psnr": torch.tensor(20.0)}
     trainer.global_step = 7
     curve.on_validation_end(trainer, trainer.system)
-    again = HeldOutCurve(tmp_path / "held_out.csv", clock)
+    again = HeldOutCurve(tmp_path, clock)
     again.load_state_dict(curve.state_dict())
     clock.load_state_dict({"seconds": 80.0})
     trainer.global_step = 9
     again.on_validation_end(trainer, trainer.system)
-    assert [(row["seconds"], row["step"]) for row in rows_of(curve.path)] == [("50.000", "7"), ("80.000", "9")]
+    assert [(row["seconds"], row["step"]) for row in rows_of(tmp_path)] == [("50.000", "7"), ("80.000", "9")]
     trainer.sanity_checking = True
     again.on_validation_end(trainer, trainer.system)
-    assert len(again.rows) == 2
+    assert len(again.looks) == 2
 
 
 def test_validation_is_a_stage_of_its_own_and_what_was_spent_goes_into_the_checkpoint(tmp_path):

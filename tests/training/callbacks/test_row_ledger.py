@@ -6,7 +6,7 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 
-from sparsestreet.records.ledger import read_changes
+from sparsestreet.records.ledger import LEDGER
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.masks import StaticMaskSettings
@@ -121,12 +121,12 @@ def test_the_changes_of_a_training_are_a_chain(tmp_path):
     set_rows(nodes["background"], "mask_logits", {2: -9.0, 5: -9.0})
     system = make_system(nodes)
     control = DensityControl(Interval(0.0, 1.0, every=2), 1.0, Interval(0.0, 0.0))
-    ledger = RowLedger(tmp_path / "counts.csv")
+    ledger = RowLedger(LEDGER.path(tmp_path))
     trainer = StubTrainer(system, [ledger, control, MaskTraining(Interval(0.0, 1.0, every=3))], max_steps=6)
     trainer.start()
     trainer.train(6, frame_at())
     ledger.on_train_end(trainer, system)
-    changes = read_changes(tmp_path / "counts.csv")
+    changes = LEDGER.read(tmp_path)
     reached = {"background": 0, "rigid": 0}
     for change in changes:
         assert change.before == reached[change.node] != change.after, change

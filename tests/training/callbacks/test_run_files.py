@@ -8,7 +8,7 @@ import torch
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
-from sparsestreet.records.run import read_run, run_path
+from sparsestreet.records.run import RUN
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import load_scene
@@ -52,7 +52,7 @@ def check_whole(trainer: StubTrainer, folder: Path) -> None:
     views = read_views(folder / "views.json")
     assert [view.frame_index for view in views.training] == [0, 2, 3, 5, 6]
     assert [view.frame_index for view in views.held_out] == [1, 4]
-    run = read_run(run_path(folder))
+    run = RUN.read(folder)
     assert (run.steps, run.training_seconds) == (trainer.global_step, 12.5)
     assert run.label == make_run().label
 
@@ -60,7 +60,7 @@ def check_whole(trainer: StubTrainer, folder: Path) -> None:
 def test_the_end_of_training_leaves_all_three(trainer, tmp_path):
     trainer.callbacks[0].on_train_end(trainer, trainer.system)
     check_whole(trainer, tmp_path)
-    assert read_run(run_path(tmp_path)).caps == {}
+    assert RUN.read(tmp_path).caps == {}
 
 
 def test_so_does_an_interruption_between_two_steps(trainer, tmp_path):
@@ -92,7 +92,7 @@ def test_run_json_names_the_nodes_that_their_limit_held_down(trainer, tmp_path):
     assert callback.caps == {"background": 10}
     resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(9) < 2), "cull")
     callback.on_train_end(trainer, system)
-    assert read_run(run_path(tmp_path)).caps == {"background": 10}
+    assert RUN.read(tmp_path).caps == {"background": 10}
 
 
 def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
