@@ -1,7 +1,6 @@
 """Renders against recorded images, one at a time: nothing is kept but numbers, and predictions on disk."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,13 +9,7 @@ from torch import Tensor
 
 from sparsestreet.data.device import to_device
 from sparsestreet.data.lidar import near_returns
-from sparsestreet.evaluation.predictions import (
-    prediction_path,
-    quantized,
-    read_prediction,
-    restored,
-    write_prediction,
-)
+from sparsestreet.evaluation.predictions import Predictions, quantized, restored
 from sparsestreet.metrics import image as metrics
 from sparsestreet.metrics import ssim
 from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
@@ -47,7 +40,7 @@ def evaluate_frames(
     scene: SceneGraph,
     frames: Iterable[Frame],
     options: RenderOptions,
-    predictions: Path | None = None,
+    predictions: Predictions | None = None,
     lpips: Mapping[str, Lpips] | None = None,
 ) -> Iterator[FrameQuality]:
     """The quality of each frame's render, in order; holds one frame at a time, and moves it to the scene's device.
@@ -56,7 +49,7 @@ def evaluate_frames(
         scene: what is rendered.
         frames: recorded views; may load its images while iterating.
         options: how it is rendered.
-        predictions: a folder in which renders are stored; what is compared is then read back from there. None: they
+        predictions: where renders are stored; what is compared is then read back from there. None: they
             are rounded alike, and not stored.
         lpips: the perceptual distances to measure, by the quantity that each is; on the scene's device.
 
@@ -65,21 +58,23 @@ def evaluate_frames(
     for frame in frames:
         pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         if predictions is not None:
-            path = prediction_path(predictions, frame.frame_index, frame.camera_index)
-            write_prediction(path, pixels)
-            pixels = read_prediction(path)
+            predictions.write(frame.frame_index, frame.camera_index, pixels)
+            pixels = predictions.read(frame.frame_index, frame.camera_index)
         yield _quality(pixels, frame, scene.device, lpips)
 
 
 def evaluate_predictions(
-    folder: Path, frames: Iterable[Frame], device: torch.device, lpips: Mapping[str, Lpips] | None = None
+    predictions: Predictions,
+    frames: Iterable[Frame],
+    device: torch.device,
+    lpips: Mapping[str, Lpips] | None = None,
 ) -> Iterator[FrameQuality]:
     """The quality of stored predictions of frames, without the scene; otherwise as ``evaluate_frames``.
 
     Raises PredictionError for a prediction that is absent or damaged.
     """
     for frame in frames:
-        pixels = read_prediction(prediction_path(folder, frame.frame_index, frame.camera_index))
+        pixels = predictions.read(frame.frame_index, frame.camera_index)
         yield _quality(pixels, frame, device, lpips)
 
 

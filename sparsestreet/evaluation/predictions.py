@@ -4,6 +4,7 @@
 so OpenCV reads and writes them.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -19,20 +20,46 @@ class PredictionError(ValueError):
     """A stored prediction that cannot be read; names the file and the remedy."""
 
 
-def predictions_folder(run: Path, split: str) -> Path:
-    """Where a run keeps its predictions of the views of a split."""
-    return run / "predictions" / split
+@dataclass(frozen=True)
+class Predictions:
+    """The predictions of some views, one file each."""
 
+    folder: Path
 
-def prediction_path(folder: Path, frame: int, camera: int) -> Path:
-    """The prediction of one view."""
-    return folder / f"{frame:03d}_{camera}.png"
+    @classmethod
+    def of(cls, run: Path, split: str) -> "Predictions":
+        """Those that a run keeps of the views of a split."""
+        return cls(run / "predictions" / split)
 
+    def path(self, frame: int, camera: int) -> Path:
+        """The file of one view."""
+        return self.folder / f"{frame:03d}_{camera}.png"
 
-def clear_predictions(folder: Path) -> None:
-    """Remove those of an earlier evaluation, perhaps of other views; files of other names stay."""
-    for path in folder.glob("[0-9]*_[0-9]*.png"):
-        path.unlink()
+    def clear(self) -> None:
+        """Remove those of an earlier evaluation, perhaps of other views; files of other names stay."""
+        for path in self.folder.glob("[0-9]*_[0-9]*.png"):
+            path.unlink()
+
+    def write(self, frame: int, camera: int, pixels: UInt16[np.ndarray, "h w 3"]) -> None:
+        """Write one, the whole file or nothing. Raises OSError where it cannot be written."""
+        path = self.path(frame, camera)
+        with atomic_file(path) as temporary:
+            # OpenCV's order is BGR. Of 16 bits the lower are noise, which no effort compresses.
+            done, data = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            if not done:
+                raise OSError(f"{path}: an image of shape {pixels.shape} cannot be encoded as PNG")
+            temporary.write_bytes(data.tobytes())
+
+    def read(self, frame: int, camera: int) -> UInt16[np.ndarray, "h w 3"]:
+        """Read one back. Raises PredictionError for a file that is absent, damaged or no 16-bit RGB PNG."""
+        path = self.path(frame, camera)
+        if not path.is_file():
+            raise PredictionError(f"{path} is not there: evaluate the run, which stores its predictions")
+        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
+            found = "cannot be decoded" if pixels is None else f"is {pixels.dtype} of shape {pixels.shape}"
+            raise PredictionError(f"{path} {found}, a prediction is a 16-bit RGB PNG: evaluate the run again")
+        return np.ascontiguousarray(pixels[..., ::-1])
 
 
 def quantized(image: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
@@ -43,24 +70,3 @@ def quantized(image: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
 def restored(pixels: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """What a prediction holds as float32 in [0, 1]."""
     return (pixels / LEVELS).astype(np.float32)
-
-
-def write_prediction(path: Path, pixels: UInt16[np.ndarray, "h w 3"]) -> None:
-    """Write one, the whole file or nothing. Raises OSError where it cannot be written."""
-    with atomic_file(path) as temporary:
-        # OpenCV's order is BGR. Of 16 bits the lower are noise, which no effort compresses.
-        done, data = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        if not done:
-            raise OSError(f"{path}: an image of shape {pixels.shape} cannot be encoded as PNG")
-        temporary.write_bytes(data.tobytes())
-
-
-def read_prediction(path: Path) -> UInt16[np.ndarray, "h w 3"]:
-    """Read one back. Raises PredictionError for a file that is absent, damaged or no 16-bit RGB PNG."""
-    if not path.is_file():
-        raise PredictionError(f"{path} is not there: evaluate the run, which stores its predictions")
-    pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        found = "cannot be decoded" if pixels is None else f"is {pixels.dtype} of shape {pixels.shape}"
-        raise PredictionError(f"{path} {found}, a prediction is a 16-bit RGB PNG: evaluate the run again")
-    return np.ascontiguousarray(pixels[..., ::-1])

@@ -12,7 +12,7 @@ from torch import Tensor
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
 from sparsestreet.evaluation.node_costs import measure_scene_costs
-from sparsestreet.evaluation.predictions import clear_predictions, predictions_folder
+from sparsestreet.evaluation.predictions import Predictions
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips_weights import open_lpips
@@ -78,7 +78,7 @@ def evaluate_scene(
     main, frames = next(iter(splits.items()))
     lpips, absent = open_lpips(scene.device)
     for split in (HELD_OUT, TRAINING):
-        clear_predictions(predictions_folder(out, split))
+        Predictions.of(out, split).clear()
     for file in (NOVEL, PRESETS):
         file.remove(out)  # of an earlier evaluation, perhaps of an earlier scene
     quality = {
@@ -87,7 +87,7 @@ def evaluate_scene(
                 scene,
                 frames,
                 options,
-                predictions_folder(out, split) if split == HELD_OUT else None,
+                Predictions.of(out, split) if split == HELD_OUT else None,
                 lpips if split == main else {},
             )
         )

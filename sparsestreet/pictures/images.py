@@ -1,4 +1,4 @@
-"""Pictures that let a person judge a run: truth, render, error and Gaussian centers of one view (no torch).
+"""Pictures that let a person judge a run: truth, render, error and Gaussian centers of one view.
 
 All images are uint8 [h, w, 3]. Errors share one fixed scale, so that pictures of different runs compare.
 """
@@ -96,20 +96,23 @@ def write_picture(folder: Path, picture: Picture) -> None:
         write_png(picture_path(folder, picture.frame, picture.camera, kind), getattr(picture, kind))
 
 
+def drawn_views(folder: Path) -> list[tuple[int, int]]:
+    """Frame and camera of each picture in a folder, in order."""
+    stems = (path.stem.split("_") for path in folder.glob("*_truth.png"))
+    return sorted((int(frame), int(camera)) for frame, camera, _ in stems)
+
+
 def read_pictures(folder: Path) -> list[Picture]:
     """The pictures that a run left in its folder, in order of frame and camera.
 
     Raises FileNotFoundError if there are none, or one lacks another of its images.
     """
-    suffix = "_truth.png"
-    keys = sorted(
-        tuple(int(part) for part in path.name.removesuffix(suffix).split("_")) for path in folder.glob(f"*{suffix}")
-    )
-    if not keys:
-        raise FileNotFoundError(f"{folder} has no pictures (*{suffix}): evaluate the run first")
+    views = drawn_views(folder)
+    if not views:
+        raise FileNotFoundError(f"{folder} has no pictures (*_truth.png): evaluate the run first")
     return [
         Picture(frame, camera, *(_read_png(picture_path(folder, frame, camera, kind)) for kind in KINDS))
-        for frame, camera in keys
+        for frame, camera in views
     ]
 
 

@@ -1,4 +1,4 @@
-"""Curves over training and the scatter of runs (matplotlib without a display; no torch)."""
+"""Curves over training and the scatter of runs (matplotlib without a display)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Sheets of pictures: one run's, or several runs' beside each other (no torch).
+"""Sheets of pictures: one run's, or several runs' beside each other.
 
 The scale of the errors is written on every sheet.
 """

@@ -1,4 +1,4 @@
-"""Tables and a figure of many runs, from their records alone (no torch import)."""
+"""Tables and a figure of many runs, from their records alone."""
 
 from sparsestreet.report.collect import RunRecord, collect
 from sparsestreet.report.drawing import figure, markdown, tables

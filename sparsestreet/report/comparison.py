@@ -8,7 +8,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from sparsestreet.pictures.images import picture_path
+from sparsestreet.pictures.images import drawn_views, picture_path
 from sparsestreet.records.quality import QUALITY
 from sparsestreet.report.arms import Arm
 from sparsestreet.report.collect import RunRecord
@@ -31,7 +31,7 @@ def comparison_data(arms: Sequence[Arm]) -> str | None:
             record.summary.run.seed for arm in arms for record in arm.records if record.summary.run.scene == scene
         )
         shown = [(arm, record) for arm in arms if (record := _record(arm, scene, seed)) is not None]
-        keys = _drawn(shown[0][1])[:VIEWS] if shown else []
+        keys = drawn_views(shown[0][1].folder / "pictures")[:VIEWS] if shown else []
         views += [view for key in keys if (view := _view(scene, seed, key, shown)) is not None]
     # A tag inside the text would end the script element.
     return json.dumps(views).replace("</", "<\\/") if views else None
@@ -43,12 +43,6 @@ def _record(arm: Arm, scene: str, seed: int) -> RunRecord | None:
         if (run.scene, run.seed) == (scene, seed) and run.split != "none":
             return record
     return None
-
-
-def _drawn(record: RunRecord) -> list[tuple[int, int]]:
-    """Frame and camera of the pictures of a run."""
-    stems = sorted(path.name.split("_")[:2] for path in (record.folder / "pictures").glob("*_truth.png"))
-    return [(int(frame), int(camera)) for frame, camera in stems]
 
 
 def _view(

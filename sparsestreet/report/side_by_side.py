@@ -1,4 +1,4 @@
-"""Finished runs side by side, from what they left on disk (no torch)."""
+"""Finished runs side by side, from what they left on disk."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The report of a sweep: tables, figures and one page, from records alone (no torch)."""
+"""The report of a sweep: tables, figures and one page, from records alone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -11,7 +11,7 @@ from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.predictions import write_prediction
+from sparsestreet.evaluation.predictions import Predictions
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import ALEX, Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.ops import SplatSettings
@@ -146,12 +146,13 @@ def test_regions_of_masks(monkeypatch):
 @pytest.mark.usefixtures("noise")
 def test_what_is_stored_is_what_is_compared(monkeypatch, tmp_path):
     """A file that held something else would be told by every number."""
-    (kept,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, tmp_path)
+    (kept,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, Predictions(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == ["003_1.png"]
     (in_memory,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS)
     assert kept == in_memory
-    monkeypatch.setattr(evaluate, "write_prediction", lambda path, pixels: write_prediction(path, 65535 - pixels))
-    (inverted,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, tmp_path)
+    read = Predictions.read
+    monkeypatch.setattr(Predictions, "read", lambda *view: 65535 - read(*view))
+    (inverted,) = evaluate_frames(SCENE, [make_frame(3, 1)], OPTIONS, Predictions(tmp_path))
     assert inverted.value("psnr", "full") < in_memory.value("psnr", "full") - 5
 
 
@@ -160,7 +161,7 @@ def test_an_exact_frame_is_exact_in_its_stored_prediction(monkeypatch, tmp_path)
     replace_render(monkeypatch, lambda view: view.image.float() / 255)
     image = torch.arange(256, dtype=torch.uint8).reshape(16, 16, 1).repeat(1, 1, 3)
     frame = dataclasses.replace(make_frame(size=(16, 16)), image=image)
-    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS, tmp_path)
+    (quality,) = evaluate_frames(SCENE, [frame], OPTIONS, Predictions(tmp_path))
     for region in ("full", "no_hood"):
         assert (quality.value("mse", region), quality.value("psnr", region)) == (0, 100)
         assert quality.value("psnr8", region) == 100

@@ -12,13 +12,7 @@ from PIL import Image
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.evaluate import evaluate_predictions
-from sparsestreet.evaluation.predictions import (
-    PredictionError,
-    prediction_path,
-    predictions_folder,
-    read_prediction,
-    write_prediction,
-)
+from sparsestreet.evaluation.predictions import PredictionError, Predictions
 from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
@@ -130,18 +124,17 @@ def test_perceptual_distances_with_and_without_weights(tmp_path, monkeypatch):
 def test_held_out_numbers_are_those_of_the_stored_predictions(tmp_path):
     frames = make_frames(3)
     summary = evaluate(tmp_path, frames)
-    folder = predictions_folder(tmp_path, HELD_OUT)
-    again = summarize(evaluate_predictions(folder, frames, torch.device("cpu")))
+    predictions = Predictions.of(tmp_path, HELD_OUT)
+    again = summarize(evaluate_predictions(predictions, frames, torch.device("cpu")))
     assert again == summary.quality[HELD_OUT]
-    changed = read_prediction(prediction_path(folder, 10, 1))
-    write_prediction(prediction_path(folder, 10, 1), changed[::-1])
-    assert summarize(evaluate_predictions(folder, frames, torch.device("cpu"))) != again
-    prediction_path(folder, 10, 1).unlink()
+    predictions.write(10, 1, predictions.read(10, 1)[::-1])
+    assert summarize(evaluate_predictions(predictions, frames, torch.device("cpu"))) != again
+    predictions.path(10, 1).unlink()
     with pytest.raises(PredictionError, match=r"010_1\.png is not there: evaluate the run"):
-        list(evaluate_predictions(folder, frames, torch.device("cpu")))
-    (folder / "mine.txt").touch()
+        list(evaluate_predictions(predictions, frames, torch.device("cpu")))
+    (predictions.folder / "mine.txt").touch()
     evaluate(tmp_path, frames[:1])  # of fewer views: those of the others go
-    assert sorted(path.name for path in folder.iterdir()) == ["000_0.png", "mine.txt"]
+    assert sorted(path.name for path in predictions.folder.iterdir()) == ["000_0.png", "mine.txt"]
 
 
 def test_images_are_loaded_for_their_comparison_and_pictures_alone(tmp_path):
