@@ -39,7 +39,7 @@ _STYLE = {
 LEGEND = {"frameon": False, "labelcolor": _INK, "fontsize": 8}
 """Style of every legend."""
 
-COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
+PARETO_COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
     ("gaussians", "Gaussians", lambda run: float(run.gaussians_total)),
     ("megabytes", "MB", lambda run: run.bytes_total / 1e6),
     ("frame", "milliseconds a frame", lambda run: run.latency.p50),

@@ -13,7 +13,7 @@ from sparsestreet.report.collect import RunRecord, check_definitions, collect
 from sparsestreet.report.comparison import comparison_data
 from sparsestreet.report.costs import what_arms_cost
 from sparsestreet.report.curves import time_to_quality
-from sparsestreet.report.figures import COSTS, pareto
+from sparsestreet.report.figures import PARETO_COSTS, pareto
 from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
 from sparsestreet.report.grid import Grid, comma_separated, latex, markdown
 from sparsestreet.report.layouts import paper_table
@@ -102,7 +102,7 @@ def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[li
             (folder / f"{name}.svg").unlink(missing_ok=True)
             absent.append(lacking)
 
-    for cost in COSTS:
+    for cost in PARETO_COSTS:
         name = f"pareto_{cost[0]}"
         take(
             pareto(found, protocol, cost, folder / f"{name}.svg"),

@@ -8,7 +8,7 @@ from sparsestreet.metrics.protocols import DRIVESTUDIO
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
-from sparsestreet.report.figures import COSTS, GREY, front, pareto, short
+from sparsestreet.report.figures import GREY, PARETO_COSTS, front, pareto, short
 from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
 from tests.report.sweep_folder import write_sweep
 
@@ -29,7 +29,7 @@ def found(tmp_path):
 
 def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
     path = tmp_path / "pareto.svg"
-    assert pareto(found, DRIVESTUDIO, COSTS[0], path)
+    assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], path)
     text = path.read_text()
     titles = [name for name in ("full image", "people", "vehicles") if f">{name}<" in text]
     assert titles == ["full image", "vehicles"]  # no run measured people
@@ -41,15 +41,15 @@ def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
 
 def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     first, second = tmp_path / "a.svg", tmp_path / "b.svg"
-    pareto(found, DRIVESTUDIO, COSTS[0], first)
-    pareto(found, DRIVESTUDIO, COSTS[1], second)
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], first)
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[1], second)
     one, other = first.read_text(), second.read_text()
     assert "currentColor" in one
     assert "#010203" not in one
     ids = [set(re.findall(r'id="([^"]+)"', text)) for text in (one, other)]
     assert not ids[0] & ids[1]
     assert set(re.findall(r"#([a-z0-9]+)[\")]", one.replace("&quot;", '"'))) <= ids[0] | {"8c8c8c", "1f86c9"}
-    pareto(found, DRIVESTUDIO, COSTS[0], tmp_path / "again" / "a.svg")
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "again" / "a.svg")
     assert (tmp_path / "again" / "a.svg").read_text() == one
 
 
