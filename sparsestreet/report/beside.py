@@ -36,12 +36,12 @@ def mean_beside(arm: Arm, meters: float, name: str) -> float | None:
 
 
 def _mean(arm: Arm, value: Callable[[Path], float | None]) -> float | None:
-    found: dict[Unit, float] = {}
+    found: dict[Unit, list[float]] = {}
     for record in arm.records:
         number = value(record.folder)
         if number is not None:
-            found[unit_of(record.summary)] = number
-    return mean_over_scenes(found)
+            found.setdefault(unit_of(record.summary), []).append(number)
+    return mean_over_scenes({unit: statistics.fmean(numbers) for unit, numbers in found.items()})
 
 
 def beside_the_path(arms: Sequence[Arm]) -> Grid | None:

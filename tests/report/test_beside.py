@@ -31,6 +31,17 @@ def test_an_arm_is_the_mean_of_its_scenes(tmp_path):
     assert [row[1].text for row in grid.rows] == ["41", "-", "-"]
 
 
+@pytest.mark.parametrize("seeds", [(0, 1), (0, 0)])
+def test_a_scene_is_the_mean_of_its_runs(tmp_path, seeds):
+    """Of other seeds and of one and the same."""
+    runs = []
+    for seed, distance in zip(seeds, (41.25, 43.25), strict=True):
+        folder = tmp_path / str(distance)
+        write_beside(folder, {1.0: distance, -1.0: distance})
+        runs.append(record(make_summary("plain", seed), str(folder)))
+    assert [row[1].text for row in beside_the_path(arms(runs)).rows] == ["42.25"]
+
+
 def test_the_truth_comes_before_distances(tmp_path):
     sweep = write_sweep(tmp_path)
     write_beside(sweep / "streetgs_seed0", {1.0: 41.25, -1.0: 41.25, 2.0: 50.0}, name="a_distance", psnr=20.4)
