@@ -55,7 +55,8 @@ def write_sweep(folder: Path, *, curves: bool = True, failed: bool = True) -> Pa
         if curves:
             _write_curve(run, summary.mean("psnr_full"))
             nodes = {name: NodeCost(10, 0.1, 4.0, ms) for name, ms in (("background", 3.0), ("rigid", 1.0))}
-            steps = {"scene": 1.0, "splat": 2.0, "backward": 4.0, "optimizer": 0.5}
+            steps = {"scene": 1.0, "splat": 2.0, "sky": 0.5, "losses": 0.25, "regularizers": 0.125}
+            steps |= {"backward": 4.0, "optimizer": 0.5}
             update_costs(run, nodes=nodes, effects={"sky": 0.5}, step_ms=steps, phases={"train": 9.0, "prune": 0.25})
     if failed:
         failure = FailedRun(label="streetgs+paper", seed=0, command="train x", error="no <memory>", trace="Trace ...")

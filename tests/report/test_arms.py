@@ -6,6 +6,7 @@ import pytest
 
 from sparsestreet.records.run import CodeVersion
 from sparsestreet.report.arms import arms, plain_of, why_apart
+from sparsestreet.report.tradeoffs import paired
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, street_runs
 
@@ -33,6 +34,27 @@ def test_each_scene_counts_once():
     ]
     (arm,) = arms([record(run) for run in runs])
     assert arm.mean(psnr) == 25.5
+
+
+def test_several_runs_of_one_seed_are_their_mean():
+    (arm,) = arms([record(make_summary("plain", 0, psnr)) for psnr in (20.0, 23.0)])
+    assert list(arm.units(psnr).values()) == [21.5]
+
+
+def test_two_parts_of_one_log_are_two_scenes():
+    """Each part is paired with itself: 20 with 19 and 30 with 28."""
+    parts = [{"data.log.first_frame": first, "data.log.last_frame": first + 9} for first in (0, 10)]
+    runs = {"plain": (20.0, 30.0), "plain+removal": (19.0, 28.0)}
+    plain, removal = arms(
+        [
+            record(make_summary(label, 0, psnr, config=part))
+            for label, values in runs.items()
+            for part, psnr in zip(parts, values, strict=True)
+        ]
+    )
+    assert sorted(plain.units(psnr).values()) == [20.0, 30.0]
+    difference = paired(removal, plain, psnr)
+    assert (difference.mean, difference.n) == (-1.5, 2)
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 import pytest
 
-from sparsestreet.records.held_out import HELD_OUT_CURVE
+from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
 from sparsestreet.report.curves import QualityCurve, seconds_to, time_to_quality
-from tests.report.sweep_folder import write_sweep
+from tests.evaluation.frames import make_summary
+from tests.report.sweep_folder import record, write_sweep
 
 
 def test_the_first_look_that_is_good_enough():
@@ -24,6 +25,14 @@ def test_seconds_to_the_plain_runs_quality(tmp_path):
     # Within 1 dB: at -0.8 - 0.2 (20 s), else 30 s. Within 0.5: -0.3 - 0.2 at 30 s, else 40 s.
     assert rows["streetgs+removal"] == ["30.0 s", "40.0 s", "not reached"]
     assert rows["control: streetgs+random"] == ["not reached"] * 3
+
+
+def test_the_last_look_of_the_plain_run_counts_not_its_best(tmp_path):
+    """It ends 1 dB below its best: 0.5 dB below its end are 18.5 dB, which it has at 10 s."""
+    looks = enumerate((18.6, 20.0, 19.0), start=1)
+    HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(10.0 * step, step, psnr, None, None) for step, psnr in looks])
+    grid = time_to_quality(arms([record(make_summary("plain"), str(tmp_path))]))
+    assert [cell.text for cell in grid.rows[0][1:]] == ["10.0 s", "10.0 s", "20.0 s"]
 
 
 def test_no_curve_no_table(tmp_path):

@@ -77,3 +77,21 @@ def test_the_best_arm_of_a_budget(found):
     assert chosen["streetgs, at most 25 % of its Gaussians"]["arm"].text == "none of this sweep"  # 25.1 %
     half = chosen["streetgs, at most 50 % of its Gaussians"]
     assert (half["arm"].text, half["PSNR full, dB"].text, half["share, %"].text) == ("streetgs+removal", "-0.30", "25")
+
+
+def test_a_larger_arm_within_the_budget_is_better():
+    """Of two arms below half of the Gaussians the one that loses less, not the smaller one."""
+    counts = {"plain": (25.0, 1000), "plain+small": (23.0, 100), "plain+larger": (24.5, 400)}
+    runs = [make_summary(label, 0, psnr, {"background": rows}) for label, (psnr, rows) in counts.items()]
+    grid = matched_budget(arms([record(run) for run in runs]), DRIVESTUDIO)
+    chosen = {row[0].text: by_heading(grid, row)["arm"].text for row in grid.rows}
+    assert chosen["plain, at most 25 % of its Gaussians"] == "plain+small"
+    assert chosen["plain, at most 50 % of its Gaussians"] == "plain+larger"
+
+
+def test_a_gain_is_no_loss():
+    """An arm that is smaller and better by 0.6 dB is within every limit."""
+    runs = [make_summary("plain", 0, 25.0), make_summary("plain+removal", 0, 25.6, {"background": 300})]
+    grid = matched_quality(arms([record(run) for run in runs]), DRIVESTUDIO)
+    chosen = [by_heading(grid, row) for row in grid.rows]
+    assert [(row["arm"].text, row["PSNR full, dB"].text) for row in chosen] == [("plain+removal", "+0.60")] * 3

@@ -97,3 +97,12 @@ def test_a_difference_without_words_is_told_by_the_hash():
     found = variants([make_summary("m", config={"limit": None}), make_summary("m")])
     assert [variant.name[:3] for variant in found] == ["m #", "m #"]
     assert found[0].name != found[1].name
+
+
+def test_counts_follow_from_another_run_in_controls_alone():
+    """Elsewhere a count is an option as others are: two of them are never averaged."""
+    key = "node.background.max_gaussians"
+    assert len(variants([with_option(value, label="m", key=key) for value in (500, 1000)])) == 2
+    controls = [make_summary("m+random", config={key: value, "count_of": "../m"}) for value in (500, 1000)]
+    assert len(variants(controls)) == 1
+    assert len(variants([with_option(value, label="m+random", key=key) for value in (500, 1000)])) == 2
