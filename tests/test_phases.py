@@ -106,6 +106,16 @@ def test_stages_of_a_command_add_up_from_its_beginning(watch):
     assert sum(seconds.values()) == watch[0] - 97.0
 
 
+def test_a_stage_that_fails_is_left(watch):
+    """As one that could not save: what comes behind it is not a part of it."""
+    with StageRecorder() as recorder:
+        with pytest.raises(FileNotFoundError), stage("save"):
+            watch[0] += 1
+            raise FileNotFoundError
+        watch[0] += 2
+    assert recorder.seconds() == {"save": 1.0, "other": 2.0}
+
+
 def test_a_command_that_goes_on_adds_what_the_earlier_one_spent(watch):
     with StageRecorder() as recorder:
         with stage("train"):

@@ -1,5 +1,6 @@
 """Arrays come out of foreign pickles, and nothing in them runs."""
 
+import io
 import os
 import pickle
 import re
@@ -82,6 +83,13 @@ def test_wrapped_and_sparse_arrays(protocol, tmp_path, chumpy):
     assert_same(read_pickled(tmp_path / "body.pkl"), expected)
 
 
+def test_entries_of_one_place_add_up(tmp_path):
+    """As scipy has it: 1 and 4 in the second column of the only row."""
+    twice = scipy.sparse.csr_matrix((np.array([1.0, 2.0, 4.0]), np.array([1, 0, 1]), np.array([0, 3])), shape=(1, 3))
+    (tmp_path / "body.pkl").write_bytes(pickle.dumps({"csr": twice}, 2))
+    assert_same(read_pickled(tmp_path / "body.pkl"), {"csr": np.array([[2.0, 5.0, 0.0]])})
+
+
 class Hostile:
     """Runs a command when it is unpickled."""
 
@@ -90,6 +98,16 @@ class Hostile:
 
     def __reduce__(self):
         return self.call, self.arguments
+
+
+def stored_by_torch(value) -> bytes:
+    buffer = io.BytesIO()
+    torch.save(value, buffer)
+    return buffer.getvalue()
+
+
+def tensor_of(storage: bytes) -> Hostile:
+    return Hostile(torch._utils._rebuild_tensor_v2, Hostile(torch.storage._load_from_bytes, storage), 0, (1,), (1,))
 
 
 HOSTILE = {
@@ -101,6 +119,7 @@ HOSTILE = {
     "in a tensor": lambda path: Hostile(
         torch.storage._load_from_bytes, pickle.dumps(Hostile(exec, f"open({str(path)!r}, 'w')"))
     ),
+    "as the storage of a tensor": lambda path: tensor_of(stored_by_torch(Hostile(Path(path).touch))),
 }
 
 
@@ -112,6 +131,15 @@ def test_nothing_runs(name, dump, tmp_path):
     with pytest.raises(ValueError, match=rf"{re.escape(str(path))} must be a pickle of plain values and arrays"):
         read_pickled(path)
     assert not trace.exists()
+
+
+@pytest.mark.parametrize(("call", "name"), [(np.fromfile, "numpy.fromfile"), (os.getcwd, f"{os.name}.getcwd")])
+def test_what_a_file_asks_for_is_named(call, name, tmp_path):
+    """A name of numpy is no better than any other."""
+    path = tmp_path / "hostile.pkl"
+    path.write_bytes(pickle.dumps(Hostile(call), 2))
+    with pytest.raises(ValueError, match=rf"ValueError: it asks for {re.escape(name)}"):
+        read_pickled(path)
 
 
 def test_objects_are_no_numbers(tmp_path):

@@ -87,6 +87,17 @@ def test_between_two_instants_lies_the_middle():
         assert torch.equal(view.camera.intrinsics, before.camera.intrinsics)
 
 
+def test_a_quarter_of_the_way_lies_nearer_to_where_it_begins():
+    """1 m and 3 degrees a frame, the same step everywhere."""
+    finer = resampled(recorded(street_views()), STEP / 4)
+    for index, rig in enumerate(finer):
+        way = index / 4
+        torch.testing.assert_close(rig[0].camera.position, torch.tensor([way, 0.1 * way, 1.5]), rtol=0, atol=2e-6)
+        angle = math.radians(3.0 * way)
+        ahead = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
+        torch.testing.assert_close(rig[0].camera.camera_from_world[2, :3], ahead, rtol=0, atol=2e-6)
+
+
 def test_frames_that_are_missing_are_bridged_and_too_many_are_skipped():
     path = recorded([view for view in street_views() if view.frame_index != 2])
     bridged = resampled(path, STEP)

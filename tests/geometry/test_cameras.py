@@ -1,5 +1,7 @@
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -174,6 +176,15 @@ def test_rays_of_a_lens_project_onto_their_pixel_centers(dtype, tolerance):
         torch.testing.assert_close(pixels, expected, atol=tolerance, rtol=0)
         straight = project(replace(camera, distortion=None), camera.position + 9 * directions.reshape(-1, 3))[0]
         assert (straight - expected).abs().max() > 0.3  # or the test would hold without a lens
+
+
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.01, -0.02, 0.0), (0.0, -0.1, 0.0, 0.0, 0.0)], ids=["p1 and p2", "k2"])
+def test_rays_of_a_lens_without_k1_are_those_of_opencv(lens):
+    camera = replace(camera_of(0), distortion=torch.tensor(lens, dtype=torch.float64))
+    rays = (ray_directions(camera) @ camera.camera_from_world[:3, :3].T).reshape(-1, 3).numpy()
+    imaged, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.intrinsics.numpy(), np.array(lens))
+    row, column = np.meshgrid(np.arange(7) + 0.5, np.arange(13) + 0.5, indexing="ij")
+    np.testing.assert_allclose(imaged.reshape(7, 13, 2), np.stack((column, row), -1), atol=1e-9)
 
 
 def test_the_rays_of_a_lens_are_found_once_for_all_its_views(monkeypatch):

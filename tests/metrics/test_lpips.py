@@ -117,6 +117,19 @@ def test_black_and_flat_images_have_a_distance():
     assert lpips_of_layers(Lpips(weights).layer_maps(flat, flat + 1)) > 0
 
 
+def test_faint_features_have_a_direction():
+    """Without biases a network of fainter kernels sees the same, a hundred thousandth as strong."""
+    weights = random_weights(ALEX)
+    silent = tuple(torch.zeros_like(bias) for bias in weights.biases)
+    image, truth = image_pair((40, 40))
+    strong, faint = (
+        Lpips(LpipsWeights(ALEX, (factor * weights.kernels[0], *weights.kernels[1:]), silent, weights.channels))
+        for factor in (1.0, 1e-5)
+    )
+    # 1e-10 beside lengths of about 1e-5.
+    assert faint(image, truth) == pytest.approx(strong(image, truth), rel=1e-4)
+
+
 def test_weights_of_another_network_are_refused():
     weights = random_weights(ALEX)
     with pytest.raises(ValueError, match="LPIPS weights must have the shapes"):

@@ -146,6 +146,16 @@ def test_the_ends_of_the_range():
     torch.testing.assert_close(found.opacities, expected.opacities, rtol=4e-7, atol=0.0, equal_nan=True)
 
 
+@torch.no_grad()
+def test_autocast_rounds_no_position():
+    """A product of matrices would be one of bfloat16 there: decimeters at 50 m."""
+    raw = replace(raw_rows(20, 0, torch.float32), placement=placement(20, torch.float32))
+    expected = activate([raw], sh_degree=0, backend="torch").means
+    with torch.autocast("cpu", torch.bfloat16):
+        found = activate([raw], sh_degree=0, backend="torch").means
+    assert torch.equal(found, expected)
+
+
 def test_a_held_logit_gets_no_gradient():
     raw = raw_rows(3, 0)
     logits = torch.tensor([16.0, 15.0, -15.5], dtype=torch.float64, requires_grad=True)

@@ -90,6 +90,18 @@ def test_single_precision_is_good_to_its_last_digit(variant):
         torch.testing.assert_close(found[1].double(), truth[1], rtol=6e-8, atol=1e-7)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+@pytest.mark.parametrize(("time", "present"), [(0.05, False), (0.6, True), (0.62, False)])
+def test_padding_is_no_keyframe_and_equal_distances_may_differ_by_rounding(backend, time, present):
+    """One keyframe at 0.5; in float32 0.6 is farther from it than 0.1: a car would be gone for a frame."""
+    table, *deltas = tables(torch.float32)
+    times, valid = torch.zeros_like(table.times), torch.zeros_like(table.valid)
+    times[:, 0], valid[:, 0] = 0.5, True
+    spans = torch.tensor([[0.0, 1.0]]).repeat(6, 1)
+    table = Trajectories(times, table.quaternions, table.translations, valid, spans)
+    assert poses_at(table, *deltas, time, 0.1, backend=backend).present.tolist() == [present] * 6
+
+
 def test_quaternions_are_unit_and_agree_with_their_keyframes():
     table, *deltas = tables(size=0.0)
     found = poses_at(table, *deltas, 0.3, MAX_GAP)

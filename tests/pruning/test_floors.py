@@ -80,9 +80,9 @@ def test_no_more_than_an_instance_has():
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: type(rule).__name__)
 def test_no_object_is_thinned_to_nothing_and_a_far_one_keeps_less(rule):
-    """The views miss nothing of what is drawn: each rule would take (almost) all."""
+    """The views miss nothing of what is drawn: each rule would take (almost) all. The last one is the nearest."""
     scene = SceneGraph({"road": background(random_rows(20, 0)), "cars": objects()})
-    views = [frame(), frame(offset=1.0)]
+    views = [frame(offset=1.0), frame()]
     least = rule.floors(scene, views, CONTEXT)["cars"].instances.least
     selection = rule.select(scene, views, CONTEXT)["cars"]
     kept = torch.bincount(scene.nodes["cars"].rows.instances[selection.keep], minlength=3)

@@ -12,10 +12,12 @@ def write(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-def test_rows_before_the_checkpoint_stay_and_the_later_ones_are_the_new(tmp_path):
+@pytest.mark.parametrize("resumed_at", [20, 29])
+def test_rows_before_the_checkpoint_stay_and_the_later_ones_are_the_new(tmp_path, resumed_at):
+    """The step at which a run goes on is taken again."""
     path = tmp_path / "curves" / "metrics.csv"
     write(path, "psnr,step\n10,9\n11,19\n12,29\n")
-    with kept_curves(tmp_path, resumed_at=20):
+    with kept_curves(tmp_path, resumed_at=resumed_at):
         write(path, "psnr,step,val/psnr\n22,29,\n,30,25\n")
     assert path.read_text() == "psnr,step,val/psnr\n10,9,\n11,19,\n22,29,\n,30,25\n"
 

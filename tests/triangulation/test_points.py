@@ -98,6 +98,11 @@ def test_a_view_that_disagrees_is_dropped_and_the_point_kept():
     assert set(everywhere) <= set(_which(found, points).tolist())
 
 
+def test_a_point_whose_own_feature_disagrees_is_none():
+    """View 3 alone gathers the others, and it is the one that is wrong."""
+    assert len(_with_one_wrong(shown=(0, 2, 3, 4, 6), wrong=3)[0]) == 0
+
+
 def test_a_point_that_has_too_few_views_left_is_none():
     assert len(_with_one_wrong(shown=(0, 1, 3), wrong=1)[0]) == 0
 

@@ -138,6 +138,16 @@ def test_the_loss_looks_at_now_and_at_frames_of_the_rows_own_instance():
     torch.testing.assert_close(mask.sparsity(rows, 0.1, torch.ones(2, dtype=torch.bool)), expected)
 
 
+def test_a_resumed_mask_goes_on_with_other_frames():
+    """What a checkpoint holds is how many steps have drawn: the next frames are those of the uninterrupted run."""
+    mask, resumed = mask_of(), mask_of(seed=5)
+    rows, drawn = random_rows(6, 1, mask=mask), torch.ones(6, dtype=torch.bool)
+    before = [float(mask.sparsity(rows, 0.1, drawn).detach()) for _ in range(3)]
+    resumed.load_state_dict(mask.state_dict())
+    after = [float(mask.sparsity(rows, 0.1, drawn).detach()) for _ in range(3)]
+    assert [float(resumed.sparsity(rows, 0.1, drawn).detach()) for _ in range(3)] == after != before
+
+
 def test_rows_that_are_not_drawn_are_left_alone_where_the_settings_say_so():
     settings = TemporalMaskSettings(0.5, features=3, frames=2, width=5, octaves=2, visible_only=True)
     mask = settings.build(0, scope())

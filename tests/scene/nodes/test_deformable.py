@@ -9,6 +9,7 @@ from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import TemporalMaskSettings
 from sparsestreet.scene.nodes import Deformable, DeformableSettings, NetworkSettings
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED, SceneState
@@ -168,6 +169,15 @@ def test_it_starts_as_a_rigid_node_and_its_weights_are_those_of_the_seed():
         assert torch.equal(again.get_parameter(name), node.get_parameter(name))
         assert not torch.equal(other.get_parameter(name), node.get_parameter(name))
     assert settings.build(training_data(movers=replace(settings, classes=("Tram",))), torch.Generator()) is None
+
+
+def test_a_mask_over_time_counts_places_from_each_box():
+    """-1 and 1 at its faces."""
+    settings = deformable_settings(mask=TemporalMaskSettings(1e-4), masked=True)
+    node = settings.build(training_data(movers=settings), torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        node.rows.means[:2] = torch.tensor([[0.5], [-0.5]]) * node.sizes[node.rows.instances[:2]]
+    torch.testing.assert_close(node.mask._places(node.rows)[:2], torch.tensor([[1.0], [-1.0]]).expand(2, 3))
 
 
 def test_rows_come_and_go():

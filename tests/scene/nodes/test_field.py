@@ -109,6 +109,16 @@ def test_rows_far_beside_the_view_stay_and_the_image_is_the_same():
     assert not torch.equal(moved, (whole.raw_at(view, FINISHED).means != whole.rows.means).any(1))
 
 
+def test_the_longest_axis_of_a_row_says_how_far_it_reaches():
+    """10 m behind the camera, reach 2 m: three standard deviations of 3 m come near enough, of 1 cm they do not."""
+    node = street(2, reach=2.0)
+    with torch.no_grad():
+        node.rows.means.copy_(torch.tensor([-10.0, 0.0, 1.5]).expand(2, 3))
+        node.rows.log_scales.copy_(torch.tensor([[3.0, 0.01, 0.01], [0.01, 0.01, 0.01]]).log())
+    moved = (node.raw_at(view_at(0.6, camera_at(0.0)), FINISHED).means != node.rows.means).any(1)
+    assert moved.tolist() == [True, False]
+
+
 def test_only_training_shows_the_network_another_time_and_less_so_later():
     node = street(time_noise=0.5, time_noise_until=0.8)
     early = torch.tensor([node._time_noise(state(0.2 + step * 1e-5)) for step in range(600)])

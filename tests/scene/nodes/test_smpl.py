@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import JOINTS
@@ -17,13 +18,15 @@ from sparsestreet.scene.nodes import Smpl
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
+from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Track
 from tests.geometry.test_skeleton import oracle
 from tests.scene.people import SHIRT, bent, data_of, smpl, smpl_settings, walker
-from tests.scene.street import NUM_FRAMES, view_at
+from tests.scene.street import NUM_FRAMES, triangulated, view_at
 
 TEMPLATE = BuiltinBody(500).load()
 VERTICES = len(TEMPLATE.vertices)
+HAIR = (0.1, 0.2, 0.9)
 
 
 def in_box(track: Track, frame: int, means: torch.Tensor) -> torch.Tensor:
@@ -74,6 +77,29 @@ def test_without_returns_a_person_is_gray():
     torch.testing.assert_close(node.rows.sh_dc, torch.zeros(VERTICES, 1, 3))
 
 
+@pytest.mark.parametrize(("returns", "elsewhere"), [(True, SHIRT), (False, HAIR)])
+def test_points_of_images_color_what_is_near_them(returns, elsewhere):
+    """Four above the head; the returns are in the middle of the box."""
+    above = triangulated([[0.0, 0.0, 0.9]] * 4, color=HAIR)
+    points = StreetPoints(triangulated([]), {"walker": above})
+    data = replace(data_of(walker(), returns=returns), image_points=points)
+    colors = 0.5 + SH_CONSTANT * smpl_settings().build(data, torch.Generator()).rows.sh_dc[:, 0]
+    for vertex, color in (
+        (TEMPLATE.vertices[:, 1].argmax(), HAIR),
+        (TEMPLATE.vertices.norm(dim=1).argmin(), elsewhere),
+    ):
+        torch.testing.assert_close(colors[vertex], torch.tensor(color))
+
+
+def test_a_mask_over_time_counts_places_from_each_body():
+    """From -1 to 1 along each axis, of a child as of somebody tall."""
+    people = (walker(height=1.2), walker("tall", height=1.9, y=3.0))
+    node = smpl(*people, mask=TemporalMaskSettings(1e-4), masked=True)
+    places = node.mask._places(node.rows).view(2, VERTICES, 3)
+    torch.testing.assert_close(places.amax(1), torch.ones(2, 3))
+    torch.testing.assert_close(places.amin(1), -torch.ones(2, 3))
+
+
 def test_the_body_moves_as_4x4_matrices_say():
     track = walker()
     node = smpl(track)
@@ -107,6 +133,17 @@ def test_joints_are_half_turned_between_keyframes():
     expected[..., 0] = 1
     expected[0, JOINTS.index("left_elbow")] = quat.from_rotation_vector(torch.tensor([0.0, 0.0, 0.25]))
     torch.testing.assert_close(rotations, expected, atol=1e-6, rtol=0)
+
+
+def test_corrections_of_joints_turn_in_the_frame_of_the_joint():
+    """R exp([delta]), as for boxes; scenes that are stored depend on the order."""
+    node = smpl(walker())
+    with torch.no_grad():
+        node.joint_deltas += torch.randn(node.joint_deltas.shape, generator=torch.Generator().manual_seed(2))
+    found = node.joint_rotations(1 / (NUM_FRAMES - 1))[0, 1:].detach()
+    keyframes = Rotation.from_quat(node.joint_keyframes[0, 1].numpy(), scalar_first=True)
+    corrected = keyframes * Rotation.from_rotvec(node.joint_deltas[0, 1].detach().numpy())
+    np.testing.assert_allclose(quat.to_matrix(found).numpy(), corrected.as_matrix(), atol=1e-6)  # float32
 
 
 def test_frames_without_a_pose_are_between_those_that_have_one():
@@ -230,6 +267,15 @@ def test_even_motion_is_smooth_whatever_frames_are_held_out():
     assert terms(smooth)["smoothness"].item() < 1e-6
     # All three middles are off by 0.3 rad, a quaternion by half of that, of one joint in 23.
     assert terms(rough)["smoothness"].item() == pytest.approx((2 * math.sin(0.075)) ** 2 / 23, rel=0.02)
+
+
+def test_motion_is_uneven_where_there_are_three_keyframes():
+    """Of five keyframes three have both neighbors, of three one: the mean over four, whatever pads the table."""
+    people = (walker(), walker("short", frames=(1, 2, 3), y=3.0, seed=5))
+    both, long, short = (
+        terms(smpl(*some, smoothness_weight=1.0))["smoothness"].item() for some in (people, people[:1], people[1:])
+    )
+    assert both == pytest.approx((3 * long + short) / 4, rel=1e-5)
 
 
 def test_gradients_of_corrections_are_finite_differences():

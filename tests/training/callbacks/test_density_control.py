@@ -64,9 +64,10 @@ def test_screen_gradients_are_gathered_while_rows_are_refined_and_no_longer():
 
 
 def test_a_node_may_grow_for_another_time_than_the_others():
-    early, late, others = AskedStrategy(), AskedStrategy(), AskedStrategy()
+    never, early, late, others = (AskedStrategy() for _ in range(4))
     trainer, _, _ = started(
         every_ten(densify_until=0.5),
+        never=background(density=never, densify_until=0.0),
         early=background(density=early, densify_until=0.2),
         late=background(density=late, densify_until=0.7),
         others=background(density=others),
@@ -74,7 +75,8 @@ def test_a_node_may_grow_for_another_time_than_the_others():
     trainer.walk(100)
     lasts = [asked_at(strategy, "densify")[-1] for strategy in (early, late, others)]
     assert lasts == [20, 70, 50]
-    assert asked_at(early, "cull")[-1] == 90
+    assert asked_at(never, "densify") == []
+    assert asked_at(never, "cull")[-1] == asked_at(early, "cull")[-1] == 90
     with pytest.raises(ValueError, match=r"densify_until is a fraction of the run in \[0, 1\], got 2"):
         background(density=early, densify_until=2.0)
 
