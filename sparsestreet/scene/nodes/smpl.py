@@ -206,7 +206,8 @@ class Smpl(Tracked):
         self.register_buffer("joints", anatomy.joints)
         self.register_buffer("joint_keyframes", anatomy.keyframes)
         self.joint_deltas = nn.Parameter(torch.zeros_like(anatomy.keyframes[..., 1:]))
-        self._neighbors: Tensor | None = None
+        # Of which vertices, and the rows next to each.
+        self._neighbors: tuple[Tensor, Tensor] | None = None
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
         """Every person's Gaussians as the skeleton moves them; opacity exactly 0 where the person is absent."""
@@ -280,14 +281,16 @@ class Smpl(Tracked):
 
     def _nearest(self) -> Int[Tensor, "n k"]:
         """The rows next to each row on the body at rest, itself among them; looked for when the rows have changed."""
-        if self._neighbors is None or len(self._neighbors) != len(self.rows):
+        vertices = self.rows.vertex_ids
+        # A plan puts another tensor here, also where as many rows come as go.
+        if self._neighbors is None or self._neighbors[0] is not vertices:
             apart = _APART * self.rows.instances[:, None].float()
-            places = torch.cat((self.vertices[self.rows.vertex_ids], apart), 1).cpu().numpy()
+            places = torch.cat((self.vertices[vertices], apart), 1).cpu().numpy()
             distances, found = cKDTree(places).query(places, k=self.settings.neighbors)
             itself = np.arange(len(places))[:, None]
             found = np.where(distances < _APART / 2, found, itself)
-            self._neighbors = torch.from_numpy(found).to(self.rows.means.device)
-        return self._neighbors
+            self._neighbors = vertices, torch.from_numpy(found).to(self.rows.means.device)
+        return self._neighbors[1]
 
 
 def _mean_of(values: Float[Tensor, " n"], drawn: Bool[Tensor, " n"]) -> Float[Tensor, ""]:

@@ -231,6 +231,15 @@ def test_neighbors_are_looked_for_when_rows_have_gone_and_only_then():
     assert len(node.gaussians_at(view_at(0.5), FINISHED)) == 0
 
 
+def test_neighbors_are_looked_for_anew_where_as_many_rows_came_as_went():
+    node = smpl(walker())
+    before = node._nearest()
+    turned = torch.arange(VERTICES).flip(0)
+    node.rows.resize(RowPlan(VERTICES, turned, torch.zeros(VERTICES, dtype=torch.bool)))
+    torch.testing.assert_close(node._nearest()[:, 0], torch.arange(VERTICES))
+    assert torch.equal(node.rows.vertex_ids[node._nearest()].sort(1).values.flip(0), before.sort(1).values)
+
+
 def test_regularizers_by_hand():
     node = smpl(walker(), neighbor_weight=2.0, scale_weight=3.0)
     rows = node.rows
