@@ -2,11 +2,12 @@
 
 import pytest
 from hydra import compose
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.report import sweep_name
-from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, sweep_problem
+from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, sweep_problem
 from sparsestreet.cli.train import train
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY
@@ -89,6 +90,27 @@ def test_launchers_compose_or_say_how_they_are_installed():
         assert "pip install hydra-submitit-launcher" in problem
     else:
         assert problem is None
+
+
+@pytest.mark.parametrize(
+    ("change", "steps", "done"),
+    [
+        ({}, 60, 25.0),
+        ({"seed": 1}, 60, None),
+        ({"data.root": "/drives/2"}, 60, None),
+        ({"data.log.width": 480}, 60, None),
+        ({}, 59, None),
+    ],
+    ids=["itself", "another seed", "another drive", "another option", "interrupted"],
+)
+def test_a_job_is_done_where_its_folder_holds_its_complete_record(tmp_path, change, steps, done):
+    summary = make_summary("plain", 0, 25.0, config={"data.root": "/drives/1"}, steps=steps)
+    SUMMARY.write(tmp_path, summary)
+    asked = OmegaConf.create()
+    for key, value in (summary.run.config | change).items():
+        OmegaConf.update(asked, key, value, force_add=True)
+    assert finished(asked, tmp_path) == done
+    assert finished(asked, tmp_path / "elsewhere") is None
 
 
 @pytest.mark.lengthy

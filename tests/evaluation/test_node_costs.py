@@ -108,6 +108,28 @@ def test_costs_are_what_a_frame_takes_longer(monkeypatch):
     assert costs.noise.quiet
 
 
+def test_a_cost_is_the_median_of_what_rounds_differ_by(monkeypatch):
+    """Rounds of a machine that gets slower: 1, 9 and 2 ms apart, where the medians 20 and 11 ms are 9 ms apart."""
+    whole, without = (10, 20, 30), (9, 11, 28)
+    timed(monkeypatch, lambda scene, view: 1e-3 * (whole if scene.counts()["road"] else without)[view.frame_index])
+    views = [make_frame(index) for index in range(3)]
+    road = measure_scene_costs(SceneGraph({"road": node_of([[0.4, 0.3, 2.0]])}), views, OPTIONS, repeats=3).nodes[
+        "road"
+    ]
+    assert (road.ms, road.frame_ms) == (pytest.approx(2), pytest.approx(11))
+
+
+def test_megabytes_are_of_rows_and_poses_and_add_up_with_the_sky(monkeypatch):
+    timed(monkeypatch, lambda scene, view: 1e-3)
+    scene = SceneGraph({"background": background(7), "rigid": rigid(4)}, small_scene().sky)
+    costs = measure_scene_costs(scene, FRAMES, OPTIONS, repeats=1)
+    parts = scene.bytes_by_part()
+    # Two instances of two keyframes: a time, a quaternion and a translation each.
+    assert costs.nodes["rigid"].megabytes * 1e6 == pytest.approx(parts["rigid"] + 4 * 4 * 8)
+    megabytes = sum(node.megabytes for node in costs.nodes.values())
+    assert megabytes * 1e6 + parts["sky"] == pytest.approx(sum(parts.values()))
+
+
 def test_what_a_scene_lacks_costs_nothing_and_is_not_named(monkeypatch):
     timed(monkeypatch, lambda scene, view: 1e-3)
     assert set(measure_scene_costs(small_scene(), FRAMES, OPTIONS, repeats=1).effects) == {"sky"}

@@ -1,9 +1,11 @@
 """A trained scene rendered in other ways: which image each is, what is compared with what."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import presets as presets_module
@@ -12,9 +14,10 @@ from sparsestreet.evaluation.presets import ROUNDS, evaluate_presets
 from sparsestreet.ops import SplatSettings
 from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.strict_json import RecordError
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame
-from tests.evaluation.scenes import OPTIONS, small_scene
+from tests.evaluation.scenes import OPTIONS, node_of, small_scene
 
 SCENE = small_scene()
 FRAMES = Frames.of((make_frame(0), make_frame(1, size=(11, 7))))
@@ -52,6 +55,23 @@ def test_exact_keeps_what_a_splat_is():
     trained = RenderOptions(SplatSettings(eps2d=1.0, alpha_max=0.6, antialias=True), backend="reference")
     exact = RenderOptions(replace(trained.settings, alpha_min=0.0, transmittance_min=0.0))
     assert evaluated({"exact": exact}, trained).rendered[0].psnr_to_exact == 100
+
+
+def test_exact_goes_on_behind_what_is_all_but_opaque():
+    """A white Gaussian behind a dark one that lets 12 % through, by a way that stops a pixel at 30 %."""
+    stack = node_of([[0.0, 0.0, 2.0], [0.0, 0.0, 2.5]])
+    with torch.no_grad():
+        stack.rows.sh_dc[1] = 1.0
+    scene, frames = SceneGraph({"road": stack}), Frames.of((make_frame(),))
+    trained = replace(OPTIONS, settings=SplatSettings(transmittance_min=0.3))
+    (rendered,) = evaluate_presets(scene, frames, {"early": trained}, trained, command="c").rendered
+    early, late = (
+        render(scene, frames.views[0], options=replace(OPTIONS, settings=settings)).rgb.detach().double().clamp(0, 1)
+        for settings in (trained.settings, SplatSettings(alpha_min=0.0, transmittance_min=0.0))
+    )
+    expected = -10 * math.log10((early - late).square().mean())
+    assert rendered.psnr_to_exact == pytest.approx(expected, abs=1e-3)  # the exact image knows no end of a splat
+    assert expected < 40
 
 
 def test_what_is_slow_is_timed_once_a_view(monkeypatch):

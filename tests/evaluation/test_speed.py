@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from sparsestreet import ops
 from sparsestreet.evaluation import speed
 from sparsestreet.evaluation.speed import frame_image, instants, measure_latency
 from sparsestreet.noise import Calibration
 from sparsestreet.records.latency import FRAME, LATENCY, RASTER, RIG, clock_rows
+from sparsestreet.scene import rendering
+from sparsestreet.scene.graph import SceneGraph
 from tests.evaluation.frames import make_frame, make_latency
 from tests.evaluation.scenes import OPTIONS, masked_scene, replace_render, small_scene
 
@@ -82,11 +85,46 @@ def test_real_clock_sees_the_whole_render(monkeypatch):
     assert frame.p50 < 30  # sleep never wakes early; ten times late would be a unit mistake, not a busy machine
 
 
-def test_the_scene_is_what_is_timed():
-    """No render is replaced here."""
+@pytest.fixture
+def stopped(monkeypatch):
+    """A clock that stands still, in milliseconds; ``slowed`` makes a function move it."""
+    now = [0.0]
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0] / 1000)
+
+    def slowed(place, name, milliseconds, true=None):
+        true = getattr(place, name) if true is None else true
+
+        def slow(*given, **named):
+            now[0] += milliseconds
+            return true(*given, **named)
+
+        monkeypatch.setattr(place, name, slow)
+
+    return slowed
+
+
+@pytest.mark.usefixtures("steady")
+def test_the_scene_is_what_is_timed(stopped):
+    """No render is replaced here: a scene takes 2 ms to assemble, and 5 ms to splat, which is all that "raster" holds.
+
+    The instants have one camera each.
+    """
+    stopped(SceneGraph, "gaussians_at", 2.0)
+    for module in (rendering, speed):
+        stopped(module, "splat", 5.0, ops.splat)
     latency = measure_latency(SCENE, FRAMES, OPTIONS, warmup=1, repeats=5)
-    assert 0 < latency.clocks[RASTER].p50 < latency.p50  # the op is a part of the frame
+    found = {name: (clock.p50, clock.p99) for name, clock in latency.clocks.items()}
+    expected = {RASTER: 5.0, FRAME: 7.0, RIG: 7.0}
+    assert found == {name: pytest.approx((time, time)) for name, time in expected.items()}
     assert latency.removed == {}
+
+
+@pytest.mark.usefixtures("steady")
+def test_taking_closed_rows_out_is_no_part_of_a_frame(stopped):
+    """Somebody who wants to be fast does so beforehand."""
+    stopped(speed, "without_closed_rows", 3.0)
+    latency = measure_latency(masked_scene(), FRAMES[:2], OPTIONS, warmup=1, repeats=4)
+    assert {name: clock.p99 for name, clock in latency.removed.items()} == {RASTER: 0.0, FRAME: 0.0, RIG: 0.0}
 
 
 def test_an_image_for_a_screen_is_clamped_and_rounded(monkeypatch):
