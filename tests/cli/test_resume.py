@@ -6,11 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from sparsestreet.cli.resume import check_resumed
 from sparsestreet.cli.train import train
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.summary import SUMMARY
@@ -131,6 +134,24 @@ def test_another_configuration_is_refused_and_nothing_is_touched(whole, change, 
     assert train([f"resume={whole}", change]) == 2
     assert said in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        ({"trainer": {"accelerator": "gpu", "max_time": "00:01:00:00"}}, None),
+        ({"evaluation": {"novel": [1.0]}}, None),
+        ({"weight": 2.0}, r"but 1 options differ: weight \(1\.0 before\)"),
+        ({"seed": 4}, r"but 1 options differ: seed \(3 before\)"),
+    ],
+    ids=["where it trains", "what is measured", "an option", "the seed"],
+)
+def test_what_may_change_when_a_run_goes_on(tmp_path, change, refused):
+    config = {"seed": 3, "weight": 1.0, "trainer": {"accelerator": "cpu", "max_time": None}, "folder": str(tmp_path)}
+    (tmp_path / ".hydra").mkdir()
+    OmegaConf.save(config, tmp_path / ".hydra" / "config.yaml")
+    with nullcontext() if refused is None else pytest.raises(ValueError, match=refused):
+        check_resumed(config | change, tmp_path)
 
 
 def test_an_interrupted_run_can_be_evaluated(tiny_street, tmp_path, monkeypatch):

@@ -1,13 +1,16 @@
 """Sweeps: what composes, what is skipped, what fails and stands."""
 
+import math
+
 import pytest
 from hydra import compose
 from omegaconf import OmegaConf
 
+from sparsestreet.cli import sweep
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.cli.report import sweep_name
-from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, sweep_problem
+from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, run_job, sweep_problem, sweep_status
 from sparsestreet.cli.train import train
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY
@@ -111,6 +114,24 @@ def test_a_job_is_done_where_its_folder_holds_its_complete_record(tmp_path, chan
         OmegaConf.update(asked, key, value, force_add=True)
     assert finished(asked, tmp_path) == done
     assert finished(asked, tmp_path / "elsewhere") is None
+
+
+def test_a_failure_stands_until_its_job_succeeds(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sweep.SweepFolder, "folder", tmp_path)
+    monkeypatch.setattr(sweep.HydraConfig, "get", lambda: OmegaConf.create({"overrides": {"task": ["seed=3"]}}))
+    cfg, out = OmegaConf.create({"name": "plain", "seed": 3}), tmp_path / "plain_seed3"
+
+    def fails() -> float:
+        raise ValueError("no room")
+
+    assert math.isnan(run_job(cfg, out, fails))
+    ((folder, failure),) = read_failures(tmp_path)
+    assert (folder, failure.label, failure.seed, failure.error) == (out, "plain", 3, "no room")
+    assert sweep_status() == 1
+    assert f"{out} failed: no room" in capsys.readouterr().err
+    assert run_job(cfg, out, lambda: 25.0) == 25.0
+    assert read_failures(tmp_path) == []
+    assert sweep_status() == 0
 
 
 @pytest.mark.lengthy
