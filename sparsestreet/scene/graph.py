@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,7 +35,8 @@ class SceneGraph(nn.Module):
         super().__init__()
         if not nodes:
             raise ValueError("a scene needs at least one node, got none: add a background")
-        self.nodes = nn.ModuleDict(nodes)
+        # A ModuleDict's values are any modules to a type checker.
+        self.nodes = cast("Mapping[str, Node]", nn.ModuleDict(nodes))
         self.sky = sky
 
     @property

@@ -1,6 +1,7 @@
 """A table of Gaussians: every parameter and buffer in it has one entry per row."""
 
 from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,11 @@ class Rows(nn.Module):
 
     Raises ValueError without any column, or if the columns disagree in their number of rows.
     """
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """Every column is a tensor."""
 
     def __init__(
         self,

@@ -30,6 +30,8 @@ class BakedMask(Mask):
     Before the first and behind the last frame the nearest one counts.
     """
 
+    times: Tensor
+
     columns = ()
     sparsity_weight = 0.0
 

@@ -71,6 +71,14 @@ class TemporalMask(Mask):
     be below 0.5. The first layer is a sum of what row and time bring, so that several times cost little more than one.
     """
 
+    settings: TemporalMaskSettings
+    times: Tensor
+    valid: Tensor
+    centers: Tensor
+    half_sizes: Tensor
+    limit: Tensor
+    draws: Tensor
+
     columns = (FEATURES,)
 
     def __init__(self, settings: TemporalMaskSettings, min_gaussians: int, scope: MaskScope) -> None:

@@ -49,6 +49,8 @@ class Deformable(Tracked):
     """Rows in their boxes that one network deforms, by place, time and instance; ``embeddings`` [i, f] tell the
     instances apart."""
 
+    settings: DeformableSettings
+
     def __init__(self, *args: Any, **keywords: Any) -> None:
         """Takes what ``Tracked`` takes; the network starts from seed 0."""
         super().__init__(*args, **keywords)

@@ -69,6 +69,9 @@ class FieldSettings(BackgroundSettings):
 class Field(Node):
     """Canonical rows in the world, and the network that moves, turns and scales them."""
 
+    settings: FieldSettings
+    center: Tensor
+
     def __init__(
         self,
         settings: FieldSettings,

@@ -162,6 +162,10 @@ class Node(nn.Module, ABC):
     (a scale of 0 has no logarithm and no ratio).
     """
 
+    settings: NodeSettings
+    rows: Rows
+    mask: Mask | None
+
     def __init__(self, settings: NodeSettings, rows: Rows, mask: Mask | None = None) -> None:
         super().__init__()
         held, wanted = sorted(rows.transient), sorted(mask.columns if mask is not None else ())

@@ -27,6 +27,8 @@ class RigidSettings(TrackedSettings):
 class Rigid(Tracked):
     """Objects whose Gaussians keep their places in the box."""
 
+    settings: RigidSettings
+
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
         """Every instance's Gaussians at its pose; opacity exactly 0 where the instance is absent."""
         return self.placed(view)

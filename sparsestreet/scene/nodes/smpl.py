@@ -186,6 +186,13 @@ class Smpl(Tracked):
     corrections as rotation vectors, zero at the start.
     """
 
+    settings: SmplSettings
+    vertices: Tensor
+    attached: Tensor
+    weights: Tensor
+    joints: Tensor
+    joint_keyframes: Tensor
+
     def __init__(
         self,
         settings: SmplSettings,

@@ -123,6 +123,14 @@ class Tracked(Node):
     The pose of a keyframe is its annotation with learned corrections, zero at the start (see ``ops.poses.poses_at``).
     """
 
+    settings: TrackedSettings
+    keyframe_times: Tensor
+    keyframe_quaternions: Tensor
+    keyframe_translations: Tensor
+    keyframe_valid: Tensor
+    spans: Tensor
+    sizes: Tensor
+
     def __init__(
         self,
         settings: TrackedSettings,

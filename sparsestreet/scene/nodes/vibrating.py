@@ -76,6 +76,8 @@ class Vibrating(Node):
     """Rows in the world with three more columns: ``velocities`` [n, 3] at the life peak, meters per unit of the node's
     time, ``life_peaks`` [n] and ``log_life_spans`` [n]."""
 
+    settings: VibratingSettings
+
     def __init__(
         self, settings: VibratingSettings, rows: Rows, *, num_frames: int, seed: int = 0, mask: Mask | None = None
     ) -> None:

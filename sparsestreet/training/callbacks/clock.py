@@ -1,6 +1,7 @@
 """Wall time of training, validation left out."""
 
 import time
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
@@ -36,7 +37,7 @@ class Clock(Callback):
     def state_dict(self) -> dict[str, object]:
         return {"seconds": self.seconds}
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._finished = state_dict["seconds"]
 
     def _pause(self) -> None:

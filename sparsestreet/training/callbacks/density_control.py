@@ -1,7 +1,9 @@
 """When to densify, cull and reset opacities (the schedule of 3DGS, as DriveStudio runs it per node)."""
 
+from typing import Any
+
 import torch
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from sparsestreet.phases import phase
 from sparsestreet.records.ledger import CountChange
@@ -43,12 +45,12 @@ class DensityControl(Callback, RowListener):
         self.statistics: dict[str, DensityStatistics] = {}
         self.last_reset: int | None = None
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         for name, node in pl_module.scene.nodes.items():
             if (strategy := node.settings.density) is not None:
                 self.statistics.setdefault(name, DensityStatistics(len(node.rows), watched=strategy.watched))
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         # Only now are rows on their device, and statistics of a checkpoint restored.
         for statistics in self.statistics.values():
             statistics.to(pl_module.device)
@@ -58,7 +60,7 @@ class DensityControl(Callback, RowListener):
         if change.node in self.statistics:
             self.statistics[change.node].resize(plan)
 
-    def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_after_backward(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if not pl_module.screen_gradients:
             return
         splats = pl_module.rendering.splats
@@ -71,14 +73,14 @@ class DensityControl(Callback, RowListener):
                 statistics.add(splats.screen_offsets.grad[span], splats.radii[span], width, height, watched)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step, steps = trainer.global_step, trainer.max_steps
         if self.refine_in.due(step, steps) and not self._recovering(step):
             for name in self.statistics:
                 self._refine(trainer, pl_module, name)
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: object, batch_idx: int) -> None:
         pl_module.screen_gradients = bool(self.statistics) and trainer.global_step < self.refine_in.last(
             trainer.max_steps
         )
@@ -118,7 +120,7 @@ class DensityControl(Callback, RowListener):
             "last_reset": self.last_reset,
         }
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.statistics = {name: DensityStatistics.from_state(s) for name, s in state_dict["statistics"].items()}
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]

@@ -2,6 +2,7 @@
 
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
@@ -37,5 +38,5 @@ class HeldOutCurve(Callback):
     def state_dict(self) -> dict[str, object]:
         return {"rows": [astuple(look) for look in self.looks]}
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.looks = [HeldOutLook(*row) for row in state_dict["rows"]]

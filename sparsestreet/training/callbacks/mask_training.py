@@ -2,7 +2,7 @@
 
 import logging
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from sparsestreet.training.callbacks.resizing import end_mask, resize_rows
 from sparsestreet.training.schedule import Interval
@@ -24,7 +24,7 @@ class MaskTraining(Callback):
         self.remove_in = remove_in
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step, steps = trainer.global_step, trainer.max_steps
         last = self.remove_in.closes(step, steps)

@@ -2,6 +2,7 @@
 
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
@@ -53,7 +54,7 @@ class PhaseTimes(Callback):
     def state_dict(self) -> dict[str, object]:
         return {"rows": [astuple(row) for row in self.rows]}
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.rows = [StepPhase(*row) for row in state_dict["rows"]]
 
     def _note(self, step: int) -> None:

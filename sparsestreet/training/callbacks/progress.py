@@ -3,9 +3,11 @@
 import logging
 import time
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +23,7 @@ class TrainingProgress(Callback):
         self._task = None
         self._since = (0, 0.0)
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._since = (trainer.global_step, time.perf_counter())
         console = Console()
         if console.is_terminal:
@@ -31,7 +33,7 @@ class TrainingProgress(Callback):
             self._bar.start()
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
         if not self._due(step, trainer.max_steps):
@@ -42,10 +44,10 @@ class TrainingProgress(Callback):
         else:
             log.info("step %d of %d: %s", step, trainer.max_steps, text)
 
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def teardown(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         self._stop()
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, pl_module: StreetSystem, exception: BaseException) -> None:
         # Lightning tears no callback down then, and a live bar hides the cursor.
         self._stop()
 
@@ -60,7 +62,7 @@ class TrainingProgress(Callback):
         # Where another tenth is full.
         return step * LINES // steps > (step - 1) * LINES // steps
 
-    def _status(self, trainer: Trainer, system: LightningModule) -> str:
+    def _status(self, trainer: Trainer, system: StreetSystem) -> str:
         first, then = self._since
         now = time.perf_counter()
         self._since = (trainer.global_step, now)

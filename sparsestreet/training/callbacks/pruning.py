@@ -3,12 +3,13 @@
 import logging
 from collections.abc import Sequence
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from sparsestreet.phases import stage
 from sparsestreet.pruning import PruningRule, RenderContext
 from sparsestreet.training.callbacks.resizing import resize_rows
 from sparsestreet.training.schedule import milestone
+from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
@@ -28,14 +29,14 @@ class Pruning(Callback):
         self.rule = rule
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         if trainer.global_step not in {milestone(fraction, trainer.max_steps) for fraction in self.at}:
             return
         with stage(f"prune/{type(self.rule).__name__} at step {trainer.global_step}"):
             self._prune(trainer, pl_module)
 
-    def _prune(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def _prune(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         frames = trainer.datamodule.split.train
         context = RenderContext(pl_module.state(), pl_module.options)
         for name, selection in self.rule.select(pl_module.scene, frames, context).items():

@@ -2,12 +2,14 @@
 
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from sparsestreet.records.ledger import LEDGER, CountChange
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowListener
+from sparsestreet.training.system import StreetSystem
 
 
 class RowLedger(Callback, RowListener):
@@ -21,14 +23,14 @@ class RowLedger(Callback, RowListener):
         if change.after != change.before:
             self.changes.append(change)
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if not self.changes:
             self.changes += [CountChange(0, node, 0, rows, "start") for node, rows in pl_module.scene.counts().items()]
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._write(trainer)
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, pl_module: StreetSystem, exception: BaseException) -> None:
         # Training that failed before its start has nothing to say, and a full disk would hide what failed.
         if self.changes and not isinstance(exception, OSError):
             self._write(trainer)
@@ -36,7 +38,7 @@ class RowLedger(Callback, RowListener):
     def state_dict(self) -> dict[str, object]:
         return {"changes": [astuple(change) for change in self.changes]}
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.changes = [CountChange(*change) for change in state_dict["changes"]]
 
     def _write(self, trainer: Trainer) -> None:

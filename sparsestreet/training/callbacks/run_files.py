@@ -2,8 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from sparsestreet.noise import Calibration, calibrate, noise_between
 from sparsestreet.phases import stage
@@ -36,10 +37,10 @@ class RunFiles(Callback, RowListener):
         self._limits: dict[str, int | None] = {}
         self._calibration: Calibration | None = None
 
-    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+    def setup(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         self._limits = {name: node.settings.max_gaussians for name, node in pl_module.scene.nodes.items()}
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._calibration = calibrate(pl_module.device)
 
     def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
@@ -48,11 +49,11 @@ class RunFiles(Callback, RowListener):
         if limit is not None and change.after > change.before and change.after >= limit - 1:
             self.caps[change.node] = limit
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if not trainer.interrupted:
             self.write(trainer, pl_module)
 
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: Trainer, pl_module: StreetSystem, exception: BaseException) -> None:
         if trainer.global_step > 0 and not isinstance(exception, TornStop | OSError):
             self.write(trainer, pl_module)
 
@@ -77,5 +78,5 @@ class RunFiles(Callback, RowListener):
     def state_dict(self) -> dict[str, object]:
         return {"caps": self.caps}
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.caps = dict(state_dict["caps"])

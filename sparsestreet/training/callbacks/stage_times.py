@@ -1,5 +1,7 @@
 """What the stages of a command do not see by themselves: validations, and what an interrupted command spent."""
 
+from typing import Any
+
 from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.phases import StageRecorder
@@ -20,5 +22,5 @@ class StageTimes(Callback):
     def state_dict(self) -> dict[str, object]:
         return {"seconds": self.recorder.seconds()}
 
-    def load_state_dict(self, state_dict: dict[str, object]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.recorder.go_on(state_dict["seconds"])
