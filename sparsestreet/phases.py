@@ -6,7 +6,7 @@ to the innermost one.
 """
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
@@ -72,7 +72,7 @@ class Timeline:
     def seconds(self) -> dict[str, float]:
         """Those of every name since ``begin``; they add up to all of it."""
         marks = [*self._marks, (self._clock.mark(), "")]
-        seconds: Counter[str] = Counter()
+        seconds: defaultdict[str, float] = defaultdict(float)
         for (begin, name), (end, _) in pairwise(marks):
             seconds[name] += self._clock.seconds(begin, end)
         return dict(seconds)

@@ -102,7 +102,9 @@ def _rows_of_instances(
     keep = torch.zeros_like(placed.gaussians.opacities, dtype=torch.bool)
     for node_name, node in stored.scene.nodes.items():
         objects = node.instances()
-        for name in () if objects is None else sorted(set(names) & set(objects.names)):
+        if objects is None:
+            continue
+        for name in sorted(set(names) & set(objects.names)):
             rows = objects.ids == objects.names.index(name)
             if not bool((placed.gaussians.opacities[placed.spans[node_name]][rows] > 0).any()):
                 raise ValueError(f"{name} is not in the scene at time {time:g}: {_presence(stored, node, rows)}")

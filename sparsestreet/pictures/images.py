@@ -76,7 +76,7 @@ def draw_lidar_end(
     """
     reach = max(round(picture.shape[1] / TILE_WIDTH), 1)
     touched = Image.fromarray(beyond).convert("L").filter(ImageFilter.MaxFilter(2 * reach + 1))
-    return np.where((near & (np.asarray(touched) > 0))[..., None], np.uint8(LIDAR_END), picture)
+    return np.where((near & (np.asarray(touched) > 0))[..., None], np.array(LIDAR_END, np.uint8), picture)
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:

@@ -52,7 +52,7 @@ def picture_sheet(
         tile_width: pixels of each column; images are scaled to it.
     """
     headings = ("render", "error", "Gaussian centers")
-    lines = [
+    lines: list[list[Tile | None]] = [
         [
             Tile(f"truth: {_view(picture)}", picture.truth),
             *(Tile(*pair) for pair in zip(headings, _outcome(picture), strict=True)),

@@ -32,7 +32,7 @@ def joint_rotations(person: Pedestrian, traveled: float) -> Float64[np.ndarray, 
     rotations[0] = _BOX_FROM_BODY
     for side, name in ((1, "left"), (-1, "right")):
         hip, knee, foot = person.leg(side, traveled)
-        toe = tuple(a + b for a, b in zip(foot, _TOE, strict=True))
+        toe = (foot[0] + _TOE[0], foot[1] + _TOE[1], foot[2] + _TOE[2])
         _point(rotations, [f"{name}_{joint}" for joint in ("hip", "knee", "ankle", "foot")], (hip, knee, foot, toe))
         _point(rotations, [f"{name}_{joint}" for joint in ("shoulder", "elbow", "wrist")], person.arm(side, traveled))
     return rotations

@@ -43,7 +43,7 @@ def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: i
 
 
 def _directions(sensor: LidarSensor) -> Float32[np.ndarray, "3 b a"]:
-    elevation = np.radians(np.linspace(*sensor.elevations, sensor.beams))[:, None]
+    elevation = np.radians(np.linspace(sensor.elevations[0], sensor.elevations[1], sensor.beams))[:, None]
     azimuth = (np.pi - 2 * np.pi * (np.arange(sensor.azimuth_steps) + 0.5) / sensor.azimuth_steps)[None]
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
     return np.stack((x, y, np.broadcast_to(np.sin(elevation), x.shape))).astype(np.float32)

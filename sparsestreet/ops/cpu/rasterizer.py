@@ -204,7 +204,8 @@ def _raise_for(
     if status == native.STATUS_OK:
         return
     if status == native.STATUS_BAD_VALUE:
-        check_values(Gaussians(*fields, displacements))
+        means, quaternions, scales, opacities, sh = fields
+        check_values(Gaussians(means, quaternions, scales, opacities, sh, displacements))
     if status == native.STATUS_TOO_MANY_PAIRS:
         worst = [(row, pairs) for row, pairs in zip(report.worst_rows, report.worst_pairs, strict=True) if row >= 0]
         raise PairLimitError.of(report.pairs, PAIR_LIMIT, worst)

@@ -18,8 +18,7 @@ class Rows(nn.Module):
 
     if TYPE_CHECKING:
 
-        def __getattr__(self, name: str) -> Tensor:
-            """Every column is a tensor."""
+        def __getattr__(self, name: str) -> Tensor: ...  # every column is one
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sparsestreet.geometry.quaternions import normalized
@@ -30,7 +30,7 @@ def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         return torch.full((num_points,), MINIMUM_SCALE)
     # The nearest is the point itself, or a coincident one: both are 0 away, so dropping the first is right.
     positions = points.double().numpy()
-    distances, _ = cKDTree(positions).query(positions, k=np.arange(2, neighbors + 2))
+    distances, _ = KDTree(positions).query(positions, k=np.arange(2, neighbors + 2))
     return torch.from_numpy(distances.mean(1)).float().clamp(min=MINIMUM_SCALE)
 
 

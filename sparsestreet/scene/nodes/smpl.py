@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
@@ -141,7 +141,7 @@ def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "
         if len(measured) == 0:
             colors.append(torch.full_like(vertices, 0.5))
             continue
-        tree = cKDTree(measured.positions.numpy())
+        tree = KDTree(measured.positions.numpy())
         _, nearest = tree.query(vertices.numpy(), k=list(range(1, min(_COLORED_BY, len(measured)) + 1)))
         colors.append(measured.colors[torch.from_numpy(nearest)].mean(1))
     return torch.cat(colors)
@@ -293,7 +293,7 @@ class Smpl(Tracked):
         if self._neighbors is None or self._neighbors[0] is not vertices:
             apart = _APART * self.rows.instances[:, None].float()
             places = torch.cat((self.vertices[vertices], apart), 1).cpu().numpy()
-            distances, found = cKDTree(places).query(places, k=self.settings.neighbors)
+            distances, found = KDTree(places).query(places, k=self.settings.neighbors)
             itself = np.arange(len(places))[:, None]
             found = np.where(distances < _APART / 2, found, itself)
             self._neighbors = vertices, torch.from_numpy(found).to(self.rows.means.device)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import project
@@ -107,5 +107,5 @@ def directions(count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
 def _camera_distances(positions: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[Tensor, " n"]:
     """Meters to the nearest camera."""
     cameras = torch.stack([view.camera.position for view in views]).double().numpy()
-    distances, _ = cKDTree(cameras).query(positions.double().numpy())
+    distances, _ = KDTree(cameras).query(positions.double().numpy())
     return torch.from_numpy(distances).float()
