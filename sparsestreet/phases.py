@@ -10,8 +10,18 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
+from typing import Any, Protocol, runtime_checkable
 
 import torch
+
+
+@runtime_checkable
+class Timer(Protocol):
+    """Marks moments, and says how many seconds lie between two of them."""
+
+    def mark(self) -> Any: ...
+
+    def seconds(self, start: Any, end: Any) -> float: ...
 
 
 class WallClock:
@@ -37,7 +47,7 @@ class CudaClock:
         return 1e-3 * start.elapsed_time(end)
 
 
-def clock_of(device: torch.device) -> WallClock | CudaClock:
+def clock_of(device: torch.device) -> Timer:
     """The clock that sees the work of a device."""
     return CudaClock() if device.type == "cuda" else WallClock()
 
@@ -45,7 +55,7 @@ def clock_of(device: torch.device) -> WallClock | CudaClock:
 class Timeline:
     """Seconds by name of what is under way."""
 
-    def __init__(self, clock: WallClock | CudaClock, outside: str) -> None:
+    def __init__(self, clock: Timer, outside: str) -> None:
         """``outside`` is the name of the time that belongs to nothing else."""
         self._clock = clock
         self._names = [outside]
@@ -81,7 +91,7 @@ class Timeline:
 class PhaseRecorder(Timeline):
     """What happened between ``start`` and ``stop``, as seconds by name of the phase."""
 
-    def __init__(self, clock: WallClock | CudaClock, outside: str = "rest") -> None:
+    def __init__(self, clock: Timer, outside: str = "rest") -> None:
         super().__init__(clock, outside)
 
     def start(self) -> None:

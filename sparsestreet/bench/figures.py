@@ -1,19 +1,21 @@
 """The figures of the measurements (matplotlib without a display): SVG for documents, PNG for looking."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from sparsestreet.bench.fit import Line
-from sparsestreet.records.strict_json import Json
 
-Record = dict[str, Json]
+Record = dict[str, Any]
+"""A line of a file of records, as JSON has it."""
 PlottedPoint = tuple[float, float, Record]
 """Cost, error, and what they belong to."""
 # Okabe and Ito's palette: distinguishable with any color vision. One color and marker a knob.
@@ -139,7 +141,7 @@ def _blank_figure(width: float, height: float, x_label: str, y_label: str) -> Fi
 
 def _legend(place: Axes, panels: Sequence[Axes]) -> None:
     """One legend of all panels, alone in its place."""
-    handles: dict[str, object] = {}
+    handles: dict[str, Artist] = {}
     for axes in panels:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     place.axis("off")
@@ -223,7 +225,7 @@ def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
 
 
 def draw_scaling(
-    work: Sequence[float], times: dict[str, Sequence[float]], lines: dict[str, Line], folder: Path
+    work: Sequence[float], times: Mapping[str, Sequence[float]], lines: dict[str, Line], folder: Path
 ) -> list[Path]:
     """Milliseconds of each part against (splat, tile) pairs, with its straight line; both axes logarithmic."""
     figure = Figure(figsize=(7.2, 4.6), dpi=130, layout="constrained")

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from statistics import mean
 
 import torch
-from lightning import LightningModule
 
 from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS
 from sparsestreet.ops.ssim_window import WINDOW
+from sparsestreet.training.system import StreetSystem
 
 NUMBER = 4.0
 """Bytes of a float32."""
@@ -51,7 +51,7 @@ class StepWork:
     sky_pixels: int
 
     @staticmethod
-    def of(system: LightningModule, samples: int | None) -> "StepWork":
+    def of(system: StreetSystem, samples: int | None) -> "StepWork":
         """Of the step that the system has just made."""
         rendering = system.rendering
         stepped = (value.numel() for value in system.scene.parameters() if value.grad is not None)

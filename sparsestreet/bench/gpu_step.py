@@ -15,7 +15,7 @@ from sparsestreet.phases import clock_of
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.types import Camera, Gaussians
 
-Seen = Callable[[], tuple[Tensor, Tensor]]
+Seen = Callable[[], tuple[Tensor | None, Tensor]]
 """Absolute screen gradients [n, 2] and radii [n] of a rendering, after its backward pass."""
 Render = Callable[[Gaussians], tuple[Tensor, Seen]]
 

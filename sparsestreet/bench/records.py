@@ -5,6 +5,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.records.run import CodeVersion, Machine
@@ -41,10 +42,10 @@ class RecordFile:
             file.write(text + "\n")
 
 
-def read_records(path: Path) -> list[dict[str, Json]]:
+def read_records(path: Path) -> list[dict[str, Any]]:
     """All lines of a file. Raises RecordError, naming file and line, for anything that is not strict JSON."""
     lines = path.read_text(encoding="utf-8").splitlines()
-    return [parsed(line, f"{path}:{number}") for number, line in enumerate(lines, start=1)]
+    return [cast("dict[str, Any]", parsed(line, f"{path}:{number}")) for number, line in enumerate(lines, start=1)]
 
 
 def settings_entries(settings: SplatSettings) -> dict[str, Json]:

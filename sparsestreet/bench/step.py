@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestreet.bench.blend import measured_peak
@@ -17,6 +17,7 @@ from sparsestreet.bench.step_record import PhaseRecord, StepRecord
 from sparsestreet.bench.timing import last_workspace, spread
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.training.callbacks.phase_times import LOOP
+from sparsestreet.training.system import StreetSystem
 
 OP = ("splat", "splat backward")
 
@@ -52,7 +53,7 @@ class StepWatch(Callback):
         self._mode: TorchDispatchMode | None = None
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, pl_module: StreetSystem, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         step, window = trainer.global_step, self.window
         if window.first < step <= window.first + window.timed:
@@ -86,7 +87,7 @@ class CountedOperations(TorchDispatchMode):
 
 def run_step(
     what: str,
-    train: Callable[[Callback], LightningModule],
+    train: Callable[[Callback], StreetSystem],
     window: StepWindow,
     file: RecordFile,
     folder: Path,
@@ -113,7 +114,7 @@ def run_step(
     return record
 
 
-def _record(what: str, system: LightningModule, watch: StepWatch) -> StepRecord:
+def _record(what: str, system: StreetSystem, watch: StepWatch) -> StepRecord:
     bandwidth, peak = measured_bandwidth(system.device), measured_peak()
     least = floors(watch.work)
     names = sorted(
@@ -145,7 +146,7 @@ def _total(watch: StepWatch, name: str) -> float:
     return sum(seconds.get(name, 0.0) for seconds in watch.seconds)
 
 
-def _samples(system: LightningModule) -> int | None:
+def _samples(system: StreetSystem) -> int | None:
     """(splat, pixel) samples of the newest rendering, where the backend counts them."""
     rows = system.rendering.splats.radii
     return last_workspace(rows.dtype).sample_count() if rows.device.type == "cpu" else None
