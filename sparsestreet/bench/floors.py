@@ -64,7 +64,7 @@ class StepWork:
             samples,
             sum(stepped),
             tuple(rendering.alpha.shape),
-            int(seen.sum()) if system.scene.sky is not None else 0,
+            int(seen.sum()) if "sky" in system.scene.effects else 0,
         )
 
 

@@ -22,7 +22,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
     """The parts of a training, before any data is read. Raises ValueError where they do not fit together."""
     recipe = Recipe(
         nodes=instantiate(cfg.node, _convert_="all"),
-        sky=instantiate(cfg.sky, _convert_="all") if cfg.sky else None,
+        effects=instantiate(cfg.effects, _convert_="all") if cfg.effects else {},
         losses=instantiate(cfg.loss, _convert_="all"),
         callbacks=instantiate(cfg.callback, _convert_="all"),
         optimizer=instantiate(cfg.optimizer, _convert_="all"),

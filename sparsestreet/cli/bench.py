@@ -150,7 +150,7 @@ def _gpu(options: argparse.Namespace) -> bool:
 
 
 def trained_street(run: Path) -> BenchScene:
-    """A recorded view of a trained run, in the middle of its log, as ``evaluate`` would render it (without the sky).
+    """A recorded view of a trained run, in the middle of its log, as ``evaluate`` would splat it.
 
     Raises FileNotFoundError if the folder holds no scene or no views.
     """
@@ -161,9 +161,9 @@ def trained_street(run: Path) -> BenchScene:
     views = read_views(run / FILE_NAME).all
     view = views[len(views) // 2]
     with torch.no_grad():
-        gaussians = stored.scene.gaussians_at(view).gaussians
+        placed = stored.scene.gaussians_at(view)
     source = f"trained: {run.name} on {stored.name}, frame {view.frame_index}"
-    return BenchScene("trained street", source, gaussians, view.camera)
+    return BenchScene("trained street", source, placed.gaussians, placed.view.camera)
 
 
 def _file(options: argparse.Namespace) -> RecordFile:

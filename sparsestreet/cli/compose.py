@@ -41,7 +41,7 @@ class TrainSchema:
     preset: Any = MISSING
     sparsify: Any = MISSING
     node: Any = MISSING
-    sky: Any = None
+    effects: Any = None
     image_points: Any = None
     loss: Any = MISSING
     callback: Any = MISSING

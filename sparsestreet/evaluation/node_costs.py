@@ -1,13 +1,13 @@
 """What each node class and each effect costs of a frame: the same frames with and without it, side by side."""
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from operator import sub
 
 import torch
 
-from sparsestreet.evaluation.scene_parts import has_masks, without_masks, without_node, without_sky
+from sparsestreet.evaluation.scene_parts import has_masks, without_masks
 from sparsestreet.evaluation.speed import frame_image
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.phases import PhaseRecorder, clock_of
@@ -15,13 +15,13 @@ from sparsestreet.records.costs import NodeCost
 from sparsestreet.records.run import Noise
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.types import Camera, View
+from sparsestreet.types import View
 
 OUTPUT = "output"
 """The part of a frame that is in no phase: what holds the others together, and uint8."""
 
-LENS, SHUTTER, SKY, MASKS = "lens", "shutter", "sky", "masks"
-"""Effects."""
+MASKS = "masks"
+"""All masks together, beside the effects of a scene."""
 
 _WARMUP = 2
 """Rounds that do not count."""
@@ -35,14 +35,6 @@ class SceneCosts:
     nodes: dict[str, NodeCost]
     effects: dict[str, float]
     noise: Noise
-
-
-@dataclass(frozen=True)
-class _Variant:
-    """Frames with something left out."""
-
-    scene: SceneGraph
-    seen_by: Callable[[Camera], Camera] = lambda camera: camera
 
 
 @torch.no_grad()
@@ -60,9 +52,11 @@ def measure_scene_costs(
     if not views or repeats < 1:
         raise ValueError(f"costs need at least one view and one repeat, got {len(views)} and {repeats}")
     before = calibrate(scene.device)
-    left_out = {name: _Variant(without_node(scene, name)) for name in scene.nodes}
-    effects = _effects(scene, views)
-    rounds = _rounds({"": _Variant(scene)} | left_out | effects, views, options, repeats)
+    left_out = {name: scene.without(name) for name in scene.nodes}
+    effects = {name: scene.without(name) for name, effect in scene.effects.items() if effect.is_on}
+    if has_masks(scene):
+        effects[MASKS] = without_masks(scene)
+    rounds = _rounds({"": scene} | left_out | effects, views, options, repeats)
     frames = rounds.pop("")
     without = {name: [sum(parts.values()) for parts in times] for name, times in rounds.items()}
     whole = [sum(parts.values()) for parts in frames]
@@ -79,22 +73,8 @@ def measure_scene_costs(
     )
 
 
-def _effects(scene: SceneGraph, views: Sequence[View]) -> dict[str, _Variant]:
-    """Those that the scene and its cameras have."""
-    found = {}
-    if any(view.camera.distortion is not None for view in views):
-        found[LENS] = _Variant(scene, lambda camera: replace(camera, distortion=None))
-    if any(view.camera.shutter is not None for view in views):
-        found[SHUTTER] = _Variant(scene, lambda camera: replace(camera, shutter=None))
-    if scene.sky is not None:
-        found[SKY] = _Variant(without_sky(scene))
-    if has_masks(scene):
-        found[MASKS] = _Variant(without_masks(scene))
-    return found
-
-
 def _rounds(
-    variants: Mapping[str, _Variant], views: Sequence[View], options: RenderOptions, repeats: int
+    variants: Mapping[str, SceneGraph], views: Sequence[View], options: RenderOptions, repeats: int
 ) -> dict[str, list[dict[str, float]]]:
     """Variant -> part of a frame -> milliseconds, for each round."""
     times: dict[str, list[dict[str, float]]] = {name: [] for name in variants}
@@ -107,9 +87,8 @@ def _rounds(
     return times
 
 
-def _frame_parts(variant: _Variant, view: View, options: RenderOptions) -> dict[str, float]:
-    view = replace(view, camera=variant.seen_by(view.camera))
-    recorder = PhaseRecorder(clock_of(variant.scene.device), outside=OUTPUT)
+def _frame_parts(scene: SceneGraph, view: View, options: RenderOptions) -> dict[str, float]:
+    recorder = PhaseRecorder(clock_of(scene.device), outside=OUTPUT)
     recorder.start()
-    frame_image(variant.scene, view, options)
+    frame_image(scene, view, options)
     return {name: 1e3 * seconds for name, seconds in recorder.stop().items()}

@@ -114,7 +114,8 @@ def evaluate_scene(
 def _guard_counts(scene: SceneGraph, views: Sequence[View], options: RenderOptions) -> GuardCounts:
     total = Guards()
     for view in views:
-        total += guards(scene.gaussians_at(view).gaussians, view.camera, settings=options.settings)
+        placed = scene.gaussians_at(view)
+        total += guards(placed.gaussians, placed.view.camera, settings=options.settings)
     return GuardCounts(asdict(total), total.alarms)
 
 

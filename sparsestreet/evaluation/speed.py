@@ -34,7 +34,7 @@ def measure_latency(
     The protocol, which the answer repeats in words: batch of one; ``warmup`` renders that are thrown away, then
     ``repeats`` timed ones, cycling through all ``views`` so that no easy view is singled out. Three clocks: "raster"
     is the splat op alone, "frame" all that a time and a pose need to become an image of uint8 on the device
-    (assembling the scene at that time, projection, blending, sky, rounding) and neither loading of images nor metrics,
+    (assembling the scene at that time, projection, blending, effects, rounding) and neither loading nor metrics,
     "rig" the frames of all cameras of an instant, one after the other. On a CUDA device the clock waits for the device
     before and after. The median of "frame" is the headline: the mean of timings with a slow tail is several times
     noisier. A published number needs ``repeats`` >= 50. Frames per second are 1000 / p50, never the mean of 1 / t.
@@ -107,9 +107,11 @@ class _Clocks:
         frame_image(self._scene_at(view), view, self._options)
 
     def _raster(self, view: View) -> Callable[[], object]:
-        gaussians = self._scene_at(view).gaussians_at(view).gaussians
+        placed = self._scene_at(view).gaussians_at(view)
         settings, backend = self._options.settings, self._options.backend
-        return lambda: splat(gaussians, view.camera, settings=settings, backend=backend, screen_gradients=False)
+        return lambda: splat(
+            placed.gaussians, placed.view.camera, settings=settings, backend=backend, screen_gradients=False
+        )
 
     def _timed(self, work: Callable[[], object], view: View) -> float:
         """Milliseconds of some work on the scene of a view, which is there before the clock starts."""

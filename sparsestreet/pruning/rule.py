@@ -70,6 +70,6 @@ def contributions(
         placed = scene.gaussians_at(frame, context.state)
         options = context.options
         yield (
-            contribution(placed.gaussians, frame.camera, settings=options.settings, backend=options.backend),
+            contribution(placed.gaussians, placed.view.camera, settings=options.settings, backend=options.backend),
             placed.spans,
         )

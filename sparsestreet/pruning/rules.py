@@ -1,7 +1,7 @@
 """What decides which rows of some nodes go, given all training views: by the paper's importance or by removal."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Float64
@@ -11,9 +11,10 @@ from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.importance import Importance
 from sparsestreet.pruning.rule import PruningRule, RenderContext, contributions, on_device
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
+from sparsestreet.scene.effects import linearized
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import render, sky_image
+from sparsestreet.scene.rendering import render
 from sparsestreet.types import Frame, LeaveOneOut
 
 LEAST_ERROR = 1e-12
@@ -62,6 +63,8 @@ class LeaveOneOutRule(PruningRule):
     of the error; what overlapping rows lose together is more, and is made up for by the steps that follow. Unlike
     the importance gate this asks whether a row would be missed, not whether it leads somewhere.
 
+    Images are those behind the scene's effects, which change them by their slopes (``effects.linearized``).
+
     A row that moves no channel of any pixel by more than ``noticeable`` costs nothing.
     """
 
@@ -78,6 +81,14 @@ class LeaveOneOutRule(PruningRule):
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
+        costs, floors = self.costs(scene, frames, context), self.floors(scene, frames, context)
+        return keep_by_cost({name: costs[name] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
+
+    @torch.no_grad()
+    def costs(
+        self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
+    ) -> dict[str, Float64[Tensor, " _"]]:
+        """Name of a node -> what each of its rows costs, relative to the present squared error."""
         errors = sum(_squared_errors(scene, frame, context) for frame in on_device(scene, frames))
         spans = scene.gaussians_at(frames[0], context.state).spans
         rows = max(span.stop for span in spans.values())
@@ -86,8 +97,7 @@ class LeaveOneOutRule(PruningRule):
             change = _without_each(scene, frame, errors, context)
             largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         costs = torch.where(largest > self.noticeable, squared, 0.0)
-        floors = self.floors(scene, frames, context)
-        return keep_by_cost({name: costs[spans[name]] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
+        return {name: costs[rows] for name, rows in spans.items()}
 
 
 def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
@@ -99,18 +109,26 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
 
 
 def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], context: RenderContext) -> LeaveOneOut:
-    """Over the sky, as the image is seen; squared changes relative to the error of the regions a pixel belongs to."""
+    """Behind the effects; squared changes are relative to the error of the regions that a pixel belongs to.
+
+    The largest change is multiplied by the largest slope of any pixel: at least as much as is seen of it.
+    """
     # Where no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
     share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
-    return leave_one_out(
-        scene.gaussians_at(frame, context.state).gaussians,
-        frame.camera,
-        background=sky_image(scene, frame.camera),
-        pixel_weights=weights,
+    placed = scene.gaussians_at(frame, context.state)
+    effects = linearized(scene.effects.values(), placed.view)
+    change = leave_one_out(
+        placed.gaussians,
+        placed.view.camera,
+        background=effects.background,
+        pixel_weights=weights if effects.slope is None else weights * effects.slope.square(),
         settings=context.options.settings,
         backend=context.options.backend,
     )
+    if effects.slope is None:
+        return change
+    return replace(change, max_abs_change=effects.slope.max() * change.max_abs_change)
 
 
 def _squared_errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:

@@ -64,10 +64,10 @@ class CostRecord:
     peak_device_mb: float | None = None
     """10^6 bytes that torch had allocated on the GPU at once; None on a CPU."""
     frame_ms: dict[str, float]
-    """Part of a frame (scene, splat, sky, output) -> median milliseconds; they add up to the frame."""
+    """Part of a frame (scene, splat, effects by name, output) -> median milliseconds; they add up to the frame."""
     nodes: dict[str, NodeCost]
     effects: dict[str, float]
-    """"lens", "shutter", "sky", "masks", those that the scene has -> milliseconds that a frame takes longer with it."""
+    """Name of an effect of the scene, or "masks" -> milliseconds that a frame takes longer with it."""
     noise: Noise | None = None
     """While ``frame_ms``, ``nodes`` and ``effects`` were measured."""
 

@@ -8,8 +8,6 @@ from sparsestreet.report.arms import Arm
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import ABSENT, Cell, Grid
 
-_FORWARD = ("scene", "splat", "sky", "losses", "regularizers")
-
 _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] = (
     ("", "Gaussians", "{:,.0f}", lambda record: float(record.summary.gaussians_total)),
     ("", "MB", "{:.2f}", lambda record: record.summary.bytes_total / 1e6),
@@ -17,7 +15,7 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] 
     ("", "train s", "{:.1f}", lambda record: record.summary.run.training_seconds),
     ("seconds", "pruning", "{:.1f}", lambda record: _of(record, lambda costs: costs.phases.get(PRUNE, 0.0))),
     ("seconds", "whole command", "{:.0f}", lambda record: _of(record, lambda costs: costs.wall_seconds)),
-    ("ms of a step", "forward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, *_FORWARD))),
+    ("ms of a step", "forward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, *_forward(costs)))),
     ("ms of a step", "backward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, "backward"))),
     ("ms of a step", "optimizer", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, "optimizer"))),
     ("peak MB", "host", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_host_mb)),
@@ -47,6 +45,11 @@ def what_arms_cost(arms: Sequence[Arm]) -> Grid:
 def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:
     costs = COSTS.find(record.folder)
     return None if costs is None else value(costs)
+
+
+def _forward(costs: CostRecord) -> tuple[str, ...]:
+    """Parts of a step's forward pass: effects go by their names."""
+    return ("scene", "splat", *costs.effects, "losses", "regularizers")
 
 
 def _step(costs: CostRecord, *parts: str) -> float | None:

@@ -8,11 +8,11 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import Assignment, assign_tracks
+from sparsestreet.scene.effects import Effect, EffectSettings
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.triangulation import ImagePointSettings, cached_street_points
 from sparsestreet.types import Track
 
@@ -24,7 +24,7 @@ def build_scene(
     train_frames: Frames,
     held_out: frozenset[int],
     nodes: Mapping[str, NodeSettings],
-    sky: SkySettings | None,
+    effects: Mapping[str, EffectSettings],
     seed: int,
     image_points: ImagePointSettings | None = None,
 ) -> SceneGraph:
@@ -36,11 +36,13 @@ def build_scene(
         held_out: integer frames whose sweeps and boxes must not be used.
         nodes: name of the node class -> what is said about it. A class without any instance is left out, and the
             program's log says so.
-        sky: settings of the cube map; None for a scene without sky.
-        seed: each node draws from its own stream, so a change of one leaves the others as they are.
+        effects: name of the effect -> what is said about it, in the order in which they act on an image. The program's
+            log says which the scene has, and why.
+        seed: each node and effect draws from its own stream, so a change of one leaves the others as they are.
         image_points: how points are triangulated from the views; None: no node gets any.
 
-    Raises ValueError where two nodes claim one track, or a node has nothing to start from.
+    Raises ValueError where two nodes claim one track, a node has nothing to start from, or an effect is asked for that
+    the log cannot support.
     """
     assignment = assign_tracks(log.tracks, nodes)
     _report(assignment)
@@ -55,7 +57,21 @@ def build_scene(
         else:
             _log.info("node %r starts with %d Gaussians", name, len(node.rows))
             built[name] = node
-    return SceneGraph(built, None if sky is None else Sky(sky))
+    return SceneGraph(built, _effects(effects, TrainingData(log, train_frames, held_out), seed))
+
+
+def _effects(effects: Mapping[str, EffectSettings], data: TrainingData, seed: int) -> dict[str, Effect]:
+    """Those that are asked for or called for; what stands in the place of one that is off."""
+    built = {}
+    for name, settings in effects.items():
+        if settings.when == "off":
+            built[name] = settings.left_out()
+            continue
+        finding = settings.detect(data)
+        wanted = finding.called_for or settings.when == "on"
+        _log.info("effect %r is %s: %s", name, "on" if wanted else "not needed", finding.reason)
+        built[name] = settings.build(data, finding, named_generator(seed, name)) if wanted else None
+    return {name: effect for name, effect in built.items() if effect is not None}
 
 
 def _report(assignment: Assignment) -> None:

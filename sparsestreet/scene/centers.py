@@ -30,7 +30,8 @@ def project_centers(scene: SceneGraph, view: View, *, min_opacity: float = 0.005
 
     Rows below ``min_opacity`` are left out: those of absent instances, those masked, those about to be culled.
     """
-    placed, camera = scene.gaussians_at(view), view.camera
+    placed = scene.gaussians_at(view)
+    camera = placed.view.camera
     colors = placed.gaussians.means.new_zeros(len(placed.gaussians), 3)
     for position, rows in enumerate(placed.spans.values()):
         colors[rows] = colors.new_tensor(NODE_COLORS[position % len(NODE_COLORS)])

@@ -1,5 +1,6 @@
-"""The scene graph: nodes by name, one list of Gaussians in a view."""
+"""The scene graph: nodes and effects by name, one list of Gaussians in a view."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast
@@ -10,9 +11,10 @@ from torch import Tensor, nn
 
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.scene.effects.effect import Effect
+from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
-from sparsestreet.scene.sky import Sky
 from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.types import Gaussians, View
 
@@ -26,64 +28,104 @@ class SceneGaussians:
     """Name of a node -> its rows in ``gaussians``."""
     parts: dict[str, RawGaussians]
     """Name of a node -> what it answered."""
+    view: View
+    """As nodes and splats see it (``SceneGraph.seen``)."""
 
 
 class SceneGraph(nn.Module):
-    """Nodes by name, and the sky behind them. Raises ValueError without any node."""
+    """Nodes by name, and the effects that they are seen through, in the order in which these act.
 
-    def __init__(self, nodes: Mapping[str, Node], sky: Sky | None = None) -> None:
+    Raises ValueError without any node, or where a node and an effect share a name.
+    """
+
+    def __init__(self, nodes: Mapping[str, Node], effects: Mapping[str, Effect] | None = None) -> None:
         super().__init__()
         if not nodes:
             raise ValueError("a scene needs at least one node, got none: add a background")
-        # A ModuleDict's values are any modules to a type checker.
+        effects = effects or {}
+        if shared := nodes.keys() & effects.keys():
+            raise ValueError(f"a node and an effect are both named {', '.join(sorted(shared))}: rename one of them")
+        # To a type checker a ModuleDict holds any modules.
         self.nodes = cast("Mapping[str, Node]", nn.ModuleDict(nodes))
-        self.sky = sky
+        self.effects = cast("Mapping[str, Effect]", nn.ModuleDict(effects))
 
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""
         return next(self.parameters()).device
 
+    def seen(self, view: View, state: SceneState = FINISHED) -> View:
+        """What the effects make of a view before nodes and splats see it."""
+        for effect in self.effects.values():
+            view = effect.view(view, state)
+        return view
+
     def gaussians_at(self, view: View, state: SceneState = FINISHED) -> SceneGaussians:
-        """Activated Gaussians of all nodes in the world, seen from a view."""
+        """Activated Gaussians of all nodes in the world, seen from a view through the effects."""
+        view = self.seen(view, state)
         parts = {name: node.raw_at(view, state) for name, node in self.nodes.items()}
         spans, start = {}, 0
         for name, part in parts.items():
             spans[name] = slice(start, start + len(part))
             start += len(part)
-        return SceneGaussians(activate(list(parts.values()), sh_degree=state.sh_degree), spans, parts)
+        return SceneGaussians(activate(list(parts.values()), sh_degree=state.sh_degree), spans, parts, view)
 
     def counts(self) -> dict[str, int]:
         """Number of rows of every node, absent instances included."""
         return {name: len(node.rows) for name, node in self.nodes.items()}
 
     def regularizers(
-        self, parts: Mapping[str, RawGaussians], drawn: Mapping[str, Bool[Tensor, " _"]], state: SceneState
+        self, view: View, parts: Mapping[str, RawGaussians], drawn: Mapping[str, Bool[Tensor, " _"]], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """The weighted terms of all nodes, named node/term.
+        """The weighted terms of all nodes and effects, named node/term and effect/term.
 
-        ``parts`` is what they answered for the view, ``drawn`` which of their rows it shows.
+        ``parts`` is what the nodes answered for the view, ``drawn`` which of their rows it shows.
         """
-        return {
-            f"{name}/{term}": value
-            for name, node in self.nodes.items()
-            for term, value in node.regularizers(parts[name], drawn[name], state).items()
-        }
+        terms = {name: node.regularizers(parts[name], drawn[name], state) for name, node in self.nodes.items()}
+        terms |= {name: effect.regularizers(view, state) for name, effect in self.effects.items()}
+        return {f"{name}/{term}": value for name, own in terms.items() for term, value in own.items()}
 
     def learning_rates(self) -> dict[str, LearningRate]:
         """Dotted name of every parameter -> its rate. Raises ValueError, naming where to add it, for a missing one."""
         rates = {}
-        for name, node in self.nodes.items():
-            for parameter, _ in node.named_parameters():
-                where = f"node.{name}.learning_rates"
-                rates[f"nodes.{name}.{parameter}"] = matching_rate(parameter, node.settings.learning_rates, where)
-        if self.sky is not None:
-            rates["sky.texels"] = self.sky.settings.learning_rate
+        for modules, group, key in ((self.nodes, "nodes", "node"), (self.effects, "effects", "effects")):
+            for name, module in modules.items():
+                for parameter, _ in module.named_parameters():
+                    where = f"{key}.{name}.learning_rates"
+                    rate = matching_rate(parameter, module.settings.learning_rates, where)
+                    rates[f"{group}.{name}.{parameter}"] = rate
         return rates
 
     def bytes_by_part(self) -> dict[str, int]:
-        """float32 bytes of what has to be stored: every node's rows (no masks), ``poses``, ``sky``."""
+        """float32 bytes of what has to be stored: every node's rows (no masks), ``poses``, every effect that learns."""
         parts = {name: node.row_bytes() for name, node in self.nodes.items()}
         parts["poses"] = sum(node.pose_bytes() for node in self.nodes.values())
-        parts["sky"] = 0 if self.sky is None else BYTES_PER_NUMBER * self.sky.texels.numel()
+        for name, effect in self.effects.items():
+            numbers = sum(parameter.numel() for parameter in effect.parameters())
+            parts |= {name: BYTES_PER_NUMBER * numbers} if numbers else {}
         return parts
+
+    def without(self, name: str) -> "SceneGraph":
+        """The scene with a node or an effect left out; the others are the same modules.
+
+        A lone node stays, without rows. Raises ValueError where there is no node or effect of that name.
+        """
+        if name in self.nodes:
+            others = {other: node for other, node in self.nodes.items() if other != name}
+            return self.with_nodes(others or {name: _emptied(self.nodes[name])})
+        if name not in self.effects:
+            known = ", ".join([*self.nodes, *self.effects])
+            raise ValueError(f"the scene has no node or effect {name!r} to leave out: choose one of {known}")
+        effects = dict(self.effects.items()) | {name: self.effects[name].settings.left_out()}
+        return SceneGraph(dict(self.nodes.items()), {key: one for key, one in effects.items() if one is not None})
+
+    def with_nodes(self, nodes: Mapping[str, Node]) -> "SceneGraph":
+        """Other nodes seen through the same effects."""
+        return SceneGraph(nodes, dict(self.effects.items()))
+
+
+def _emptied(node: Node) -> Node:
+    empty = copy.deepcopy(node)
+    empty.mask = None
+    empty.rows.resize(RowPlan.keep(torch.zeros(len(node.rows), dtype=torch.bool, device=node.rows.means.device)))
+    return empty

@@ -1,8 +1,8 @@
 """The scene file: a trained scene that opens by itself, on any device, without the log it was made from.
 
-Tensors in safetensors, and in its header, as JSON, what they mean: a version, the nodes with their settings, the sky,
-how the scene is rendered. No pickle, nothing of the log but the names of its tracks. Masks are not in it: what they
-closed is gone.
+Tensors in safetensors, and in its header, as JSON, what they mean: a version, the nodes and effects with their
+settings, how the scene is rendered. No pickle, nothing of the log but the names of its tracks. Masks are not in it:
+what they closed is gone.
 """
 
 import copy
@@ -18,17 +18,17 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
+from sparsestreet.scene.effects.effect import Effect, EffectSettings
 from sparsestreet.scene.encoding import decode_as, encode
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import BakedMaskSettings
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import View
 
-VERSION = 2
-"""Raised when an older program could not read the file."""
+VERSION = 3
+"""Raised when an older program could not read the file, or this one no older file."""
 
 FILE_NAME = "scene.safetensors"
 """Name of the scene file in a run's folder."""
@@ -65,7 +65,6 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
         "name": stored.name,
         "num_frames": stored.num_frames,
         "options": encode(stored.options),
-        "sky": None if scene.sky is None else encode(scene.sky.settings),
         "nodes": {
             name: {
                 "settings": encode(node.settings),
@@ -74,6 +73,10 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
                 "mask": None if node.mask is None else encode(node.mask.settings),
             }
             for name, node in scene.nodes.items()
+        },
+        "effects": {
+            name: {"settings": encode(effect.settings), "header": effect.header()}
+            for name, effect in scene.effects.items()
         },
     }
     # safetensors refuses what shares memory or is not contiguous.
@@ -88,7 +91,7 @@ def save_scene(path: Path | str, stored: StoredScene) -> None:
 def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredScene:
     """Open a scene file, or that of a run's folder; what it shows needs no log.
 
-    Raises FileNotFoundError where there is none, ValueError for a file that is no scene or of a newer version.
+    Raises FileNotFoundError where there is none, ValueError for a file that is no scene or of another version.
     """
     path = Path(path)
     path = path / FILE_NAME if path.is_dir() else path
@@ -114,9 +117,16 @@ def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredSc
 def _scene_of(header: Mapping[str, Any], tensors: dict[str, Tensor]) -> StoredScene:
     if header["version"] > VERSION:
         raise ValueError(f"the file has version {header['version']}, this program reads {VERSION}: update it")
+    if header["version"] < VERSION:
+        raise ValueError(
+            f"the file has version {header['version']}, this program reads {VERSION}: train the scene again, or open "
+            "it with SparseStreet 0.1"
+        )
     nodes = {name: _restored(entry, _below(f"nodes.{name}.", tensors)) for name, entry in header["nodes"].items()}
-    sky = None if header["sky"] is None else Sky(decode_as(SkySettings, header["sky"]))
-    scene = SceneGraph(nodes, sky)
+    effects = {
+        name: _restored_effect(entry, _below(f"effects.{name}.", tensors)) for name, entry in header["effects"].items()
+    }
+    scene = SceneGraph(nodes, effects)
     scene.load_state_dict(tensors)
     options = decode_as(RenderOptions, header["options"])
     return StoredScene(scene.eval(), options, header["name"], header["num_frames"])
@@ -129,10 +139,14 @@ def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
         {name: column for name, column in columns.items() if not column.is_floating_point()},
     )
     node = decode_as(NodeSettings, entry["settings"]).restore(rows, tensors, entry["header"])
-    # Files of version 1 know no mask.
-    if entry.get("mask") is not None:
+    if entry["mask"] is not None:
         node.mask = decode_as(BakedMaskSettings, entry["mask"]).restored(tensors["mask.times"])
     return node
+
+
+def _restored_effect(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Effect:
+    settings = decode_as(EffectSettings, entry["settings"])
+    return settings.left_out() if settings.when == "off" else settings.restore(tensors, entry["header"])
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ from sparsestreet.training.visible_adam import VisibleAdam
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Adam for the whole scene; the rates are those that nodes and sky say of their parameters."""
+    """Adam for the whole scene; the rates are those that nodes and effects say of their parameters."""
 
     eps: float = 1e-15
     """Adam's epsilon. At torch's default of 1e-8 mask logits whose only gradient is lambda_n / K never move."""

@@ -7,9 +7,9 @@ from lightning import Callback
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.effects import EffectSettings
 from sparsestreet.scene.nodes import NodeSettings
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.scene.sky import SkySettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
 from sparsestreet.training.losses import Loss, MaskSparsity
 from sparsestreet.training.optimizer import OptimizerSettings
@@ -22,7 +22,7 @@ class Recipe:
     """The parts of a training by name: a method, and what makes it small."""
 
     nodes: Mapping[str, NodeSettings]
-    sky: SkySettings | None
+    effects: Mapping[str, EffectSettings]
     losses: Mapping[str, Loss]
     callbacks: Mapping[str, Callback]
     optimizer: OptimizerSettings
@@ -54,13 +54,15 @@ class Recipe:
                 )
         if self._has(DensityControl) and all(settings.density is None for settings in self.nodes.values()):
             found.append("DensityControl is among the callbacks but every node's density is null: leave it out")
+        if shared := self.nodes.keys() & self.effects.keys():
+            found.append(f"a node and an effect are both named {', '.join(sorted(shared))}: rename one of them")
         return found
 
     def build(self, data: StreetData) -> StreetSystem:
         """Start the scene from the training part of the data, and wrap it for training."""
         log, split = data.driving_log, data.split
         scene = build_scene(
-            log, split.train, split.held_out_indices, self.nodes, self.sky, self.seed, self.image_points
+            log, split.train, split.held_out_indices, self.nodes, self.effects, self.seed, self.image_points
         )
         return StreetSystem(
             scene, self.losses, self.optimizer, radius=log.radius, options=self.options, sh_interval=self.sh_interval

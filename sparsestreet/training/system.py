@@ -84,7 +84,7 @@ class StreetSystem(LightningModule):
                 with phase(f"loss {name}"):
                     terms[name] = loss(self.rendering, frame, self.scene)
             with phase("regularizers"):
-                terms |= self.scene.regularizers(self.rendering.parts, self.rendering.drawn, state)
+                terms |= self.scene.regularizers(frame, self.rendering.parts, self.rendering.drawn, state)
         if self._logs():
             with phase("logging"):
                 self._log_training(terms, frame)

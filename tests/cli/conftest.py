@@ -27,7 +27,7 @@ def tiny_street(tmp_path_factory) -> list[str]:
         assert data(["make", *street]) == 0
     return [
         *street,
-        "sky.resolution=8",
+        "effects.sky.resolution=8",
         *TINY_BACKGROUND,
         f"image_points.cache={root.parent / 'points'}",
         "schedule.max_steps=60",

@@ -21,7 +21,7 @@ from tests.scene.street import NUM_FRAMES, pose, street_log, track
 METHODS = ("3dgs", "deformgs", "pvg", "streetgs", "omnire")
 SMALL = (
     "image_points=none",
-    "sky.resolution=4",
+    "effects.sky.resolution=4",
     "node.background.num_points=60",
     "node.background.min_gaussians=10",
 )
@@ -50,7 +50,7 @@ def trains(system: StreetSystem, log: DrivingLog) -> dict[str, int]:
         rendering = render(system.scene, frame, state)
         assert rendering.rgb.isfinite().all()
         terms = [loss(rendering, frame, system.scene) for loss in system.losses.values() if loss.applies(frame)]
-        terms += system.scene.regularizers(rendering.parts, rendering.drawn, state).values()
+        terms += system.scene.regularizers(frame, rendering.parts, rendering.drawn, state).values()
         torch.stack(terms).sum().backward()
     for name, parameter in system.scene.named_parameters():
         assert parameter.grad is None or parameter.grad.isfinite().all(), name

@@ -22,7 +22,7 @@ from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Background
-from sparsestreet.scene.rendering import RenderOptions, sky_image
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene, load_scene
 from sparsestreet.training.callbacks import MaskTraining, Pruning
 from sparsestreet.training.losses import Depth, MaskSparsity, Photometric, SkyMask
@@ -43,9 +43,10 @@ def planted_street(tiny_street, tmp_path_factory):
     few = ("schedule.max_steps=300", "node=[background]", "node.background.max_gaussians=2500")
     assert train([*tiny_street, f"out={out}", *few]) == 0
     data, stored = data_of(load_run_config(out)), load_scene(out)
-    cameras = [view.camera for view in data.split.train.views]
+    views = data.split.train.views
+    cameras = [view.camera for view in views]
     generator = torch.Generator().manual_seed(0)
-    sky = [sky_image(stored.scene, camera).detach() for camera in cameras]
+    sky = [stored.scene.effects["sky"].background(view).detach() for view in views]
     table = stored.scene.nodes["background"].rows
     rows, planted = plant(table, cameras, generator, hidden=60, copies=12, backend="cpu", sky_images=sky)
     sample = torch.randperm(int((~planted).sum()), generator=generator)[:FEW_VISIBLE]
@@ -69,8 +70,9 @@ def test_a_budget_takes_what_is_missed_least(planted_street):
     """0.01 dB: more rows than nobody sees, but none whose removal moves a pixel by more than 16/255."""
     out, data, rows, planted, _ = planted_street
     stored = load_scene(out)
-    cameras = [view.camera for view in data.split.train.views]
-    sky = [sky_image(stored.scene, camera).detach() for camera in cameras]
+    views = data.split.train.views
+    cameras = [view.camera for view in views]
+    sky = [stored.scene.effects["sky"].background(view).detach() for view in views]
     keep = _prune_by_removal(stored, data, rows, allowed_db=0.01)
     assert int(keep.sum()) < int(_prune_by_removal(load_scene(out), data, rows, allowed_db=0.0).sum())
     lost = torch.nonzero(~keep & ~planted).squeeze(-1)[::4]

@@ -7,13 +7,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.evaluation import evaluate
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes import Background, BackgroundSettings
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.scene.sky import Sky, SkySettings
 
 OPTIONS = RenderOptions(backend="reference")
 
@@ -49,7 +49,8 @@ def small_scene() -> SceneGraph:
     """Three Gaussians ahead and one behind the cameras of ``frames.make_frame``, which look along z; a gray sky."""
     ahead = [[0.4, 0.3, 2.0], [0.6, 0.5, 3.0]]
     return SceneGraph(
-        {"road": node_of(ahead), "cars": node_of([[0.2, 0.6, 1.5], [0.0, 0.0, -2.0]])}, Sky(SkySettings(2))
+        {"road": node_of(ahead), "cars": node_of([[0.2, 0.6, 1.5], [0.0, 0.0, -2.0]])},
+        {"sky": Sky(SkySettings(resolution=2))},
     )
 
 
@@ -86,4 +87,4 @@ def masked_scene() -> SceneGraph:
     """A road of four Gaussians, of which two show at time 0 and three later; a car; a gray sky."""
     road = node_of([[0.4, 0.3, 2.0], [0.6, 0.5, 3.0], [0.2, 0.1, 2.5], [0.0, 0.2, 2.2]])
     road.mask = TwoTimes()
-    return SceneGraph({"road": road, "cars": node_of([[0.2, 0.6, 1.5]])}, Sky(SkySettings(2)))
+    return SceneGraph({"road": road, "cars": node_of([[0.2, 0.6, 1.5]])}, {"sky": Sky(SkySettings(resolution=2))})

@@ -7,13 +7,13 @@ from torch import Tensor
 
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
 from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, View
 
@@ -45,11 +45,11 @@ def stored_street() -> StoredScene:
         names=("car", "tram"),
         max_gap=1.0,
     )
-    sky = Sky(SkySettings(4))
+    sky = Sky(SkySettings(resolution=4))
     with torch.no_grad():
         sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
     return StoredScene(
-        SceneGraph({"background": road, "rigid": objects}, sky), RenderOptions(), "hand-made", NUM_FRAMES
+        SceneGraph({"background": road, "rigid": objects}, {"sky": sky}), RenderOptions(), "hand-made", NUM_FRAMES
     )
 
 

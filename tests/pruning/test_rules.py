@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, PruningRule, RenderContext
+from sparsestreet.scene.effects import Effect, Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.types import Camera, Frame
 from tests.scene.street import background
 
@@ -20,7 +20,7 @@ CONTEXT = RenderContext(options=OPTIONS)
 
 
 def scene_of(
-    opacities: list[float], depths: list[float], *, min_gaussians: int = 0, sky: Sky | None = None
+    opacities: list[float], depths: list[float], *, min_gaussians: int = 0, effects: dict[str, Effect] | None = None
 ) -> SceneGraph:
     """Large white discs across the view, one behind the other."""
     n = len(opacities)
@@ -34,7 +34,7 @@ def scene_of(
             "sh_rest": torch.zeros(n, 0, 3),
         }
     )
-    return SceneGraph({"background": background(rows, min_gaussians=min_gaussians)}, sky)
+    return SceneGraph({"background": background(rows, min_gaussians=min_gaussians)}, effects)
 
 
 def frame_of(scene: SceneGraph, offset: int) -> Frame:
@@ -114,10 +114,10 @@ def test_what_shows_a_vehicle_or_a_person_costs_more(region: str):
 
 def test_a_change_is_measured_over_the_sky():
     """A disc of the sky's color is not missed, a black one before the same sky is."""
-    white = Sky(SkySettings(2, initial_color=1.0))
+    white = {"sky": Sky(SkySettings(resolution=2, initial_color=1.0))}
     color = (1.0 - 0.5) / 0.28209479177387814
-    for sh_dc, sky, removed in ((color, white, 1), (-9.0, white, 0), (color, None, 0), (-9.0, None, 1)):
-        scene = scene_of([0.3], [2.0], sky=sky)
+    for sh_dc, effects, removed in ((color, white, 1), (-9.0, white, 0), (color, {}, 0), (-9.0, {}, 1)):
+        scene = scene_of([0.3], [2.0], effects=effects)
         with torch.no_grad():
             scene.nodes["background"].rows.sh_dc.fill_(sh_dc)
         selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], CONTEXT)["background"]

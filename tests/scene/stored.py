@@ -7,11 +7,11 @@ from torch import Tensor
 
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
 from tests.scene.street import (
@@ -71,7 +71,7 @@ def cars(count: int = 8, *, sh_degree: int = 1, masked: bool = False) -> Rigid:
 
 
 def sky() -> Sky:
-    made = Sky(SkySettings(5, initial_color=0.3))
+    made = Sky(SkySettings(resolution=5, initial_color=0.3))
     with torch.no_grad():
         made.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
     return made
@@ -89,11 +89,11 @@ def stored(sh_degree: int = 1, *, masked: bool = False) -> StoredScene:
             if masked:  # around -4.6, where a score of 0.01 lies
                 generator = torch.Generator().manual_seed(seed)
                 node.rows.mask_logits.copy_(torch.randn(len(node.rows), generator=generator) - 4.6)
-    return StoredScene(SceneGraph(nodes, sky()), OPTIONS, "hand-made", 5)
+    return StoredScene(SceneGraph(nodes, {"sky": sky()}), OPTIONS, "hand-made", 5)
 
 
 def with_nodes(scene: StoredScene, **nodes) -> StoredScene:
-    return replace(scene, scene=SceneGraph(nodes, scene.scene.sky))
+    return replace(scene, scene=scene.scene.with_nodes(nodes))
 
 
 def pixels(rendering: SceneRendering) -> list[Tensor]:

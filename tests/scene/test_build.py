@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.effects import SkySettings
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.sky import SkySettings
 from sparsestreet.triangulation import ImagePointSettings, StreetPoints
 from tests.scene.street import background_settings, rigid_settings, street_log, triangulated, view_at
 
@@ -13,15 +13,15 @@ BACKGROUND = background_settings(lidar=30, near=10, far=10)
 CARS = rigid_settings()
 
 
-def build(nodes: dict, sky: SkySettings | None = None, seed: int = 0) -> SceneGraph:
+def build(nodes: dict, effects: dict | None = None, seed: int = 0) -> SceneGraph:
     log = street_log()
-    return build_scene(log, log.frames, frozenset({3}), nodes, sky, seed)
+    return build_scene(log, log.frames, frozenset({3}), nodes, effects or {}, seed)
 
 
 def test_all_parts():
-    scene = build({"background": BACKGROUND, "rigid": CARS}, SkySettings(4))
+    scene = build({"background": BACKGROUND, "rigid": CARS}, {"sky": SkySettings(resolution=4)})
     assert scene.counts() == {"background": 50, "rigid": 1000}
-    assert scene.sky.texels.shape == (6, 4, 4, 3)
+    assert scene.effects["sky"].texels.shape == (6, 4, 4, 3)
     assert len(scene.gaussians_at(view_at(0.3)).gaussians) == 1050
 
 
@@ -29,7 +29,7 @@ def test_a_class_without_instance_is_left_out_and_reported(caplog):
     with caplog.at_level(logging.WARNING):
         scene = build({"background": BACKGROUND, "trams": rigid_settings(classes=("Tram",))})
     assert list(scene.nodes) == ["background"]
-    assert scene.sky is None
+    assert len(scene.effects) == 0
     assert "node 'trams' has no instance in hand-made" in caplog.text
 
 
@@ -72,10 +72,10 @@ def test_points_from_images_are_made_once_of_what_training_sees(monkeypatch):
     frames = log.frames.where(lambda view: view.frame_index != 3)
     nodes = {"background": background_settings(images=7), "cars": CARS}
     settings = ImagePointSettings()
-    scene = build_scene(log, frames, frozenset({3}), nodes, None, 0, settings)
+    scene = build_scene(log, frames, frozenset({3}), nodes, {}, 0, settings)
     assert asked == [([0, 1, 2, 4], ["driving"], settings)]
     assert scene.counts() == {"background": 7, "cars": 5000}
-    build_scene(log, frames, frozenset({3}), {"cars": CARS}, None, 0)
+    build_scene(log, frames, frozenset({3}), {"cars": CARS}, {}, 0)
     assert len(asked) == 1
 
 

@@ -11,11 +11,11 @@ import torch
 
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.effects import SkySettings
 from sparsestreet.scene.encoding import CLASS, decode, decode_as, encode
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
-from sparsestreet.scene.sky import SkySettings
 from tests.scene.street import background_settings
 
 
@@ -67,7 +67,7 @@ def test_the_settings_of_a_scene():
     assert isinstance(again, BackgroundSettings)
     assert again == settings
     assert through_json(SplatSettings()) == SplatSettings()
-    assert through_json(SkySettings(3)) == SkySettings(3)
+    assert through_json(SkySettings(resolution=3)) == SkySettings(resolution=3)
 
 
 @pytest.mark.parametrize("value", [torch.zeros(2), {1, 2}, b"bytes", object(), Outer, 1j])
@@ -82,8 +82,8 @@ def test_a_mapping_must_not_look_like_a_dataclass():
 
 
 def test_what_is_decoded_is_of_the_class_that_is_asked_for():
-    encoded = encode(SkySettings(3))
-    assert decode_as(SkySettings, encoded) == SkySettings(3)
+    encoded = encode(SkySettings(resolution=3))
+    assert decode_as(SkySettings, encoded) == SkySettings(resolution=3)
     with pytest.raises(TypeError, match="a SkySettings stands where a LearningRate belongs"):
         decode_as(LearningRate, encoded)
 
@@ -115,13 +115,13 @@ def test_a_file_cannot_make_the_program_import(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_functions_and_plain_classes_are_no_settings():
-    for name in ("sparsestreet.scene.encoding:encode", "sparsestreet.scene.sky:Sky", "sparsestreet.ops:splat"):
+    for name in ("sparsestreet.scene.encoding:encode", "sparsestreet.scene.effects.sky:Sky", "sparsestreet.ops:splat"):
         with pytest.raises(ValueError, match="as settings, but that is no dataclass"):
             decode({CLASS: name})
 
 
 def test_values_that_do_not_fit_the_class():
     with pytest.raises(ValueError, match=r"SkySettings of this version cannot be made from the file.*clouds"):
-        decode({CLASS: "sparsestreet.scene.sky:SkySettings", "clouds": 3})
+        decode({CLASS: "sparsestreet.scene.effects.sky:SkySettings", "clouds": 3})
     with pytest.raises(ValueError, match=r"StaticMaskSettings of this version cannot be made.*sparsity_weight"):
         decode({CLASS: "sparsestreet.scene.masks.static:StaticMaskSettings"})

@@ -4,9 +4,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background, Rigid
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.state import SceneState
 from tests.scene.street import (
     background,
@@ -96,26 +96,26 @@ def test_regularizers_are_named_by_node_and_term():
     state = SceneState(progress=0.25, training=True)
     parts = scene.gaussians_at(VIEW, state).parts
     drawn = {name: torch.ones(len(part), dtype=torch.bool) for name, part in parts.items()}
-    terms = scene.regularizers(parts, drawn, state)
+    terms = scene.regularizers(VIEW, parts, drawn, state)
     assert list(terms) == ["heavy/weight", "heavy/age"]
     assert terms["heavy/age"].item() == 0.25
     assert torch.equal(terms["heavy/weight"], heavy.rows.means.sum())
     sum(terms.values()).backward()
     assert torch.equal(heavy.rows.means.grad, torch.ones(3, 3))
     plain = SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]})
-    assert plain.regularizers(parts, drawn, SceneState()) == {}
+    assert plain.regularizers(VIEW, parts, drawn, SceneState()) == {}
 
 
 def test_bytes_of_every_part():
     road = background(random_rows(4, 0, sh_degree=3, mask=MASK), MASK)
-    scene = SceneGraph({"road": road, "cars": cars(3)}, Sky(SkySettings(8)))
+    scene = SceneGraph({"road": road, "cars": cars(3)}, {"sky": Sky(SkySettings(resolution=8))})
     assert scene.bytes_by_part() == {
         "road": 4 * 59 * 4,
         "cars": 3 * (3 + 3 + 4 + 1 + 12 + 1) * 4,  # degree 1 and the instance
         "poses": 2 * 8 * 4,
         "sky": 6 * 8 * 8 * 3 * 4,
     }
-    assert SceneGraph({"road": road}).bytes_by_part() == {"road": 4 * 59 * 4, "poses": 0, "sky": 0}
+    assert SceneGraph({"road": road}).bytes_by_part() == {"road": 4 * 59 * 4, "poses": 0}
 
 
 def test_poses_of_all_nodes_are_stored():
@@ -126,7 +126,9 @@ def test_poses_of_all_nodes_are_stored():
 
 def test_names_of_the_parameters():
     """The optimizer's groups and checkpoints go by these."""
-    scene = SceneGraph({"road": background(random_rows(1, 0)), "cars": cars(1)}, Sky(SkySettings(2)))
+    scene = SceneGraph(
+        {"road": background(random_rows(1, 0)), "cars": cars(1)}, {"sky": Sky(SkySettings(resolution=2))}
+    )
     names = {name for name, _ in scene.named_parameters()}
-    assert {"sky.texels", "nodes.road.rows.means", "nodes.cars.rotation_deltas"} <= names
+    assert {"effects.sky.texels", "nodes.road.rows.means", "nodes.cars.rotation_deltas"} <= names
     assert len(names) == 1 + 6 + 8

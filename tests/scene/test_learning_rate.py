@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
-from sparsestreet.scene.sky import Sky, SkySettings
 from tests.scene.street import POSE_RATES, RATES, background, keyframes, pose, random_rows, rigid, static_mask, track
 
 ONE, TWO, THREE = LearningRate(1.0), LearningRate(2.0), LearningRate(3.0)
@@ -85,7 +85,10 @@ def scene_of(learning_rates: dict[str, LearningRate]) -> SceneGraph:
     road = background(random_rows(2, 0, mask=mask), mask, learning_rates=RATES | {"means": TWO})
     boxes = keyframes([track("car", [0, 1], [pose(0, (5.0, 0, 0))] * 2)], 2)
     rows = random_rows(2, 0, instances=random_rows(2, 0).means.detach()[:, 0].long() * 0)
-    return SceneGraph({"road": road, "cars": rigid(rows, boxes, learning_rates=learning_rates)}, Sky(SkySettings(2)))
+    return SceneGraph(
+        {"road": road, "cars": rigid(rows, boxes, learning_rates=learning_rates)},
+        {"sky": Sky(SkySettings(resolution=2))},
+    )
 
 
 def test_the_scene_gives_every_parameter_the_rate_of_its_own_node():
@@ -95,7 +98,7 @@ def test_the_scene_gives_every_parameter_the_rate_of_its_own_node():
     assert (rates["nodes.road.rows.means"], rates["nodes.cars.rows.means"]) == (TWO, ONE)
     assert rates["nodes.cars.rotation_deltas"] is POSE_RATES["rotation_deltas"]
     assert rates["nodes.road.rows.mask_logits"] is RATES["mask_logits"]
-    assert rates["sky.texels"] == scene.sky.settings.learning_rate == LearningRate(0.01)
+    assert rates["effects.sky.texels"] == LearningRate(0.01)
 
 
 def test_a_node_without_a_rate_is_named():

@@ -3,11 +3,10 @@ import torch
 
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import SplatSettings, over_sky
-from sparsestreet.scene import rendering
+from sparsestreet.scene.effects import Sky, SkySettings, sky
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.types import Frame, View
 from tests.scene.street import (
@@ -32,11 +31,11 @@ def scene_of(road_rows: int = 9, car_rows: int = 5, mask: StaticMask | None = MA
     car = track("car", [0, 1], [pose(0.0, (0.0, -1.0, 1.0)), pose(0.4, (0.0, 1.0, 1.0))])
     rows = random_rows(car_rows, 1, instances=instances, mask=mask, dtype=dtype)
     cars = rigid(rows, keyframes([car], 2, dtype=dtype), mask=mask, max_gap=1.0)
-    sky = Sky(SkySettings(4)).to(dtype)
+    sky = Sky(SkySettings(resolution=4)).to(dtype)
     with torch.no_grad():
         sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
     road = background(random_rows(road_rows, 0, mask=mask, dtype=dtype), mask)
-    return SceneGraph({"road": road, "cars": cars}, sky)
+    return SceneGraph({"road": road, "cars": cars}, {"sky": sky})
 
 
 def rendered(scene: SceneGraph, time: float = 0.5) -> SceneRendering:
@@ -95,8 +94,8 @@ def test_options_are_those_of_the_op():
 def test_the_sky_shines_through_what_alpha_leaves():
     scene = scene_of()
     with_sky = rendered(scene)
-    sky = scene.sky.colors(ray_directions(CAMERA))
-    scene.sky = None
+    sky = scene.effects["sky"].colors(ray_directions(CAMERA))
+    del scene.effects["sky"]
     over_black = rendered(scene)
     expected = over_black.rgb + (1 - over_black.alpha[..., None]) * sky
     torch.testing.assert_close(with_sky.rgb, expected, atol=1e-6, rtol=0)  # one float32 rounding
@@ -110,7 +109,7 @@ def test_the_sky_takes_the_backend_of_the_splats(monkeypatch, backend, taken):
         asked.append(options["backend"])
         return over_sky(*arguments, **options)
 
-    monkeypatch.setattr(rendering, "over_sky", recorded)
+    monkeypatch.setattr(sky, "over_sky", recorded)
     result = render(scene_of(), view_at(0.5, CAMERA), options=RenderOptions(backend=backend))
     assert asked == [taken]
     torch.testing.assert_close(result.rgb, rendered(scene_of()).rgb, atol=1e-5, rtol=0)  # the bar of the splats
@@ -119,7 +118,7 @@ def test_the_sky_takes_the_backend_of_the_splats(monkeypatch, backend, taken):
 def test_an_empty_scene_is_the_sky():
     scene = scene_of(0, 0)
     result = rendered(scene)
-    assert torch.equal(result.rgb, scene.sky.colors(ray_directions(CAMERA)))
+    assert torch.equal(result.rgb, scene.effects["sky"].colors(ray_directions(CAMERA)))
     assert (result.alpha == 0).all()
 
 

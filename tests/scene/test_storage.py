@@ -54,7 +54,7 @@ def test_everything_that_is_said_comes_back(tmp_path: Path):
         assert type(again) is type(node)
         # A tuple of classes comes back as a list.
         assert replace(again.settings, classes=tuple(again.settings.classes)) == node.settings
-    assert loaded.scene.sky.settings == scene.scene.sky.settings
+    assert loaded.scene.effects["sky"].settings == scene.scene.effects["sky"].settings
     assert loaded.scene.nodes["cars"].instances().names == tuple(NAMES)
     assert loaded.scene.nodes["cars"].max_gap == 0.61
     state = scene.scene.state_dict()
@@ -110,10 +110,10 @@ def test_rows_that_the_floor_holds_are_in_the_file(tmp_path: Path):
 
 def test_nodes_without_rows_and_a_scene_without_sky(tmp_path: Path):
     scene = with_nodes(stored(), road=background(0, 0, sh_degree=3), cars=cars(0), trees=background(4, 1, sh_degree=0))
-    scene.scene.sky = None
+    del scene.scene.effects["sky"]
     loaded = reopened(tmp_path, scene)
     assert loaded.scene.counts() == {"road": 0, "cars": 0, "trees": 4}
-    assert loaded.scene.sky is None
+    assert dict(loaded.scene.effects.items()) == {}
     assert loaded.scene.nodes["cars"].instances().names == tuple(NAMES)
     assert all(map(torch.equal, pixels(loaded.render(view())), pixels(scene.render(view()))))
 

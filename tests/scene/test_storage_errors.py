@@ -108,7 +108,7 @@ def test_a_setting_that_contradicts_another(path: Path):
 DAMAGES = {
     "no column": lambda header, tensors: tensors.pop("nodes.road.rows.means"),
     "no keyframes": lambda header, tensors: tensors.pop("nodes.cars.keyframe_times"),
-    "no sky": lambda header, tensors: tensors.pop("sky.texels"),
+    "no sky": lambda header, tensors: tensors.pop("effects.sky.texels"),
     "a tensor of no node": lambda header, tensors: tensors.update(stray=torch.zeros(2)),
     "a node less": lambda header, tensors: header["nodes"].pop("trees"),
     "no version": lambda header, tensors: header.pop("version"),
@@ -120,7 +120,7 @@ DAMAGES = {
     "settings of something else": lambda header, tensors: header["nodes"]["road"].update(settings=header["options"]),
     "settings that are none": lambda header, tensors: header["nodes"]["road"].update(settings=None),
     "options that are none": lambda header, tensors: header.update(options=settings_of(header)),
-    "a sky of something else": lambda header, tensors: header.update(sky=header["options"]),
+    "a sky of something else": lambda header, tensors: header["effects"]["sky"].update(settings=header["options"]),
 }
 
 

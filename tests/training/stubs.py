@@ -16,13 +16,13 @@ from sparsestreet.data.log import Split
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics
+from sparsestreet.scene.effects import Effect
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid, RigidSettings
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.scene.sky import Sky
 from sparsestreet.training.callbacks.resizing import RowListener
 from sparsestreet.training.losses import Loss, Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
@@ -119,13 +119,13 @@ def make_system(
     losses: Mapping[str, Loss] | None = None,
     optimizer: OptimizerSettings | None = None,
     *,
-    sky: Sky | None = None,
+    effects: Mapping[str, Effect] | None = None,
     radius: float = 10.0,
     options: RenderOptions | None = None,
     sh_interval: float = 0.1,
 ) -> StreetSystem:
     return StreetSystem(
-        SceneGraph(nodes, sky),
+        SceneGraph(nodes, effects),
         {"photometric": Photometric()} if losses is None else losses,
         OptimizerSettings() if optimizer is None else optimizer,
         radius=radius,

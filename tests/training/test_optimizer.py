@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.visible_adam import VisibleAdam
 from tests.training.stubs import background, group_of, rigid
@@ -24,7 +24,7 @@ def scene() -> SceneGraph:
         "translation_deltas": LearningRate(2e-5),
     }
     nodes = {"background": background(3, learning_rates=RATES), "rigid": rigid(4, learning_rates=rates)}
-    return SceneGraph(nodes, Sky(SkySettings(resolution=2, learning_rate=LearningRate(1e-2))))
+    return SceneGraph(nodes, {"sky": Sky(SkySettings(resolution=2, learning_rates={"texels": LearningRate(1e-2)}))})
 
 
 def rate(optimizer: torch.optim.Optimizer, street: SceneGraph, name: str) -> float:
@@ -39,7 +39,7 @@ def test_rates_scale_with_the_scene_and_decay_log_linearly():
         set_rates(optimizer, progress)
         assert rate(optimizer, street, "nodes.background.rows.means") == pytest.approx(means)
         assert rate(optimizer, street, "nodes.background.rows.sh_dc") == pytest.approx(1e-3)
-        assert rate(optimizer, street, "sky.texels") == pytest.approx(1e-2)
+        assert rate(optimizer, street, "effects.sky.texels") == pytest.approx(1e-2)
 
 
 def test_every_node_has_rates_of_its_own():
@@ -117,7 +117,7 @@ def test_epsilon_slows_what_has_a_small_gradient(eps, visible_only):
     """Adam's first step by hand: rate * g / (|g| + eps)."""
     street = scene()
     optimizer = OptimizerSettings(eps=eps, visible_only=visible_only).build(street, 1.0)
-    texels = street.sky.texels
+    texels = street.effects["sky"].texels
     texels.grad = torch.full_like(texels, 1e-3)
     optimizer.step()
     moved = 0.5 - float(texels.detach()[0, 0, 0, 0])

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes import Background
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
-from sparsestreet.scene.sky import Sky, SkySettings
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.losses import Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
@@ -196,7 +196,7 @@ def sunny() -> Sky:
 def test_validation_logs_the_psnr_of_the_clamped_image_as_training_renders_it():
     options = RenderOptions(SplatSettings(near_plane=2.7), "reference")
     nodes = {"background": background(), "rigid": rigid()}
-    trainer = StubTrainer(make_system(nodes, sky=sunny(), options=options, sh_interval=0.2), max_steps=10)
+    trainer = StubTrainer(make_system(nodes, effects={"sky": sunny()}, options=options, sh_interval=0.2), max_steps=10)
     trainer.global_step = 3
     frame = frame_at(2)
     validate(trainer, frame)
@@ -211,7 +211,7 @@ def test_validation_logs_the_psnr_of_the_clamped_image_as_training_renders_it():
 
 def test_training_logs_the_running_psnr_and_the_number_of_gaussians():
     nodes = {"background": background(12), "rigid": rigid(4)}
-    trainer = StubTrainer(make_system(nodes, sky=sunny()), max_steps=10)
+    trainer = StubTrainer(make_system(nodes, effects={"sky": sunny()}), max_steps=10)
     values = []
     for index in range(3):
         frame = frame_at(index)

@@ -68,8 +68,8 @@ def test_no_loss_waits(loss: Callable[[], Loss], monkeypatch):
 
 
 def test_no_regularizer_waits():
-    rendering, _, placed = given()
-    terms = placed.regularizers(rendering.parts, rendering.drawn, rendering.state)
+    rendering, frame, placed = given()
+    terms = placed.regularizers(frame, rendering.parts, rendering.drawn, rendering.state)
     assert set(terms) == {"background/sharp_shape", "rigid/sharp_shape", "rigid/temporal_smooth"}
     assert all(term.device == META for term in terms.values())
 

@@ -38,7 +38,8 @@ class DynamicRegion:
         with torch.no_grad():
             # Of no interest in which colors.
             gaussians, options = activate(objects, sh_degree=0), rendering.options
-            alone = splat(gaussians, frame.camera, settings=options.settings, backend=options.backend)
+            camera = scene.seen(frame, rendering.state).camera
+            alone = splat(gaussians, camera, settings=options.settings, backend=options.backend)
         region = alone.alpha > self.threshold
         error = (rendering.rgb - frame.image.to(rendering.rgb.dtype) / 255).abs().mean(-1)
         # Over all pixels, because picking those of the region would wait for a device.

@@ -142,7 +142,7 @@ def test_nodes_have_the_terms_that_their_settings_weigh():
     scene, state = SceneGraph({"road": road, "cars": cars, "plain": plain}), SceneState()
     parts = {name: node.raw_at(view_at(0.5), state) for name, node in scene.nodes.items()}
     drawn = {name: torch.ones(len(part), dtype=torch.bool) for name, part in parts.items()}
-    terms = scene.regularizers(parts, drawn, state)
+    terms = scene.regularizers(view_at(0.0), parts, drawn, state)
     assert set(terms) == {"road/sharp_shape", "cars/temporal_smooth"}
     assert terms["road/sharp_shape"].item() == pytest.approx(0.5 * sharp_shape(road.rows.log_scales, 2.0).item())
     # |0 + 3 - 4| and |0 + 0 - 2| over three coordinates.

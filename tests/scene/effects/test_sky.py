@@ -2,13 +2,13 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from sparsestreet.scene.sky import Sky, SkySettings
+from sparsestreet.scene.effects import Sky, SkySettings
 
 AXES = torch.tensor([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]).double()
 
 
 def random_sky(side: int, dtype: torch.dtype = torch.float64) -> Sky:
-    sky = Sky(SkySettings(side)).to(dtype)
+    sky = Sky(SkySettings(resolution=side)).to(dtype)
     with torch.no_grad():
         sky.texels.copy_(torch.rand(sky.texels.shape, generator=torch.Generator().manual_seed(0), dtype=dtype))
     return sky
@@ -116,9 +116,9 @@ def test_gradients_go_to_the_texels_only():
 
 def test_the_diagonals_and_an_empty_image():
     assert torch.isfinite(random_sky(4).colors(torch.tensor([[[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0]]]))).all()
-    assert Sky(SkySettings(2)).colors(torch.zeros(0, 4, 3)).shape == (0, 4, 3)
+    assert Sky(SkySettings(resolution=2)).colors(torch.zeros(0, 4, 3)).shape == (0, 4, 3)
 
 
 def test_no_texels_are_an_error():
     with pytest.raises(ValueError, match="at least one texel"):
-        Sky(SkySettings(0))
+        Sky(SkySettings(resolution=0))

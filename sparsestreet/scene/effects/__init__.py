@@ -1,0 +1,25 @@
+"""Effects: what cameras and light do to the image of a scene, each in a module of its own.
+
+``effect`` says what one is, ``linearized`` how all of a scene change an image together. The sky is an image behind the
+splats; lens and shutter are what a camera brings, and what takes them away from it.
+"""
+
+from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.lens import Lens, LensSettings
+from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
+from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
+from sparsestreet.scene.effects.sky import Sky, SkySettings
+
+__all__ = [
+    "Effect",
+    "EffectSettings",
+    "Finding",
+    "Lens",
+    "LensSettings",
+    "LinearizedEffects",
+    "RollingShutter",
+    "ShutterSettings",
+    "Sky",
+    "SkySettings",
+    "linearized",
+]

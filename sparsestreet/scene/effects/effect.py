@@ -1,0 +1,121 @@
+"""What every effect has in common: what is said about it, and where it acts.
+
+An effect is what cameras and light do to the image of a scene: a lens, an exposure, the sky. A scene has those that its
+log calls for, by name; one that it does not have is not built and costs nothing.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.options import RenderOptions
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Rendering, View
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Whether a log calls for an effect, and why."""
+
+    called_for: bool
+    reason: str
+    """One sentence, without a full stop."""
+    value: float | None = None
+    """What was measured or counted; None: nothing."""
+    unit: str = ""
+    """Of the value and its threshold."""
+    threshold: float | None = None
+    """Value from which the effect is called for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectSettings(ABC):
+    """Everything that is said about one effect. Raises ValueError where ``when`` is none of its words."""
+
+    when: Literal["auto", "on", "off"] = "auto"
+    """auto: the scene has the effect if its log calls for it; on: in any case; off: never, whatever the log says."""
+    learning_rates: Mapping[str, LearningRate] = field(default_factory=dict)
+    """Parameter or module of the effect -> its rate; the longest name that matches wins."""
+
+    def __post_init__(self) -> None:
+        if self.when not in ("auto", "on", "off"):
+            raise ValueError(f"when must be auto, on or off, got {self.when!r}: in a YAML file write 'on' in quotes")
+
+    @abstractmethod
+    def detect(self, data: TrainingData) -> Finding:
+        """Whether the log calls for the effect; asked only where ``when`` is not off."""
+
+    @abstractmethod
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Effect":
+        """Make the effect. Raises ValueError, saying what is missing, where the data cannot support it."""
+
+    @abstractmethod
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Effect":
+        """The effect of a scene file: all its tensors by name, and what ``Effect.header`` said.
+
+        What the tensors hold need not be copied: they are loaded into the scene afterwards.
+        """
+
+    def left_out(self) -> "Effect | None":
+        """What stands in the place of the effect where it is off or left out; None: nothing.
+
+        What a camera declares is taken away from it there. The settings of a stand-in say ``off``.
+        """
+        return None
+
+
+class Effect(nn.Module, ABC):
+    """One effect. It acts on the view before the nodes, on the image behind the splats, or on both.
+
+    A view without frame and camera index is a novel one: it is answered from its camera and time alone.
+    """
+
+    def __init__(self, settings: EffectSettings) -> None:
+        super().__init__()
+        self.settings = settings
+
+    def view(self, view: View, state: SceneState) -> View:
+        """The view as nodes and splats see it."""
+        return view
+
+    def image(
+        self, rgb: Float[Tensor, "h w 3"], splats: Rendering, view: View, options: RenderOptions
+    ) -> Float[Tensor, "h w 3"]:
+        """The image behind the effect; ``rgb`` is that before it, ``view`` the one that was splatted."""
+        return rgb
+
+    def slope(self, view: View) -> Float[Tensor, "h w"] | None:
+        """Derivative of ``image`` with respect to ``rgb``, the same for all channels and above 0; None: 1.
+
+        For whoever asks how far the image moves with the splats, without rendering it again.
+        """
+        return None
+
+    def background(self, view: View) -> Float[Tensor, "h w 3"] | None:
+        """Light that ``image`` lets through where the splats leave some: minus its derivative by alpha; None: none."""
+        return None
+
+    def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """Terms of the loss that concern the effect alone, by name, each with its weight."""
+        return {}
+
+    def header(self) -> dict[str, Any]:
+        """What a scene file has to know beside settings and tensors; JSON values only."""
+        return {}
+
+    @property
+    def has_image(self) -> bool:
+        """Whether it acts on images: then it is a phase of a frame."""
+        return type(self).image is not Effect.image
+
+    @property
+    def is_on(self) -> bool:
+        """False for what stands in the place of an effect that is left out."""
+        return self.settings.when != "off"

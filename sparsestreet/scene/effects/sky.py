@@ -1,0 +1,68 @@
+"""The sky: a color for every direction, at infinity."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sparsestreet.geometry.cameras import ray_directions
+from sparsestreet.ops import over_sky
+from sparsestreet.ops.cube_map import colors_along
+from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.options import RenderOptions
+from sparsestreet.types import Rendering, View
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkySettings(EffectSettings):
+    """Size, start and learning rate of the sky's cube map. Raises ValueError for a cube map without a texel."""
+
+    resolution: int = 128
+    initial_color: float = 0.5
+    learning_rates: Mapping[str, LearningRate] = field(default_factory=lambda: {"texels": LearningRate(0.01)})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.resolution < 1:
+            raise ValueError(f"a cube map needs at least one texel a side, got resolution {self.resolution}")
+
+    def detect(self, data: TrainingData) -> Finding:
+        return Finding(called_for=True, reason="streets lie under the sky")
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Sky":
+        return Sky(self)
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Sky":
+        return Sky(self)
+
+
+class Sky(Effect):
+    """A cube map with bilinear interpolation, also across the edges of its faces; values are not bounded."""
+
+    settings: SkySettings
+    texels: Float[Tensor, "6 r r 3"]
+
+    def __init__(self, settings: SkySettings = SkySettings()) -> None:
+        super().__init__(settings)
+        side = settings.resolution
+        self.texels = nn.Parameter(torch.full((6, side, side, 3), settings.initial_color))
+
+    def colors(self, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Color seen along world directions of any non-zero length; gradients go to the texels only."""
+        return colors_along(self.texels, directions.reshape(-1, 3)).reshape(directions.shape)
+
+    def image(
+        self, rgb: Float[Tensor, "h w 3"], splats: Rendering, view: View, options: RenderOptions
+    ) -> Float[Tensor, "h w 3"]:
+        """Sky behind the splats where more light gets through than at which the op stops a pixel, by its backend."""
+        backend = "torch" if options.backend == "reference" else options.backend
+        limit = options.settings.transmittance_min
+        return over_sky(rgb, splats.alpha, self.texels, view.camera, transmittance_min=limit, backend=backend)
+
+    def background(self, view: View) -> Float[Tensor, "h w 3"]:
+        return self.colors(ray_directions(view.camera, self.texels.device))
