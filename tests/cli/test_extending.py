@@ -59,7 +59,7 @@ def test_the_page_shows_what_is_run():
     shown = re.findall(r"^`(tests/\S+)`[^\n]*\n\n```\w+\n(.*?)^```", page, flags=re.M | re.S)
     names = {name for name, _ in shown}
     assert {
-        f"tests/cli/toy/{name}.py" for name in ("bobbing", "source", "loss", "rule", "mask", "reader", "metric")
+        f"tests/cli/toy/{name}.py" for name in ("bobbing", "gain", "source", "loss", "rule", "mask", "reader", "metric")
     } <= names
     for name, code in shown:
         # Comments in brackets stand for what was left out.

@@ -8,11 +8,13 @@ import torch
 
 from sparsestreet.evaluation import node_costs
 from sparsestreet.evaluation.node_costs import measure_scene_costs
-from sparsestreet.evaluation.scene_parts import without_closed_rows, without_masks, without_node, without_sky
+from sparsestreet.evaluation.scene_parts import without_closed_rows, without_masks
 from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.noise import Calibration
+from sparsestreet.scene.effects import Lens, LensSettings, RollingShutter, ShutterSettings
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import RenderOptions, render, sky_image
+from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Shutter
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, masked_scene, node_of, small_scene
@@ -35,25 +37,26 @@ def picture(scene, frame=FRAMES[0]):
 
 def test_a_scene_without_a_node_is_the_scene_of_the_others():
     scene = small_scene()
-    other = without_node(scene, "cars")
+    other = scene.without("cars")
     assert other.counts() == {"road": 2}
     assert other.nodes["road"] is scene.nodes["road"]
-    assert torch.equal(picture(other), picture(SceneGraph({"road": scene.nodes["road"]}, scene.sky)))
+    assert torch.equal(picture(other), picture(SceneGraph({"road": scene.nodes["road"]}, dict(scene.effects.items()))))
 
 
 def test_a_lone_node_leaves_the_sky():
-    scene = SceneGraph({"road": node_of([[0.4, 0.3, 2.0]])}, small_scene().sky)
-    empty = without_node(scene, "road")
+    scene = small_scene().with_nodes({"road": node_of([[0.4, 0.3, 2.0]])})
+    empty = scene.without("road")
     assert empty.counts() == {"road": 0}
     assert scene.counts() == {"road": 1}
-    assert torch.equal(picture(empty), sky_image(scene, FRAMES[0].camera))
+    assert torch.equal(picture(empty), scene.effects["sky"].colors(ray_directions(FRAMES[0].camera)))
 
 
 def test_the_sky_and_the_masks_can_be_left_out():
     scene = masked_scene()
-    assert without_sky(scene).sky is None
-    assert without_sky(scene).counts() == scene.counts()
+    assert len(scene.without("sky").effects) == 0
+    assert scene.without("sky").counts() == scene.counts()
     bare = without_masks(scene)
+    assert bare.effects["sky"] is scene.effects["sky"]
     assert bare.nodes["road"].mask is None
     assert scene.nodes["road"].mask is not None
     assert bare.nodes["cars"] is scene.nodes["cars"]
@@ -64,6 +67,7 @@ def test_closed_rows_change_no_image(index, rows):
     scene = masked_scene()
     removed = without_closed_rows(scene, FRAMES[index].time)
     assert removed.counts() == {"road": rows, "cars": 1}
+    assert removed.effects["sky"] is scene.effects["sky"]
     assert torch.equal(picture(removed, FRAMES[index]), picture(scene, FRAMES[index]))
     assert scene.counts() == {"road": 4, "cars": 1}
 
@@ -90,13 +94,16 @@ def test_costs_are_what_a_frame_takes_longer(monkeypatch):
             return 5.0 if slower[0] < 1.5e-9 or 7.5e-9 < slower[0] < 8.5e-9 else 1.0
         rows = sum(scene.counts().values())
         masks = any(node.mask is not None for node in scene.nodes.values())
-        camera = view.camera
-        effects = 8 * (scene.sky is not None) + 16 * masks
+        camera = scene.seen(view).camera
+        effects = 8 * ("sky" in scene.effects) + 16 * masks
         effects += 32 * (camera.distortion is not None) + 64 * (camera.shutter is not None)
         return 1e-3 * (rows + effects) + slower[0]
 
     timed(monkeypatch, seconds)
-    costs = measure_scene_costs(masked_scene(), BENT, OPTIONS, repeats=1)
+    masked = masked_scene()
+    bent = {"lens": Lens(LensSettings()), "shutter": RollingShutter(ShutterSettings())}
+    scene = SceneGraph(dict(masked.nodes.items()), dict(masked.effects.items()) | bent)
+    costs = measure_scene_costs(scene, BENT, OPTIONS, repeats=1)
     road, cars = costs.nodes["road"], costs.nodes["cars"]
     assert (road.gaussians, cars.gaussians) == (4, 1)
     assert road.megabytes == 4 * 14 * 4 / 1e6
@@ -133,14 +140,17 @@ def test_megabytes_are_of_rows_and_poses_and_add_up_with_the_sky(monkeypatch):
 def test_what_a_scene_lacks_costs_nothing_and_is_not_named(monkeypatch):
     timed(monkeypatch, lambda scene, view: 1e-3)
     assert set(measure_scene_costs(small_scene(), FRAMES, OPTIONS, repeats=1).effects) == {"sky"}
-    assert measure_scene_costs(without_sky(small_scene()), FRAMES, OPTIONS, repeats=1).effects == {}
+    assert measure_scene_costs(small_scene().without("sky"), FRAMES, OPTIONS, repeats=1).effects == {}
+    # What stands in the place of a lens that is left out is no lens.
+    pinholes = SceneGraph(dict(small_scene().nodes.items()), {"lens": LensSettings().left_out()})
+    assert measure_scene_costs(pinholes, BENT, OPTIONS, repeats=1).effects == {}
 
 
 @pytest.mark.slow
 def test_quiet_machines_agree_with_themselves():
     """The parts of a frame add up to the frame, which is timed by another clock at another time, within 10 %, and the
     protocol taken twice gives medians within 5 %. Where the machine is not quiet, the records say so."""
-    scene = SceneGraph({"background": background(1000), "rigid": rigid(100)}, small_scene().sky)
+    scene = small_scene().with_nodes({"background": background(1000), "rigid": rigid(100)})
     views, options = [frame_at(index, 96, 64) for index in range(3)], RenderOptions()
     disagreed = []
     for _ in range(5):

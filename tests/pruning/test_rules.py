@@ -1,5 +1,7 @@
 """The leave-one-out rule on a scene whose answer is known, and both rules' errors."""
 
+import copy
+import math
 from bisect import bisect_left
 from dataclasses import replace
 from functools import partial
@@ -12,7 +14,8 @@ from sparsestreet.scene.effects import Effect, Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
-from sparsestreet.types import Camera, Frame
+from sparsestreet.types import Camera, Frame, Rendering, View
+from tests.cli.toy.gain import Gain, GainSettings
 from tests.scene.street import background
 
 OPTIONS = RenderOptions(backend="reference")
@@ -122,6 +125,61 @@ def test_a_change_is_measured_over_the_sky():
             scene.nodes["background"].rows.sh_dc.fill_(sh_dc)
         selection = LeaveOneOutRule(0.0).select(scene, [frame_of(scene, 5)], CONTEXT)["background"]
         assert selection.removed == removed
+
+
+def without_row(scene: SceneGraph, row: int) -> SceneGraph:
+    """The scene with a row of its background made invisible."""
+    scene = copy.deepcopy(scene)
+    with torch.no_grad():
+        scene.nodes["background"].rows.opacity_logits[row] = -40.0
+    return scene
+
+
+class Vignette(Effect):
+    """Brighter to the right, so that no two columns have one slope."""
+
+    def slope(self, view: View) -> torch.Tensor:
+        return torch.linspace(0.5, 1.5, view.camera.width).expand(view.camera.height, -1)
+
+    def image(self, rgb: torch.Tensor, splats: Rendering, view: View, options: RenderOptions) -> torch.Tensor:
+        return self.slope(view)[..., None] * rgb
+
+
+@pytest.mark.parametrize("order", [["sky", "gain"], ["sky", "gain", "vignette"], ["gain", "sky"], ["gain"], ["sky"]])
+def test_costs_are_those_of_images_behind_the_effects(order: list[str]):
+    """Against rendering without each row in turn: a gain of 1.3 makes every change 1.3 times as large."""
+    gain = Gain(GainSettings(evenness=0.0), 1)
+    with torch.no_grad():
+        gain.log_gains.fill_(math.log(1.3))
+    effects = {
+        "sky": Sky(SkySettings(resolution=2, initial_color=0.4)),
+        "gain": gain,
+        "vignette": Vignette(GainSettings(evenness=0.0)),
+    }
+    scene = scene_of([0.3, 0.2, 0.4], [2.0, 3.0, 4.0], effects={name: effects[name] for name in order})
+    with torch.no_grad():
+        scene.nodes["background"].rows.sh_dc.copy_(torch.tensor([0.5, -0.5, -1.0]).reshape(3, 1, 1))
+    frame = frame_of(scene, 20)
+
+    def image(seen: SceneGraph) -> torch.Tensor:
+        with torch.no_grad():
+            return render(seen, frame, options=OPTIONS).rgb.double()
+
+    error = (image(scene).clamp(0, 1) - frame.image / 255).square().sum()
+    expected = torch.stack([(image(without_row(scene, row)) - image(scene)).square().sum() for row in range(3)]) / error
+    costs = LeaveOneOutRule(0.1, noticeable=0.0).costs(scene, [frame], CONTEXT)["background"]
+    torch.testing.assert_close(costs, expected, rtol=1e-4, atol=0)  # images are float32, changes of 0.02 and more
+
+
+def test_what_a_gain_makes_noticeable_is_not_free():
+    """The last row moves a pixel by 0.87 steps of 255, and behind a gain of 1.3 by 1.14."""
+    gain = Gain(GainSettings(evenness=0.0), 1)
+    with torch.no_grad():
+        gain.log_gains.fill_(math.log(1.3))
+    for effects, last in (({}, False), ({"gain": gain}, True)):
+        scene = scene_of([0.99, 0.3, 0.5], [2.0, 3.0, 4.0], effects=effects)
+        costs = LeaveOneOutRule(0.0).costs(scene, [frame_of(scene, 5)], CONTEXT)["background"]
+        assert (costs > 0).tolist() == [True, False, last]
 
 
 def test_only_prunable_nodes_are_asked_each_with_its_own_floor():

@@ -72,6 +72,16 @@ def test_a_newer_version(path: Path):
         load_scene(path)
 
 
+@pytest.mark.parametrize("version", [1, VERSION - 1])
+def test_an_earlier_version(path: Path, version: int):
+    rewritten(path, lambda header, _: (header.update(version=version), header.pop("effects")))
+    said = (
+        f"{path}: the file has version {version}, this program reads {VERSION}: train the scene again, or open it with"
+    )
+    with pytest.raises(ValueError, match=f"{said} SparseStreet 0.1"):
+        load_scene(path)
+
+
 def settings_of(header: dict) -> dict:
     return header["nodes"]["road"]["settings"]
 
@@ -120,6 +130,7 @@ DAMAGES = {
     "settings of something else": lambda header, tensors: header["nodes"]["road"].update(settings=header["options"]),
     "settings that are none": lambda header, tensors: header["nodes"]["road"].update(settings=None),
     "options that are none": lambda header, tensors: header.update(options=settings_of(header)),
+    "no effects": lambda header, tensors: header.pop("effects"),
     "a sky of something else": lambda header, tensors: header["effects"]["sky"].update(settings=header["options"]),
 }
 

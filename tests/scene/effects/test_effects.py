@@ -1,0 +1,211 @@
+"""Which effects a scene has, where they act, and what it is without one of them."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from sparsestreet.data.lazy import Frames
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.effects import Effect, EffectSettings, LensSettings, ShutterSettings, Sky, SkySettings
+from sparsestreet.scene.effects.lens import Pinhole
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.scene.state import FINISHED
+from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
+from sparsestreet.types import Shutter, View
+from tests.cli.toy.gain import Gain, GainSettings
+from tests.scene.street import background, background_settings, camera_at, random_rows, street_log, training_data
+
+CAMERA = camera_at(-6.0, width=17, height=11)
+BENT = replace(CAMERA, distortion=torch.tensor([-0.2, 0.05, 0.0, 0.0, 0.0]))
+ROLLING = replace(CAMERA, shutter=Shutter(torch.tensor([0.3, 0.0, 0.0]), torch.zeros(3)))
+ALL = {"sky": SkySettings(resolution=2), "lens": LensSettings(), "shutter": ShutterSettings()}
+GAIN = GainSettings(evenness=0.5)
+
+
+def log_through(lens: bool = False, shutter: bool = False) -> DrivingLog:
+    """The street, seen by a camera with a lens or a rolling shutter."""
+
+    def seen(frame):
+        camera = replace(frame.camera, distortion=BENT.distortion if lens else None)
+        return replace(frame, camera=replace(camera, shutter=ROLLING.shutter if shutter else None))
+
+    log = street_log()
+    return replace(log, frames=Frames.of(tuple(seen(frame) for frame in log.frames)))
+
+
+def built(effects: dict[str, EffectSettings], log: DrivingLog) -> dict[str, Effect]:
+    nodes = {"road": background_settings(lidar=5)}
+    return dict(build_scene(log, log.frames, frozenset(), nodes, effects, 0).effects.items())
+
+
+def scene_of(**effects: Effect) -> SceneGraph:
+    return SceneGraph({"road": background(random_rows(9, 0))}, effects)
+
+
+def sky() -> Sky:
+    """Of many colors."""
+    made = Sky(SkySettings(resolution=4))
+    with torch.no_grad():
+        made.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
+    return made
+
+
+def gain(*factors: float) -> Gain:
+    made = Gain(GAIN, len(factors))
+    with torch.no_grad():
+        made.log_gains.copy_(torch.tensor(factors).log())
+    return made
+
+
+@torch.no_grad()
+def picture(scene: SceneGraph, camera=CAMERA, camera_index: int | None = 0) -> torch.Tensor:
+    view = View(camera, 0.5, None, camera_index)
+    return render(scene, view, options=RenderOptions(backend="reference")).rgb
+
+
+@pytest.mark.parametrize(("lens", "shutter"), [(False, False), (True, False), (False, True), (True, True)])
+def test_a_scene_has_what_its_log_calls_for(lens: bool, shutter: bool, caplog):
+    wanted = {"sky": True, "lens": lens, "shutter": shutter}
+    with caplog.at_level(logging.INFO):
+        assert list(built(ALL, log_through(lens, shutter))) == [name for name, has in wanted.items() if has]
+    state = "is on: 1 of 1" if lens else "is not needed: 0 of 1"
+    assert f"effect 'lens' {state} cameras of hand-made have a lens" in caplog.text
+
+
+def test_a_finding_has_a_number_and_its_threshold():
+    found = LensSettings().detect(training_data(log_through(lens=True)))
+    assert (found.called_for, found.value, found.unit, found.threshold) == (True, 1.0, "cameras", 1.0)
+    assert not ShutterSettings().detect(training_data(log_through(lens=True))).called_for
+
+
+def test_effects_act_in_the_order_of_the_configuration():
+    gains = replace(GAIN, when="on")
+    assert list(built({"gain": gains, "sky": SkySettings(resolution=2)}, street_log())) == ["gain", "sky"]
+    # Behind the gain the sky is as it was; before it, it is as much brighter as the street.
+    first, last = scene_of(sky=sky(), gain=gain(1.3)), scene_of(gain=gain(1.3), sky=sky())
+    plain, street = picture(scene_of(sky=sky())), picture(scene_of())
+    torch.testing.assert_close(picture(first), 1.3 * plain)
+    torch.testing.assert_close(picture(last), plain + 0.3 * street)
+
+
+@pytest.mark.parametrize(
+    ("name", "lacks"), [("lens", "0 of 1 cameras of hand-made have a lens"), ("shutter", "shutter")]
+)
+def test_what_the_log_cannot_support_is_an_error_that_says_what_is_missing(name: str, lacks: str):
+    with pytest.raises(ValueError, match=rf"the {name} is on, but .*{lacks}.*or say auto"):
+        built({name: replace(ALL[name], when="on")}, street_log())
+
+
+def test_on_builds_what_is_not_called_for():
+    assert list(built({"gain": GAIN}, street_log())) == []  # one camera
+    assert list(built({"gain": replace(GAIN, when="on")}, street_log())) == ["gain"]
+
+
+class Undetectable(GainSettings):
+    def detect(self, data):
+        raise AssertionError("what is off is not looked for")
+
+
+def test_off_is_absent_and_nothing_is_measured():
+    off = {"sky": SkySettings(when="off"), "gain": Undetectable(evenness=0.0, when="off")}
+    assert built(off, log_through(lens=True)) == {}
+
+
+def test_a_lens_and_a_shutter_that_are_off_are_taken_from_the_camera():
+    off = {"lens": LensSettings(when="off"), "shutter": ShutterSettings(when="off")}
+    effects = built(off, log_through(lens=True, shutter=True))
+    assert not any(effect.is_on for effect in effects.values())
+    scene = scene_of(sky=sky(), **effects)
+    plain = picture(scene_of(sky=sky()))
+    for camera in (CAMERA, BENT, ROLLING):
+        assert torch.equal(picture(scene, camera), plain)
+
+
+@pytest.mark.parametrize(("name", "camera"), [("lens", BENT), ("shutter", ROLLING)])
+def test_without_lens_or_shutter_the_image_is_that_of_a_camera_without(name: str, camera):
+    effect = ALL[name].restore({}, {})
+    scene = scene_of(sky=sky(), **{name: effect})
+    assert not torch.equal(picture(scene, camera), picture(scene))
+    bare = scene.without(name)
+    # The sky's rays, too.
+    assert torch.equal(picture(bare, camera), picture(scene))
+    assert list(bare.effects) == ["sky", name]
+    assert torch.equal(picture(bare.without(name), camera), picture(scene))
+    assert scene.effects[name] is effect
+
+
+def test_what_is_left_out_is_gone_and_the_rest_is_the_same():
+    scene = scene_of(sky=sky(), gain=gain(1.3))
+    bare = scene.without("sky")
+    assert list(bare.effects) == ["gain"]
+    assert bare.nodes["road"] is scene.nodes["road"]
+    torch.testing.assert_close(picture(bare), 1.3 * picture(scene_of()))
+    assert list(scene.effects) == ["sky", "gain"]
+    with pytest.raises(ValueError, match="no node or effect 'fog' to leave out: choose one of road, sky, gain"):
+        scene.without("fog")
+
+
+def test_other_nodes_are_seen_through_the_same_effects():
+    scene = scene_of(sky=sky(), gain=gain(1.3))
+    other = scene.with_nodes({"trees": background(random_rows(4, 1))})
+    assert other.counts() == {"trees": 4}
+    assert [other.effects[name] is effect for name, effect in scene.effects.items()] == [True, True]
+
+
+def test_a_node_and_an_effect_of_one_name_are_an_error():
+    with pytest.raises(ValueError, match="a node and an effect are both named sky: rename one of them"):
+        SceneGraph({"sky": background(random_rows(1, 0))}, {"sky": sky()})
+
+
+def test_an_effect_is_a_phase_of_a_frame_where_it_acts_on_the_image():
+    recorder = PhaseRecorder(clock_of(torch.device("cpu")))
+    recorder.start()
+    picture(scene_of(sky=sky(), lens=LensSettings().restore({}, {}), gain=gain(1.3)))
+    assert recorder.stop().keys() == {"rest", "scene", "splat", "sky", "gain"}
+
+
+def test_a_word_that_says_nothing_is_an_error():
+    with pytest.raises(ValueError, match=r"when must be auto, on or off, got 'maybe'"):
+        replace(GAIN, when="maybe")
+
+
+def test_a_novel_view_has_no_camera_of_the_log():
+    scene, plain = scene_of(gain=gain(1.2, 0.9)), picture(scene_of())
+    torch.testing.assert_close(picture(scene, camera_index=1), 0.9 * plain)
+    torch.testing.assert_close(picture(scene, camera_index=None), (1.2 * 0.9) ** 0.5 * plain)
+
+
+def test_terms_rates_and_bytes_of_effects_stand_beside_those_of_nodes():
+    rated = Gain(replace(GAIN, learning_rates={"log_gains": SkySettings().learning_rates["texels"]}), 3)
+    scene = scene_of(gain=rated)
+    with torch.no_grad():
+        rated.log_gains.fill_(0.2)
+    view = View(CAMERA, 0.5)
+    parts = scene.gaussians_at(view).parts
+    terms = scene.regularizers(view, parts, {"road": torch.ones(9, dtype=torch.bool)}, FINISHED)
+    assert terms.keys() == {"gain/evenness"}
+    torch.testing.assert_close(terms["gain/evenness"], torch.tensor(0.5 * 0.2**2))
+    assert scene.learning_rates()["effects.gain.log_gains"].initial == 0.01
+    assert scene.bytes_by_part()["gain"] == 3 * 4
+    with pytest.raises(ValueError, match=r"'log_gains' has no learning rate: add one to effects.gain.learning_rates"):
+        scene_of(gain=gain(1.0)).learning_rates()
+
+
+def test_effects_come_back_from_a_file_in_their_order(tmp_path: Path):
+    scene = scene_of(gain=gain(1.2, 0.9), sky=sky(), lens=Pinhole(LensSettings(when="off")))
+    save_scene(tmp_path / "scene.safetensors", StoredScene(scene, RenderOptions(), "x", 5))
+    again = load_scene(tmp_path).scene
+    assert list(again.effects) == ["gain", "sky", "lens"]
+    assert again.effects["gain"].settings == GAIN
+    assert torch.equal(picture(again, BENT, 1), picture(scene, BENT, 1))
+    # Left out of a scene that is then stored, a lens stays left out.
+    lens = scene_of(lens=LensSettings().restore({}, {}))
+    for saved, camera in ((lens, BENT), (lens.without("lens"), CAMERA)):
+        save_scene(tmp_path / "scene.safetensors", StoredScene(saved, RenderOptions(), "x", 5))
+        assert torch.equal(picture(load_scene(tmp_path).scene, BENT), picture(scene_of(), camera))
