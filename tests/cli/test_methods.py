@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -157,6 +158,13 @@ def test_every_option_can_be_set_without_plus_signs(override: str):
 def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: str):
     with pytest.raises(ValueError, match=said):
         recipe_of(composed(*overrides))
+
+
+def test_a_node_and_an_effect_of_one_name_are_an_error():
+    recipe = recipe_of(composed())
+    assert recipe.problems() == []
+    shared = replace(recipe, effects={"background": recipe.effects["sky"]})
+    assert shared.problems() == ["a node and an effect are both named background: rename one of them"]
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ def costs(scene: SceneGraph, frame: Frame) -> torch.Tensor:
 
 
 def region(scene: SceneGraph, frame: Frame) -> torch.Tensor:
-    return DynamicRegion(threshold=0.4)(render(scene, frame, FINISHED, OPTIONS), frame, scene)
+    return DynamicRegion(threshold=0.3)(render(scene, frame, FINISHED, OPTIONS), frame, scene)
 
 
 @pytest.mark.parametrize("look", [weights, costs, region, project_centers])
