@@ -4,6 +4,7 @@
    each node class and its settings; ``effects`` has what cameras and light do to the image (sky, lens, shutter);
    ``state`` says how far training is;
 2. from a view to an image: ``rendering`` asks the graph for Gaussians, calls the splat op and adds the effects;
+   ``options`` say how;
 3. what a node consists of: its table of Gaussians (``gaussians``), whose rows change only by a ``RowPlan``; its mask
    (``masks``), its density control (``density``) and its learning rates (``learning_rate``); ``body`` and
    ``vibration`` have the formulas of people and of PVG;

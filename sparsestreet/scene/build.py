@@ -46,6 +46,8 @@ def build_scene(
     """
     assignment = assign_tracks(log.tracks, nodes)
     _report(assignment)
+    # Before the points, which take long: an effect that the log cannot support is an error.
+    seen_through = _effects(effects, TrainingData(log, train_frames, held_out), seed)
     with stage("points"):
         points = None if image_points is None else cached_street_points(train_frames, assignment.claimed, image_points)
     built: dict[str, Node] = {}
@@ -57,7 +59,7 @@ def build_scene(
         else:
             _log.info("node %r starts with %d Gaussians", name, len(node.rows))
             built[name] = node
-    return SceneGraph(built, _effects(effects, TrainingData(log, train_frames, held_out), seed))
+    return SceneGraph(built, seen_through)
 
 
 def _effects(effects: Mapping[str, EffectSettings], data: TrainingData, seed: int) -> dict[str, Effect]:
@@ -69,8 +71,8 @@ def _effects(effects: Mapping[str, EffectSettings], data: TrainingData, seed: in
             continue
         finding = settings.detect(data)
         wanted = finding.called_for or settings.when == "on"
-        _log.info("effect %r is %s: %s", name, "on" if wanted else "not needed", finding.reason)
         built[name] = settings.build(data, finding, named_generator(seed, name)) if wanted else None
+        _log.info("effect %r is %s: %s", name, "on" if wanted else "not needed", finding.reason)
     return {name: effect for name, effect in built.items() if effect is not None}
 
 

@@ -120,7 +120,7 @@ def _scene_of(header: Mapping[str, Any], tensors: dict[str, Tensor]) -> StoredSc
     if header["version"] < VERSION:
         raise ValueError(
             f"the file has version {header['version']}, this program reads {VERSION}: train the scene again, or open "
-            "it with SparseStreet 0.1"
+            "it with the version that wrote it"
         )
     nodes = {name: _restored(entry, _below(f"nodes.{name}.", tensors)) for name, entry in header["nodes"].items()}
     effects = {
