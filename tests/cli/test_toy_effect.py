@@ -9,9 +9,9 @@ import torch
 from sparsestreet import load_scene
 from sparsestreet.cli.report import report
 from sparsestreet.cli.train import train
-from sparsestreet.records.costs import cost_path, read_costs
-from sparsestreet.records.run import read_run, run_path
-from sparsestreet.records.summary import read_summary, summary_path
+from sparsestreet.records.costs import COSTS
+from sparsestreet.records.run import RUN
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.views import read_views
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.toy.gain import Gain
@@ -56,10 +56,10 @@ def test_the_scene_opens_with_it_and_shows_what_the_run_showed(toy_run):
 
 
 def test_it_is_timed_counted_and_reported(toy_run, capsys):
-    costs, summary = read_costs(cost_path(toy_run)), read_summary(summary_path(toy_run))
+    costs, summary = COSTS.read(toy_run), SUMMARY.read(toy_run)
     assert set(costs.effects) == {"sky", "gain"}
     assert {"sky", "gain"} <= set(costs.frame_ms) & set(costs.step_ms)
     assert summary.bytes_by_part["gain"] == 2 * 4
-    assert read_run(run_path(toy_run)).config["effects.gain.evenness"] == 0.1
+    assert RUN.read(toy_run).config["effects.gain.evenness"] == 0.1
     assert report([str(toy_run)]) == 0
     assert "streetgs+removal" in capsys.readouterr().out
