@@ -6,7 +6,7 @@ _ABSENT = {
     "vehicle": "no vehicle masks: there are no metrics of vehicle pixels",
     "lidar": "no lidar: Gaussians start from points in images and random ones, and there is no depth term in the loss",
     "boxes": "no boxes: nothing is modeled as moving, whatever moves becomes part of the background",
-    "clock": "no clock: the frame rate is unknown, and videos take 10 frames of the log a second (log_fps=...)",
+    "clock": "no clock: the frame rate is unknown, and a video plays at the one that log_fps says",
 }
 
 
