@@ -2,11 +2,11 @@
 
 Conventions, everywhere: world frame metric and right-handed, re-centered at load; camera frame as in
 OpenCV (x right, y down, z forward); quaternions wxyz; ``a_from_b`` maps points of frame b to frame a;
-pixel centers at +0.5; time in [0, 1] beside the integer frame; images float32 in [0, 1] at the splat
-op and uint8 in storage.
+pixel centers at +0.5; time in [0, 1] beside the integer frame, and seconds and integer nanoseconds where
+the log has a clock; images float32 in [0, 1] at the splat op and uint8 in storage.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
@@ -109,6 +109,10 @@ class View:
     """Integer frame of the log; all cameras of one instant share it. None: between or beside the recorded frames."""
     camera_index: int | None = None
     """Which camera of the log's rig; None: none of them."""
+    seconds: float | None = None
+    """Since the first stamp of the log; None: the log has no clock."""
+    stamp: int | None = None
+    """Nanoseconds on the log's own clock, whatever its zero; None: no clock, or between the recorded frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +128,11 @@ class Frame(View):
     ego: Bool[Tensor, "h w"] | None = None
     """Pixels of the recording car itself, such as its hood."""
 
+    @classmethod
+    def of(cls, view: View, **pixels: Tensor | None) -> "Frame":
+        """The view, all that it says, with its pixels."""
+        return cls(**{entry.name: getattr(view, entry.name) for entry in fields(View)}, **pixels)
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -134,6 +143,10 @@ class Sweep:
     colors: Float[Tensor, "n 3"]
     """RGB in [0, 1]; rows without ``colored`` are gray 0.5."""
     colored: Bool[Tensor, " n"]
+    seconds: float | None = None
+    """Since the first stamp of the log; None: the log has no clock."""
+    stamp: int | None = None
+    """Nanoseconds on the log's own clock; None: it has none."""
 
 
 @dataclass(frozen=True)

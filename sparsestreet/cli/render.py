@@ -28,7 +28,7 @@ sparsestreet render scene=RUN out=FILE [key=value ...]     a video of a trained 
   frames    40:60: only these frames of the log, the last one left out
   width     pixels of one camera's image (default: as recorded)
   fps       frames a second of the video; poses between the recorded ones are interpolated (default: as the log)
-  log_fps   frames a second of the log, where views.json does not know it (default: 10)
+  log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
   views     the views.json that holds the cameras (default: the one beside the scene)
   device    cpu or cuda (default: a GPU if there is one)
@@ -83,16 +83,17 @@ def _render(request: RenderRequest) -> None:
     stored = open_scene(request.scene, request.device)
     beside = request.scene if request.scene.is_dir() else request.scene.parent
     views = read_views(request.views or beside / FILE_NAME)
-    log_fps = request.log_fps or views.frames_per_second
+    log_fps = request.log_fps or views.frame_rate
     if log_fps is None:
         log_fps = DEFAULT_LOG_FPS
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
     fps = request.fps or log_fps
+    speed = f"the log's speed, {log_fps:g} of its frames a second"
     path = _path(request, views.all, step=log_fps / fps / max(stored.num_frames - 1, 1))
     pictures = shown(path_pictures(stored, path), len(path), "frames")
     count = write_pictures(request.out, pictures, fps=fps, quality=request.quality)
     cameras, seconds = ", ".join(str(view.camera_index) for view in path[0]), time.perf_counter() - started
-    print(f"{request.out}: {count} frames of camera {cameras} at {fps:g} a second, made in {seconds:.0f} s")
+    print(f"{request.out}: {count} frames of camera {cameras} at {fps:g} a second ({speed}), made in {seconds:.0f} s")
 
 
 def _path(request: RenderRequest, views: "Sequence[View]", step: float) -> "CameraPath":

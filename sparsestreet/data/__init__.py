@@ -1,11 +1,21 @@
 """Driving logs: what they are, where they come from, and in which order training sees them.
 
 log          DrivingLog, what the rest of the package sees of any data set; its split
+clock        when frames were recorded: normalized time, seconds and stamps
+window       which frames and cameras of a log are read
+rig          the cameras of a rig, and whether their lenses are simulated
+poses        rigid transforms: checked, and re-centered
+tracks       annotated objects: checked, and cut to the frames that are read
+scene_folder a log on disk whose images and points are decoded when they are asked for
+extent       whether all of a log lies within one scene
+notes        what a run does without the parts that a log lacks
+fingerprint  a hash of the files that are read
 lazy         frames and sweeps that are read when they are indexed, and the cache of what was read
 reader       LogReader, what every data set offers: check and read
 problems     what is wrong with a log on disk, all at once, with remedies
 check        what `sparsestreet data check` prints
 images       pixels and masks from files
+numbers      numbers from text files
 lidar        colors that points take from images, depth that pixels take from points
 formats      data sets as they are published, to be named where they must be converted first
 drivestudio  reader of DriveStudio's processed layout

@@ -44,6 +44,7 @@ def _summary(log: DrivingLog) -> Table:
     counts = [(len(sweep.points), int(sweep.colored.sum())) for sweep in log.sweeps.gray()]
     points, colored = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     table.add_row("frames x cameras", f"{log.num_frames} x {log.num_cameras}")
+    table.add_row("frames a second", "not known" if log.frame_rate is None else f"{log.frame_rate:.4g}")
     table.add_row("image size", ", ".join(f"{width}x{height}" for width, height in sizes))
     table.add_row("lidar points", f"{points:,} ({colored:,} seen by a camera)" if log.sweeps else "none")
     table.add_row("objects", str(len(log.tracks)))

@@ -1,6 +1,9 @@
 """Images and masks, brought to the size that is asked for."""
 
 import os
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +12,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from torch import Tensor
 
-from sparsestreet.data.problems import LogError, fault
+from sparsestreet.data.problems import LogError, Problem, attempt, fault
 
 _JPEG_END = b"\xff\xd9"
 _PNG_END = b"IEND\xae\x42\x60\x82"
@@ -29,6 +32,39 @@ def check_pixels(path: Path, *, decode: bool) -> None:
     """Raises LogError where the file cannot be decoded; without ``decode`` only what looks cut short is tried."""
     if decode or not _ends_well(path):
         _decode(path, "RGB", None, Image.Resampling.NEAREST)
+
+
+def check_camera_images(
+    camera: str | int, images: Sequence[Path], masks: Iterable[Path], *, decode: bool
+) -> list[Problem]:
+    """Problems of a camera's images and masks: all at the size of most of its images, and whole.
+
+    Files that are missing are passed over; ``decode`` as in ``check_pixels``.
+    """
+    problems: list[Problem] = []
+    sizes = {path: attempt(problems, partial(image_size, path)) for path in images if path.is_file()}
+    counts = Counter(size for size in sizes.values() if size is not None)
+    if not counts:
+        return problems
+    common = counts.most_common(1)[0][0]
+    for path, size in sizes.items():
+        if size is not None and size != common:
+            message = f"the image is {size[0]}x{size[1]}, the others of camera {camera} are {common[0]}x{common[1]}"
+            problems.append(Problem(path, message, "write all images of a camera at one size"))
+        elif size is not None:
+            attempt(problems, partial(check_pixels, path, decode=decode))
+    for path in masks:
+        if path.is_file():
+            attempt(problems, partial(_check_mask, path, common, decode))
+    return problems
+
+
+def _check_mask(path: Path, size: tuple[int, int], decode: bool) -> None:
+    found = image_size(path)
+    if found != size:
+        message = f"the mask is {found[0]}x{found[1]}, the camera's images are {size[0]}x{size[1]}"
+        raise fault(path, message, "write masks at the size of the images")
+    check_pixels(path, decode=decode)
 
 
 def _ends_well(path: Path) -> bool:

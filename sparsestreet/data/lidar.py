@@ -1,14 +1,28 @@
 """Lidar points and images: the colors that points take from pixels, and the depth they give to them."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 
+from sparsestreet.data.problems import fault
 from sparsestreet.geometry.cameras import project
 from sparsestreet.metrics.definitions import LIDAR_REACH
 from sparsestreet.types import Camera
+
+_FARTHEST = 1000.0
+"""Meters: no street lidar reaches this far, so a point beyond it is not a point."""
+
+
+def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "drop these returns") -> None:
+    """Raises LogError, naming the file, unless all points, in the frame of their sensor, are where lidar can see."""
+    # A NaN compares false, so it counts as broken too.
+    broken = int((~(points.abs() <= _FARTHEST)).any(-1).sum())
+    if broken:
+        message = f"{broken} of {points.shape[0]} points are NaN, infinite or more than {_FARTHEST:g} m away"
+        raise fault(path, message, remedy)
 
 
 def color_points(

@@ -56,6 +56,38 @@ class DrivingLog:
         return self.frames.views
 
     @cached_property
+    def seconds(self) -> dict[int, float]:
+        """Frame index -> seconds of the first of its views since the log's first stamp; empty without a clock."""
+        return {index: view.seconds for index, view in self._first_views().items()}
+
+    @cached_property
+    def stamps(self) -> dict[int, int]:
+        """Frame index -> stamp of the first of its views, nanoseconds on the log's clock; empty without a clock."""
+        return {index: view.stamp for index, view in self._first_views().items()}
+
+    @property
+    def frame_rate(self) -> float | None:
+        """Frames a second, from the first to the last; None without a clock, and of a log of one frame.
+
+        The mean step, not the median: a video of all frames then lasts as long as the drive, and stamps that were
+        rounded (KITTI's converted ones, to 10 ms) do not bias it.
+        """
+        if len(self.stamps) < 2:
+            return None
+        first, last = min(self.stamps), max(self.stamps)
+        return 1e9 * (last - first) / (self.stamps[last] - self.stamps[first])
+
+    def _first_views(self) -> dict[int, View]:
+        """Frame index -> the view with the lowest stamp; empty where some view has none."""
+        first: dict[int, View] = {}
+        for view in self.views:
+            if view.stamp is None:
+                return {}
+            if view.frame_index not in first or view.stamp < first[view.frame_index].stamp:
+                first[view.frame_index] = view
+        return first
+
+    @cached_property
     def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
         """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.
 

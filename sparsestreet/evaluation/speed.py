@@ -54,7 +54,8 @@ def measure_latency(
     kept = clocks.measure(_cycled(views, repeats), _cycled(rigs, repeats), warmup)
     removed = {}
     if has_masks(scene):
-        clocks = _Clocks(_WithoutClosedRows(scene, options), options, scene.device)
+        times_of_a_rig = max(len({view.time for view in rig}) for rig in rigs)
+        clocks = _Clocks(_WithoutClosedRows(scene, options, times_of_a_rig), options, scene.device)
         in_order = [view for rig in rigs for view in rig]
         removed = clocks.measure(_stretched(in_order, repeats), _stretched(rigs, repeats), warmup)
     noise = noise_between(before, calibrate(scene.device))
@@ -74,9 +75,9 @@ def to_uint8(rgb: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
 
 
 def instants(views: Sequence[View]) -> list[tuple[View, ...]]:
-    """The views of each instant, instants in order of time."""
-    ordered = sorted(views, key=lambda view: view.time)
-    return [tuple(group) for _, group in groupby(ordered, key=lambda view: view.time)]
+    """The recorded views of each instant, by their frame index and in its order: cameras fire at times of their own."""
+    ordered = sorted(views, key=lambda view: view.frame_index)
+    return [tuple(group) for _, group in groupby(ordered, key=lambda view: view.frame_index)]
 
 
 def device_name(device: torch.device) -> str:
@@ -98,9 +99,9 @@ class _Clocks:
         for index in range(warmup):
             self._frame(frames[index % len(frames)])
         return {
-            FRAME: _percentiles([self._timed(lambda view=view: self._frame(view), view) for view in frames]),
-            RIG: _percentiles([self._timed(lambda rig=rig: [self._frame(v) for v in rig], rig[0]) for rig in rigs]),
-            RASTER: _percentiles([self._timed(self._raster(view), view) for view in frames]),
+            FRAME: _percentiles([self._timed(lambda view=view: self._frame(view), [view]) for view in frames]),
+            RIG: _percentiles([self._timed(lambda rig=rig: [self._frame(v) for v in rig], rig) for rig in rigs]),
+            RASTER: _percentiles([self._timed(self._raster(view), [view]) for view in frames]),
         }
 
     def _frame(self, view: View) -> None:
@@ -113,9 +114,10 @@ class _Clocks:
             placed.gaussians, placed.view.camera, settings=settings, backend=backend, screen_gradients=False
         )
 
-    def _timed(self, work: Callable[[], object], view: View) -> float:
-        """Milliseconds of some work on the scene of a view, which is there before the clock starts."""
-        self._scene_at(view)
+    def _timed(self, work: Callable[[], object], views: Sequence[View]) -> float:
+        """Milliseconds of some work on the scenes of views, which are there before the clock starts."""
+        for view in views:
+            self._scene_at(view)
         _wait_for(self._device)
         start = time.perf_counter()
         work()
@@ -124,18 +126,26 @@ class _Clocks:
 
 
 class _WithoutClosedRows:
-    """The scene without the rows that are closed at the time of a view; it is drawn once whenever it is made."""
+    """The scene without the rows that are closed at the time of a view; it is drawn once whenever it is made.
 
-    def __init__(self, scene: SceneGraph, options: RenderOptions) -> None:
+    The last few are kept: as many as the views of an instant have different times.
+    """
+
+    def __init__(self, scene: SceneGraph, options: RenderOptions, kept: int) -> None:
         self._scene = scene
         self._options = options
-        self._made: tuple[float, SceneGraph] | None = None
+        self._kept = kept
+        self._made: dict[float, SceneGraph] = {}
 
     def __call__(self, view: View) -> SceneGraph:
-        if self._made is None or self._made[0] != view.time:
-            self._made = view.time, without_closed_rows(self._scene, view.time)
-            frame_image(self._made[1], view, self._options)
-        return self._made[1]
+        scene = self._made.pop(view.time, None)
+        if scene is None:
+            scene = without_closed_rows(self._scene, view.time)
+            frame_image(scene, view, self._options)
+        self._made[view.time] = scene
+        if len(self._made) > self._kept:
+            del self._made[next(iter(self._made))]
+        return scene
 
 
 def _cycled(items: Sequence[T], count: int) -> list[T]:

@@ -29,8 +29,8 @@ def recorded(views: Sequence[View]) -> CameraPath:
         raise ValueError("a path needs views, got none: check that the log's views were written")
     instants = defaultdict(list)
     for view in views:
-        instants[view.time].append(view)
-    return tuple(tuple(sorted(instants[time], key=lambda view: view.camera_index)) for time in sorted(instants))
+        instants[view.frame_index].append(view)
+    return tuple(tuple(sorted(instants[index], key=lambda view: view.camera_index)) for index in sorted(instants))
 
 
 def of_frames(path: CameraPath, frames: slice) -> CameraPath:
@@ -108,7 +108,7 @@ def _view_of(rig: Rig, camera: int) -> View:
 
 def _bare(view: View) -> View:
     """Without a Frame's pixels, which belong to its recorded pose."""
-    return View(view.camera, view.time, view.frame_index, view.camera_index)
+    return View(view.camera, view.time, view.frame_index, view.camera_index, view.seconds, view.stamp)
 
 
 def _each_camera(path: CameraPath, change: Callable[[Camera], Camera]) -> CameraPath:
@@ -140,4 +140,6 @@ def _between(a: View, b: View, fraction: float) -> View:
     world_from_camera[:3, 3] = torch.lerp(first[:3, 3], second[:3, 3], fraction)
     pose = inverse(world_from_camera).to(a.camera.camera_from_world.dtype)
     time = a.time + fraction * (b.time - a.time)
-    return View(replace(a.camera, camera_from_world=pose), time, None, a.camera_index)
+    timed = a.seconds is not None and b.seconds is not None
+    seconds = a.seconds + fraction * (b.seconds - a.seconds) if timed else None
+    return View(replace(a.camera, camera_from_world=pose), time, None, a.camera_index, seconds)

@@ -11,9 +11,14 @@ from torch import Tensor
 from sparsestreet.records.strict_json import EXACT, json_line, read_json, version, write_atomically
 from sparsestreet.types import Camera, Shutter, View
 
-FORMAT = 1
+FORMAT = 2
 FILE_NAME = "views.json"
 """Name of the file in a run's folder."""
+
+_REMEDY = (
+    "one below 2 is of an earlier version, without the clock of the log: train again, or go on with the version that "
+    "wrote it; one above 2 needs a newer version"
+)
 
 Numbers = tuple[float, ...]
 Matrix = tuple[Numbers, ...]
@@ -25,13 +30,13 @@ class RecordedViews:
 
     training: tuple[View, ...]
     held_out: tuple[View, ...]
-    frames_per_second: float | None = None
-    """Of the log; None: not known."""
+    frame_rate: float | None = None
+    """Frames of the log a second; None: not known."""
 
     @property
     def all(self) -> tuple[View, ...]:
-        """Training and held-out views in order of time, those of one instant in order of their cameras."""
-        return tuple(sorted((*self.training, *self.held_out), key=lambda view: (view.time, view.camera_index)))
+        """Training and held-out views in order of their frames, those of one frame in order of their cameras."""
+        return tuple(sorted((*self.training, *self.held_out), key=lambda view: (view.frame_index, view.camera_index)))
 
 
 @dataclass(frozen=True)
@@ -49,22 +54,26 @@ class _Entry:
     distortion: Numbers | None = field(default=None, metadata=EXACT)
     shutter_translation: Numbers | None = field(default=None, metadata=EXACT)
     shutter_rotation: Numbers | None = field(default=None, metadata=EXACT)
+    seconds: float | None = field(default=None, metadata=EXACT)
+    stamp: int | None = None
 
 
 @dataclass(frozen=True)
 class _File:
-    frames_per_second: float | None
+    frame_rate: float | None
     views: tuple[_Entry, ...]
-    format: int = version(FORMAT, "update the program, or write the views anew by training")
+    format: int = version(FORMAT, _REMEDY)
 
 
 def write_views(
     path: Path | str,
     training: Sequence[View],
     held_out: Sequence[View],
-    frames_per_second: float | None = None,
+    frame_rate: float | None = None,
 ) -> None:
     """Write the cameras, times and indices of views, the whole file or nothing. A Frame's pixels are not touched.
+
+    ``frame_rate`` is that of the log, frames a second; None: not known.
 
     Poses are written as float32. Raises ValueError for a view without frame or camera index, or with a number that is
     not finite.
@@ -73,7 +82,7 @@ def write_views(
     entries = [_entry("training", view) for view in training] + [_entry("held_out", view) for view in held_out]
     # A view a line: short enough to read, and a diff shows which view changed.
     lines = ",\n".join(json_line(entry, f"{path}: view {index}") for index, entry in enumerate(entries))
-    head = json_line({"format": FORMAT, "frames_per_second": frames_per_second}, str(path)).removesuffix("}")
+    head = json_line({"format": FORMAT, "frame_rate": frame_rate}, str(path)).removesuffix("}")
     write_atomically(path, f'{head}, "views": [\n{lines}\n]}}\n')
 
 
@@ -92,7 +101,7 @@ def read_views(path: Path | str) -> RecordedViews:
         if entry.split not in views:
             raise ValueError(f"{path}: view {index} has split {entry.split!r}, which is none of {', '.join(views)}")
         views[entry.split].append(_view(entry, f"{path}: view {index}"))
-    return RecordedViews(tuple(views["training"]), tuple(views["held_out"]), file.frames_per_second)
+    return RecordedViews(tuple(views["training"]), tuple(views["held_out"]), file.frame_rate)
 
 
 def _entry(split: str, view: View) -> _Entry:
@@ -113,6 +122,8 @@ def _entry(split: str, view: View) -> _Entry:
         distortion=None if camera.distortion is None else _numbers(camera.distortion),
         shutter_translation=None if camera.shutter is None else _numbers(camera.shutter.translation),
         shutter_rotation=None if camera.shutter is None else _numbers(camera.shutter.rotation),
+        seconds=view.seconds,
+        stamp=view.stamp,
     )
 
 
@@ -131,7 +142,7 @@ def _view(entry: _Entry, where: str) -> View:
         None if entry.distortion is None else _tensor(entry.distortion, (5,), where, "distortion"),
         shutter,
     )
-    return View(camera, entry.time, entry.frame_index, entry.camera_index)
+    return View(camera, entry.time, entry.frame_index, entry.camera_index, entry.seconds, entry.stamp)
 
 
 def _matrix(values: Float[Tensor, "r c"]) -> Matrix:

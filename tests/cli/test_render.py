@@ -1,6 +1,6 @@
 """``sparsestreet render`` on a hand-made scene; the run of a real training is rendered in test_train."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,12 +72,30 @@ def test_a_smooth_small_video(run, tmp_path):
 
 def test_the_logs_own_rate_is_taken_where_it_is_known(run, tmp_path, capsys):
     views = read_views(run / "views.json")
-    write_views(tmp_path / "others.json", views.training, views.held_out, frames_per_second=4.0)
+    write_views(tmp_path / "others.json", views.training, views.held_out, frame_rate=4.0)
     words = [f"scene={run}", f"out={tmp_path / 'a'}", "cameras=0", f"views={tmp_path / 'others.json'}"]
     assert render(words) == 0
     said = capsys.readouterr().out
     assert "not known" not in said
-    assert "5 frames of camera 0 at 4 a second" in said
+    assert "5 frames of camera 0 at 4 a second (the log's speed, 4 of its frames a second)" in said
+
+
+def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
+    """Five frames, 0.1 s apart: each is shown for 0.1 s, whatever the frames a second of the video."""
+    from tests.export.test_video import read_video
+
+    views = [replace(view, seconds=0.1 * view.frame_index) for view in street_views(cameras=(0,))]
+    write_views(tmp_path / "clock.json", views, [], frame_rate=10.0)
+    words = [f"scene={run}", f"views={tmp_path / 'clock.json'}", "cameras=0", "width=24"]
+    assert render([*words, f"out={tmp_path / 'own.mp4'}"]) == 0
+    fps, frames = read_video(tmp_path / "own.mp4")
+    assert (fps, len(frames), len(frames) / fps) == (10.0, 5, 0.5)
+    assert "at 10 a second (the log's speed, 10 of its frames a second)" in capsys.readouterr().out
+    assert render([*words, f"out={tmp_path / 'fine.mp4'}", "fps=40"]) == 0
+    fps, frames = read_video(tmp_path / "fine.mp4")
+    # From the first frame to the last, 0.4 s, in steps of 1/40 s, and the last one.
+    assert (fps, len(frames)) == (40.0, 17)
+    assert "at 40 a second (the log's speed, 10 of its frames a second)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

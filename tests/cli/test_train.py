@@ -133,6 +133,8 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
 def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
     views = read_views(finished / "views.json")
     assert {view.frame_index for view in views.held_out} == {5}
+    assert views.frame_rate == 10.0
+    assert {(view.seconds, view.stamp) for view in views.held_out} == {(0.5, 500_000_000)}
     assert {view.frame_index for view in views.training} == set(range(12)) - {5}
     out = run_train(
         tmp_path, "split.stride=4", "split.offset=3", "seed=3", "trainer.fast_dev_run=2", "data.log.settings.seed=0"

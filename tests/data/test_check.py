@@ -19,7 +19,7 @@ def console() -> Console:
 def test_a_sound_log_is_summed_up(make, tmp_path, console):
     assert report_check(DriveStudioReader(make(tmp_path)), console) == 0
     printed = console.file.getvalue()
-    for words in ("3 x 2", "40x24", "15 (1", "Vehicle", "ready to train"):
+    for words in ("3 x 2", "40x24", "15 (1", "frames a second  │ 10 ", "Vehicle", "ready to train"):
         assert words in printed
 
 

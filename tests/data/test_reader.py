@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from sparsestreet.data.fingerprint import LogFiles, hash_files
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
@@ -44,13 +45,47 @@ def test_the_same_log_elsewhere_has_the_same_hash(log, tmp_path):
     assert AnyFolder(shutil.copytree(log, tmp_path / "copy")).data_hash() == before
 
 
-@pytest.mark.parametrize("place", [0, 65535, 200_000 - 65536, 199_999])
-def test_the_first_and_the_last_64_kb_count(log, place):
+@pytest.mark.parametrize(
+    ("place", "counts"), [(0, True), (4095, True), (4096, False), (195_903, False), (195_904, True), (199_999, True)]
+)
+def test_the_first_and_the_last_4_kb_of_what_was_recorded_count(log, place, counts):
     before = AnyFolder(log).data_hash()
     content = bytearray(200_000)
     content[place] = 1
     (log / "images" / "0.bin").write_bytes(content)
-    assert AnyFolder(log).data_hash() != before
+    assert (AnyFolder(log).data_hash() != before) == counts
+
+
+@pytest.mark.parametrize("place", [0, 100_000, 199_999])
+def test_of_what_describes_a_log_every_byte_counts(tmp_path, place):
+    path = tmp_path / "boxes.json"
+    path.write_bytes(bytes(200_000))
+    before = hash_files(tmp_path, LogFiles(described=[path]))
+    content = bytearray(200_000)
+    content[place] = 1
+    path.write_bytes(content)
+    assert hash_files(tmp_path, LogFiles(described=[path])) != before
+
+
+def test_the_order_of_files_does_not_count_and_their_absence_does(log):
+    files = [log / "poses.txt", log / "images" / "0.bin", log / "boxes.json"]
+    before = hash_files(log, LogFiles(recorded=files))
+    assert hash_files(log, LogFiles(recorded=files[::-1])) == before
+    (log / "boxes.json").touch()
+    assert hash_files(log, LogFiles(recorded=files)) != before
+
+
+@dataclass(frozen=True)
+class OneFile(AnyFolder):
+    def files(self) -> LogFiles:
+        return LogFiles(recorded=[self.root / "images" / "0.bin"])
+
+
+def test_what_a_reader_does_not_read_does_not_count(log):
+    before = OneFile(log).data_hash(), AnyFolder(log).data_hash()
+    (log / "another.log").write_text("of the same data set")
+    assert OneFile(log).data_hash() == before[0]
+    assert AnyFolder(log).data_hash() != before[1]
 
 
 def test_names_and_sizes_count(log):

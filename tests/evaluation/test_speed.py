@@ -79,6 +79,41 @@ def test_a_rig_is_all_cameras_of_an_instant(monkeypatch):
     assert (latency.clocks[RIG].p50, latency.clocks[RIG].p99) == (2000.0, 2000.0)
 
 
+def test_the_cameras_of_a_rig_may_fire_at_times_of_their_own():
+    frames = [
+        replace(make_frame(index, camera), time=0.1 * index + 0.06 * camera) for index in (1, 0) for camera in (0, 1)
+    ]
+    assert [[(view.frame_index, view.camera_index) for view in rig] for rig in instants(frames)] == [
+        [(0, 0), (0, 1)],
+        [(1, 0), (1, 1)],
+    ]
+
+
+@pytest.mark.usefixtures("steady")
+def test_what_is_closed_is_taken_out_for_each_time_of_a_rig_before_the_clock_starts(monkeypatch):
+    """Of two instants of two cameras that fire 60 ms apart; the scene of each time is made once for a rig's turns."""
+    views = [
+        replace(make_frame(index, camera), time=0.1 * index + 0.06 * camera) for index in (0, 1) for camera in (0, 1)
+    ]
+    running, made = [False], []
+
+    def tick():
+        running[0] = not running[0]
+        return 0.0
+
+    def without(scene, time, true=speed.without_closed_rows):
+        assert not running[0], "a scene is made while the clock runs"
+        made.append(time)
+        return true(scene, time)
+
+    monkeypatch.setattr(speed.time, "perf_counter", tick)
+    monkeypatch.setattr(speed, "without_closed_rows", without)
+    measure_latency(masked_scene(), views, OPTIONS, warmup=1, repeats=4)
+    # One a time for each of the three clocks, and the first for the warm-up before them.
+    assert len(made) <= 3 * 4 + 1
+    assert set(made) == {0.0, 0.06, 0.1, 0.16}
+
+
 def test_real_clock_sees_the_whole_render(monkeypatch):
     frame = measure(monkeypatch, lambda view: time.sleep(0.003), warmup=2, repeats=50).clocks[FRAME]
     assert 3 <= frame.p50 <= frame.p90 <= frame.p99

@@ -20,6 +20,27 @@ def test_recorded_views_are_rigs_in_order_of_time():
     assert {view.time for view in path[3]} == {0.75}
 
 
+def test_a_rig_is_the_views_of_a_frame_though_its_cameras_fire_one_after_the_other():
+    path = recorded([replace(view, time=view.time + 0.02 * view.camera_index) for view in street_views()])
+    assert [[view.camera_index for view in rig] for rig in path] == [[0, 1, 2, 3]] * NUM_FRAMES
+
+
+def test_seconds_go_with_time_and_a_stamp_with_what_was_recorded():
+    """Frame f at 0.1 f seconds, by cameras that fire 10 ms after one another."""
+    views = [
+        replace(view, seconds=0.1 * view.frame_index + 0.01 * view.camera_index, stamp=7 + view.frame_index)
+        for view in street_views()
+    ]
+    path = recorded(views)
+    for rig in (resized(path, 24)[3], shifted(path, 1.5)[3]):
+        assert [(view.seconds, view.stamp) for view in rig] == [(view.seconds, 10) for view in path[3]]
+    between = resampled(path, STEP / 2)[3]
+    # Halves of sums of two roundings.
+    assert [view.seconds for view in between] == pytest.approx([0.15, 0.16, 0.17, 0.18], abs=1e-12)
+    assert {view.stamp for view in between} == {None}
+    assert {view.seconds for view in resampled(recorded(street_views()), STEP / 2)[3]} == {None}
+
+
 def test_an_instant_without_one_of_the_cameras_is_named():
     path = recorded(street_views()[:-1])
     with pytest.raises(ValueError, match=r"no camera 3 in frame 4, only \[0, 1, 2\]: choose other cameras or frames"):

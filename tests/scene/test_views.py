@@ -1,6 +1,7 @@
 """The cameras of a log as ``views.json``."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,11 +19,12 @@ def odd_view(frame: int = 3) -> View:
         return torch.randn(*shape, generator=generator) * torch.logspace(-6, 6, shape[-1])
 
     camera = Camera(numbers(4, 4), numbers(3, 3), 97, 61, numbers(5), Shutter(numbers(3), numbers(3)))
-    return View(camera, frame / 7, frame, 2)
+    return View(camera, frame / 7, frame, 2, frame / 9.7, 1_532_402_927_600_000_251 + 99_999_997 * frame)
 
 
 def same(a: View, b: View) -> None:
     assert (a.time, a.frame_index, a.camera_index) == (b.time, b.frame_index, b.camera_index)
+    assert (a.seconds, a.stamp) == (b.seconds, b.stamp)
     assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
     assert torch.equal(a.camera.camera_from_world, b.camera.camera_from_world)
     assert torch.equal(a.camera.intrinsics, b.camera.intrinsics)
@@ -31,11 +33,12 @@ def same(a: View, b: View) -> None:
 def test_views_come_back_bit_for_bit(tmp_path):
     path = tmp_path / "run" / "views.json"
     plain, odd = street_views(), [odd_view(3), odd_view(4)]
-    write_views(path, odd, plain, frames_per_second=12.5)
+    write_views(path, odd, plain, frame_rate=12.5)
     views = read_views(path)
     for written, read in zip([*odd, *plain], [*views.training, *views.held_out], strict=True):
         same(written, read)
-    assert views.frames_per_second == 12.5
+    assert views.frame_rate == 12.5
+    assert (views.held_out[0].seconds, views.held_out[0].stamp) == (None, None)
     assert views.held_out[0].camera.distortion is None
     assert views.held_out[0].camera.shutter is None
     for written, read in zip(odd, views.training, strict=True):
@@ -45,8 +48,9 @@ def test_views_come_back_bit_for_bit(tmp_path):
     assert [entry.name for entry in path.parent.iterdir()] == ["views.json"]
 
 
-def test_all_views_are_in_order_of_time_and_camera(tmp_path):
-    views = street_views()
+def test_all_views_are_in_order_of_frame_and_camera(tmp_path):
+    """Though the cameras of an instant fire one after the other, the last one first."""
+    views = [replace(view, time=view.time - 0.01 * view.camera_index) for view in street_views()]
     write_views(tmp_path / "views.json", views[8:12], [*views[12:], *views[:8]])
     order = [(view.frame_index, view.camera_index) for view in read_views(tmp_path / "views.json").all]
     assert order == [(view.frame_index, view.camera_index) for view in views]
@@ -54,14 +58,14 @@ def test_all_views_are_in_order_of_time_and_camera(tmp_path):
 
 def test_an_unknown_frame_rate_is_none(tmp_path):
     write_views(tmp_path / "views.json", street_views(), [])
-    assert read_views(tmp_path / "views.json").frames_per_second is None
+    assert read_views(tmp_path / "views.json").frame_rate is None
 
 
 def test_pixels_are_not_touched(tmp_path):
     """A frame whose image raises when it is read, as one would that loads it from disk."""
     view = street_views()[0]
     frame = object.__new__(Frame)
-    for name in ("camera", "time", "frame_index", "camera_index"):
+    for name in ("camera", "time", "frame_index", "camera_index", "seconds", "stamp"):
         object.__setattr__(frame, name, getattr(view, name))
     with pytest.raises(AttributeError):
         _ = frame.image
@@ -86,7 +90,7 @@ def test_a_file_that_is_not_there_says_who_writes_it(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda file: file.update(format=2), "format 2, this version reads 1"),
+        (lambda file: file.update(format=1), "format 1, this version reads 2: one below 2 is .* train again"),
         (lambda file: file["views"][1].update(split="test"), "view 1 has split 'test'"),
         (lambda file: file["views"][2]["camera_from_world"].pop(), "view 2: camera_from_world must be 4 x 4"),
         (lambda file: file["views"][2]["intrinsics"][1].pop(), "view 2: intrinsics must be 3 x 3"),

@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.data.drivestudio.layout import Layout
-from sparsestreet.data.drivestudio.poses import RIGIDITY_TOLERANCE, world_from_camera
+from sparsestreet.data.drivestudio.poses import world_from_camera
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE
 from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import NUM_JOINTS

@@ -1,18 +1,14 @@
 """Annotated objects from the instances JSON."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from sparsestreet.data.drivestudio.layout import Layout
-from sparsestreet.data.drivestudio.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, fault
+from sparsestreet.data.tracks import checked_track
 from sparsestreet.types import Track
 
 _COLUMNS = ("frame_idx", "obj_to_world", "box_size")
@@ -38,22 +34,6 @@ def read_instances(layout: Layout) -> list[Track]:
     return tracks
 
 
-def window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -> Track | None:
-    """The track inside the window, frames counted from its start, in the re-centered world; None where it is absent.
-
-    The size stays the mean over all of the log: an object does not change with the window.
-    """
-    inside = (track.frames >= frames.start) & (track.frames < frames.stop)
-    if not inside.any():
-        return None
-    poses = track.world_from_object[inside].clone()
-    poses[:, :3, 3] -= origin
-    body = None
-    if track.body is not None:
-        body = replace(track.body, rotations=track.body.rotations[inside], valid=track.body.valid[inside])
-    return replace(track, frames=track.frames[inside] - frames.start, world_from_object=poses, body=body)
-
-
 def _read_track(key: str, entry: Any, layout: Layout) -> Track:
     path, name = layout.instances, f"object {key}"
     try:
@@ -63,33 +43,7 @@ def _read_track(key: str, entry: Any, layout: Layout) -> Track:
         remedy = f"give it class_name and frame_annotations with the lists {', '.join(_COLUMNS)}"
         raise fault(path, f"{name} cannot be read ({error!r})", remedy) from error
     frames, poses, sizes = columns
-    count = len(frames)
-    if count == 0:
-        raise fault(
-            path, f"{name} ({class_name}) has no frames", "remove it, or write the frames that its boxes are from"
-        )
-    if poses.shape != (count, 4, 4) or sizes.shape != (count, 3):
-        message = f"{name} has {count} frames, but poses {poses.shape} and sizes {sizes.shape}"
-        raise fault(
-            path, message, f"write a 4x4 pose and three lengths for each frame: ({count}, 4, 4) and ({count}, 3)"
-        )
-    _check_frames(frames, path, name, layout.num_frames_on_disk)
-    if not (sizes > 0).all() or not np.isfinite(sizes).all():
-        message = f"{name} has a box of {sizes.min(axis=0).round(3).tolist()} m (smallest length, width, height)"
-        raise fault(path, message, "write positive lengths in meters, or drop the box")
-    for frame, pose in zip(frames.astype(int), torch.from_numpy(poses), strict=True):
-        check_rigid(pose, path, f"the pose of {name} at frame {frame}")
-    size = torch.from_numpy(sizes).mean(0).float()
-    return Track(key, class_name, torch.from_numpy(frames.astype(np.int64)), torch.from_numpy(poses), size)
-
-
-def _check_frames(frames: np.ndarray, path: Path, name: str, num_frames: int) -> None:
-    if frames.ndim != 1 or not (frames % 1 == 0).all() or not (np.diff(frames) > 0).all():
-        message = f"{name} has frame_idx {frames.tolist()[:5]} ..., not strictly increasing integers"
-        raise fault(path, message, "sort its boxes by frame and keep one a frame")
-    if frames[0] < 0 or frames[-1] >= num_frames:
-        message = f"{name} has boxes at frames {frames[0]:g} to {frames[-1]:g}, the log ends at {num_frames - 1}"
-        raise fault(path, message, "number frames from 0 as the images are, or drop the boxes behind the end")
+    return checked_track(key, class_name, frames, poses, sizes, path=path, num_frames=layout.num_frames_on_disk)
 
 
 def _unknown_instances(layout: Layout, known: set[str]) -> list[Problem]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sparsestreet.data.formats import published_format
 from sparsestreet.data.problems import LogError, fault
+from sparsestreet.data.window import chosen_cameras, frame_window
 
 _FRAME = re.compile(r"(\d+)")
 _CAMERA = re.compile(r"(\d+)")
@@ -79,6 +80,15 @@ class Layout:
     def bodies(self) -> Path:
         return self.root / "humanpose" / "smpl.pkl"
 
+    @property
+    def timestamps(self) -> Path:
+        """Seconds of each frame, one a line, by any clock."""
+        return self.root / "timestamps.txt"
+
+    @property
+    def has_clock(self) -> bool:
+        return self.timestamps.exists()
+
     def ego_mask(self, camera: int) -> Path | None:
         """What the recording car covers of a camera's images, the same at all frames; None where it is not told."""
         path = self.root / "ego_masks" / f"{camera}.png"
@@ -132,13 +142,9 @@ def find_layout(
     if not images or not on_disk:
         raise fault(root / "images", "the folder holds no TTT_C.jpg", "write the images as frame_camera, as 000_0.jpg")
     count = _count_frames(root, waymo, lidar)
-    last = count - 1 if last_frame == -1 else last_frame
-    if not 0 <= first_frame <= last < count:
-        raise ValueError(f"frames {first_frame} to {last_frame} are not within the log's 0 to {count - 1}: {root}")
-    chosen = tuple(on_disk) if cameras is None else tuple(cameras)
-    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(on_disk):
-        raise ValueError(f"cameras {list(chosen)} must be different ones of the log's {on_disk}: {root}")
-    frames, has_lidar = range(first_frame, last + 1), lidar and (root / "lidar").is_dir()
+    frames = frame_window(count, first_frame, last_frame, root)
+    chosen = chosen_cameras(on_disk, cameras, root)
+    has_lidar = lidar and (root / "lidar").is_dir()
     has_bodies = bodies and (root / "humanpose").is_dir()
     return Layout(root, waymo, frames, chosen, on_disk[0], count, has_lidar, has_bodies)
 

@@ -2,31 +2,29 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
-from sparsestreet.data.drivestudio.instances import read_instances, window
+from sparsestreet.data.drivestudio.files import hashed_files
+from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
+from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
-from sparsestreet.data.drivestudio.poses import world_origin
-from sparsestreet.data.drivestudio.source import Source, read_mount
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.drivestudio.poses import read_clock, world_origin
+from sparsestreet.data.drivestudio.sweeps import read_points
+from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.notes import absence_notes
+from sparsestreet.data.poses import dataset_from_world
 from sparsestreet.data.problems import LogError, Problem
 from sparsestreet.data.reader import LogReader
+from sparsestreet.data.scene_folder import SceneFolder
+from sparsestreet.data.tracks import track_in_window
 from sparsestreet.types import Track
-
-_ABSENT = {
-    "sky": "no sky masks: nothing but the images tells sky from scene, and there is no sky term in the loss",
-    "human": "no human masks: there are no metrics of human pixels",
-    "vehicle": "no vehicle masks: there are no metrics of vehicle pixels",
-    "lidar": "no lidar: Gaussians start from points in images and random ones, and there is no depth term in the loss",
-    "boxes": "no boxes: nothing is modeled as moving, whatever moves becomes part of the background",
-}
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,9 @@ class DriveStudioReader(LogReader):
     Both flavors are recognized by their files. The world keeps the data set's axes and is shifted, in float64, so
     that the vehicle (Waymo) or the front camera (nuScenes) starts at the origin. Frames are counted from the window's
     start, cameras by their place in ``cameras``. Time is frame / (frames - 1), 0 in a log of one frame.
+
+    A file ``timestamps.txt`` beside the folders is the clock: the seconds of each frame, one a line, by any zero. All
+    cameras and the lidar share the stamp of their frame.
     """
 
     root: Path | str
@@ -74,23 +75,29 @@ class DriveStudioReader(LogReader):
             raise LogError(problems)
         origin = world_origin(layout)
         tracks, people = _read_tracks(layout, origin)
-        mounts = [
-            read_mount(layout, index, number, self.width, self.min_lens_shift)
-            for index, number in enumerate(layout.cameras)
-        ]
-        source = Source(layout, mounts, origin, 1_000_000 * self.cache_mb, lambda: check_layout(layout, contents=True))
-        dataset_from_world = torch.eye(4, dtype=torch.float64)
-        dataset_from_world[:3, 3] = origin
+        clock, rig = read_clock(layout), read_rig(layout, self.width, self.min_lens_shift)
+        folder = SceneFolder(
+            read_views(layout, rig, origin, clock),
+            partial(read_frame, layout, rig),
+            partial(read_points, layout, origin) if layout.has_lidar else None,
+            clock=clock,
+            cache_bytes=1_000_000 * self.cache_mb,
+            check=lambda: check_layout(layout, contents=True),
+        )
         return DrivingLog(
             name=layout.root.resolve().name,
-            frames=Frames(source.views, source.frame),
-            sweeps=Sweeps(range(len(layout.frames)) if layout.has_lidar else (), source.sweep, source.gray_sweep),
+            frames=folder.frames,
+            sweeps=folder.sweeps,
             tracks=tracks,
             num_frames=len(layout.frames),
-            num_cameras=len(mounts),
-            dataset_from_world=dataset_from_world,
-            notes=(*_notes(layout), *(mount.note for mount in mounts if mount.note is not None), *people),
+            num_cameras=len(rig),
+            dataset_from_world=dataset_from_world(origin),
+            notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
         )
+
+    def files(self) -> LogFiles:
+        """Those of the chosen frames and cameras, of every kind that the folder has."""
+        return hashed_files(self._layout())
 
     def _layout(self) -> Layout:
         return find_layout(
@@ -108,11 +115,17 @@ def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Tr
     if not layout.has_instances:
         return (), ()
     tracks, notes = with_bodies(read_instances(layout), layout)
-    windows = [window(track, layout.frames, origin) for track in tracks]
+    windows = [track_in_window(track, layout.frames, origin) for track in tracks]
     return tuple(track for track in windows if track is not None), notes
 
 
 def _notes(layout: Layout) -> tuple[str, ...]:
-    present = {kind: layout.mask_folder(kind) is not None for kind in ("sky", "human", "vehicle")}
-    present |= {"lidar": layout.has_lidar, "boxes": layout.has_instances}
-    return tuple(sentence for kind, sentence in _ABSENT.items() if not present[kind])
+    sky, human, vehicle = (layout.mask_folder(kind) is not None for kind in ("sky", "human", "vehicle"))
+    return absence_notes(
+        sky=sky,
+        human=human,
+        vehicle=vehicle,
+        lidar=layout.has_lidar,
+        boxes=layout.has_instances,
+        clock=layout.has_clock,
+    )

@@ -1,19 +1,17 @@
 """Lidar sweeps from their files."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import read_pose
+from sparsestreet.data.lidar import check_points
 from sparsestreet.data.problems import fault
 from sparsestreet.geometry.transforms import transform_points
 
-_FARTHEST = 1000.0
-"""Meters: no street lidar reaches this far, so a point beyond it is not a point."""
+_REMEDY = "drop these returns, and make sure that the rows have the flavor's columns"
 
 
 def check_sweep_size(layout: Layout, frame: int) -> None:
@@ -27,19 +25,16 @@ def check_sweep_size(layout: Layout, frame: int) -> None:
         raise fault(path, message, remedy)
 
 
+def read_points(layout: Layout, origin: Float64[Tensor, "3"], index: int) -> Float[Tensor, "n 3"]:
+    """Points of a frame of the window in the re-centered world; raises as ``read_sweep``."""
+    return (read_sweep(layout, layout.frames[index]) - origin).float()
+
+
 def read_sweep(layout: Layout, frame: int) -> Float64[Tensor, "n 3"]:
     """Points of one instant in the data set's world, meters; raises LogError for broken rows or a broken pose."""
     check_sweep_size(layout, frame)
     path = layout.sweep(frame)
     rows = np.fromfile(path, dtype="<f4").reshape(-1, layout.sweep_columns)
     points = torch.from_numpy(rows[:, layout.sweep_xyz].astype(np.float64))
-    _check_points(points, path)
+    check_points(points, path, remedy=_REMEDY)
     return transform_points(read_pose(layout.sweep_pose(frame)), points)
-
-
-def _check_points(points: Float64[Tensor, "n 3"], path: Path) -> None:
-    # A NaN compares false, so it counts as broken too.
-    broken = int((~(points.abs() <= _FARTHEST)).any(-1).sum())
-    if broken:
-        message = f"{broken} of {points.shape[0]} points are NaN, infinite or more than {_FARTHEST:g} m away"
-        raise fault(path, message, "drop these returns, and make sure that the rows have the flavor's columns")

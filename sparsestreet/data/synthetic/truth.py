@@ -47,11 +47,8 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
             chosen = [index for index in near if world.actors[index].model.class_name in names]
             return torch.from_numpy(np.isin(image.object_indices, chosen))
 
-        return Frame(
-            camera,
-            view.time,
-            view.frame_index,
-            view.camera_index,
+        return Frame.of(
+            view,
             image=torch.from_numpy(image.rgb),
             sky=torch.from_numpy(image.sky),
             human=of_classes(HUMAN_CLASSES),

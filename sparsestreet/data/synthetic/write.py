@@ -53,7 +53,7 @@ class StreetWriter:
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
         self._bodies.write(self.root / "humanpose" / "smpl.pkl")
         times = np.arange(self.settings.num_frames) / self.settings.frame_rate
-        np.savetxt(self.root / "timestamps.txt", times, fmt="%.6f")
+        np.savetxt(self.root / "timestamps.txt", times, fmt="%.9f")
 
     def _file(self, folder: str, name: str) -> Path:
         (self.root / folder).mkdir(parents=True, exist_ok=True)

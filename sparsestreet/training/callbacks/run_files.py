@@ -71,7 +71,9 @@ class RunFiles(Callback, RowListener):
         stored = StoredScene(system.scene, system.options, log.name, log.num_frames)
         with stage("save"):
             save_scene(self.folder / FILE_NAME, stored)
-            views.write_views(self.folder / views.FILE_NAME, split.train.views, split.held_out.views)
+            views.write_views(
+                self.folder / views.FILE_NAME, split.train.views, split.held_out.views, frame_rate=log.frame_rate
+            )
             RUN.write(self.folder, description)
         return description
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 
+from sparsestreet.data.clock import LogClock
 from sparsestreet.data.images import check_pixels, image_size, read_image
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
@@ -36,7 +37,7 @@ class PicturesReader(LogReader):
         if problems := self.check():
             raise LogError(problems)
         count = len(list(self.folder.glob("*.png")))
-        views = [View(self._camera(index), index / max(count - 1, 1), index, 0) for index in range(count)]
+        views = [LogClock(count).view(self._camera(index), index, 0) for index in range(count)]
         no_shift = torch.eye(4, dtype=torch.float64)
         return DrivingLog(self.folder.name, Frames(views, self._frame), (), (), count, 1, no_shift)
 
@@ -49,7 +50,7 @@ class PicturesReader(LogReader):
 
     def _frame(self, view: View) -> Frame:
         image = read_image(self._path(view.frame_index), (view.camera.width, view.camera.height))
-        return Frame(view.camera, view.time, view.frame_index, view.camera_index, image=image)
+        return Frame.of(view, image=image)
 
     def _path(self, index: int) -> Path:
         return self.folder / f"{index:03d}.png"

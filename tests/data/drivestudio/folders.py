@@ -12,6 +12,8 @@ from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 40, 24, 40.0
 COLORS = ((200, 30, 30), (30, 30, 200), (30, 200, 30))
+FIRST_STAMP, STEP = 1_532_402_927_600_000_251, 100_000_000
+"""Nanoseconds since 1970, as nuScenes and Argoverse count; 10 frames a second."""
 CAR = np.array([10.0, 2.0, 0.75])
 CAR_SIZE = [4.0, 2.0, 1.5]
 
@@ -79,6 +81,13 @@ def write_common(root: Path, frames: int, cameras: int, offset: np.ndarray) -> N
     info = {"0": {"id": "a1", "class_name": "Vehicle", "frame_annotations": annotations}}
     write_json(root / "instances/instances_info.json", info)
     write_json(root / "instances/frame_instances.json", {str(frame): [0] for frame in range(frames)})
+    write_stamps(root, [FIRST_STAMP + frame * STEP for frame in range(frames)])
+
+
+def write_stamps(root: Path, stamps: list[int]) -> None:
+    """Nanoseconds as decimal seconds; no float in between rounds them."""
+    lines = [f"{stamp // 10**9}.{stamp % 10**9:09d}\n" for stamp in stamps]
+    (root / "timestamps.txt").write_text("".join(lines))
 
 
 def write_matrix(path: Path, matrix: np.ndarray) -> None:

@@ -132,6 +132,14 @@ CORRUPTIONS = {
     "frame behind the end": (boxes(frame_idx=[0, 1, 3]), INFO, "ends at 2"),
     "NaN box pose": (boxes(obj_to_world=[np.full((4, 4), np.nan).tolist()] * 3), INFO, "NaN"),
     "scaled box pose": (boxes(obj_to_world=[np.diag([2.0, 1, 1, 1]).tolist()] * 3), INFO, "rigid"),
+    "too few stamps": (text("timestamps.txt", "0.0\n0.1\n"), "timestamps.txt", "3 stamps, got 2"),
+    "stamps out of order": (text("timestamps.txt", "0.0\n0.2\n0.1\n"), "timestamps.txt", "must increase"),
+    "a stamp that is no number": (text("timestamps.txt", "0.0\n0,1\n0.2\n"), "timestamps.txt", "'0,1' is no number"),
+    "a folder for a clock": (
+        lambda root: (root / "timestamps.txt").rename(root / "old.txt") and (root / "timestamps.txt").mkdir(),
+        "timestamps.txt",
+        "cannot be read",
+    ),
     "unknown object": (text("instances/frame_instances.json", '{"0": [7]}'), "instances/frame_instances.json", "7"),
     "fine masks for one class": (
         lambda root: shutil.copytree(root / "dynamic_masks/human", root / "fine_dynamic_masks/human"),

@@ -33,6 +33,8 @@ def test_it_holds_what_its_description_says(log):
     assert {track.class_name for track in log.tracks} == {"Car", "Cyclist", "Tram"}
     (tram,) = (track for track in log.tracks if track.class_name == "Tram")
     assert tram.path_length > 30
+    # The file's last stamp is 6.080000162 s.
+    assert log.frame_rate == pytest.approx(59 / 6.080000162, rel=1e-9)
     assert len(log.notes) == 1
     assert "sky" in log.notes[0]
 

@@ -17,9 +17,11 @@ from tests.data.drivestudio.folders import (
     CAR,
     CAR_SIZE,
     COLORS,
+    FIRST_STAMP,
     FOCAL,
     HEIGHT,
     POINTS_IN_WORLD,
+    STEP,
     WIDTH,
     make_nuscenes,
     make_waymo,
@@ -27,6 +29,7 @@ from tests.data.drivestudio.folders import (
     write_image,
     write_json,
     write_lines,
+    write_stamps,
 )
 from tests.scene.street import background
 
@@ -45,6 +48,38 @@ def test_frames_are_ordered_and_timed(make, tmp_path):
     assert [sweep.index for sweep in log.sweeps] == [0, 1, 2]
     assert log.frames[0].image.dtype == torch.uint8
     assert (log.frames[0].camera.width, log.frames[0].camera.height) == (WIDTH, HEIGHT)
+
+
+@FLAVORS
+def test_frames_and_sweeps_have_the_stamps_of_the_folder(make, tmp_path):
+    """A clock that is not even: 10 frames a second on the whole."""
+    stamps = [FIRST_STAMP, FIRST_STAMP + 70_000_000, FIRST_STAMP + 200_000_000]
+    write_stamps(make(tmp_path), stamps)
+    log = DriveStudioReader(tmp_path).read()
+    assert [frame.stamp for frame in log.frames] == [stamp for stamp in stamps for _ in range(2)]
+    assert [frame.seconds for frame in log.frames[::2]] == [0.0, 0.07, 0.2]
+    assert [frame.time for frame in log.frames[::2]] == [0.0, 0.5, 1.0]
+    for sweeps in (log.sweeps, log.sweeps.gray()):
+        assert [(sweep.seconds, sweep.stamp) for sweep in sweeps] == list(zip([0.0, 0.07, 0.2], stamps, strict=True))
+    assert (log.frame_rate, list(log.stamps.values())) == (10.0, stamps)
+
+
+def test_the_clock_of_a_window_starts_at_its_first_frame(tmp_path):
+    make_nuscenes(tmp_path, frames=6)
+    log = DriveStudioReader(tmp_path, first_frame=2, last_frame=4).read()
+    assert log.stamps == {0: FIRST_STAMP + 2 * STEP, 1: FIRST_STAMP + 3 * STEP, 2: FIRST_STAMP + 4 * STEP}
+    assert log.seconds == {0: 0.0, 1: 0.1, 2: 0.2}
+    assert log.frame_rate == 10.0
+    assert DriveStudioReader(tmp_path, last_frame=0).read().frame_rate is None
+
+
+def test_a_log_without_a_clock_says_so(tmp_path):
+    (make_nuscenes(tmp_path) / "timestamps.txt").unlink()
+    assert DriveStudioReader(tmp_path).check() == []
+    log = DriveStudioReader(tmp_path).read()
+    (note,) = log.notes
+    assert note.startswith("no clock: the frame rate is unknown")
+    assert (log.frame_rate, log.frames[0].seconds, log.sweeps[0].stamp) == (None, None, None)
 
 
 @FLAVORS

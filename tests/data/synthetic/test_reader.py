@@ -13,7 +13,7 @@ from sparsestreet.data.synthetic.world import Actor, build_world
 from sparsestreet.geometry.cameras import project
 
 SETTINGS = StreetSettings(
-    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1,
+    seed=1, num_frames=2, width=64, height=40, num_cameras=2, supersampling=1, frame_rate=12.0,
     lidar=replace(WAYMO_TOP, beams=12, azimuth_steps=120),
 )  # fmt: skip
 
@@ -22,6 +22,9 @@ SETTINGS = StreetSettings(
 def test_a_street_opens_as_a_log(tmp_path):
     log = StreetReader(SETTINGS, tmp_path / "street").read()
     assert (log.num_frames, log.num_cameras, len(log.sweeps)) == (2, 2, 2)
+    # Written in decimals of a nanosecond.
+    assert log.frame_rate == pytest.approx(12.0, rel=1e-8)
+    assert log.sweeps[1].seconds == pytest.approx(1 / 12, abs=1e-9)
     world = build_world(SETTINGS)
     ego_from_world = torch.linalg.inv(torch.from_numpy(world.ego.pose(0.0)))
     seen_from_camera = torch.stack([_in_camera(ego_from_world, actor) for actor in world.actors])

@@ -45,6 +45,7 @@ def test_at_recorded_views_it_is_what_was_recorded(settings, request, tmp_path):
         for name in ("sky", "human", "vehicle"):
             assert (getattr(found, name) != getattr(frame, name)).float().mean() < 1e-3
         assert (found.frame_index, found.camera_index) == (frame.frame_index, frame.camera_index)
+        assert (found.seconds, found.stamp) == (frame.frame_index / 2, frame.frame_index * 500_000_000)
         people, vehicles = people + int(frame.human.sum()), vehicles + int(frame.vehicle.sum())
     assert people > 20
     assert vehicles > 200

@@ -1,5 +1,6 @@
 """What a training leaves for everybody else, when, and what run.json says of it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,8 @@ def trainer(tmp_path) -> StubTrainer:
     clock = Clock()
     clock.load_state_dict({"seconds": 12.5})
     trainer = StubTrainer(make_system(nodes, options=OPTIONS), [RunFiles(tmp_path, make_run(), clock)], max_steps=10)
-    log = DrivingLog("seven", tuple(frame_at(index) for index in range(7)), (), (), 7, 1, torch.eye(4).double())
+    frames = tuple(replace(frame_at(index), seconds=0.25 * index, stamp=250_000_000 * index) for index in range(7))
+    log = DrivingLog("seven", frames, (), (), 7, 1, torch.eye(4).double())
     trainer.datamodule = StreetData(log, stride=3, offset=1)
     trainer.walk(3)
     return trainer
@@ -52,6 +54,7 @@ def check_whole(trainer: StubTrainer, folder: Path) -> None:
     views = read_views(folder / "views.json")
     assert [view.frame_index for view in views.training] == [0, 2, 3, 5, 6]
     assert [view.frame_index for view in views.held_out] == [1, 4]
+    assert (views.frame_rate, [view.seconds for view in views.held_out]) == (4.0, [0.25, 1.0])
     run = RUN.read(folder)
     assert (run.steps, run.training_seconds) == (trainer.global_step, 12.5)
     assert run.label == make_run().label

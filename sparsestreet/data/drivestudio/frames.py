@@ -1,0 +1,59 @@
+"""Views from poses and calibrations, and frames from the files of images and masks."""
+
+from collections.abc import Sequence
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from sparsestreet.data.clock import LogClock
+from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
+from sparsestreet.data.drivestudio.poses import read_intrinsics, world_from_camera
+from sparsestreet.data.images import image_size, read_image, read_mask
+from sparsestreet.data.poses import recentered
+from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.types import Frame, View
+
+
+def read_rig(layout: Layout, width: int | None, min_lens_shift: float | None) -> list[RigCamera]:
+    """The chosen cameras; raises as ``rig_camera``."""
+    rig = []
+    for index, number in enumerate(layout.cameras):
+        intrinsics, distortion = read_intrinsics(layout.intrinsics(number))
+        rig.append(
+            rig_camera(
+                number,
+                index,
+                intrinsics=intrinsics,
+                distortion=distortion,
+                recorded_size=image_size(layout.image(layout.frames[0], number)),
+                width=width,
+                min_lens_shift=min_lens_shift,
+            )
+        )
+    return rig
+
+
+def read_views(layout: Layout, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> list[View]:
+    """Every view of the window, in the re-centered world; raises LogError for a broken pose."""
+    views = []
+    for index, frame in enumerate(layout.frames):
+        for mounted in rig:
+            camera = mounted.at(recentered(world_from_camera(layout, frame, mounted.name), origin))
+            views.append(clock.view(camera, index, mounted.index))
+    return views
+
+
+def read_frame(layout: Layout, rig: Sequence[RigCamera], view: View) -> Frame:
+    """The view with its image and masks, decoded; raises LogError where a file is broken."""
+    number, camera = layout.frames[view.frame_index], rig[view.camera_index]
+    paths = {kind: layout.mask(kind, number, camera.name) for kind in MASK_KINDS}
+    masks = {
+        kind: None if path is None else read_mask(path, camera.size, sky=kind == "sky") for kind, path in paths.items()
+    }
+    ego = layout.ego_mask(camera.name)
+    return Frame.of(
+        view,
+        image=read_image(layout.image(number, camera.name), camera.size),
+        ego=None if ego is None else read_mask(ego, camera.size, sky=False),
+        **masks,
+    )

@@ -1,0 +1,98 @@
+"""A log on disk: its views are known at once, its images and points are read when a frame or a sweep is asked for."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.data.clock import LogClock
+from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
+from sparsestreet.data.lidar import color_points, depth_image, seen_points
+from sparsestreet.data.problems import LogError, Problem
+from sparsestreet.types import Frame, Sweep, View
+
+T = TypeVar("T")
+
+
+class SceneFolder:
+    """Frames with the lidar depth of their instant, and sweeps in the colors of its images, from what decodes files."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        read_frame: Callable[[View], Frame],
+        read_points: Callable[[int], Float[Tensor, "n 3"]] | None,
+        *,
+        clock: LogClock,
+        cache_bytes: int,
+        check: Callable[[], list[Problem]],
+    ) -> None:
+        """
+        Args:
+            views: of the log, ordered by (frame_index, camera_index), in its re-centered world.
+            read_frame: decodes the image and the masks of a view; depth is added here.
+            read_points: lidar points of a frame index in the log's world; None: the log has no lidar.
+            clock: whose stamps are those of the sweeps.
+            cache_bytes: of decoded frames that are kept in memory.
+            check: finds everything that is wrong with the folder; it is asked once something is.
+        """
+        self._views: dict[int, list[View]] = {}
+        for view in views:
+            self._views.setdefault(view.frame_index, []).append(view)
+        self._read_pixels = read_frame
+        self._clock = clock
+        self._check = check
+        self._frames = RecentlyUsed(self._read_frame, _count_bytes, cache_bytes)
+        # The cameras of one instant are mostly asked for in a row, and look at the same points.
+        self._points = None if read_points is None else RecentlyUsed(read_points, lambda points: 1, 1)
+
+    @property
+    def frames(self) -> Frames:
+        """Decoded when indexed; raises LogError then, with all problems of the folder, where a file is broken."""
+        return Frames([view for rig in self._views.values() for view in rig], self._frame)
+
+    @property
+    def sweeps(self) -> Sweeps:
+        """Read when indexed, and colored by the images of their instant; empty without lidar. Raises as ``frames``."""
+        return Sweeps(() if self._points is None else self._views, self._sweep, self._gray_sweep)
+
+    def _frame(self, view: View) -> Frame:
+        return self._explained(lambda: self._frames((view.frame_index, view.camera_index)))
+
+    def _sweep(self, index: int) -> Sweep:
+        return self._explained(lambda: self._read_sweep(index))
+
+    def _gray_sweep(self, index: int) -> Sweep:
+        return self._explained(lambda: self._read_gray_sweep(index))
+
+    def _explained(self, read: Callable[[], T]) -> T:
+        try:
+            return read()
+        except LogError as error:
+            raise LogError(self._check() or error.problems) from error
+
+    def _read_frame(self, key: tuple[int, int]) -> Frame:
+        index, camera_index = key
+        (view,) = (view for view in self._views[index] if view.camera_index == camera_index)
+        frame = self._read_pixels(view)
+        return frame if self._points is None else replace(frame, depth=depth_image(self._points(index), view.camera))
+
+    def _read_sweep(self, index: int) -> Sweep:
+        frames = [self._frames((index, view.camera_index)) for view in self._views[index]]
+        points = self._points(index)
+        colors, colored = color_points(points, [(frame.camera, frame.image) for frame in frames])
+        return Sweep(index, points, colors, colored, *self._clock.moment(index))
+
+    def _read_gray_sweep(self, index: int) -> Sweep:
+        """The same without colors, for which no image need be decoded."""
+        points = self._points(index)
+        seen = seen_points(points, [view.camera for view in self._views[index]])
+        return Sweep(index, points, torch.full_like(points, 0.5), seen, *self._clock.moment(index))
+
+
+def _count_bytes(frame: Frame) -> int:
+    pixels = (frame.image, frame.sky, frame.human, frame.vehicle, frame.depth, frame.ego)
+    return sum(part.nbytes for part in pixels if part is not None)
