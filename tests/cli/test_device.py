@@ -30,9 +30,9 @@ def test_any_other_is_refused(without_gpu):
 
 
 def test_commands_say_what_asked_for_it(without_gpu, tmp_path):
-    with pytest.raises(ValueError, match="device=cuda needs a CUDA device .*: say device=cpu"):
+    with pytest.raises(ValueError, match=r"device=cuda needs a CUDA device .*: say device=cpu"):
         open_scene(tmp_path, "cuda")
     run = replace(make_run(), device="cuda: NVIDIA H100")
-    with pytest.raises(ValueError, match="trained on cuda: NVIDIA H100 needs .* another machine's; say device=cpu"):
+    with pytest.raises(ValueError, match=r"trained on cuda: NVIDIA H100 needs .* another machine's; say device=cpu"):
         _device(run, None)
     assert _device(run, "cpu") == torch.device("cpu")
