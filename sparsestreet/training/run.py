@@ -69,7 +69,7 @@ def train(
 ) -> RunSummary | None:
     """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
 
-    Of several processes each one trains; the first alone writes, evaluates and answers with more than None.
+    Of several processes each one trains; the first alone writes, evaluates and returns a summary.
 
     Args:
         recipe: the parts of the training. Its callbacks keep state: take a new recipe for another run.
@@ -93,6 +93,7 @@ def train(
         SystemExit: with the status of the signal that ended training, after a checkpoint was written.
     """
     identity, extra = identity or RunIdentity(label=out.name), extra or ExtraMetrics()
+    checkpoint = resume if resume is None or resume.is_file() else newest_checkpoint(resume)
     with stages or StageRecorder() as stages:
         system = build(recipe, data)
 
@@ -111,7 +112,7 @@ def train(
         try:
             with stage("train"):
                 trainer = fit(
-                    system, data, callbacks, make_trainer, out, max_steps=max_steps, logger=logger, resume=resume
+                    system, data, callbacks, make_trainer, out, max_steps=max_steps, logger=logger, start=checkpoint
                 )
         except SystemExit:
             sys.exit(stop.exit_status or 1)
@@ -151,15 +152,14 @@ def fit(
     *,
     max_steps: int,
     logger: Logger | bool = False,
-    resume: Path | None = None,
+    start: Path | None = None,
 ) -> Trainer:
-    """Train to the end, or from a checkpoint on; answers with the trainer.
+    """Train to the end, from the checkpoint ``start`` on if there is one; returns the trainer.
 
     Lightning's Trainer is made with these callbacks, in their order, and nothing of its own beside them.
 
-    Raises SystemExit where a signal ended training, FileNotFoundError where there is nothing to resume.
+    Raises SystemExit where a signal ended training.
     """
-    checkpoint = newest_checkpoint(resume) if resume is not None and resume.is_dir() else resume
     trainer = make_trainer(
         max_steps=max_steps,
         max_epochs=-1,
@@ -170,13 +170,13 @@ def fit(
         enable_progress_bar=False,
         enable_checkpointing=False,
     )
-    if checkpoint is None:
+    if start is None:
         trainer.fit(system, datamodule=data)
         return trainer
     # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
-    step = torch.load(checkpoint, map_location="cpu", weights_only=False)["global_step"]
+    step = torch.load(start, map_location="cpu", weights_only=False)["global_step"]
     with kept_curves(out, step if trainer.is_global_zero else None):
-        trainer.fit(system, datamodule=data, ckpt_path=checkpoint, weights_only=False)
+        trainer.fit(system, datamodule=data, ckpt_path=start, weights_only=False)
     return trainer
 
 

@@ -109,6 +109,12 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(whole, tmp_path):
     assert (tmp_path / ledger).read_text() == (whole / ledger).read_text()
 
 
+def test_a_run_that_is_not_there_is_an_error_before_anything_is_built(tmp_path):
+    unbuilt = Recipe(nodes={})
+    with pytest.raises(FileNotFoundError, match="has no checkpoint to go on from"):
+        train(unbuilt, data(), tmp_path / "new", resume=tmp_path / "old")
+
+
 class NotTheFirst(SingleDeviceStrategy):
     """As a process that is not the first of several sees itself, without the others."""
 
