@@ -11,6 +11,9 @@ from pathlib import Path
 def atomic_file(path: Path) -> Iterator[Path]:
     """A file to write beside ``path``; it takes its place when the block ends, and goes when the block fails.
 
+    A block that writes nothing changes nothing: of several processes that save together, the first writes and the
+    others come here with nothing to say (``Trainer.save_checkpoint`` must be called by all).
+
     Raises OSError before the block where nothing can be written.
     """
     # The ending stays, because some writers choose the format by it.
@@ -21,13 +24,15 @@ def atomic_file(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
         mode = temporary.stat().st_mode
+        temporary.unlink()
     except OSError as error:
         raise _unwritable(path, error) from error
     try:
         yield temporary
-        # Some writers (safetensors) leave a file that only its owner may read.
-        temporary.chmod(mode)
-        os.replace(temporary, path)
+        if temporary.exists():
+            # Some writers (safetensors) leave a file that only its owner may read.
+            temporary.chmod(mode)
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 

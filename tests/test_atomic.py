@@ -20,9 +20,19 @@ def test_a_file_takes_its_place_when_it_is_whole(tmp_path):
 def test_a_file_may_be_read_by_whom_the_user_lets_read(tmp_path):
     (tmp_path / "plain").write_text("")
     with atomic_file(tmp_path / "a.txt") as temporary:
-        temporary.unlink()
         temporary.touch(mode=0o600)
     assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
+    """As on a process that leaves writing to another one."""
+    old, new = tmp_path / "old.txt", tmp_path / "new.txt"
+    old.write_text("old")
+    for path in (old, new):
+        with atomic_file(path) as temporary:
+            assert not temporary.exists()
+    assert old.read_text() == "old"
+    assert names(tmp_path) == ["old.txt"]
 
 
 @pytest.mark.parametrize("stopped_by", [RuntimeError, KeyboardInterrupt])

@@ -1,20 +1,16 @@
 """From a config to the objects of a run."""
 
 import shlex
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
-import torch
 from hydra.utils import instantiate
-from lightning import Callback, Trainer
+from lightning import Trainer
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.log import DrivingLog
-from sparsestreet.evaluation.speed import device_name
-from sparsestreet.records.configuration import config_hash, flat_config
-from sparsestreet.records.provenance import this_machine, this_source
-from sparsestreet.records.run import RunDescription
+from sparsestreet.records.configuration import flat_config
+from sparsestreet.training.identity import RunIdentity
 from sparsestreet.training.recipe import Recipe
 
 
@@ -31,9 +27,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         seed=cfg.seed,
         image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,
     )
-    problems = recipe.problems()
-    if problems:
-        raise ValueError("; ".join(problems))
+    recipe.check()
     return recipe
 
 
@@ -43,49 +37,26 @@ def data_of(cfg: DictConfig) -> StreetData:
     return StreetData(log, **cfg.split, seed=cfg.seed)
 
 
-def trainer_of(cfg: DictConfig, callbacks: Sequence[Callback], out: Path) -> Trainer:
-    """Lightning's, with these callbacks and nothing of its own beside them."""
-    return instantiate(
-        cfg.trainer,
-        callbacks=list(callbacks),
-        logger=instantiate(cfg.logger) if cfg.logger else False,
-        default_root_dir=str(out),
-        enable_model_summary=False,
-        enable_progress_bar=False,
-        enable_checkpointing=False,
-        max_epochs=-1,
-    )
+def trainer_of(cfg: DictConfig) -> Callable[..., Trainer]:
+    """What makes Lightning's trainer, once its callbacks are there."""
+    return instantiate(cfg.trainer, _partial_=True)
 
 
-def description_of(cfg: DictConfig, log: DrivingLog, device: torch.device, command: str) -> RunDescription:
-    """What identifies a run that is about to start on a device."""
-    config = flat_config(OmegaConf.to_container(cfg, resolve=True))
-    return RunDescription(
+def logger_of(cfg: DictConfig) -> Logger | bool:
+    """Where curves go; False: nowhere."""
+    return instantiate(cfg.logger) if cfg.logger else False
+
+
+def identity_of(cfg: DictConfig, command: str) -> RunIdentity:
+    """What the run is called in its records. Reads the log's files for their hash."""
+    return RunIdentity(
+        label=cfg.name,
         method=cfg.method.name,
         sparsify=cfg.sparsify.name,
-        label=cfg.name,
-        scene=log.name,
-        seed=cfg.seed,
-        split=split_in_words(cfg),
-        config=config,
-        config_hash=config_hash(config),
+        config=flat_config(OmegaConf.to_container(cfg, resolve=True)),
         data_hash=instantiate(cfg.data.log, _convert_="all").data_hash(),
         command=command,
-        device=device_name(device),
-        threads=torch.get_num_threads(),
-        steps=0,
-        max_steps=cfg.schedule.max_steps,
-        training_seconds=None,
-        noise=None,
-        caps={},
-        machine=this_machine(),
-        source=this_source(),
     )
-
-
-def split_in_words(cfg: DictConfig) -> str:
-    """Which frames are held out."""
-    return f"every {cfg.split.stride}th frame from {cfg.split.offset}" if cfg.split.stride else "none"
 
 
 def this_command(words: Sequence[str]) -> str:

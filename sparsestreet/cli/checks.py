@@ -8,12 +8,13 @@ import re
 import typing
 from collections.abc import Iterable, Iterator, Sequence
 
-import torch
 from beartype.door import is_bearable
 from beartype.roar import BeartypeException
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from sparsestreet.cli.device import device_of
 
 Tree = typing.Any
 
@@ -90,6 +91,9 @@ def _device_problem(cfg: DictConfig) -> str | None:
             f"training runs on one device, got trainer.devices={devices}: several would train on the same frames; "
             "start one run a device, as a sweep does"
         )
-    if cfg.trainer.get("accelerator") in ("gpu", "cuda") and not torch.cuda.is_available():
-        return "trainer=gpu needs a CUDA device and torch sees none: train with trainer=cpu, or check the driver"
+    if cfg.trainer.get("accelerator") in ("gpu", "cuda"):
+        try:
+            device_of("cuda", "trainer=gpu", "train with trainer=cpu, or check the driver")
+        except ValueError as error:
+            return str(error)
     return None

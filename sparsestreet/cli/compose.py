@@ -1,6 +1,5 @@
 """Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
 
-import difflib
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
+from sparsestreet.cli.options import unknown_key
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.
@@ -73,7 +73,7 @@ def override_problem(overrides: list[str], config_name: str = "train") -> str | 
                 return f"{text!r} is no override: write key=value"
             # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
             if text.startswith("+") and not text.startswith(ADDABLE):
-                return _unknown_key(text.lstrip("+").partition("=")[0], config_name)
+                return unknown_key(text.lstrip("+").partition("=")[0], _known(config_name))
         # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
         single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
         try:
@@ -124,16 +124,11 @@ def _explain(reason: str, overrides: list[str], config_name: str) -> str:
     key = next((name for name in given if part in name.split(".") or name == part), part)
     if key in _known(config_name):
         return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
-    return _unknown_key(key, config_name)
+    return unknown_key(key, _known(config_name))
 
 
 def _options(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-
-
-def _unknown_key(key: str, config_name: str) -> str:
-    close = difflib.get_close_matches(key, _known(config_name), n=1, cutoff=0.5)
-    return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else "")
 
 
 def _known(config_name: str) -> list[str]:

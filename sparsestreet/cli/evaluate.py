@@ -9,14 +9,14 @@ from hydra.utils import instantiate
 
 from sparsestreet.cli.assemble import data_of, this_command
 from sparsestreet.cli.compose import load_run_config
+from sparsestreet.cli.device import device_of
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
 from sparsestreet.evaluation.extra import ExtraMetrics
-from sparsestreet.evaluation.run import evaluate_scene
-from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.provenance import this_machine
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.records.summary import SUMMARY
+from sparsestreet.training.run import evaluate as evaluate_run
 
 USAGE = """\
 sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true] [presets=fast,default,exact]
@@ -47,9 +47,9 @@ class Options:
     presets: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        self.looks(ExtraMetrics())
+        self.extra(ExtraMetrics())
 
-    def looks(self, of_run: ExtraMetrics) -> ExtraMetrics:
+    def extra(self, of_run: ExtraMetrics) -> ExtraMetrics:
         """What is asked for, else what the run's configuration asks for."""
         asked = {name: getattr(self, name) for name in ("novel", "ramp", "presets")}
         return replace(of_run, **{name: value for name, value in asked.items() if value is not None})
@@ -67,35 +67,34 @@ def _evaluate(options: Options) -> None:
         raise ValueError(f"{run} is of an earlier version, its configuration lacks 'evaluation': train it again")
     # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
     torch.set_num_threads(min(description.threads, this_machine().cores))
-    looks = options.looks(instantiate(cfg.evaluation, _convert_="all"))
-    command = this_command(["evaluate", f"run={run}", *looks.words()])
+    extra = options.extra(instantiate(cfg.evaluation, _convert_="all"))
     stored = open_scene(run, "cpu")
-    data = data_of(cfg)
-    summary = evaluate_scene(
+    summary = evaluate_run(
         stored.scene,
-        data.split.held_out,
-        data.split.train,
-        run=description,
-        options=stored.options,
-        out=run,
-        command=command,
+        stored.options,
+        data_of(cfg),
+        run,
         device=_device(description, options.device),
+        command=this_command(["evaluate", f"run={run}", *extra_words(extra)]),
+        extra=extra,
+        say=print,
     )
-    draw_history(run)
     for split, quality in summary.quality.items():
         print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
     latency = summary.latency
     steady = "" if latency.noise.quiet else " on a machine that was not quiet"
     print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {SUMMARY.path(run)}")
-    looks.take(stored.scene, data, stored.options, out=run, command=command, say=print)
+
+
+def extra_words(extra: ExtraMetrics) -> list[str]:
+    """What asks this command for these metrics."""
+    novel = [f"novel={','.join(f'{offset:g}' for offset in extra.novel)}"] if extra.novel else []
+    ramp = ["ramp=true"] if extra.ramp else []
+    return [*novel, *ramp, *([f"presets={','.join(extra.presets)}"] if extra.presets else [])]
 
 
 def _device(description: RunDescription, device: str | None) -> torch.device:
-    """The one that is asked for, else of the kind that trained. Raises ValueError where that is not there."""
-    wanted = torch.device(device or description.device.partition(":")[0])
-    if wanted.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(
-            f"the run was trained on {description.device} and torch sees no CUDA device here: its milliseconds would "
-            "be another machine's; say device=cpu to measure on the CPU all the same"
-        )
-    return wanted
+    """The one that is asked for, else of the kind that trained."""
+    asker = f"device={device}" if device else f"a run that was trained on {description.device}"
+    remedy = "its milliseconds would be another machine's; say device=cpu to measure on the CPU all the same"
+    return device_of(device or description.device.partition(":")[0], asker, remedy)

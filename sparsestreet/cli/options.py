@@ -12,6 +12,9 @@ from typing import Any, TypeVar
 
 Options = TypeVar("Options")
 
+FEW = 20
+"""Keys that an error still lists."""
+
 _WORDS = {"true": True, "false": False}
 
 
@@ -90,10 +93,12 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | N
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:
-    """One line about a key that does not exist, with the one that was probably meant."""
+    """One line about a key that does not exist, with the one that was probably meant, or all where they are few."""
     known = list(known)
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-    return f"no key {key!r}" + (f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(known)}")
+    if close:
+        return f"no key {key!r}; did you mean {close[0]!r}?"
+    return f"no key {key!r}" + (f"; there are {', '.join(known)}" if len(known) <= FEW else "")
 
 
 def _value(key: str, text: str, kind: Any) -> Any:

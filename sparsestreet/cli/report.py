@@ -1,13 +1,14 @@
 """``sparsestreet report DIR ...``: tables from the records of runs."""
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, PROTOCOLS, Protocol
-from sparsestreet.records.strict_json import RecordError
+from sparsestreet.cli.options import run_command
+from sparsestreet.metrics.protocols import PROTOCOLS, Protocol
 from sparsestreet.report import collect, figure, markdown, sections, tables
 from sparsestreet.report.arms import arms
 from sparsestreet.report.figures_readme import time_figure
@@ -31,69 +32,59 @@ The protocol chooses definitions: drivestudio as in published tables; strict cou
 recording car, takes the Gaussian window of SSIM, and both networks of LPIPS. A record holds all of them.
 """
 
-OPTIONS = ("sweep", "baseline", "sections", "protocol", "markdown", "figure")
-SECTIONS = ("scenes", "mean", "all")
+
+@dataclass(frozen=True)
+class ReportRequest:
+    """The command's options. Raises ValueError where they contradict each other."""
+
+    folders: tuple[Path, ...] = ()
+    sweep: Path | None = None
+    baseline: str | None = None
+    sections: Literal["scenes", "mean", "all"] = "all"
+    protocol: Literal["drivestudio", "strict"] = "drivestudio"
+    markdown: Path | None = None
+    figure: Path | None = None
+
+    def __post_init__(self) -> None:
+        if bool(self.folders) == (self.sweep is not None):
+            raise ValueError("name folders of runs, or sweep=DIR: one of both")
+        if self.sweep is not None and (self.baseline or self.markdown or self.sections != "all"):
+            raise ValueError("the report of a sweep has all of its sections: sweep=DIR goes with protocol and figure")
 
 
 def report(arguments: list[str]) -> int:
     """Print the tables; 2 on wrong usage, 1 if records are missing or malformed."""
-    if "--help" in arguments:
-        print(USAGE)
-        return 0
-    options, roots = {}, []
-    for text in arguments:
-        key, equals, value = text.partition("=")
-        if equals and key in OPTIONS:
-            options[key] = value
-        else:
-            roots.append(Path(text))
-    wanted = options.get("sections", "all")
-    protocol = PROTOCOLS.get(options.get("protocol", DRIVESTUDIO.name))
-    if "sweep" in options and not roots and protocol is not None and options.keys() <= {"sweep", "protocol", "figure"}:
-        return _report_sweep(Path(options["sweep"]), protocol, options.get("figure"))
-    # A run's folder may have an equals sign in its name; what has one and is no folder is a slip.
-    if (
-        "sweep" in options
-        or not roots
-        or wanted not in SECTIONS
-        or protocol is None
-        or any("=" in str(root) and not root.exists() for root in roots)
-    ):
-        print(USAGE, file=sys.stderr)
-        return 2
-    try:
-        records = collect(roots)
-        found = sections(records, options.get("baseline"), protocol)
-        if "figure" in options:
-            figure(records, Path(options["figure"]))
-    except (RecordError, FileNotFoundError, ValueError) as error:
-        print(f"sparsestreet report: {error}", file=sys.stderr)
-        return 1
+    return run_command("report", USAGE, arguments, ReportRequest, _report, positional="folders")
+
+
+def _report(request: ReportRequest) -> None:
+    protocol = PROTOCOLS[request.protocol]
+    if request.sweep is not None:
+        _report_sweep(request.sweep, protocol, request.figure)
+        return
+    records = collect(request.folders)
+    found = sections(records, request.baseline, protocol)
+    if request.figure is not None:
+        figure(records, request.figure)
+    wanted = request.sections
     shown = [one for one in found if wanted in ("all", "mean" if one.over_scenes else "scenes")]
     if not shown:
-        print("sparsestreet report: no configuration was run on two scenes, so there is no mean", file=sys.stderr)
-        return 1
+        raise ValueError("no configuration was run on two scenes, so there is no mean")
     console = Console()
     for part in tables(shown, console.width):
         console.print(part)
-    if "markdown" in options:
-        Path(options["markdown"]).write_text(markdown(shown))
-    return 0
+    if request.markdown is not None:
+        request.markdown.write_text(markdown(shown))
 
 
-def _report_sweep(folder: Path, protocol: Protocol, picture: str | None) -> int:
-    """Write the report of a sweep and say where; 1 if records are missing or malformed."""
-    try:
-        written = write_report(folder, sweep_name(folder), protocol)
-        if picture is not None:
-            time_figure(arms(sweep_records(folder)), protocol, Path(picture))
-    except (RecordError, FileNotFoundError, ValueError) as error:
-        print(f"sparsestreet report: {error}", file=sys.stderr)
-        return 1
+def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> None:
+    """Write the report of a sweep and say where."""
+    written = write_report(folder, sweep_name(folder), protocol)
+    if picture is not None:
+        time_figure(arms(sweep_records(folder)), protocol, picture)
     for note in written.notes:
         print(note)
     print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
-    return 0
 
 
 def sweep_name(folder: Path) -> str | None:

@@ -1,43 +1,19 @@
-"""One run: train, evaluate, record."""
+"""One run of a configuration: ``training/run.py`` on what it says, in a process that suits it."""
 
 import logging
-import sys
 import warnings
 from pathlib import Path
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning import Callback, Trainer, seed_everything
 from omegaconf import DictConfig
 
-from sparsestreet.cli.assemble import data_of, description_of, recipe_of, this_command, trainer_of
+from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.process import keep_freed_memory
-from sparsestreet.data.datamodule import StreetData
-from sparsestreet.evaluation.extra import ExtraMetrics
-from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
-from sparsestreet.evaluation.run import evaluate_scene
+from sparsestreet.evaluation.memory import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
-from sparsestreet.pictures.history import draw_history
-from sparsestreet.records.costs import stage_costs, step_costs, update_costs
-from sparsestreet.records.run import RUN
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.training.callbacks import (
-    Checkpoints,
-    Clock,
-    GracefulStop,
-    HeldOutCurve,
-    RunFiles,
-    StageTimes,
-    TrainingProgress,
-    newest_checkpoint,
-)
-from sparsestreet.training.curves import kept_curves
-from sparsestreet.training.recipe import Recipe
-from sparsestreet.training.system import StreetSystem
-
-log = logging.getLogger(__name__)
+from sparsestreet.training.run import train
 
 
 def run(cfg: DictConfig, out: Path, started: float) -> float:
@@ -51,100 +27,29 @@ def run(cfg: DictConfig, out: Path, started: float) -> float:
     # A sweep's launcher starts processes of its own.
     keep_freed_memory()
     forget_peaks()
+    silence_known_noise()
     problem = config_problem(cfg)
     if problem:
         raise ValueError(problem)
-    recipe, looks = recipe_of(cfg), instantiate(cfg.evaluation, _convert_="all")
-    seed_everything(cfg.seed, verbose=False)
-    silence_known_noise()
-    # The job's own overrides: in a sweep they are not what was typed.
-    command = this_command(["train", *HydraConfig.get().overrides.task])
-    with StageRecorder(started) as recorder:
-        summary, device = _train_and_evaluate(cfg, recipe, looks, recorder, out, command)
-        if summary is None:
-            return 0.0
-        with stage("pictures"):
-            draw_history(out)
-        _write_costs(out, recorder, device)
-    log.info("records and pictures in %s", out)
-    return summary.quality[summary.main_split]["psnr_full"].mean
-
-
-def _train_and_evaluate(
-    cfg: DictConfig, recipe: Recipe, looks: ExtraMetrics, recorder: StageRecorder, out: Path, command: str
-) -> tuple[RunSummary | None, torch.device]:
-    """What was measured (None of a ``fast_dev_run``), and the device."""
-    with stage("data"):
+    recipe, extra, logger = recipe_of(cfg), instantiate(cfg.evaluation, _convert_="all"), logger_of(cfg)
+    stages = StageRecorder(started)
+    with stages, stage("data"):
         data = data_of(cfg)
-    for note in data.driving_log.notes:
-        log.info(note)
-    with stage("initialize"):
-        system = recipe.build(data)
-    callbacks = [*recipe.callbacks.values(), StageTimes(recorder)]
-    with stage("train"):
-        trainer = _train(cfg, callbacks, system, data, out, command)
-    device = trainer.strategy.root_device
-    if trainer.fast_dev_run:
-        log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
-        return None, device
-    with stage("evaluate"):
-        summary = evaluate_scene(
-            system.scene,
-            data.split.held_out,
-            data.split.train,
-            run=RUN.read(out),
-            options=system.options,
-            out=out,
-            command=command,
-            device=device,
-        )
-    looks.take(system.scene, data, system.options, out=out, command=command, say=log.info)
-    return summary, device
-
-
-def _write_costs(out: Path, recorder: StageRecorder, device: torch.device) -> None:
-    """What the command cost; the last that it writes, so that a run with costs is a whole one."""
-    host, on_device = peak_megabytes(device)
-    seconds = recorder.seconds()
-    phases, passes = stage_costs(seconds)
-    update_costs(
+        # The job's own overrides: in a sweep they are not what was typed.
+        identity = identity_of(cfg, this_command(["train", *HydraConfig.get().overrides.task]))
+    summary = train(
+        recipe,
+        data,
         out,
-        wall_seconds=sum(seconds.values()),
-        phases=phases,
-        passes=passes,
-        step_ms=step_costs(out),
-        peak_host_mb=host,
-        peak_device_mb=on_device,
+        max_steps=cfg.trainer.max_steps,
+        make_trainer=trainer_of(cfg),
+        logger=logger,
+        identity=identity,
+        extra=extra,
+        resume=Path(cfg.resume) if cfg.resume else None,
+        stages=stages,
     )
-
-
-def _train(
-    cfg: DictConfig, callbacks: list[Callback], system: StreetSystem, data: StreetData, out: Path, command: str
-) -> Trainer:
-    """Fit to the end, or end the program as the signal wants that came."""
-    clock, stop, checkpoint = Clock(), GracefulStop(), _checkpoint(cfg)
-    curve = HeldOutCurve(out, clock)
-    trainer = trainer_of(cfg, [clock, *callbacks, curve, TrainingProgress()], out)
-    with stage("data"):  # its files are read for a hash
-        description = description_of(cfg, data.driving_log, trainer.strategy.root_device, command)
-    trainer.callbacks += [RunFiles(out, description, clock), Checkpoints(out / "checkpoints"), stop]
-    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
-    resume = {} if checkpoint is None else {"ckpt_path": checkpoint, "weights_only": False}
-    at = None if checkpoint is None else torch.load(checkpoint, map_location="cpu", weights_only=False)["global_step"]
-    try:
-        with kept_curves(out, at):
-            trainer.fit(system, datamodule=data, **resume)
-    except SystemExit:
-        sys.exit(stop.exit_status or 1)
-    return trainer
-
-
-def _checkpoint(cfg: DictConfig) -> Path | None:
-    """The checkpoint to go on from, if any."""
-    if not cfg.resume:
-        return None
-    path = Path(cfg.resume)
-    return newest_checkpoint(path) if path.is_dir() else path
+    return 0.0 if summary is None else summary.mean("psnr_full")
 
 
 def silence_known_noise() -> None:

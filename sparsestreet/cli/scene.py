@@ -6,6 +6,7 @@ import torch
 from hydra.utils import get_class
 
 from sparsestreet.cli.compose import load_run_config
+from sparsestreet.cli.device import device_of
 from sparsestreet.scene.storage import StoredScene, load_scene
 
 
@@ -16,7 +17,8 @@ def open_scene(path: Path, device: str | None = None) -> StoredScene:
     """
     if (path / ".hydra").is_dir():
         import_nodes(path)
-    return load_scene(path, _device(device))
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    return load_scene(path, device_of(device, f"device={device}", "say device=cpu, or check the driver"))
 
 
 def import_nodes(run: Path) -> None:
@@ -24,13 +26,3 @@ def import_nodes(run: Path) -> None:
     for node in load_run_config(run).node.values():
         if not node._target_.startswith("sparsestreet."):
             get_class(node._target_)
-
-
-def _device(name: str | None) -> torch.device:
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name.partition(":")[0] not in ("cpu", "cuda"):
-        raise ValueError(f"device must be cpu or cuda, got {name!r}")
-    if name != "cpu" and not torch.cuda.is_available():
-        raise ValueError(f"device={name} asks for a GPU, but torch sees none: say device=cpu, or check the driver")
-    return torch.device(name)

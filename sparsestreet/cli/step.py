@@ -4,13 +4,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hydra import compose
-from lightning import Callback, seed_everything
+from lightning import Callback
 
 from sparsestreet.cli.assemble import data_of, recipe_of, trainer_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import configuration
 from sparsestreet.cli.run import silence_known_noise
 from sparsestreet.training.callbacks import PhaseTimes
+from sparsestreet.training.run import build, fit
 from sparsestreet.training.system import StreetSystem
 
 NEVER = 10**9
@@ -30,13 +31,12 @@ def train_with(overrides: Sequence[str], folder: Path) -> Callable[[Callback], S
         raise ValueError(problem)
 
     def train(watch: Callback) -> StreetSystem:
-        seed_everything(cfg.seed, verbose=False)
         silence_known_noise()
         recipe, data = recipe_of(cfg), data_of(cfg)
-        system = recipe.build(data)
+        system = build(recipe, data)
         # One recorder at a time.
         callbacks = [callback for callback in recipe.callbacks.values() if not isinstance(callback, PhaseTimes)]
-        trainer_of(cfg, [*callbacks, watch], folder).fit(system, datamodule=data)
+        fit(system, data, [*callbacks, watch], trainer_of(cfg), folder, max_steps=cfg.trainer.max_steps)
         return system
 
     return train

@@ -1,4 +1,4 @@
-"""``sparsestreet train``: compose, assemble, fit, evaluate, record."""
+"""``sparsestreet train``: compose, then ``training/run.py``, once or for each job of a sweep."""
 
 import os
 import sys
@@ -36,7 +36,7 @@ def train(arguments: list[str]) -> int:
         if problem:
             print(f"sparsestreet train: {problem}", file=sys.stderr)
             return 2
-    sys.argv = ["sparsestreet train", *arguments]
+    sys.argv = [sys.argv[0], *arguments]  # which Hydra reads
     SweepFolder.folder = None  # of an earlier command of this process
     app()
     return sweep_status()
@@ -66,6 +66,9 @@ def app(cfg: DictConfig) -> float:
     started = time.perf_counter() if HydraConfig.get().mode == RunMode.MULTIRUN else _started
     from sparsestreet.cli.run import run
 
+    # Lightning starts further processes with what stands here, behind this program (``python -m sparsestreet`` or the
+    # installed script): they need the command's name, which Hydra does not know, and the overrides of this job alone.
+    sys.argv = [sys.argv[0], "train", *HydraConfig.get().overrides.task]
     out = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         return run_job(cfg, out, lambda: run(cfg, out, started))

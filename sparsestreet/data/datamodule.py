@@ -93,6 +93,8 @@ class StreetData(LightningDataModule):
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
         self.driving_log = log
         self.split = split(log, stride=stride, offset=offset)
+        self.split_in_words = f"every {stride}th frame from {offset}" if stride else "none"
+        """Which frames are held out, for records."""
         self.seed = seed
         self.val_frames = val_frames
 

@@ -38,13 +38,7 @@ class ExtraMetrics:
         if self.ramp and not self.novel:
             raise ValueError("ramp=true says how the views of novel are shifted: say novel=1,2,3 too")
 
-    def words(self) -> list[str]:
-        """What asks for it, as words of ``sparsestreet evaluate``."""
-        novel = [f"novel={','.join(f'{offset:g}' for offset in self.novel)}"] if self.novel else []
-        ramp = ["ramp=true"] if self.ramp else []
-        return [*novel, *ramp, *([f"presets={','.join(self.presets)}"] if self.presets else [])]
-
-    def take(
+    def measure(
         self,
         scene: SceneGraph,
         data: StreetData,

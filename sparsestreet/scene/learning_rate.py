@@ -31,6 +31,24 @@ class LearningRate:
         return (self.final / self.initial) ** min(max(progress, 0.0), 1.0)
 
 
+def usual_rates() -> dict[str, LearningRate]:
+    """Those of 3DGS (Kerbl et al. 2023) for Gaussians; for masks and tracks those of conf/schedule/paper.yaml and
+    conf/node/rigid.yaml, for runs of 30,000 steps."""
+    return {
+        "means": LearningRate(1.6e-4, 1.6e-6, scale_by_scene_radius=True),
+        "log_scales": LearningRate(5e-3),
+        "quaternions": LearningRate(1e-3),
+        "opacity_logits": LearningRate(5e-2),
+        "sh_dc": LearningRate(2.5e-3),
+        "sh_rest": LearningRate(1.25e-4),
+        "mask_features": LearningRate(1e-3),
+        "mask": LearningRate(1.6e-3),
+        "mask_logits": LearningRate(1e-2),
+        "rotation_deltas": LearningRate(1e-5, 5e-6),
+        "translation_deltas": LearningRate(5e-4, 1e-4),
+    }
+
+
 def matching_rate(name: str, rates: Mapping[str, LearningRate], where: str) -> LearningRate:
     """The rate of a parameter by its dotted name.
 

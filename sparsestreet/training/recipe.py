@@ -1,7 +1,7 @@
-"""What a configuration says of a training before any data is read, and the system that comes of it."""
+"""The parts of a training before any data is read, and the system that comes of them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lightning import Callback
 
@@ -9,9 +9,9 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.effects import EffectSettings
 from sparsestreet.scene.nodes import NodeSettings
-from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
-from sparsestreet.training.losses import Loss, MaskSparsity
+from sparsestreet.training.losses import Loss, MaskSparsity, Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.triangulation import ImagePointSettings
@@ -19,17 +19,18 @@ from sparsestreet.triangulation import ImagePointSettings
 
 @dataclass(frozen=True)
 class Recipe:
-    """The parts of a training by name: a method, and what makes it small."""
+    """The parts of a training by name: a method, and what makes it small. Only nodes must be given."""
 
     nodes: Mapping[str, NodeSettings]
-    effects: Mapping[str, EffectSettings]
-    losses: Mapping[str, Loss]
-    callbacks: Mapping[str, Callback]
-    optimizer: OptimizerSettings
-    options: RenderOptions
-    sh_interval: float
+    effects: Mapping[str, EffectSettings] = field(default_factory=dict)
+    losses: Mapping[str, Loss] = field(default_factory=lambda: {"photometric": Photometric()})
+    callbacks: Mapping[str, Callback] = field(default_factory=dict)
+    """What changes Gaussians, and what watches; every run has those of ``training/run.py`` beside them."""
+    optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
+    options: RenderOptions = DEFAULT_OPTIONS
+    sh_interval: float = 1 / 30
     """Fraction of the run after which one more degree of spherical harmonics is used."""
-    seed: int
+    seed: int = 0
     image_points: ImagePointSettings | None = None
     """How points are triangulated from the training images; None: not at all."""
 
@@ -57,6 +58,11 @@ class Recipe:
         if shared := self.nodes.keys() & self.effects.keys():
             found.append(f"a node and an effect are both named {', '.join(sorted(shared))}: rename one of them")
         return found
+
+    def check(self) -> None:
+        """Raises ValueError where there are ``problems``."""
+        if found := self.problems():
+            raise ValueError("; ".join(found))
 
     def build(self, data: StreetData) -> StreetSystem:
         """Start the scene from the training part of the data, and wrap it for training."""

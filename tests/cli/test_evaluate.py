@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.cli.evaluate import Options, evaluate
+from sparsestreet.cli.evaluate import Options, evaluate, extra_words
 from sparsestreet.evaluation.extra import ExtraMetrics
 
 
@@ -21,8 +21,8 @@ def test_an_unknown_preset_is_named(tmp_path, capsys):
 
 def test_an_evaluation_measures_what_the_runs_configuration_asks_for_unless_it_is_told_otherwise():
     of_run = ExtraMetrics(novel=[1.5], presets=["fast"])
-    assert Options(Path("run")).looks(of_run) == of_run
-    told = Options(Path("run"), novel=(2.0,), ramp=True, presets=()).looks(of_run)
+    assert Options(Path("run")).extra(of_run) == of_run
+    told = Options(Path("run"), novel=(2.0,), ramp=True, presets=()).extra(of_run)
     assert told == ExtraMetrics(novel=(2.0,), ramp=True, presets=())
-    assert of_run.words() == ["novel=1.5", "presets=fast"]
-    assert told.words() == ["novel=2", "ramp=true"]
+    assert extra_words(of_run) == ["novel=1.5", "presets=fast"]
+    assert extra_words(told) == ["novel=2", "ramp=true"]

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from sparsestreet.cli.options import OptionError, parse_options, run_command
+from sparsestreet.cli.options import OptionError, parse_options, run_command, unknown_key
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,11 @@ def test_words_without_a_key_go_to_the_field_that_takes_them(tmp_path, monkeypat
     assert wishes == Folders((Path("outputs"), Path("sweep/method=3dgs"), Path("seed=1")), "plain")
     with pytest.raises(OptionError, match="did you mean 'baseline'"):
         parse_options(["outputs", "baselin=plain"], Folders, positional="folders")
+
+
+def test_very_many_keys_are_not_listed():
+    assert unknown_key("zz", ["width", "height"]) == "no key 'zz'; there are width, height"
+    assert unknown_key("zz", [f"key_{number}" for number in range(100)]) == "no key 'zz'"
 
 
 def _fail(error: BaseException):

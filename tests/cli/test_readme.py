@@ -5,20 +5,41 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from sparsestreet.cli import COMMANDS
 from sparsestreet.cli.compose import override_problem
+from sparsestreet.data.drivestudio import DriveStudioReader
+from tests.conftest import unchecked
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
 def test_the_lines_of_python_render_a_run(run_train, tmp_path):
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    code, _ = re.findall(r"```python\n(.*?)```", README, flags=re.S)
     run = run_train(tmp_path / "run", "schedule.max_steps=3")
     code = code.replace('"RUN"', repr(str(run)))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "[192, 320, 3]" in done.stdout
     assert "'background'" in done.stdout
+
+
+@pytest.mark.filterwarnings("ignore:The number of training batches")
+def test_the_lines_of_python_train_a_street(tiny_street, tmp_path, monkeypatch, capsys):
+    """On the street of the other tests, since tracing one takes seconds."""
+    monkeypatch.chdir(tmp_path)
+    _, code = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    (root,) = (word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
+    code, streets = re.subn(r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", code)
+    code, trainings = re.subn("max_steps=200", "max_steps=5", code)
+    assert (streets, trainings) == (1, 1)
+    with unchecked():
+        exec(code, {"DriveStudioReader": DriveStudioReader})
+    psnr, gaussians = capsys.readouterr().out.splitlines()[-1].split(maxsplit=1)
+    assert 5 < float(psnr) < 40
+    assert gaussians.startswith("{'background': 5000, 'rigid': ")
+    assert (tmp_path / "outputs" / "mine" / "scene.safetensors").is_file()
 
 
 def test_every_command_line_is_one_that_is_understood():

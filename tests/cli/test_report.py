@@ -1,8 +1,11 @@
 """The table on the command line."""
 
+import typing
+
 import pytest
 
-from sparsestreet.cli.report import report
+from sparsestreet.cli.report import ReportRequest, report
+from sparsestreet.metrics.protocols import PROTOCOLS
 from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import write_sweep
@@ -44,10 +47,27 @@ def test_a_folder_may_have_an_equals_sign(runs, capsys):
     assert "ours" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [[], ["basline=plain", "."], [".", "sections=none"], [".", "protocol=loose"]])
-def test_wrong_usage(arguments, capsys):
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["basline=plain", "."], "no key 'basline'; did you mean 'baseline'?"),
+        ([".", "sections=none"], "sections must be one of scenes, mean, all, got 'none'"),
+        ([".", "protocol=loose"], "protocol must be one of drivestudio, strict, got 'loose'"),
+        (["baseline=plain"], "name folders of runs, or sweep=DIR"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, said, capsys):
     assert report(arguments) == 2
-    assert "sparsestreet report DIR" in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith(f"sparsestreet report: {said}")
+
+
+def test_without_a_word_there_is_nothing_to_report(capsys):
+    assert report([]) == 2
+    assert "sparsestreet report DIR" in capsys.readouterr().out
+
+
+def test_protocols_are_those_of_the_metrics():
+    assert typing.get_args(typing.get_type_hints(ReportRequest)["protocol"]) == tuple(PROTOCOLS)
 
 
 def test_help(capsys):
@@ -86,7 +106,7 @@ def test_the_report_of_a_sweep(tmp_path, capsys):
 @pytest.mark.parametrize("arguments", [["sweep=x", "."], ["sweep=x", "baseline=plain"], ["sweep=x", "protocol=mine"]])
 def test_what_does_not_go_with_a_sweep(arguments, capsys):
     assert report(arguments) == 2
-    assert "sparsestreet report sweep=DIR" in capsys.readouterr().err
+    assert "sparsestreet report: " in capsys.readouterr().err
 
 
 def test_an_empty_sweep_is_one_line(tmp_path, capsys):

@@ -7,11 +7,13 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
+from lightning.fabric.strategies.launchers.subprocess_script import _hydra_subprocess_cmd
+from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
@@ -342,3 +344,25 @@ def test_a_slip_is_one_line_and_no_trace(overrides, said, tmp_path):
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert "Error in call" not in done.stderr
+
+
+def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):
+    """By Lightning's launcher, which is asked for the words alone; of a sweep each job has its own."""
+    started = []
+
+    def ask(cfg: DictConfig, out: Path, started_at: float) -> float:
+        for module in (None, ModuleSpec("sparsestreet.__main__", None)):  # the installed script; python -m
+            monkeypatch.setattr(sys.modules["__main__"], "__spec__", module)
+            started.append(_hydra_subprocess_cmd(local_rank=1)[0])
+        return 0.0
+
+    monkeypatch.setattr("sparsestreet.cli.run.run", ask)
+    for check in ("override_problem", "_problem_of_values"):  # half of the test's time
+        monkeypatch.setattr(f"sparsestreet.cli.train.{check}", lambda words: None)
+    monkeypatch.setattr(sys, "argv", ["/there/bin/sparsestreet", "train", "-m"])
+    assert train(["method=3dgs", "seed=1", f"out={tmp_path / 'one'}"]) == 0
+    assert train(["-m", "method=3dgs", "seed=2,3", f"hydra.sweep.dir={tmp_path}"]) == 0
+    programs = [sys.executable, "/there/bin/sparsestreet"], [sys.executable, "-m", "sparsestreet.__main__"]
+    words = [command[: command.index("train") + 3] for command in started]
+    assert words == [[*program, "train", "method=3dgs", f"seed={seed}"] for seed in (1, 2, 3) for program in programs]
+    assert f'hydra.run.dir="{tmp_path / "one"}"' in started[0]

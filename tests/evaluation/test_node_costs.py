@@ -128,7 +128,7 @@ def test_a_cost_is_the_median_of_what_rounds_differ_by(monkeypatch):
 
 def test_megabytes_are_of_rows_and_poses_and_add_up_with_the_sky(monkeypatch):
     timed(monkeypatch, lambda scene, view: 1e-3)
-    scene = SceneGraph({"background": background(7), "rigid": rigid(4)}, small_scene().sky)
+    scene = SceneGraph({"background": background(7), "rigid": rigid(4)}, {"sky": small_scene().effects["sky"]})
     costs = measure_scene_costs(scene, FRAMES, OPTIONS, repeats=1)
     parts = scene.bytes_by_part()
     # Two instances of two keyframes: a time, a quaternion and a translation each.

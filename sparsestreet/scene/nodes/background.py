@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.coverage import Coverage, coverage
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
-from sparsestreet.scene.initialize.sources import PointSource, Seeds
+from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import Node, NodeSettings
@@ -26,6 +26,16 @@ _EXTREMES = (Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0))
 """All is near the lidar, all is near points from images, all is near neither; linear shares are largest at one."""
 
 
+def usual_sources() -> dict[str, PointSource]:
+    """The lidar, images, and guesses where neither sees anything; as in conf/source."""
+    return {
+        "lidar": LidarPoints(),
+        "images": ImagePoints(initial_opacity=0.5),
+        "near": NearPoints(part=0.333),
+        "far": FarPoints(part=0.667),
+    }
+
+
 @dataclass(frozen=True, kw_only=True)
 class BackgroundSettings(NodeSettings):
     """Starts from what its sources give.
@@ -33,9 +43,9 @@ class BackgroundSettings(NodeSettings):
     Raises ValueError for limits that contradict each other, and for sources that ask for more than all points.
     """
 
-    num_points: int
+    num_points: int = 40_000
     """Of all sources together, at most; each is asked for its share, by what the training images show."""
-    sources: Mapping[str, PointSource]
+    sources: Mapping[str, PointSource] = field(default_factory=usual_sources)
     """Each draws from its own stream, so a change of one leaves the points of the others as they are."""
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from sparsestreet.scene.gaussians import Rows, drop_parameter
 from sparsestreet.scene.initialize.gaussians import init_gaussians
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.learning_rate import LearningRate, usual_rates
 from sparsestreet.scene.masks import Mask, MaskScope, MaskSettings
 from sparsestreet.scene.nodes.regularizers import sharp_shape
 from sparsestreet.scene.state import SceneState
@@ -40,29 +40,29 @@ class NodeSettings(ABC):
     """Meters; a track that travels no farther is left to the static nodes."""
     has_body_pose: bool | None = None
     """True: only tracks that come with body poses; False: only those without; None: both."""
-    min_gaussians: int
+    min_gaussians: int = 0
     """K_min of the paper: neither masks nor pruning leave fewer Gaussians in the node class."""
     min_instance_gaussians: float = 0.0
     """What pruning leaves of each object: so many Gaussians per 1,000 pixels that it fills in the training view that
     shows it largest, or all that it has."""
-    max_gaussians: int | None
+    max_gaussians: int | None = None
     """Density control stops here; None: no limit."""
     sh_degree: int = 3
-    mask: MaskSettings | None
+    mask: MaskSettings | None = None
     """None: this node knows no mask."""
-    masked: bool
-    """Whether the mask is trained in this run."""
-    density: DensityStrategy | None
+    masked: bool = True
+    """Whether the mask, if there is one, is trained in this run."""
+    density: DensityStrategy | None = None
     """None: the node keeps the Gaussians it starts with."""
     densify_until: float | None = None
     """Fraction of the run after which none are added any more; None: the schedule says."""
-    prunable: bool
+    prunable: bool = True
     """Whether pruning rules may take Gaussians of this node."""
     sharp_shape: float = 0.0
     """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: it is not computed."""
     max_axis_ratio: float = 10.0
     """Ratio of a Gaussian's longest to its shortest axis from which that term counts."""
-    learning_rates: Mapping[str, LearningRate]
+    learning_rates: Mapping[str, LearningRate] = field(default_factory=usual_rates)
     """Column, parameter or module of the node -> its rate; the longest name that matches wins."""
 
     def __post_init__(self) -> None:

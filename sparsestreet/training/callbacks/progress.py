@@ -16,7 +16,8 @@ LINES = 10
 
 
 class TrainingProgress(Callback):
-    """Shows the step rate (of the last ``REFRESH_EVERY`` steps), counts per node and running PSNR."""
+    """Shows the step rate (of the last ``REFRESH_EVERY`` steps), counts per node and running PSNR; of several processes
+    the first does."""
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
@@ -26,7 +27,7 @@ class TrainingProgress(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._since = (trainer.global_step, time.perf_counter())
         console = Console()
-        if console.is_terminal:
+        if console.is_terminal and trainer.is_global_zero:
             columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
             self._bar = Progress(*columns, console=console)
             self._task = self._bar.add_task("", total=trainer.max_steps, completed=trainer.global_step)
@@ -36,7 +37,7 @@ class TrainingProgress(Callback):
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        if not self._due(step, trainer.max_steps):
+        if not trainer.is_global_zero or not self._due(step, trainer.max_steps):
             return
         text = self._status(trainer, pl_module)
         if self._bar is not None:

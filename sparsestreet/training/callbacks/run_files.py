@@ -4,8 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import Callback, Trainer
 
+from sparsestreet.evaluation.speed import device_name
 from sparsestreet.noise import Calibration, calibrate, noise_between
 from sparsestreet.phases import stage
 from sparsestreet.records.ledger import CountChange
@@ -21,6 +23,8 @@ from sparsestreet.training.system import StreetSystem
 
 class RunFiles(Callback, RowListener):
     """Writes ``scene.safetensors``, ``views.json`` and ``run.json`` when training ends, or is interrupted.
+
+    Of several processes only the first writes.
 
     Args:
         folder: of the run.
@@ -57,11 +61,15 @@ class RunFiles(Callback, RowListener):
         if trainer.global_step > 0 and not isinstance(exception, TornStop | OSError):
             self.write(trainer, pl_module)
 
-    def write(self, trainer: Trainer, system: StreetSystem) -> RunDescription:
-        """Leave the files as training stands now; answers with what ``run.json`` says."""
+    def write(self, trainer: Trainer, system: StreetSystem) -> None:
+        """Leave the files as training stands now."""
+        if not trainer.is_global_zero:
+            return
         before = self._calibration
         description = replace(
             self.description,
+            device=device_name(system.device),
+            threads=torch.get_num_threads(),
             steps=trainer.global_step,
             training_seconds=self.clock.seconds,
             noise=None if before is None else noise_between(before, calibrate(system.device)),
@@ -75,7 +83,6 @@ class RunFiles(Callback, RowListener):
                 self.folder / views.FILE_NAME, split.train.views, split.held_out.views, frame_rate=log.frame_rate
             )
             RUN.write(self.folder, description)
-        return description
 
     def state_dict(self) -> dict[str, object]:
         return {"caps": self.caps}

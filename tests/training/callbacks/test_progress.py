@@ -43,6 +43,17 @@ def test_without_a_terminal_there_is_a_line_per_tenth(caplog, max_steps, steps):
     assert [message.split(":")[0] for message in caplog.messages] == [f"step {step} of {max_steps}" for step in steps]
 
 
+def test_of_several_processes_the_first_alone_shows_it(caplog, monkeypatch):
+    console = Console(file=io.StringIO(), force_terminal=True)
+    monkeypatch.setattr(progress, "Console", lambda: console)
+    trainer = trainer_of(10)
+    trainer.is_global_zero = False
+    with caplog.at_level(logging.INFO):
+        trainer.start()
+        trainer.walk(10)
+    assert (caplog.messages, console.file.getvalue()) == ([], "")
+
+
 def test_a_line_by_hand(caplog, seconds):
     trainer = trainer_of(100, resumed_at=30)
     with caplog.at_level(logging.INFO):

@@ -1,0 +1,212 @@
+"""A training from its first line to its last: build, resume, fit, evaluate, record. Read this page first.
+
+``sparsestreet train`` calls ``train`` with what a configuration says, Python with objects of its own (README).
+Callbacks (``training/callbacks``) decide when the scene's rows change and when files are written; the system
+(``training/system.py``) is one step.
+"""
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+from lightning import Callback, Trainer, seed_everything
+from lightning.pytorch.loggers import CSVLogger, Logger
+
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.evaluation.run import evaluate_scene
+from sparsestreet.phases import StageRecorder, stage
+from sparsestreet.pictures.history import draw_history
+from sparsestreet.records.run import RUN
+from sparsestreet.records.summary import RunSummary
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.training.callbacks import (
+    Checkpoints,
+    Clock,
+    GracefulStop,
+    HeldOutCurve,
+    RunFiles,
+    StageTimes,
+    TrainingProgress,
+    newest_checkpoint,
+)
+from sparsestreet.training.costs import record_costs
+from sparsestreet.training.curves import kept_curves
+from sparsestreet.training.identity import RunIdentity
+from sparsestreet.training.recipe import Recipe
+from sparsestreet.training.system import StreetSystem
+
+log = logging.getLogger(__name__)
+
+CPU_TRAINER = partial(
+    Trainer,
+    accelerator="cpu",
+    devices=1,
+    # Between two validations lie steps, not epochs: an epoch is as long as the log.
+    check_val_every_n_epoch=None,
+    val_check_interval=500,
+    log_every_n_steps=10,
+)
+"""Lightning's Trainer with the settings of conf/trainer/cpu.yaml."""
+
+
+def train(
+    recipe: Recipe,
+    data: StreetData,
+    out: Path,
+    *,
+    max_steps: int = 2000,
+    make_trainer: Callable[..., Trainer] = CPU_TRAINER,
+    logger: Logger | bool | None = None,
+    identity: RunIdentity | None = None,
+    extra: ExtraMetrics | None = None,
+    resume: Path | None = None,
+    stages: StageRecorder | None = None,
+) -> RunSummary | None:
+    """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
+
+    Of several processes each one trains; the first alone writes, evaluates and returns a summary.
+
+    Args:
+        recipe: the parts of the training. Its callbacks keep state: take a new recipe for another run.
+        data: the log, split into views to train on and views held out.
+        out: the run's folder.
+        max_steps: optimizer steps.
+        make_trainer: Lightning's Trainer, or what makes one; ``fit`` shows what it is given.
+        logger: of Lightning, for the curves of the training; None: ``curves/metrics.csv``; False: none.
+        identity: what the run is called in its records; None: as its folder.
+        extra: what is measured beside the record of every run; None: nothing.
+        resume: a run's folder, or one of its checkpoints, to go on from.
+        stages: counts the seconds of the command that trains; None: they begin here.
+
+    Returns:
+        What was measured of the finished scene; None of a trainer with ``fast_dev_run``, and on all processes but one.
+
+    Raises:
+        ValueError: for parts that do not fit together.
+        FileNotFoundError: where there is nothing to resume.
+        OSError: for files that cannot be written.
+        SystemExit: with the status of the signal that ended training, after a checkpoint was written.
+    """
+    identity, extra = identity or RunIdentity(label=out.name), extra or ExtraMetrics()
+    checkpoint = resume if resume is None or resume.is_file() else newest_checkpoint(resume)
+    with stages or StageRecorder() as stages:
+        system = build(recipe, data)
+
+        clock, stop = Clock(), GracefulStop()
+        callbacks = [
+            clock,
+            *recipe.callbacks.values(),
+            StageTimes(stages),
+            HeldOutCurve(out, clock),
+            TrainingProgress(),
+            RunFiles(out, identity.describe(recipe, data, max_steps), clock),
+            Checkpoints(out / "checkpoints"),
+            stop,  # the last: a signal ends training when the others are done with the step
+        ]
+        logger = CSVLogger(out, name="", version="curves") if logger is None else logger
+        try:
+            with stage("train"):
+                trainer = fit(
+                    system, data, callbacks, make_trainer, out, max_steps=max_steps, logger=logger, start=checkpoint
+                )
+        except SystemExit:
+            sys.exit(stop.exit_status or 1)
+        if trainer.fast_dev_run:
+            log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
+        if trainer.fast_dev_run or not trainer.is_global_zero:
+            return None
+
+        device = trainer.strategy.root_device
+        summary = evaluate(
+            system.scene, system.options, data, out, device=device, command=identity.command, extra=extra
+        )
+        record_costs(out, stages, device)  # the last file: a run with costs is a whole one
+    log.info("records and pictures in %s", out)
+    return summary
+
+
+def build(recipe: Recipe, data: StreetData) -> StreetSystem:
+    """The scene as it starts, from what training may see, ready for ``fit``.
+
+    Raises ValueError for parts of the recipe that do not fit together, or that have nothing to start from.
+    """
+    recipe.check()
+    seed_everything(recipe.seed, verbose=False)
+    for note in data.driving_log.notes:
+        log.info(note)
+    with stage("initialize"):
+        return recipe.build(data)
+
+
+def fit(
+    system: StreetSystem,
+    data: StreetData,
+    callbacks: Sequence[Callback],
+    make_trainer: Callable[..., Trainer],
+    out: Path,
+    *,
+    max_steps: int,
+    logger: Logger | bool = False,
+    start: Path | None = None,
+) -> Trainer:
+    """Train to the end, from the checkpoint ``start`` on if there is one; returns the trainer.
+
+    Lightning's Trainer is made with these callbacks, in their order, and nothing of its own beside them.
+
+    Raises SystemExit where a signal ended training.
+    """
+    trainer = make_trainer(
+        max_steps=max_steps,
+        max_epochs=-1,
+        callbacks=list(callbacks),
+        logger=logger,
+        default_root_dir=str(out),
+        enable_model_summary=False,
+        enable_progress_bar=False,
+        enable_checkpointing=False,
+    )
+    if start is None:
+        trainer.fit(system, datamodule=data)
+        return trainer
+    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
+    step = torch.load(start, map_location="cpu", weights_only=False)["global_step"]
+    with kept_curves(out, step if trainer.is_global_zero else None):
+        trainer.fit(system, datamodule=data, ckpt_path=start, weights_only=False)
+    return trainer
+
+
+def evaluate(
+    scene: SceneGraph,
+    options: RenderOptions,
+    data: StreetData,
+    out: Path,
+    *,
+    device: torch.device,
+    command: str,
+    extra: ExtraMetrics,
+    say: Callable[[str], None] = log.info,
+) -> RunSummary:
+    """Measure a scene on the views of its log, as ``out/run.json`` identifies it; write records and pictures there.
+
+    Raises ValueError for renders that are not finite.
+    """
+    with stage("evaluate"):
+        summary = evaluate_scene(
+            scene,
+            data.split.held_out,
+            data.split.train,
+            run=RUN.read(out),
+            options=options,
+            out=out,
+            command=command,
+            device=device,
+        )
+    extra.measure(scene, data, options, out=out, command=command, say=say)
+    with stage("pictures"):
+        draw_history(out)
+    return summary
