@@ -15,6 +15,7 @@ from sparsestreet.evaluation.speed import device_name
 from sparsestreet.records.configuration import config_hash, flat_config
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.records.run import RunDescription
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.recipe import Recipe
 
 
@@ -26,7 +27,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         losses=instantiate(cfg.loss, _convert_="all"),
         callbacks=instantiate(cfg.callback, _convert_="all"),
         optimizer=instantiate(cfg.optimizer, _convert_="all"),
-        options=instantiate(cfg.render, _convert_="all"),
+        options=_render_options(cfg),
         sh_interval=cfg.schedule.sh_interval,
         seed=cfg.seed,
         image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,
@@ -35,6 +36,12 @@ def recipe_of(cfg: DictConfig) -> Recipe:
     if problems:
         raise ValueError("; ".join(problems))
     return recipe
+
+
+def _render_options(cfg: DictConfig) -> RenderOptions:
+    """Without the name of the preset: its values stand in the settings."""
+    said = OmegaConf.to_container(cfg.render, resolve=True)
+    return instantiate({key: value for key, value in said.items() if key != "preset"}, _convert_="all")
 
 
 def data_of(cfg: DictConfig) -> StreetData:

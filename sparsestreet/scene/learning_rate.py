@@ -1,7 +1,8 @@
 """A learning rate over a run; every node says which of its parameters takes which."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,16 @@ class LearningRate:
             raise ValueError(f"learning rates must be > 0, got initial={self.initial} and final={self.final}")
         if not 0 <= self.start <= 1:
             raise ValueError(f"a learning rate starts at a fraction of the run in [0, 1], got start={self.start}")
+
+    @classmethod
+    def of(cls, said: "LearningRate | Mapping[str, Any]") -> "LearningRate":
+        """A rate as it is, or one from a mapping of its fields. Raises ValueError for anything else."""
+        if isinstance(said, LearningRate):
+            return said
+        names = [field.name for field in fields(cls)]
+        if not (isinstance(said, Mapping) and {"initial"} <= said.keys() <= set(names)):
+            raise ValueError(f"a learning rate has initial, and may have {', '.join(names[1:])}; got {said}")
+        return cls(**said)
 
     def factor(self, progress: float) -> float:
         """Multiplier of the initial rate at a progress in [0, 1]."""

@@ -62,10 +62,13 @@ class NodeSettings(ABC):
     """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: it is not computed."""
     max_axis_ratio: float = 10.0
     """Ratio of a Gaussian's longest to its shortest axis from which that term counts."""
-    learning_rates: Mapping[str, LearningRate]
-    """Column, parameter or module of the node -> its rate; the longest name that matches wins."""
+    learning_rates: Mapping[str, LearningRate | Mapping[str, Any]]
+    """Column, parameter or module of the node -> its rate; the longest name that matches wins. A mapping of its fields
+    is taken for a rate and becomes one."""
 
     def __post_init__(self) -> None:
+        rates = {name: LearningRate.of(rate) for name, rate in self.learning_rates.items()}
+        object.__setattr__(self, "learning_rates", rates)
         if self.min_gaussians < 0:
             raise ValueError(f"min_gaussians must be >= 0, got {self.min_gaussians}")
         if not self.min_instance_gaussians >= 0:
