@@ -53,20 +53,19 @@ bench: $(VENV)/.ok ## what accuracy costs in time: records and figures
 	$(BIN)/sparsestreet bench knobs
 	$(BIN)/sparsestreet bench scaling
 
-# Two runs beside each other, a thread each; what stands is skipped. Once more where a job failed: a control may have come
-# before the run that it has its count from. What fails again stands in the tables.
+# Two runs beside each other, a thread each; what stands is skipped. What fails stands in the tables.
 TRAIN := OMP_NUM_THREADS=1 $(BIN)/sparsestreet train hydra/launcher=joblib hydra.launcher.n_jobs=2
 
 tables: $(VENV)/.ok ## five methods, pruned, and controls on three streets (75 trainings): outputs/sweeps/streets/report
-	$(TRAIN) +sweep=streets || $(TRAIN) +sweep=streets; status=$$?; \
+	$(TRAIN) +sweep=streets; status=$$?; \
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/streets; exit $$status
 
 claims: $(VENV)/.ok ## what the paper claims, at equal count, and what accuracy costs a trained scene (30 trainings): outputs/sweeps
-	for sweep in claims renders; do $(TRAIN) +sweep=$$sweep || $(TRAIN) +sweep=$$sweep || exit $$?; done
+	for sweep in claims renders; do $(TRAIN) +sweep=$$sweep || exit $$?; done
 	for sweep in claims renders; do $(BIN)/sparsestreet report sweep=outputs/sweeps/$$sweep; done
 
 figure: $(VENV)/.ok ## quality against training and frame time on the default streets (9 trainings): docs/figures/time.png
-	$(TRAIN) +sweep=readme || $(TRAIN) +sweep=readme; status=$$?; \
+	$(TRAIN) +sweep=readme; status=$$?; \
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/readme figure=docs/figures/time.png; exit $$status
 
 clean: ## removes what the targets made

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.records.configuration import flat_config
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.identity import RunIdentity
 from sparsestreet.training.recipe import Recipe
 
@@ -22,13 +23,19 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         losses=instantiate(cfg.loss, _convert_="all"),
         callbacks=instantiate(cfg.callback, _convert_="all"),
         optimizer=instantiate(cfg.optimizer, _convert_="all"),
-        options=instantiate(cfg.render, _convert_="all"),
+        options=_render_options(cfg),
         sh_interval=cfg.schedule.sh_interval,
         seed=cfg.seed,
         image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,
     )
     recipe.check()
     return recipe
+
+
+def _render_options(cfg: DictConfig) -> RenderOptions:
+    """Without the name of the preset: its values stand in the settings."""
+    said = OmegaConf.to_container(cfg.render, resolve=True)
+    return instantiate({key: value for key, value in said.items() if key != "preset"}, _convert_="all")
 
 
 def data_of(cfg: DictConfig) -> StreetData:

@@ -6,7 +6,8 @@ Asked before any data is read, so that nobody waits for a street to hear of a sl
 import inspect
 import re
 import typing
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import is_dataclass
 
 from beartype.door import is_bearable
 from beartype.roar import BeartypeException
@@ -24,35 +25,63 @@ def config_problem(cfg: DictConfig) -> str | None:
     try:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        reason = str(error).splitlines()[0]
-        missing = re.search(r"[Mm]issing mandatory value: (\S+)", reason)
-        if missing:
-            key = error.full_key if isinstance(error, MissingMandatoryValue) else missing[1]
-            return f"{key} has no value: give {key}=..."
-        return reason.partition("interpolation: ")[2] or reason
+        return _in_one_line(error)
     return next(_wrong_types(tree), None) or _device_problem(cfg)
 
 
-def _wrong_types(tree: Tree, path: str = "") -> Iterator[str]:
-    """Values that the classes and functions they are handed to do not take."""
+def unresolvable(cfg: DictConfig) -> str | None:
+    """The first ``${...}`` that gives no value, in one sentence; None where each does."""
+    try:
+        OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException as error:
+        return _in_one_line(error)
+    return None
+
+
+def _in_one_line(error: OmegaConfBaseException) -> str:
+    reason = str(error).splitlines()[0]
+    missing = re.search(r"[Mm]issing mandatory value: (\S+)", reason)
+    if missing:
+        key = error.full_key if isinstance(error, MissingMandatoryValue) else missing[1]
+        return f"{key} has no value: give {key}=..."
+    if absent := re.search(r"Interpolation key '(\S+)' not found", reason):
+        key = error.full_key
+        return f"{key} follows from {absent[1]!r}, which these choices lack: choose another option, or give {key}=..."
+    return reason.partition("interpolation: ")[2] or reason
+
+
+def _wrong_types(tree: Tree, path: str = "", kind: typing.Any = None) -> Iterator[str]:
+    """Values that the classes and functions they are handed to do not take; ``kind`` is what the tree shall become."""
     if not isinstance(tree, dict):
         return
-    hints = _hints(tree["_target_"]) if "_target_" in tree else {}
+    hints = _hints(tree, kind)
     for name, value in tree.items():
         key = f"{path}.{name}" if path else name
+        if is_dataclass(kind) and "_target_" not in tree and name not in hints:
+            yield f"no key {key!r}: {kind.__name__} has {', '.join(hints)}"
         if name in hints and not isinstance(value, dict) and not _fits(value, hints[name]):
             yield f"{key} must be {_in_words(hints[name])}, got {value!r}"
-        yield from _wrong_types(value, key)
+        yield from _wrong_types(value, key, hints.get(name))
 
 
-def _hints(target: str) -> dict[str, typing.Any]:
-    """Argument -> annotation of what a ``_target_`` names; nothing where it has none that can be read."""
-    found = get_object(target)
+def _hints(tree: Mapping[str, Tree], kind: typing.Any) -> dict[str, typing.Any]:
+    """Key -> annotation of its value, by what ``_target_`` names or by the kind; nothing where neither can be read."""
+    if typing.get_origin(kind) is Mapping and "_target_" not in tree:
+        item = _from_mapping(typing.get_args(kind)[1])
+        return {name: item for name, value in tree.items() if isinstance(value, dict)}
+    found = get_object(tree["_target_"]) if "_target_" in tree else kind
+    if not (callable(found) and ("_target_" in tree or is_dataclass(found))):
+        return {}
     try:
         function = found.__init__ if inspect.isclass(found) else found
         return {name: hint for name, hint in typing.get_type_hints(function).items() if name != "return"}
     except (NameError, TypeError):
         return {}
+
+
+def _from_mapping(hint: typing.Any) -> typing.Any:
+    """Of a dataclass or a mapping of its fields: the dataclass."""
+    return next((one for one in typing.get_args(hint) if is_dataclass(one)), hint)
 
 
 def _fits(value: Tree, hint: typing.Any) -> bool:

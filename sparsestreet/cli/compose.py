@@ -1,14 +1,16 @@
 """Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -23,6 +25,9 @@ CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "co
 ADDABLE = ("++", "+hydra", "+sweep")
 """What may be added: keys that are meant to be new, and sweeps."""
 
+Tree = dict[str, Any]
+"""Keys below a key: a word in their place (``render=fast``) is an error."""
+
 
 @dataclass
 class TrainSchema:
@@ -31,25 +36,25 @@ class TrainSchema:
     name: str = MISSING
     seed: int = MISSING
     capacity: str = MISSING
-    split: Any = MISSING
+    split: Tree = MISSING
     resume: str | None = None
     count_of: str | None = None
-    data: Any = MISSING
-    schedule: Any = MISSING
-    assignment: Any = MISSING
-    method: Any = MISSING
-    preset: Any = MISSING
-    sparsify: Any = MISSING
-    node: Any = MISSING
+    data: Tree = MISSING
+    schedule: Tree = MISSING
+    assignment: Tree = MISSING
+    method: Tree = MISSING
+    preset: Tree = MISSING
+    sparsify: Tree = MISSING
+    node: Tree = MISSING
     effects: Any = None
     image_points: Any = None
-    loss: Any = MISSING
-    callback: Any = MISSING
-    optimizer: Any = MISSING
-    render: Any = MISSING
-    trainer: Any = MISSING
+    loss: Tree = MISSING
+    callback: Tree = MISSING
+    optimizer: Tree = MISSING
+    render: Tree = MISSING
+    trainer: Tree = MISSING
     logger: Any = None
-    evaluation: Any = MISSING
+    evaluation: Tree = MISSING
     out: str = MISSING
     folder: str = MISSING
 
@@ -64,33 +69,59 @@ def configuration() -> Iterator[None]:
         yield
 
 
-def override_problem(overrides: list[str], config_name: str = "train") -> str | None:
-    """One line on what is wrong with the overrides, naming the nearest key; None if they compose."""
-    keyed = [text for before, text in zip(["", *overrides], overrides, strict=False) if not _is_flag(before, text)]
+def composed(overrides: Iterable[str]) -> DictConfig:
+    """The configuration of train with these overrides, as long as no app runs: its ``folder`` is here.
+
+    Answers to the same overrides are one object: read it, never change it. Raises what Hydra raises.
+    """
+    return _composed(tuple(overrides))
+
+
+@cache
+def _composed(overrides: tuple[str, ...]) -> DictConfig:
     with configuration():
-        for text in keyed:
-            if "=" not in text and not text.startswith("~"):
-                return f"{text!r} is no override: write key=value"
-            # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
-            if text.startswith("+") and not text.startswith(ADDABLE):
-                return unknown_key(text.lstrip("+").partition("=")[0], _known(config_name))
+        return compose("train", [*overrides, "folder=."])
+
+
+def override_problem(overrides: list[str]) -> str | None:
+    """One line on what is wrong with the overrides, naming the nearest key; None if they compose."""
+    keyed = without_flags(overrides)
+    for text in keyed:
+        if "=" not in text and not text.startswith("~"):
+            return f"{text!r} is no override: write key=value"
+        # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
+        if text.startswith("+") and not text.startswith(ADDABLE):
+            return _unknown_key(text.lstrip("+").partition("=")[0])
+    try:
         # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
-        single = [text for text in keyed if "," not in text.partition("=")[2] or text.partition("=")[2][:1] in "[{'\""]
-        try:
-            cfg = compose(config_name, single)
-        except OverrideParseException as error:
-            return f"{error.override!r} cannot be read: put a value with special characters in quotes, key='a=b'"
-        except (HydraException, OmegaConfBaseException, ValueError) as error:
-            cause = error.__cause__ or error
-            key = getattr(cause, "full_key", None)
-            reason = str(cause).splitlines()[0]
-            return _explain(f"{key}: {reason}" if key and key not in reason else reason, single, config_name)
+        single = [text for text in keyed if not _is_sweep(text)]
+        if len(single) < len(keyed) and not {"-m", "--multirun"} & set(overrides):
+            several = next(text for text in keyed if text not in single)
+            return f"{several} asks for several runs: add -m, or choose one"
+        cfg = composed(single)
+    except OverrideParseException as error:
+        return f"{error.override!r} cannot be read: put a value with special characters in quotes, key='a=b'"
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
+        cause = error.__cause__ or error
+        key = getattr(cause, "full_key", None)
+        reason = str(cause)
+        return _explain(f"{key}: {reason}" if key and key not in reason.splitlines()[0] else reason, single)
     return _masks_that_are_off(single, cfg)
 
 
+def without_flags(overrides: Sequence[str]) -> list[str]:
+    """The overrides without flags of Hydra's, and without the words after them (``--cfg job``)."""
+    pairs = zip(["", *overrides], overrides, strict=False)
+    return [text for before, text in pairs if not _is_flag(before, text)]
+
+
 def _is_flag(before: str, text: str) -> bool:
-    """A flag of Hydra's, or the word after it (``--cfg job``)."""
     return text.startswith("-") or (before.startswith("-") and "=" not in text)
+
+
+def _is_sweep(text: str) -> bool:
+    """Whether an override asks for several jobs. Raises OverrideParseException for one that cannot be read."""
+    return OverridesParser.create().parse_overrides([text])[0].is_sweep_override()
 
 
 def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:
@@ -100,41 +131,82 @@ def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:
     for text in overrides:
         key = text.partition("=")[0]
         if re.match(r"(node\.\w+\.mask\.|schedule\.(mask_learning_rate|lambda_m))", key):
-            return f"{key} has no effect with sparsify={cfg.sparsify.name}: choose sparsify=masks, paper or removal"
+            return f"{key} has no effect with sparsify={cfg.sparsify.name}: choose {_sparsify_with_masks()}"
     return None
 
 
-def _explain(reason: str, overrides: list[str], config_name: str) -> str:
-    """Hydra's reason with the whole key and the key or option that was probably meant."""
-    if "Got NoneType" in reason:
+def _sparsify_with_masks() -> str:
+    names = _options("sparsify")
+    *some, last = [name for name in names if OmegaConf.load(CONF / "sparsify" / f"{name}.yaml").sparsify.get("masks")]
+    return f"sparsify={', '.join(some)} or {last}"
+
+
+def _explain(reason: str, overrides: list[str]) -> str:
+    """Hydra's reason (its first line names what is wrong) with the whole key and the key or option that was meant."""
+    said, given = reason.splitlines()[0], [text.partition("=")[0].lstrip("+~") for text in overrides]
+    if "Got NoneType" in said:
         group = next((key for key, _, value in (text.partition("=") for text in overrides) if value == "null"), "")
-        return f"no option null in conf/{group}: choose one of {', '.join(_options(group))}"
-    option = re.search(r"Could not find '([^']+)/([^/']+)'|Could not load '([^']+)/([^/']+)'", reason)
+        return _no_option("null", group)
+    if branch := re.search(r"^(\w+): Cannot assign \w+ to Dict|^field '(\w+)' is not Optional", said):
+        return _needs_a_key(branch[1] or branch[2])
+    option = re.search(r"Could not find '([^']+)/([^/']+)'|Could not load '([^']+)/([^/']+)'", said)
     if option:
         group, name = (part for part in option.groups() if part)
-        if group == "hydra/launcher":
-            package = name.partition("_")[0]
-            return f"no launcher {name!r} is installed: pip install hydra-{package}-launcher, or leave it out"
-        return f"no option {name!r} in conf/{group}: choose one of {', '.join(_options(group))}"
-    unknown = re.search(r"[Kk]ey '([^']+)' is not in struct|Key '([^']+)' not in|Could not override '([^']+)'", reason)
+        return _no_option(name, group)
+    unknown = re.search(r"[Kk]ey '([^']+)' is not in struct|Key '([^']+)' not in|Could not override '([^']+)'", said)
     if not unknown:
-        return reason
+        return said
     part = next(group for group in unknown.groups() if group)
-    given = [text.partition("=")[0].lstrip("+~") for text in overrides]
     key = next((name for name in given if part in name.split(".") or name == part), part)
-    if key in _known(config_name):
+    if places := re.search(r"Did you mean to override (?:one of )?(.+)\?", reason):
+        return f"no key {key!r}; did you mean {places[1].replace(', ', ' or ')}?{_options_of(key)}"
+    if key in _known() or (CONF / _group(key)).is_dir():
         return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
-    return unknown_key(key, _known(config_name))
+    return _unknown_key(key)
+
+
+def _no_option(name: str, group: str) -> str:
+    if group == "hydra/launcher":
+        package = name.partition("_")[0]
+        return f"no launcher {name!r} is installed: pip install hydra-{package}-launcher, or leave it out"
+    while not _options(group) and "/" in group:
+        group, name = group.rpartition("/")[0], f"{group.rpartition('/')[2]}/{name}"
+    return f"no option {name!r} in conf/{group}: choose one of {', '.join(_options(group))}"
+
+
+def _needs_a_key(key: str) -> str:
+    names = [f"{key}.{name}" for name in composed(())[key] if not name.startswith("_")]
+    return f"{key} is no choice but has keys of its own: set one of {', '.join(names)}"
 
 
 def _options(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
-def _known(config_name: str) -> list[str]:
-    """Every key of the configuration as it stands without overrides, and every group."""
+def _group(key: str) -> str:
+    """Of ``mask@node.rigid.mask``: mask."""
+    return key.partition("@")[0]
+
+
+def _unknown_key(key: str) -> str:
+    """One line with the key that was probably meant, and the options where that is a group."""
+    return unknown_key(key, _known(), _options_of)
+
+
+def _options_of(key: str) -> str:
+    options = _options(_group(key))
+    return f" Its options are {', '.join(options)}" if options else ""
+
+
+@cache
+def _known() -> tuple[str, ...]:
+    """Every key of the configuration as it stands without overrides, every group, and every place of one."""
+    with configuration():
+        cfg = compose("train", return_hydra_config=True)
     groups = [str(path.relative_to(CONF)) for path in CONF.rglob("*") if path.is_dir()]
-    return _keys(OmegaConf.to_container(compose(config_name), resolve=False)) + groups
+    places = [key for key in cfg.hydra.runtime.choices if "@" in key]
+    keys = _keys(OmegaConf.to_container(composed(()), resolve=False))
+    return (*keys, *groups, *places)
 
 
 def _keys(tree: object, prefix: str = "") -> list[str]:

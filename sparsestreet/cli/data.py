@@ -1,13 +1,13 @@
 """``sparsestreet data check`` and ``sparsestreet data make``."""
 
+import copy
 import sys
 
-from hydra import compose, initialize_config_dir
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.compose import CONF, override_problem
+from sparsestreet.cli.compose import composed, override_problem
 from sparsestreet.data.check import report_check
 from sparsestreet.data.reader import LogReader
 
@@ -66,8 +66,7 @@ def _compose(overrides: list[str]) -> DictConfig:
     problem = override_problem(overrides)
     if problem:
         raise _UsageError(problem)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides)
+    return copy.deepcopy(composed(overrides))
 
 
 def _reader(cfg: DictConfig) -> LogReader:

@@ -29,8 +29,8 @@ With novel, the held-out cameras are also shifted by so many meters to both side
 and, on synthetic streets, with the truth; with ramp the shift grows over the drive, as in a change of lane.
 records/novel.json holds what was found.
 
-With presets (of conf/render), the same views are also rendered in these ways, whatever training did: what it costs and
-saves is in records/presets.json, and in the report of the run's sweep.
+With presets (names of render.preset), the same views are also rendered in these ways, whatever training did: what it
+costs and saves is in records/presets.json, and in the report of the run's sweep.
 
 Training measures both by itself where evaluation.novel, ramp and presets ask for it; then so does this command.
 """

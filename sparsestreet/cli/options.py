@@ -92,12 +92,15 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | N
         raise OptionError(str(error)) from error
 
 
-def unknown_key(key: str, known: Iterable[str]) -> str:
-    """One line about a key that does not exist, with the one that was probably meant, or all where they are few."""
+def unknown_key(key: str, known: Iterable[str], about: Callable[[str], str] = lambda key: "") -> str:
+    """One line about a key that does not exist, with the one that was probably meant, or all where they are few.
+
+    ``about`` adds what is to be said of the one that was meant.
+    """
     known = list(known)
     close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
     if close:
-        return f"no key {key!r}; did you mean {close[0]!r}?"
+        return f"no key {key!r}; did you mean {close[0]!r}?{about(close[0])}"
     return f"no key {key!r}" + (f"; there are {', '.join(known)}" if len(known) <= FEW else "")
 
 

@@ -88,6 +88,7 @@ def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> Non
 
 
 def sweep_name(folder: Path) -> str | None:
-    """Which of conf/sweep a folder is of; None for any other sweep."""
+    """Which of conf/sweep a folder is of; None for any other sweep. ``NAME_paper`` adds rows to the folder of NAME."""
     path = folder / "multirun.yaml"
-    return OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
+    name = OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
+    return name and name.removesuffix("_paper")

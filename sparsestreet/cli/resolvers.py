@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from sparsestreet.records.summary import SUMMARY
 
@@ -16,14 +16,21 @@ def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     return values[_root_.capacity]
 
 
-def concat(*lists: Iterable[Any]) -> list[Any]:
+def concat(*lists: Iterable[Any]) -> ListConfig:
     """Of conf/assignment: all lists as one."""
-    return [entry for entries in lists for entry in entries]
+    return ListConfig([entry for entries in lists for entry in entries])  # ``--resolve`` takes no list of Python's
 
 
 def mul(factor: float, rate: float) -> float:
     """Of conf/node: a rate of the schedule times a number."""
     return float(factor) * float(rate)
+
+
+def of_preset(setting: str, *, _root_: DictConfig) -> Any:
+    """Of render.settings: what ``render.preset`` says. Raises ValueError naming the presets there are."""
+    from sparsestreet.ops import SplatSettings  # torch, which a report needs not
+
+    return getattr(SplatSettings.preset(_root_.render.preset), setting)
 
 
 def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> Any:
@@ -38,7 +45,7 @@ def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> An
             f"count_of={run}: that run has no record, and a control has its count from it; make it first"
         )
     gaussians = SUMMARY.read(Path(run)).gaussians
-    return gaussians if node is None else gaussians[node]
+    return DictConfig(gaussians) if node is None else gaussians[node]
 
 
 def by_drive(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
@@ -57,6 +64,7 @@ _RESOLVERS = {
     "concat": concat,
     "mul": mul,
     "min": min,
+    "of_preset": of_preset,
     "gaussians_of": gaussians_of,
     "by_drive": by_drive,
     "last_part": last_part,

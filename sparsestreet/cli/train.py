@@ -6,13 +6,12 @@ import time
 from pathlib import Path
 
 import hydra
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.compose import CONF, configuration, override_problem
+from sparsestreet.cli.compose import CONF, composed, override_problem, without_flags
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, run_job, sentence, sweep_problem, sweep_status
 
@@ -29,7 +28,7 @@ def train(arguments: list[str]) -> int:
     _started = time.perf_counter()
     if "--help" not in arguments:
         try:
-            arguments = as_sweep(resumed_overrides(arguments))
+            arguments = _shown(as_sweep(resumed_overrides(arguments)))
             problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
@@ -42,17 +41,25 @@ def train(arguments: list[str]) -> int:
     return sweep_status()
 
 
+def _shown(arguments: list[str]) -> list[str]:
+    """For ``--cfg job --resolve``: the run's folder, which only a running app knows, in the words of ``out``."""
+    if "--resolve" not in arguments:
+        return arguments
+    overrides = without_flags(arguments)
+    # argparse takes overrides only where they stand together.
+    return [*(text for text in arguments if text not in overrides), *overrides, "folder=${out}"]
+
+
 def _problem_of_values(arguments: list[str]) -> str | None:
     """What the values of one run say that cannot be; sweeps and questions to Hydra are looked at job by job."""
-    from sparsestreet.cli.checks import config_problem
+    from sparsestreet.cli.checks import config_problem, unresolvable
 
+    if "--resolve" in arguments:
+        return unresolvable(composed(without_flags(arguments)))
     if any(text.startswith("-") for text in arguments):
         return None
-    with configuration():
-        # The folder is known only to a running app.
-        given = [text for text in arguments if not text.startswith("hydra.run")]
-        cfg = compose("train", [*given, "folder=."])
-        problem = config_problem(cfg)
+    cfg = composed(arguments)
+    problem = config_problem(cfg)
     if problem is None and cfg.resume:
         # Before Hydra writes the configuration of this start over that of the run.
         check_resumed(OmegaConf.to_container(cfg, resolve=True), run_of(Path(cfg.resume)))

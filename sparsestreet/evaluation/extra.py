@@ -28,7 +28,7 @@ class ExtraMetrics:
     ramp: bool = False
     """Whether the shift grows over the drive, as in a change of lane."""
     presets: Sequence[str] = ()
-    """Ways to render, of conf/render."""
+    """Ways to render, names of ``render.preset``."""
 
     def __post_init__(self) -> None:
         for preset in self.presets:

@@ -15,7 +15,7 @@ class RenderedAs:
     """One way to render the scene, over the same views as all others of the record."""
 
     preset: str
-    """Its name in conf/render."""
+    """Its name, as in ``render.preset``."""
     trained: bool
     """Whether training rendered with the same settings."""
     quality: dict[str, float]

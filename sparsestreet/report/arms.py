@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from sparsestreet.records.configuration import config_hash, differing_options, only, without
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.variants import CLIP_KEYS, CONTROLS, in_few_words, log_config, variants
+from sparsestreet.report.variants import CLIP_KEYS, control_of, in_few_words, log_config, variants
 
 Value = Callable[[RunSummary], float | None]
 Unit = tuple[tuple[str, str], int]
@@ -28,9 +28,9 @@ class Arm:
     """Of both kinds: trained without held-out views, and on all."""
 
     @property
-    def control(self) -> bool:
-        """Whether this is a control, sized to match another arm."""
-        return self.sparsify in CONTROLS
+    def control(self) -> str | None:
+        """What kind of control this is, sized to match another arm; None for any other arm."""
+        return control_of(self.records[0].summary)
 
     @property
     def title(self) -> str:
@@ -95,7 +95,7 @@ def arms(records: Sequence[RunRecord]) -> list[Arm]:
             run = group[0].summary.run
             name = f"{variant.name} ({words})" if words else variant.name
             found.append(Arm(name, variant.label, run.method, run.sparsify, place, tuple(group)))
-    return sorted(found, key=lambda arm: (arm.plain_label, arm.control, arm.sparsify != "none", arm.name))
+    return sorted(found, key=lambda arm: (arm.plain_label, arm.control is not None, arm.sparsify != "none", arm.name))
 
 
 def plain_of(arm: Arm, among: Iterable[Arm]) -> Arm | None:

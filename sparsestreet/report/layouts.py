@@ -10,7 +10,6 @@ from sparsestreet.report.arms import Arm, Value
 from sparsestreet.report.beside import mean_beside
 from sparsestreet.report.grid import ABSENT, Cell, Grid
 from sparsestreet.report.published import LAYOUT, TABLES, Key, PublishedRow, PublishedTable
-from sparsestreet.report.variants import CONTROLS
 
 _GROUPS = {TRAINING: "reconstruction", HELD_OUT: "novel views", "novel": "beside the path", "": ""}
 _TEXTS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "fid": "{:.2f}", "fps": "{:.1f}"}
@@ -128,8 +127,8 @@ def _notes(arms: Sequence[Arm], table: PublishedTable, protocol: Protocol, same:
         said.append(
             "reconstruction: of the training views of the runs that hold views out; no run trained on all views"
         )
-    controls = sorted({arm.sparsify for arm in arms if arm.control})
-    said += [f"control {name}: {CONTROLS[name]}" for name in controls]
+    controls = sorted({(arm.sparsify, arm.control) for arm in arms if arm.control})
+    said += [f"control {name}: {control}" for name, control in controls]
     if failed:
         said.append("failed runs are in no mean")
     return tuple(said)

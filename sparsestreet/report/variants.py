@@ -23,12 +23,12 @@ SECTION_KEYS = ("split.*", *LOG_KEYS)
 CLIP_KEYS = ("data.log.first_frame", "data.log.last_frame")
 """Options that say which part of a log is read: where they differ, scenes differ, as where logs do."""
 
-CONTROLS = {
+_EARLIER_CONTROLS = {
     "random": "as many Gaussians, drawn at random",
     "opacity": "as many Gaussians, the most opaque",
     "capped": "the plain method, stopped at as many Gaussians",
 }
-"""Sparsifications that are no way to get small but the size of another run -> what they are."""
+"""Sparsifications of records made before a configuration said ``sparsify.control`` -> what that would be."""
 
 COUNT_KEYS = (
     "callback.pruning.rule.keep",
@@ -83,6 +83,11 @@ def variants(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) 
     return sorted(unique, key=lambda variant: variant.name)
 
 
+def control_of(run: RunSummary) -> str | None:
+    """What kind of control a run is, which is no way to get small but has the size of another run; None: it is none."""
+    return run.run.config.get("sparsify.control", _EARLIER_CONTROLS.get(run.run.sparsify))
+
+
 def log_config(run: RunSummary) -> dict[str, Setting]:
     """The options that say which images of which log a run saw."""
     return only(without(run.run.config, IDENTITY_KEYS), LOG_KEYS)
@@ -90,7 +95,7 @@ def log_config(run: RunSummary) -> dict[str, Setting]:
 
 def _compared(run: RunSummary) -> dict[str, Setting]:
     """The options by which runs of one table may differ."""
-    follows = COUNT_KEYS if run.run.sparsify in CONTROLS and run.run.config.get("count_of") else ()
+    follows = COUNT_KEYS if control_of(run) and run.run.config.get("count_of") else ()
     return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS, *follows))
 
 

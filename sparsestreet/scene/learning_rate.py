@@ -1,7 +1,8 @@
 """A learning rate over a run; every node says which of its parameters takes which."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,16 @@ class LearningRate:
         if not 0 <= self.start <= 1:
             raise ValueError(f"a learning rate starts at a fraction of the run in [0, 1], got start={self.start}")
 
+    @classmethod
+    def of(cls, said: "LearningRate | Mapping[str, Any]") -> "LearningRate":
+        """A rate as it is, or one from a mapping of its fields. Raises ValueError for anything else."""
+        if isinstance(said, LearningRate):
+            return said
+        names = [field.name for field in fields(cls)]
+        if not (isinstance(said, Mapping) and {"initial"} <= said.keys() <= set(names)):
+            raise ValueError(f"a learning rate has initial, and may have {', '.join(names[1:])}; got {said}")
+        return cls(**said)
+
     def factor(self, progress: float) -> float:
         """Multiplier of the initial rate at a progress in [0, 1]."""
         if progress < self.start:
@@ -29,6 +40,15 @@ class LearningRate:
         if self.final is None:
             return 1.0
         return (self.final / self.initial) ** min(max(progress, 0.0), 1.0)
+
+
+Rates = Mapping[str, LearningRate | Mapping[str, Any]]
+"""Rates by name, each as it is or as a mapping of its fields."""
+
+
+def rates_of(said: Rates) -> dict[str, LearningRate]:
+    """All as ``LearningRate``. Raises ValueError for what is none."""
+    return {name: LearningRate.of(rate) for name, rate in said.items()}
 
 
 def usual_rates() -> dict[str, LearningRate]:

@@ -42,8 +42,8 @@ class Recipe:
             present = any(isinstance(value, kind) for value in group.values())
             if masked and not present:
                 found.append(
-                    f"the masks of {', '.join(masked)} have no {kind.__name__} among the {part}: choose "
-                    "sparsify=masks, paper or removal, or set sparsify.masks=false"
+                    f"the masks of {', '.join(masked)} have no {kind.__name__} among the {part}: choose a "
+                    "sparsification that trains masks, or set sparsify.masks=false"
                 )
             if present and not masked:
                 found.append(f"{kind.__name__} is among the {part} but no node trains a mask: set sparsify.masks=true")

@@ -8,7 +8,12 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import configuration, load_run_config, override_problem
+from sparsestreet.cli.compose import composed, configuration, load_run_config, override_problem
+from sparsestreet.cli.train import train
+
+
+def test_the_same_overrides_are_composed_once():
+    assert composed(["seed=1"]) is composed(("seed=1",)) is not composed(["seed=2"])
 
 
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "hydra"], ["--info", "defaults"], ["-m"]])
@@ -39,6 +44,17 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["image_points=null"], "choose one of none, sift"),
         (["node.background.sources.nera.part=0.1"], "did you mean 'node.background.sources.near.part'"),
         (["logger=null"], "choose one of csv, none"),
+        (["methd=3dgs"], "did you mean 'method'? Its options are 3dgs, deformgs, omnire, pvg, streetgs"),
+        (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of strong_masks"),
+        (["sparsify=paper", "pruning@callback.pruning.rule=foo"], "in conf/pruning: choose one of importance, opacity"),
+        (["pruning@callback.pruning.rule=removal"], "with these choices: leave it out, or choose the option that has"),
+        (["density@node.background.density=foo"], "no option 'foo' in conf/density: choose one of gradient, vibrating"),
+        (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
+        (["mask@node.rigd.mask=temporal"], "mask@node.rigid.mask? Its options are static, temporal"),
+        (["render=fast"], "set one of render.backend, render.preset, render.settings"),
+        (["optimizer=visible_adam"], "set one of optimizer.eps, optimizer.visible_only"),
+        (["render=null"], "render is no choice but has keys of its own"),
+        (["seed=0,1"], "seed=0,1 asks for several runs: add -m, or choose one"),
     ],
 )
 def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
@@ -54,6 +70,8 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
         ("node.background.num_points=many", "node.background.num_points must be int, got 'many'"),
         ("node.background.sources.images.order=any", "sources.images.order must be Literal"),
         ("node.background.learning_rates.means.initial=[1]", "learning_rates.means.initial must be float"),
+        ("++node.rigid.learning_rates.means.inital=1", "no key 'node.rigid.learning_rates.means.inital': LearningRate"),
+        ("density@node.background.density=vibrating", "density.cycle follows from 'cycle', which these choices"),
         ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
         ("effects.sky.when=never", "effects.sky.when must be Literal['auto', 'on', 'off'], got 'never'"),
         ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),
@@ -79,6 +97,16 @@ def test_a_value_that_cannot_be_is_found_before_any_data_is_read(override, said)
 def test_values_that_can_be_pass(override):
     with configuration():
         assert config_problem(compose("train", ["folder=.", override])) is None
+
+
+def test_the_whole_configuration_can_be_shown_resolved(capsys):
+    """With the run's folder, which no app knows yet, and lists that follow from others; what cannot be is one line."""
+    assert train(["seed=3", "--cfg", "job", "--resolve", "out=runs/a", "method=omnire"]) == 0
+    shown = OmegaConf.create(capsys.readouterr().out)
+    assert (shown.seed, shown.folder, shown.node.smpl.classes) == (3, "runs/a", ["Pedestrian"])
+    assert shown.callback.row_ledger.path == "runs/a/records/counts.csv"
+    assert train(["--cfg", "job", "--resolve", "sparsify=random", "count_of=/nowhere"]) == 2
+    assert "that run has no record" in capsys.readouterr().err
 
 
 def test_a_gpu_that_is_not_there(monkeypatch):

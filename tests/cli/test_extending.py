@@ -1,4 +1,4 @@
-"""What docs/extending.md shows, run: a source, a loss, a rule, a mask, a method, a reader and a number from outside."""
+"""What docs/extending.md shows, run: each kind of part from outside."""
 
 import csv
 import re
@@ -19,17 +19,21 @@ from sparsestreet.cli.train import train
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.pruning import RenderContext
 from sparsestreet.records.run import RUN
+from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.views import read_views
 from tests.cli.conftest import TINY_RIGID
+from tests.cli.toy.density import GrowthDensity
 from tests.cli.toy.loss import MeanColor
 from tests.cli.toy.mask import ProbitMask, ProbitMaskSettings
 from tests.cli.toy.metric import largest_errors
 from tests.cli.toy.rule import SizeRule
 from tests.cli.toy.source import DrivenPoints
+from tests.scene.density.scenes import make_rows as rows_at_random
+from tests.scene.density.scenes import with_statistics
 from tests.scene.street import street_log, training_data
 from tests.training.stubs import background, frame_at, make_rows, set_rows
 
@@ -59,7 +63,8 @@ def test_the_page_shows_what_is_run():
     shown = re.findall(r"^`(tests/\S+)`[^\n]*\n\n```\w+\n(.*?)^```", page, flags=re.M | re.S)
     names = {name for name, _ in shown}
     assert {
-        f"tests/cli/toy/{name}.py" for name in ("bobbing", "gain", "source", "loss", "rule", "mask", "reader", "metric")
+        f"tests/cli/toy/{name}.py"
+        for name in ("bobbing", "gain", "source", "loss", "rule", "density", "mask", "reader", "metric")
     } <= names
     for name, code in shown:
         # Comments in brackets stand for what was left out.
@@ -96,6 +101,26 @@ def test_a_rule():
     selection = pruning.rule.select(SceneGraph({"background": node}), [frame_at()], RenderContext())["background"]
     assert (~selection.keep).nonzero().tolist() == [[5]]
     assert selection.floor_hit
+
+
+def test_a_rule_takes_the_place_of_another():
+    """By name, in whichever sparsification prunes; what is left of that one are its moments."""
+    pruning = recipe_of(composed("sparsify=paper", "pruning@callback.pruning.rule=size")).callbacks["pruning"]
+    assert (pruning.at, pruning.rule) == ((0.93334,), SizeRule(meters=1.0))
+
+
+def test_a_density_strategy():
+    nodes = recipe_of(composed("density@node.background.density=growth", "node.background.density.growth=0.5")).nodes
+    density = nodes["background"].density
+    assert density == GrowthDensity(growth=0.5)  # the rest as the class has it, like conf/density/gradient.yaml
+    assert nodes["rigid"].density == GradientDensity(cull_scale=0.1)
+    rows = rows_at_random(10, torch.Generator().manual_seed(0))
+    wanted = with_statistics([1.0] * 10)
+    for most, after in ((None, 15), (12, 12)):
+        plan = density.densify(
+            rows, wanted, radius=1e6, progress=0.5, max_gaussians=most, generator=torch.Generator().manual_seed(0)
+        )
+        assert len(plan.source) == after  # radius 1e6: every row is small, so that each wanted one is cloned
 
 
 def test_a_mask():

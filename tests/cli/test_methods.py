@@ -11,8 +11,11 @@ from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import recipe_of
+from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, configuration, override_problem
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
+from sparsestreet.records.configuration import flat_config
+from sparsestreet.scene.density import GradientDensity, VibratingDensity
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.triangulation import ImagePointSettings
@@ -32,7 +35,7 @@ def composed(*overrides: str):
 
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
-    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity", "capped"} == set(SPARSIFY)
+    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity", "capped"} <= set(SPARSIFY)
 
 
 @pytest.mark.parametrize(("method", "sparsify"), PAIRS)
@@ -40,11 +43,13 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     """Masks, their loss and their callback come together; what a method has stays with every sparsification."""
     cfg = composed(f"method={method}", f"sparsify={sparsify}")
     recipe, plain = recipe_of(cfg), recipe_of(composed(f"method={method}"))
-    masked = sparsify in ("masks", "paper", "removal")
+    masked = cfg.sparsify.masks
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
     assert list(recipe.losses) == [*plain.losses, *(["mask_sparsity"] if masked else [])]
+    # Which rule and which masks a sparsification has is the paper's matter, and that of its name.
     rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
     rules |= {"random": RandomRule, "opacity": OpacityRule}
+    assert masked or sparsify not in ("masks", "paper", "removal")
     added = ([MaskTraining] if masked else []) + ([Pruning] if sparsify in rules else [])
     assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:
@@ -106,13 +111,36 @@ def test_points_from_images_are_made_unless_told_otherwise():
     assert recipe_of(composed("image_points=none")).image_points is None
 
 
-def test_every_preset_of_the_op_is_an_option():
-    from sparsestreet.ops import SplatSettings
-    from sparsestreet.ops.settings import _PRESETS
+@pytest.mark.parametrize("rule", sorted(path.stem for path in (CONF / "pruning").glob("*.yaml")))
+def test_rules_are_chosen_by_name_wherever_something_is_pruned(rule: str):
+    pruning = composed("sparsify=paper", f"pruning@callback.pruning.rule={rule}").callback.pruning
+    assert OmegaConf.to_container(pruning.rule, resolve=False) == OmegaConf.to_container(
+        OmegaConf.load(CONF / "pruning" / f"{rule}.yaml"), resolve=False
+    )
+    assert pruning.at == [0.93334]
 
-    for name in _PRESETS:
-        settings = recipe_of(composed(f"render={name}")).options.settings
-        assert settings == SplatSettings.preset(name), name
+
+def test_a_density_strategy_is_a_choice():
+    """A node says what differs, whichever it is; the strategy of PVG has the period of the node it is chosen for."""
+    pvg = recipe_of(composed("method=pvg", "node.background.cycle=0.3")).nodes["background"].density
+    assert (type(pvg), pvg.cycle, pvg.cull_scale) == (VibratingDensity, 0.3, 0.5)
+    other = recipe_of(composed("method=pvg", "density@node.background.density=gradient")).nodes["background"].density
+    assert other == GradientDensity()
+    cars = recipe_of(composed()).nodes["rigid"].density
+    assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
+
+
+def test_settings_of_the_op_are_those_of_a_preset_unless_given():
+    from sparsestreet.ops import SplatSettings
+
+    assert recipe_of(composed()).options.settings == SplatSettings()
+    changed = recipe_of(composed("render.preset=fine", "render.settings.alpha_min=0.1")).options
+    assert (changed.settings, changed.backend) == (SplatSettings(max_sigma=4.0, alpha_min=0.1), "auto")
+    # A record holds the values, whatever a preset means later.
+    assert flat_config(OmegaConf.to_container(composed("render.preset=fast"), resolve=True))[
+        "render.settings.alpha_min"
+    ] == pytest.approx(1 / 128)
+    assert "no settings preset 'quick': choose one of ['default'" in config_problem(composed("render.preset=quick"))
 
 
 @pytest.mark.parametrize(
@@ -133,7 +161,10 @@ def test_every_preset_of_the_op_is_an_option():
         "render.settings.alpha_min=0.01",
         "effects.sky.learning_rates.texels.initial=0.02",
         "loss.depth.nearest=1.0",
-        "render=fast",
+        "render.preset=fast",
+        "optimizer.visible_only=true",
+        "pruning@callback.pruning.rule=removal",
+        "density@node.background.density=gradient",
         "effects.sky.when=off",
         "effects=[sky]",
         "effects=[]",
@@ -177,6 +208,7 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
     Quick masks, so that some rows do go, and a small budget of removal, so that it leaves some to the masks. One method
     starts with points from images, the other without.
     """
+    masked = OmegaConf.load(CONF / "sparsify" / f"{sparsify}.yaml").sparsify.get("masks", False)
     masks = ["schedule.mask_learning_rate=1.0", "schedule.lambda_m=10.0"]
     out = run_train(
         tmp_path,
@@ -187,13 +219,13 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
         "schedule.mask_in.every=5",
         "schedule.removal_db=0.01",
         "node.background.density.grad_threshold=1e-6",
-        *(masks if sparsify in ("masks", "paper", "removal") else []),
+        *(masks if masked else []),
         *(["image_points=none"] if method == "3dgs" else []),
     )
     with (out / "records" / "counts.csv").open() as file:
         reasons = {row["reason"] for row in csv.DictReader(file)}
     assert {"start", "densify"} <= reasons
-    assert ("mask" in reasons) == (sparsify in ("masks", "paper", "removal"))
+    assert ("mask" in reasons) == masked
     assert ("pruning" in reasons) == (sparsify not in ("none", "masks"))
     assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=False)["global_step"] == 20
 

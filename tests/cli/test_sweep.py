@@ -45,9 +45,30 @@ def test_every_job_of_a_sweep_can_be(name, tmp_path):
 
 
 def test_the_rows_of_table_1_are_the_papers():
-    labels = [composed(*job, "data.root=/drives/172").name for job in jobs("table1_waymo")]
+    """Its two sweeps write into one folder."""
+    labels = []
+    for name in ("table1_waymo", "table1_waymo_paper"):
+        params, out = (sweeper := composed(f"+sweep={name}").hydra).sweeper.params, sweeper.sweep.dir
+        assert out == "outputs/sweeps/table1_waymo"
+        rest = [f"+sweep={name}", "data.root=/drives/172", f"sparsify={params.get('sparsify', 'none')}"]
+        labels += [composed(f"method={method}", *rest).name for method in params.method.split(",")]
     plain = ["3dgs-legacy", "deformgs-legacy", "pvg-legacy", "streetgs-legacy", "omnire-legacy"]
     assert labels == [*plain, "streetgs-legacy+paper", "omnire-legacy+paper"]
+
+
+@pytest.mark.parametrize("name", ["drives", "streets", "tiny"])
+def test_what_a_control_counts_is_many_jobs_ahead(name):
+    """Hydra's sweeper changes the first option last: with sparsify first, all runs that are counted come first."""
+    params = composed(f"+sweep={name}").hydra.sweeper.params
+    first, *_ = params
+    options = params[first].split(",")
+    assert first == "sparsify"
+    assert options.index("removal") < min(options.index(one) for one in ("random", "capped") if one in options)
+
+
+def test_the_second_half_of_a_table_is_reported_as_the_table(tmp_path):
+    (tmp_path / "multirun.yaml").write_text("hydra: {runtime: {choices: {sweep: table1_waymo_paper}}}")
+    assert sweep_name(tmp_path) == "table1_waymo"
 
 
 def test_drives_are_read_where_the_authors_read_them():

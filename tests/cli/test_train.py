@@ -286,7 +286,7 @@ def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
 
 
 def test_adam_of_visible_gaussians_runs(run_train, tmp_path):
-    run_train(tmp_path, "optimizer=visible_adam", "trainer.fast_dev_run=2")
+    run_train(tmp_path, "optimizer.visible_only=true", "trainer.fast_dev_run=2")
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     (tmp_path / "records").mkdir()
     said = []
     asked = ExtraMetrics(novel=(1.0,), presets=("fast",))
-    asked.take(small_scene(), data, OPTIONS, out=tmp_path, command="c", say=said.append)
+    asked.measure(small_scene(), data, OPTIONS, out=tmp_path, command="c", say=said.append)
     assert NOVEL.read(tmp_path).real_views == views
     assert PRESETS.read(tmp_path).views == views
     assert f"1 m to the right (n={views}): nothing to compare with" in said

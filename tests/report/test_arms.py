@@ -26,6 +26,18 @@ def test_controls_of_other_counts_are_one_arm():
     assert plain_of(found["streetgs"], found.values()) is found["streetgs"]
 
 
+def test_a_sparsification_says_itself_that_it_is_a_control():
+    """In its configuration; records from before that are known by their names."""
+    runs = [
+        make_summary("streetgs", config={"sparsify.name": "none"}),
+        make_summary("streetgs+size", config={"sparsify.control": "as many Gaussians, the smallest"}),
+        make_summary("streetgs+opacity"),
+    ]
+    found = {arm.name: arm.control for arm in arms([record(run) for run in runs])}
+    known = {"streetgs+opacity": "as many Gaussians, the most opaque"}
+    assert found == {"streetgs": None, "streetgs+size": "as many Gaussians, the smallest"} | known
+
+
 def test_each_scene_counts_once():
     runs = [
         make_summary("plain", 0, 20.0, scene="a"),

@@ -7,9 +7,33 @@ import pytest
 from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
-from tests.scene.street import POSE_RATES, RATES, background, keyframes, pose, random_rows, rigid, static_mask, track
+from tests.scene.street import (
+    POSE_RATES,
+    RATES,
+    background,
+    background_settings,
+    keyframes,
+    pose,
+    random_rows,
+    rigid,
+    static_mask,
+    track,
+)
 
 ONE, TWO, THREE = LearningRate(1.0), LearningRate(2.0), LearningRate(3.0)
+
+
+def test_a_mapping_of_its_fields_is_a_rate():
+    assert LearningRate.of({"initial": 1.0, "final": 0.1, "start": 0.5}) == LearningRate(1.0, 0.1, start=0.5)
+    assert LearningRate.of(ONE) is ONE
+    settings = background_settings(1, learning_rates={"means": {"initial": 2.0}})
+    assert settings.learning_rates == {"means": TWO}
+
+
+@pytest.mark.parametrize("said", [{"inital": 1.0}, {"final": 1.0}, {"initial": 1.0, "stop": 0.5}, 0.1])
+def test_anything_else_is_no_rate(said):
+    with pytest.raises(ValueError, match="a learning rate has initial, and may have final, scale_by_scene_radius, sta"):
+        LearningRate.of(said)
 
 
 @pytest.mark.parametrize(

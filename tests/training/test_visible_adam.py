@@ -170,12 +170,12 @@ def test_a_closure_computes_gradients_and_parameters_without_any_rest(generator)
     assert unused not in optimizer.state
 
 
-@pytest.mark.parametrize(("override", "kind"), [("adam", torch.optim.Adam), ("visible_adam", VisibleAdam)])
-def test_the_configuration_chooses(override, kind):
+@pytest.mark.parametrize(("visible_only", "kind"), [("false", torch.optim.Adam), ("true", VisibleAdam)])
+def test_the_configuration_chooses(visible_only, kind):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        chosen = compose("train", [f"optimizer={override}"]).optimizer
+        chosen = compose("train", [f"optimizer.visible_only={visible_only}"]).optimizer
         default = compose("train").optimizer
     optimizer = instantiate(chosen, _convert_="all").build(scene(2), 1.0)
     assert type(optimizer) is kind
     assert optimizer.defaults["eps"] == 1e-15
-    assert (chosen == default) == (override == "adam")
+    assert (chosen == default) == (visible_only == "false")

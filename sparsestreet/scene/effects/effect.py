@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.learning_rate import Rates, rates_of
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Rendering, View
@@ -41,10 +41,11 @@ class EffectSettings(ABC):
 
     when: Literal["auto", "on", "off"] = "auto"
     """auto: the scene has the effect if its log calls for it; on: in any case; off: never, whatever the log says."""
-    learning_rates: Mapping[str, LearningRate] = field(default_factory=dict)
-    """Parameter or module of the effect -> its rate; the longest name that matches wins."""
+    learning_rates: Rates = field(default_factory=dict)
+    """Parameter or module of the effect -> its rate, or the fields of one; the longest name that matches wins."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "learning_rates", rates_of(self.learning_rates))
         if self.when not in ("auto", "on", "off"):
             raise ValueError(f"when must be auto, on or off, got {self.when!r}: in a YAML file write 'on' in quotes")
 

@@ -13,7 +13,7 @@ from sparsestreet.ops import over_sky
 from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.types import Rendering, View
 
@@ -24,7 +24,7 @@ class SkySettings(EffectSettings):
 
     resolution: int = 128
     initial_color: float = 0.5
-    learning_rates: Mapping[str, LearningRate] = field(default_factory=lambda: {"texels": LearningRate(0.01)})
+    learning_rates: Rates = field(default_factory=lambda: {"texels": LearningRate(0.01)})
 
     def __post_init__(self) -> None:
         super().__post_init__()

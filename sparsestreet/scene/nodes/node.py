@@ -17,7 +17,7 @@ from sparsestreet.scene.gaussians import Rows, drop_parameter
 from sparsestreet.scene.initialize.gaussians import init_gaussians
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.learning_rate import LearningRate, usual_rates
+from sparsestreet.scene.learning_rate import Rates, rates_of, usual_rates
 from sparsestreet.scene.masks import Mask, MaskScope, MaskSettings
 from sparsestreet.scene.nodes.regularizers import sharp_shape
 from sparsestreet.scene.state import SceneState
@@ -62,10 +62,12 @@ class NodeSettings(ABC):
     """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: it is not computed."""
     max_axis_ratio: float = 10.0
     """Ratio of a Gaussian's longest to its shortest axis from which that term counts."""
-    learning_rates: Mapping[str, LearningRate] = field(default_factory=usual_rates)
-    """Column, parameter or module of the node -> its rate; the longest name that matches wins."""
+    learning_rates: Rates = field(default_factory=usual_rates)
+    """Column, parameter or module of the node -> its rate; the longest name that matches wins. A mapping of its fields
+    is taken for a rate and becomes one."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "learning_rates", rates_of(self.learning_rates))
         if self.min_gaussians < 0:
             raise ValueError(f"min_gaussians must be >= 0, got {self.min_gaussians}")
         if not self.min_instance_gaussians >= 0:
