@@ -1,4 +1,4 @@
-"""A run's resolved configuration as a flat mapping: what identifies a run, and in which options runs differ.
+"""A run's resolved configuration as a flat mapping. It identifies the run and shows in which options runs differ.
 
 Keys are dotted (``schedule.max_steps``), values are JSON scalars or lists.
 """
@@ -14,24 +14,24 @@ Configuration = Mapping[str, Setting]
 
 IDENTITY_KEYS = (
     "seed",  # runs of other seeds are what repeats are
-    "*.seed",  # interpolated from it: density control, the embedded street (whose name holds it)
+    "*.seed",  # interpolated from seed: density control, the embedded street (whose name holds the seed)
     "name",
     "label",
-    "resume",  # a resumed run is the run
+    "resume",  # a resumed run is the same run
     "out",
     "folder",
-    "count_of",  # where a control has its numbers from; they are options of their own
-    "data.root",  # where a log lies; the scene's name says which it is
+    "count_of",  # the run whose counts a control copies; the counts are options of their own
+    "data.root",  # where a log lies; the scene's name identifies it
     "data.log.root",
     "data.log.parent",
     "data.log.cache_mb",
-    "image_points.cache",  # where points lie and who makes them, not which they are
+    "image_points.cache",  # where points lie and how many threads make them; the points are the same
     "image_points.threads",
     "split.val_frames",
     "callback.*.path",  # where something is written
     "logger",
     "logger.*",
-    "trainer.accelerator",  # where a run was made is recorded beside it; how many devices share a step is a setting
+    "trainer.accelerator",  # the device is recorded separately; the number of devices that share a step is a setting
     "trainer.log_every_n_steps",
     "trainer.val_check_interval",
     "trainer.limit_val_batches",
@@ -39,12 +39,18 @@ IDENTITY_KEYS = (
     "trainer.default_root_dir",
     "evaluation.*",
 )
-"""Patterns of the options that name a run, place it or watch it, and cannot change what it arrives at. All other
-options are part of the configuration's identity."""
+"""Patterns of the options that name, place or watch a run and cannot change its result. All other options are part of
+the configuration's identity."""
 
 
 def flat_config(tree: Mapping[str, object], prefix: str = "") -> dict[str, Setting]:
-    """A resolved tree of mappings as dotted key -> scalar or list; empty mappings vanish, infinities become words."""
+    """Returns a resolved tree of mappings as dotted key -> scalar or list.
+
+    Empty mappings vanish; infinities and NaN become words.
+
+    >>> flat_config({"schedule": {"max_steps": 100, "far": float("inf")}, "logger": {}})
+    {'schedule.max_steps': 100, 'schedule.far': 'inf'}
+    """
     flat: dict[str, Setting] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping):
@@ -57,32 +63,48 @@ def flat_config(tree: Mapping[str, object], prefix: str = "") -> dict[str, Setti
 
 
 def config_hash(config: Configuration) -> str:
-    """12 hexadecimal digits of the SHA-256 of the configuration without ``IDENTITY_KEYS``: equal for repeats."""
+    """Returns 12 hexadecimal digits of the SHA-256 of the configuration without ``IDENTITY_KEYS``; equal for repeats.
+
+    >>> config_hash({"seed": 0, "schedule.max_steps": 100}) == config_hash({"seed": 1, "schedule.max_steps": 100})
+    True
+    """
     text = "\n".join(f"{key}={_canonical(value)}" for key, value in sorted(without(config, IDENTITY_KEYS).items()))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def without(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting]:
-    """The options whose keys match none of the patterns (``*`` stands for anything, dots too)."""
+    """Returns the options whose keys match none of the patterns (``*`` matches anything, dots too).
+
+    >>> without({"seed": 0, "data.root": "logs", "split.stride": 10}, ("seed", "data.*"))
+    {'split.stride': 10}
+    """
     patterns = tuple(patterns)
     return {key: value for key, value in config.items() if not any(fnmatchcase(key, one) for one in patterns)}
 
 
 def only(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting]:
-    """The options whose keys match one of the patterns."""
+    """Returns the options whose keys match one of the patterns.
+
+    >>> only({"seed": 0, "data.root": "logs", "split.stride": 10}, ("data.*",))
+    {'data.root': 'logs'}
+    """
     left = without(config, patterns)
     return {key: value for key, value in config.items() if key not in left}
 
 
 def differing_options(configs: Sequence[Configuration], commands: Iterable[str] = ()) -> list[tuple[str, ...]]:
-    """For each configuration the options in which it differs from any other, in words such as "split.stride=5".
+    """Returns for each configuration the options in which it differs from any other, such as "split.stride=5".
 
-    Options with the same values throughout are taken for interpolations of one: the one that a command gave, else the
-    one with the shortest path. What some configurations lack altogether reads "with loss.depth", "without loss.depth".
+    Options whose values vary alike count as interpolations of one option. That one is named: the one that a command
+    gave, else the one with the shortest path. A part that some configurations lack reads "with loss.depth" or "without
+    loss.depth".
+
+    >>> differing_options([{"split.stride": 5, "lr": 0.1}, {"split.stride": 10, "lr": 0.1}])
+    [('split.stride=5',), ('split.stride=10',)]
 
     Args:
-        configs: of the runs that one table compares.
-        commands: that made them; options given there are always named.
+        configs: the configurations of the runs that one table compares.
+        commands: the commands that made them; options given there are always named.
     """
     given = given_keys(commands)
     words: list[tuple[str, ...]] = []
@@ -101,17 +123,28 @@ def differing_options(configs: Sequence[Configuration], commands: Iterable[str] 
 
 
 def given_keys(commands: Iterable[str]) -> set[str]:
-    """The keys of the options that stand in commands."""
+    """Returns the keys of the options that commands give.
+
+    >>> sorted(given_keys(["train method=streetgs +loss.depth=0.1"]))
+    ['loss.depth', 'method']
+    """
     return {word.partition("=")[0].lstrip("+") for command in commands for word in command.split() if "=" in word}
 
 
 def key_of(option: str) -> str:
-    """The key of an option in the words of ``differing_options``."""
+    """Returns the key of an option as ``differing_options`` words it.
+
+    >>> key_of("without loss.depth"), key_of("split.stride=5")
+    ('loss.depth', 'split.stride')
+    """
     return option.partition("=")[0].removeprefix("without ").removeprefix("with ")
 
 
 def _missing_part(key: str, configs: Sequence[Configuration]) -> str | None:
-    """The largest part of the tree around ``key`` that those which lack the key lack as a whole; None: just the key."""
+    """Returns the largest part of the tree around ``key`` that is absent from every configuration without the key.
+
+    None where none lacks it, or where those that lack it have its siblings.
+    """
     lacking = [config for config in configs if key not in config]
     names = key.split(".")
     for depth in range(1, len(names)):
@@ -126,7 +159,7 @@ def _has(config: Configuration, part: str) -> bool:
 
 
 def _canonical(value: Setting) -> str:
-    """JSON in which 1 and 1.0, which YAML tells apart and nobody means to, are the same."""
+    """Returns JSON in which 1 and 1.0 are the same: YAML tells them apart, but nobody means to."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, list):

@@ -1,6 +1,6 @@
-"""``records/cost.json``: where the time and the memory of a run went.
+"""``records/cost.json``: how a run spent its time and memory.
 
-Training and evaluation each write their part and keep the other's.
+Training and evaluation each write their own part and keep the other's.
 """
 
 import statistics
@@ -18,10 +18,10 @@ FORMAT = 1
 """Version of ``cost.json``; raised when a key changes its meaning."""
 
 PRUNE = "prune"
-"""The stage of pruning; each pass is a detail of it."""
+"""Name of the stage of pruning; each pass is a detail of this stage."""
 
 _BELONGS = 0.02
-"""Of the wall clock: as much may lie in no phase."""
+"""Largest share of the wall clock that may lie in no phase."""
 
 _PARTS = {
     **dict.fromkeys(("splat backward", "scene backward", "sky backward", "ssim backward"), "backward"),
@@ -32,44 +32,44 @@ _PARTS = {
 
 @dataclass(frozen=True)
 class NodeCost:
-    """What a node class takes of a scene."""
+    """What a node class costs in a scene."""
 
     gaussians: int
     megabytes: float
-    """10^6 bytes, rows and poses."""
+    """Size of its rows and poses, 10^6 bytes."""
     frame_ms: float
-    """Median of a frame without it."""
+    """Median milliseconds of a frame without the node."""
     ms: float
-    """What a frame takes longer with it: the median over pairs of frames, with and without. Noise can make it
-    negative, and nodes that hide each other cost less together than the sum of both."""
+    """Additional milliseconds of a frame with the node: the median over pairs of frames, with and without it. Noise
+    can make it negative. Nodes that hide each other cost less together than the sum of both."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CostRecord:
-    """The content of ``cost.json``. Raises ValueError where the phases are not the whole wall clock."""
+    """The content of ``cost.json``. Raises ValueError if the phases do not add up to the wall clock."""
 
     format: int = version(FORMAT, "train the run again")
     wall_seconds: float | None = None
-    """Of the whole ``train`` command, torch's import included (the interpreter's own start, 0.2 s, is not), and of the
-    interrupted ones that it went on from; None until one has ended."""
+    """Seconds of the whole ``train`` command and of the interrupted commands that it continued. They include torch's
+    import, but not the interpreter's own start (0.2 s). None until a command has ended."""
     phases: dict[str, float]
     """Part of the command (start, data, points, initialize, train, validate, prune, save, evaluate, latency, costs,
-    novel, presets, pictures, other) -> seconds, each second in one of them."""
+    novel, presets, pictures, other) -> seconds. Each second belongs to one part."""
     step_ms: dict[str, float]
-    """Part of a training step -> median milliseconds, over the noted steps that have it; empty where none was."""
+    """Part of a training step -> median milliseconds over the noted steps that have it; empty if no step was noted."""
     passes: dict[str, float]
     """Pruning pass, such as "ImportanceRule at step 28000" -> seconds."""
     peak_host_mb: float | None = None
-    """10^6 bytes of the process, from the start of the command (where Linux can tell) to its end."""
+    """Peak memory of the process, 10^6 bytes, from the start of the command (where Linux can tell) to its end."""
     peak_device_mb: float | None = None
-    """10^6 bytes that torch had allocated on the GPU at once; None on a CPU."""
+    """Peak of what torch allocated on the GPU, 10^6 bytes; None on a CPU."""
     frame_ms: dict[str, float]
     """Part of a frame (scene, splat, effects by name, output) -> median milliseconds; they add up to the frame."""
     nodes: dict[str, NodeCost]
     effects: dict[str, float]
-    """Name of an effect of the scene, or "masks" -> milliseconds that a frame takes longer with it."""
+    """Name of an effect of the scene, or "masks" -> additional milliseconds of a frame with it."""
     noise: Noise | None = None
-    """While ``frame_ms``, ``nodes`` and ``effects`` were measured."""
+    """Noise while ``frame_ms``, ``nodes`` and ``effects`` were measured."""
 
     def __post_init__(self) -> None:
         if self.wall_seconds is not None and abs(sum(self.phases.values()) / self.wall_seconds - 1) > _BELONGS:
@@ -83,13 +83,17 @@ COSTS = JsonFile("records/cost.json", CostRecord)
 
 
 def update_costs(run: Path, **parts: object) -> None:
-    """Write some fields of a run's costs anew; the others stay, or are empty where nobody wrote them."""
+    """Rewrites some fields of a run's costs. The others stay, or are empty if they were never written."""
     empty = CostRecord(phases={}, step_ms={}, passes={}, frame_ms={}, nodes={}, effects={})
     COSTS.write(run, replace(COSTS.find(run) or empty, **parts))
 
 
 def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
-    """``phases`` and ``passes`` of the seconds by stage."""
+    """Returns ``phases`` and ``passes`` from the seconds of each stage.
+
+    >>> stage_costs({"train": 90.0, "prune/ImportanceRule at step 28000": 4.0})
+    ({'train': 90.0, 'prune': 4.0}, {'ImportanceRule at step 28000': 4.0})
+    """
     phases: Counter[str] = Counter()
     passes = {}
     for name, value in seconds.items():
@@ -101,7 +105,7 @@ def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[st
 
 
 def step_costs(run: Path) -> dict[str, float]:
-    """``step_ms`` of what a run's ``phases.csv`` noted; empty without the file."""
+    """Returns ``step_ms`` from a run's ``phases.csv``; empty without the file."""
     steps: defaultdict[tuple[str, int], float] = defaultdict(float)
     for row in STEP_PHASES.find(run) or ():
         steps[_part(row.phase), row.step] += row.milliseconds

@@ -13,19 +13,19 @@ class FailedRun:
 
     format: int = version(1, "run the sweep again")
     label: str
-    """What would be the run's column, such as "streetgs+paper"."""
+    """The column that the run would have had in a table, such as "streetgs+paper"."""
     seed: int
     command: str
     """The command of this job alone."""
     error: str
-    """What it died of, in a sentence."""
+    """The error, in a sentence."""
     trace: str
-    """Where: Python's trace."""
+    """Python's traceback."""
 
 
 FAILURE = JsonFile("failed.json", FailedRun)
 
 
 def read_failures(sweep: Path) -> list[tuple[Path, FailedRun]]:
-    """Folder and reason of every job that failed below a folder, sorted. Raises RecordError for a malformed one."""
+    """Returns folder and failure of every failed job below a folder, sorted. Raises RecordError for a malformed one."""
     return [(run, FAILURE.read(run)) for run in FAILURE.runs(sweep)]

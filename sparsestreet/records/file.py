@@ -1,4 +1,4 @@
-"""The files of a run's folder: each has one value that knows its place, reads it checked and writes it whole."""
+"""The files of a run's folder. One value stands for each: it knows the path, checks what it reads and writes whole."""
 
 import csv
 import io
@@ -15,62 +15,82 @@ Row = TypeVar("Row")
 
 @dataclass(frozen=True)
 class RunFile:
-    """A file that a run may have."""
+    """A file that a run may have.
+
+    >>> str(RunFile("records/summary.json").path(Path("outputs/run")))
+    'outputs/run/records/summary.json'
+    """
 
     name: str
     """Its path within the run's folder."""
 
     def path(self, run: Path) -> Path:
-        """Where a run keeps it."""
+        """Returns its path in the folder of a run."""
         return run / self.name
 
     def exists(self, run: Path) -> bool:
-        """Whether a run has it."""
+        """Whether a run has the file."""
         return self.path(run).is_file()
 
     def remove(self, run: Path) -> None:
-        """Remove it where a run has it."""
+        """Removes the file from a run that has it."""
         self.path(run).unlink(missing_ok=True)
 
     def runs(self, root: Path) -> list[Path]:
-        """The folders below ``root`` that have it, sorted."""
+        """Returns the run folders below ``root`` that have the file, sorted."""
         depth = len(Path(self.name).parts) - 1
         return [path.parents[depth] for path in sorted(root.rglob(self.name))]
 
 
 @dataclass(frozen=True)
 class JsonFile(RunFile, Generic[Record]):
-    """A frozen dataclass as JSON; see ``strict_json``."""
+    """A frozen dataclass as JSON; see ``strict_json``.
+
+    >>> import tempfile
+    >>> from sparsestreet.records.failures import FAILURE, FailedRun
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     FAILURE.write(Path(folder), FailedRun(label="3dgs", seed=0, command="train", error="no log", trace=""))
+    ...     FAILURE.read(Path(folder)).error
+    'no log'
+    """
 
     kind: type[Record]
 
     def read(self, run: Path) -> Record:
-        """Raises RecordError naming the file and the entry that is wrong, or the file that is absent."""
+        """Returns the record of a run. Raises RecordError that names the absent file, or the file and the bad entry."""
         return read_json(self.path(run), self.kind)
 
     def find(self, run: Path) -> Record | None:
-        """As ``read``; None for a run without it."""
+        """Returns the same as ``read``, or None for a run without the file."""
         return self.read(run) if self.exists(run) else None
 
     def write(self, run: Path, record: Record) -> None:
-        """Write it whole or not at all. Raises RecordError for values that JSON has no number for."""
+        """Writes the whole file or nothing. Raises RecordError for values that JSON cannot hold."""
         write_json(self.path(run), record)
 
 
 @dataclass(frozen=True)
 class CsvFile(RunFile, Generic[Row]):
-    """Comma-separated rows below a header that is checked."""
+    """Comma-separated rows under a header that is checked.
+
+    >>> import tempfile
+    >>> from sparsestreet.records.ledger import LEDGER, CountChange
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     LEDGER.write(Path(folder), [CountChange(100, "background", 5000, 4000, "cull")])
+    ...     LEDGER.read(Path(folder))[0].after
+    4000
+    """
 
     columns: tuple[str, ...]
     cells: Callable[[Row], Sequence[object]]
-    """The cells of a row as they are written, None for a blank one; RecordError names the entry that cannot be."""
+    """Turns a row into its cells, None for a blank one. Raises RecordError naming an entry that cannot be written."""
     row: Callable[[Sequence[str]], Row]
-    """A row of as many cells as there are columns; ValueError says what is wrong."""
+    """Turns cells, one a column, into a row. Raises ValueError that says what is wrong."""
     remedy: str
-    """What makes the file, such as "train the run"."""
+    """How to make the file, such as "train the run"."""
 
     def read(self, run: Path) -> list[Row]:
-        """Raises RecordError naming the file and the line that is wrong, or the file that is absent."""
+        """Returns the rows of a run. Raises RecordError that names the absent file, or the file and the bad line."""
         path = self.path(run)
         if not path.is_file():
             raise RecordError(f"{path}: does not exist; {self.remedy} first")
@@ -82,15 +102,15 @@ class CsvFile(RunFile, Generic[Row]):
         return [self._parsed(cells, f"{path}, line {number}") for number, cells in enumerate(lines[1:], start=2)]
 
     def find(self, run: Path) -> list[Row] | None:
-        """As ``read``; None for a run without it."""
+        """Returns the same as ``read``, or None for a run without the file."""
         return self.read(run) if self.exists(run) else None
 
     def write(self, run: Path, rows: Iterable[Row]) -> None:
-        """Write it whole or not at all. Raises RecordError naming the file and the entry that cannot be written."""
+        """Writes the whole file or nothing. Raises RecordError naming the file and an entry that cannot be written."""
         self.write_to(self.path(run), rows)
 
     def write_to(self, path: Path, rows: Iterable[Row]) -> None:
-        """As ``write``, to a place that a configuration names."""
+        """Does the same as ``write``, at a path of the caller's choice."""
         try:
             cells = [self.cells(row) for row in rows]
         except RecordError as error:
@@ -107,7 +127,11 @@ class CsvFile(RunFile, Generic[Row]):
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Comma-separated lines; a cell that is None stays blank."""
+    """Returns comma-separated lines; a cell that is None stays blank.
+
+    >>> csv_text(("step", "psnr"), [(100, 24.5), (200, None)])
+    'step,psnr\\n100,24.5\\n200,\\n'
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(header)

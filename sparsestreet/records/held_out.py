@@ -1,4 +1,4 @@
-"""``curves/held_out.csv``: how good a fixed probe of held-out views got after how many seconds of training."""
+"""``curves/held_out.csv``: the quality of a fixed probe of held-out views over the seconds of training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -8,10 +8,10 @@ from sparsestreet.records.file import CsvFile
 
 @dataclass(frozen=True)
 class HeldOutLook:
-    """One look at the views."""
+    """One evaluation of the probe."""
 
     seconds: float
-    """Of training alone, over all commands of a run that was interrupted."""
+    """Seconds of training alone, summed over all commands of an interrupted run."""
     step: int
     psnr_full: float | None
     """dB, all pixels."""

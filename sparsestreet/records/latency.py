@@ -1,4 +1,4 @@
-"""How fast a scene is drawn, by three clocks; ``records/latency.csv`` has a row for each."""
+"""The speed of rendering by three clocks; ``records/latency.csv`` has a row for each."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
@@ -8,13 +8,13 @@ from sparsestreet.records.run import Noise
 from sparsestreet.records.strict_json import significant
 
 RASTER, FRAME, RIG = "raster", "frame", "rig"
-"""What the clocks of a latency hold: the splat op alone; all from a time and a pose to uint8 on the device; that for
-all cameras of an instant."""
+"""Names of the clocks. ``RASTER`` times the splat op alone. ``FRAME`` times everything from a time and a pose to a
+uint8 image on the device. ``RIG`` times that for all cameras of an instant."""
 
 
 @dataclass(frozen=True)
 class Percentiles:
-    """Of repeated times, milliseconds."""
+    """Percentiles of repeated times, milliseconds."""
 
     p50: float
     p90: float
@@ -27,12 +27,12 @@ class Latency:
     """Milliseconds by three clocks under the protocol of ``speed.measure_latency``."""
 
     clocks: dict[str, Percentiles]
-    """``RASTER``, ``FRAME`` and ``RIG`` of the scene as it is stored; Gaussians that a mask closes are masked."""
+    """Clock -> its times for the scene as stored; Gaussians that a mask closes are masked."""
     removed: dict[str, Percentiles]
-    """The same with the Gaussians taken out that the masks close at the time of the view; empty without masks."""
+    """The same after removing the Gaussians that the masks close at the time of the view; empty without masks."""
     warmup: int
     views: int
-    """Number of different views the repeats cycle through."""
+    """Number of different views that the repeats cycle through."""
     device: str
     threads: int
     noise: Noise
@@ -46,12 +46,12 @@ class Latency:
 
     @property
     def p50(self) -> float:
-        """Median of a frame."""
+        """Median of a frame, milliseconds."""
         return self.clocks[FRAME].p50
 
     @property
     def protocol(self) -> str:
-        """How the median of a frame was taken, in words."""
+        """Says in words how the median of a frame was taken."""
         return (
             f"{self.clocks[FRAME].repeats} renders cycling through {self.views} views after {self.warmup} warm-up "
             "renders, batch 1, device synchronized, scene assembly to uint8, without loading and metrics"
@@ -60,16 +60,16 @@ class Latency:
 
 @dataclass(frozen=True)
 class ClockRow:
-    """A clock, with the Gaussians that it took."""
+    """A clock with the kind of Gaussians that it timed."""
 
     clock: str
     gaussians: str
-    """"all", or where the scene has masks: "masked", all with those that are closed, or "removed", the others."""
+    """"all" without masks. With masks: "masked" for all Gaussians, closed ones included, or "removed" for open ones."""
     percentiles: Percentiles
 
 
 def clock_rows(latency: Latency) -> Iterator[ClockRow]:
-    """A row for each clock."""
+    """Yields a row for each clock."""
     for gaussians, clocks in (("masked" if latency.removed else "all", latency.clocks), ("removed", latency.removed)):
         for clock, percentiles in clocks.items():
             yield ClockRow(clock, gaussians, percentiles)

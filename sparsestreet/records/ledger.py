@@ -1,4 +1,4 @@
-"""``records/counts.csv``: how the number of Gaussians of each node changed in a training, and why."""
+"""``records/counts.csv``: each change of a node's number of Gaussians in training, with its reason."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
@@ -6,7 +6,7 @@ from dataclasses import astuple, dataclass, fields
 from sparsestreet.records.file import CsvFile
 
 MASK, PRUNING = "mask", "pruning"
-"""Reasons of the changes that make a scene small: masks fell to their threshold, a rule named what may go."""
+"""Reasons of the changes that make a scene small: a mask closed Gaussians, or a pruning rule selected them."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class CountChange:
     before: int
     after: int
     reason: str
-    """In a word or two: "start", "densify", "cull", ``MASK``, ``PRUNING`` ..."""
+    """A word or two: "start", "densify", "cull", ``MASK``, ``PRUNING`` ..."""
 
 
 def _change(cells: Sequence[str]) -> CountChange:

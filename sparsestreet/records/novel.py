@@ -1,4 +1,4 @@
-"""``records/novel.json``: what a scene shows beside the recorded path."""
+"""``records/novel.json``: the quality of a scene's renders next to the recorded path."""
 
 from dataclasses import dataclass
 
@@ -9,24 +9,23 @@ FORMAT = 2
 """Version of ``novel.json``; raised when a key changes its meaning."""
 
 TRUTH = ("psnr_full", "psnr_human", "psnr_vehicle")
-"""What an image is compared with the true one by: all pixels, people, vehicles."""
+"""Metrics that compare a render with the true image: PSNR of all pixels, of people, of vehicles."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NovelShift:
-    """One path beside the recorded one."""
+    """One path parallel to the recorded one."""
 
     offset: float
-    """Meters to the right of the rig, negative: to the left."""
+    """Meters to the right of the rig; negative to the left."""
     views: int
-    """Number of its renders that are compared with the real images."""
+    """Number of renders that are compared with the real images."""
     distances: dict[str, float]
-    """Name of a distance, such as "frechet_alexnet" -> its value; empty where it could not be measured."""
+    """Name of a distance, such as "frechet_alexnet" -> its value; empty if none could be measured."""
     truth: dict[str, float]
-    """Some of ``TRUTH`` -> dB, mean over the true images that have such pixels; empty where
-    nobody knows the truth."""
+    """Some of ``TRUTH`` -> dB, mean over the true images that have such pixels; empty without true images."""
     true_views: int
-    """Number of true images: views whose camera would sit in something have none."""
+    """Number of true images. A view whose camera lies inside an object has none."""
 
     def __post_init__(self) -> None:
         unknown = sorted(self.truth.keys() - set(TRUTH))
@@ -41,11 +40,11 @@ class NovelRecord:
     format: int = version(FORMAT, "evaluate again with novel=...")
     command: str
     ramp: bool
-    """Whether the shift grows from 0 at the first instant to its whole at the last, as in a change of lane."""
+    """Whether the shift grows from 0 at the first instant to its full value at the last, as in a change of lane."""
     real_views: int
-    """Number of real images: of the recorded views that are shifted."""
+    """Number of real images, those of the recorded views that are shifted."""
     absent: str | None
-    """Why there are no distances, and what to do about it; None: there are."""
+    """Why there are no distances, and what to do about it; None if there are some."""
     shifts: tuple[NovelShift, ...]
 
 

@@ -1,4 +1,4 @@
-"""``records/presets.json``: a trained scene, rendered in other ways than it was trained."""
+"""``records/presets.json``: a trained scene rendered with other settings than in training."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedAs:
-    """One way to render the scene, over the same views as all others of the record."""
+    """One way to render the scene, measured on the same views as the record's other ways."""
 
     preset: str
-    """Its name, as in ``render.preset``."""
+    """Name of the settings, as in ``render.preset``."""
     trained: bool
     """Whether training rendered with the same settings."""
     quality: dict[str, float]
     """Id of a metric of ``DEFINITIONS`` -> its mean over the views that have it."""
     psnr_to_exact: float
-    """dB; mean over the views, of this image against that of the same scene without cut-off and early stop."""
+    """PSNR against the same scene rendered without cut-off and early stop: mean over the views, dB."""
     frame_ms: float
-    """Median milliseconds from a time and a pose to an image of uint8; the presets of a record were timed in turn at
-    each view, so that they compare with each other better than with another record."""
+    """Median milliseconds from a time and a pose to a uint8 image. The presets of a record were timed in turn at each
+    view, so times compare better within a record than between records."""
     repeats: int
     """Number of timed frames."""
 

@@ -1,4 +1,4 @@
-"""On what and from which code a run was made."""
+"""The machine and the version of the code that made a run."""
 
 import os
 import platform
@@ -12,7 +12,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def this_machine() -> Machine:
-    """Processor, cores and software versions; no host or user name."""
+    """Returns processor, cores and software versions; no host or user name."""
     return Machine(
         processor=processor_name(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -23,7 +23,7 @@ def this_machine() -> Machine:
 
 
 def processor_name() -> str:
-    """The processor's model as the system calls it, or its architecture where the system does not say."""
+    """Returns the processor's model, or its architecture if the system does not name a model."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -34,10 +34,10 @@ def processor_name() -> str:
 
 
 def this_source(package: Path = _PACKAGE) -> CodeVersion:
-    """Commit of the checkout that holds the package, and whether tracked files differ from it.
+    """Returns the commit of the checkout that holds the package, and whether tracked files differ from it.
 
-    None where the package does not lie in a git checkout as tracked files (an installed copy inside somebody's
-    repository must not carry that repository's commit) or git is not installed.
+    Both are None if git is not installed or no checkout tracks the package. An installed copy inside another
+    repository must not carry that repository's commit.
     """
     tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py")
     commit = _git(package, "rev-parse", "HEAD")
@@ -47,7 +47,7 @@ def this_source(package: Path = _PACKAGE) -> CodeVersion:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """Output of a git command, None if git is missing or refuses."""
+    """Returns the output of a git command, or None if git is missing or fails."""
     try:
         answer = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
     except (FileNotFoundError, subprocess.CalledProcessError):

@@ -1,4 +1,4 @@
-"""How good images are: one value per frame and camera, their summary over a split, and the rows of ``quality.csv``.
+"""Image quality: values for each frame and camera, their summary over a split, and the rows of ``quality.csv``.
 
 The summary takes means over images, never over pixels; see ``metrics.definitions``.
 """
@@ -13,15 +13,15 @@ from sparsestreet.records.file import CsvFile
 from sparsestreet.records.strict_json import significant
 
 HELD_OUT, TRAINING = "held_out", "training"
-"""The splits whose views a record speaks of."""
+"""Names of the splits whose views are measured."""
 
 
 @dataclass(frozen=True)
 class RegionQuality:
     """Errors within one region of one image.
 
-    All metrics are None where the region has no pixels; those with defaults also where they are not defined for the
-    region, the image is below their window, or LPIPS has no weights.
+    All metrics are None if the region has no pixels. Those with defaults are also None if they are not defined for the
+    region, if the image is smaller than their window, or if LPIPS has no weights.
     """
 
     pixels: int
@@ -38,23 +38,23 @@ class RegionQuality:
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """One held-out image compared with its render."""
+    """The quality of one image's render."""
 
     frame: int
     camera: int
     width: int
     height: int
     regions: Mapping[str, RegionQuality]
-    """Name, of ``REGIONS`` -> its quality: "full" always; others where the data has such a mask, or lidar, with 0
-    pixels where the region is empty."""
+    """Name of a region of ``REGIONS`` -> its quality. "full" is always there; others need a mask or lidar in the data.
+    An empty region has 0 pixels."""
 
     def value(self, quantity: str, region: str) -> float | None:
-        """One metric, such as ("psnr", "vehicle"); None where the region is absent or empty."""
+        """Returns one metric, such as ("psnr", "vehicle"); None if the region is absent or empty."""
         found = self.regions.get(region)
         return None if found is None else getattr(found, quantity)
 
     def pixels(self, region: str) -> int:
-        """Number of pixels of a region; 0 where it is absent."""
+        """Returns the number of pixels of a region; 0 if it is absent."""
         return self.regions[region].pixels if region in self.regions else 0
 
 
@@ -63,17 +63,22 @@ class MetricSummary:
     """One metric over the images of a split."""
 
     mean: float | None
-    """None where no image has the region."""
+    """None if no image has the region."""
     sd: float | None
-    """Sample standard deviation over images (n - 1); None below two images. Not the spread over runs."""
+    """Sample standard deviation over images (n - 1), not over runs; None below two images."""
     images: int
     """Number of images that entered the mean."""
     capped: int
-    """Number of images whose PSNR was cut off at the cap (0 for other metrics)."""
+    """Number of images whose PSNR reached the cap (0 for other metrics)."""
 
 
 def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
-    """Id of each metric of ``DEFINITIONS`` -> its mean over the images that have the region."""
+    """Returns id of each metric of ``DEFINITIONS`` -> its summary over the images that have the region.
+
+    >>> image = FrameQuality(0, 0, 64, 48, {"full": RegionQuality(pixels=3072, mse=0.01, psnr=20.0, ssim_uniform7=0.8)})
+    >>> summarize([image])["psnr_full"]
+    MetricSummary(mean=20.0, sd=None, images=1, capped=0)
+    """
     images = list(quality)
     summaries = {}
     for region in REGIONS:
@@ -85,7 +90,7 @@ def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
 
 
 def camera_means(quality: Iterable[FrameQuality]) -> dict[str, dict[str, float | None]]:
-    """Number of each camera, in order -> id of each metric -> its mean over the camera's images with the region."""
+    """Returns number of a camera, in order -> id of a metric -> its mean over the camera's images with the region."""
     images = list(quality)
     return {
         str(camera): {
@@ -108,8 +113,10 @@ _COLUMNS = (
 
 
 def _cells(image: FrameQuality) -> Sequence[object]:
-    """A region's cells are blank where the data has no such mask or no lidar, and its metrics are blank where the
-    region is empty (0 pixels)."""
+    """Returns the cells of an image.
+
+    A region's cells are blank if the data has no such mask or no lidar. Its metrics are blank if it has 0 pixels.
+    """
     regions = [cell for region in REGIONS for cell in _region_cells(region, image)]
     return image.frame, image.camera, image.width, image.height, *regions
 
@@ -146,4 +153,4 @@ QUALITY = {
     split: CsvFile(f"records/{name}", _COLUMNS, _cells, _image, "evaluate the run")
     for split, name in ((HELD_OUT, "quality.csv"), (TRAINING, "quality_train.csv"))
 }
-"""Split -> the file of its images, a row each."""
+"""Split -> the file with a row for each of its images."""

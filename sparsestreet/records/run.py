@@ -12,22 +12,22 @@ RUN_FORMAT = 2
 
 @dataclass(frozen=True)
 class Noise:
-    """How steady the machine was while something was timed, by a fixed loop before and after it."""
+    """How steady the machine was during a timing, measured by a fixed loop before and after it."""
 
     before: float
-    """Ninth less first decile of the loop's times, relative to their median."""
+    """Ninth minus first decile of the loop's times, relative to their median."""
     after: float
     drift: float
     """Median after / median before - 1."""
     load_average: float | None
-    """Processes that wanted to run in the minute before; None where the system does not say."""
+    """Average number of processes that wanted to run in the last minute; None if the system does not say."""
     quiet: bool
-    """Whether spreads and drift were small enough for medians to be trusted to 5 % (``noise.QUIET_SPREAD``)."""
+    """Whether spreads and drift were small enough to trust medians to 5 % (``noise.QUIET_SPREAD``)."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """The host something ran on."""
+    """The host that ran something."""
 
     processor: str
     cores: int
@@ -38,7 +38,7 @@ class Machine:
 
 @dataclass(frozen=True)
 class CodeVersion:
-    """Which code ran; None outside a git checkout."""
+    """The version of the code that ran; both fields are None outside a git checkout."""
 
     commit: str | None
     dirty: bool | None
@@ -47,13 +47,13 @@ class CodeVersion:
 
 @dataclass(frozen=True, kw_only=True)
 class RunDescription:
-    """The content of ``run.json``: what identifies a run and what made it. No evaluation changes it."""
+    """The content of ``run.json``: the identity of a run and how it was made. No evaluation changes it."""
 
     format: int = version(RUN_FORMAT, "train the run again")
     method: str
-    """Which scene is trained, such as "streetgs"."""
+    """The method that is trained, such as "streetgs"."""
     sparsify: str
-    """What makes it small, such as "paper"; "none" for a plain run."""
+    """The sparsification, such as "paper"; "none" for a plain run."""
     label: str
     """The run's column in a table, such as "streetgs+paper"."""
     scene: str
@@ -64,23 +64,23 @@ class RunDescription:
     config: dict[str, Setting] = field(metadata=EXACT)
     """The resolved configuration, flat: dotted key -> value."""
     config_hash: str
-    """``configuration.config_hash`` of it: equal for repeats."""
+    """``configuration.config_hash`` of ``config``; equal for repeats."""
     data_hash: str
-    """``LogReader.data_hash``: equal for the same log, wherever it lies."""
+    """``LogReader.data_hash``; equal for the same log in any folder."""
     command: str
     """The command that trained."""
     device: str
-    """What trained, such as "cuda: NVIDIA H100" or "cpu: " and the processor."""
+    """The device that trained, such as "cuda: NVIDIA H100", or "cpu: " and the processor."""
     threads: int
     steps: int
-    """Training steps taken; fewer than ``max_steps`` where the run was stopped."""
+    """Training steps taken; fewer than ``max_steps`` if the run was stopped."""
     max_steps: int
     training_seconds: float | None
-    """Wall clock of training without evaluation; None where it is not known."""
+    """Wall clock of training without evaluation; None if unknown."""
     noise: Noise | None
-    """While it trained; None where that is not known."""
+    """Noise during training; None if unknown."""
     caps: dict[str, int]
-    """Nodes whose number of Gaussians was held down by their ``max_gaussians`` at least once -> that limit."""
+    """Name of each node that reached its ``max_gaussians`` at least once -> that limit."""
     machine: Machine
     source: CodeVersion
 

@@ -1,4 +1,4 @@
-"""``records/phases.csv``: how long the parts of some steps took."""
+"""``records/phases.csv``: the duration of the parts of some training steps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -8,7 +8,7 @@ from sparsestreet.records.file import CsvFile
 
 @dataclass(frozen=True)
 class StepPhase:
-    """A part of a step that was looked at."""
+    """A part of a step that was timed."""
 
     step: int
     phase: str

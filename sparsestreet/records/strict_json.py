@@ -1,7 +1,7 @@
-"""Frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only.
+"""Converts frozen dataclasses to JSON and back, strictly: no NaN, no unknown or missing key, whole files only.
 
-Only a field with a default may be missing: it is newer than some records. A field made with ``version`` is the number
-of the format; a record of another one is refused before its keys are looked at.
+Only a field with a default may be missing, because it is newer than some records. A field made with ``version`` holds
+the number of the format. A record of another format is refused before its keys are checked.
 """
 
 import json
@@ -18,26 +18,26 @@ Json = None | bool | int | float | str | list | dict
 Record = typing.TypeVar("Record")
 
 EXACT = types.MappingProxyType({"exact": True})
-"""Metadata of a field whose floats are settings, not measurements: written as they are, not rounded."""
+"""Metadata of a field whose floats are settings, not measurements. They are written without rounding."""
 
 
 class RecordError(ValueError):
-    """A record that cannot be written or read as it stands; names the file and the entry."""
+    """A record cannot be written or read; names the file and the entry."""
 
 
 def version(number: int, remedy: str) -> typing.Any:
-    """The field ``format`` of a record: its number, and what to do about a file that has another."""
+    """Returns the field ``format`` of a record: its number, and what to do about a file of another format."""
     return field(default=number, metadata={"remedy": remedy})
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a whole file or nothing: a reader never sees half of it, a crash leaves the old one."""
+    """Writes a whole file or nothing. A reader never sees half of it; a crash leaves the old file."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: object) -> None:
-    """Write a frozen dataclass as indented JSON, floats with 6 significant digits.
+    """Writes a frozen dataclass as indented JSON, floats with 6 significant digits.
 
     Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
     """
@@ -46,12 +46,16 @@ def write_json(path: Path, value: object) -> None:
 
 
 def json_line(value: object, where: str) -> str:
-    """A frozen dataclass or a mapping as one line of JSON, without its end; numbers and errors as ``write_json``."""
+    """Returns a frozen dataclass or a mapping as one line of JSON without newline; numbers, errors as ``write_json``.
+
+    >>> json_line({"step": 3, "psnr": 24.123456789}, "progress")
+    '{"step": 3, "psnr": 24.1235}'
+    """
     return json.dumps(_encoded(value, where), allow_nan=False)
 
 
 def read_json(path: Path, kind: type[Record]) -> Record:
-    """Read a dataclass back, every type checked. Raises RecordError naming the file and the entry."""
+    """Reads a dataclass back and checks every type. Raises RecordError naming the file and the entry."""
     try:
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, UnicodeDecodeError) as error:
@@ -60,7 +64,11 @@ def read_json(path: Path, kind: type[Record]) -> Record:
 
 
 def parsed(text: str, where: str) -> Json:
-    """The value of a JSON text. Raises RecordError, naming ``where`` it stands, for a NaN or anything not strict."""
+    """Returns the value of a JSON text. Raises RecordError, naming ``where``, for NaN or anything else not strict.
+
+    >>> parsed('{"psnr": 24.5}', "summary.json")
+    {'psnr': 24.5}
+    """
     try:
         return json.loads(text, parse_constant=_refuse_constant)
     except ValueError as error:
@@ -68,9 +76,12 @@ def parsed(text: str, where: str) -> Json:
 
 
 def significant(value: float, where: str) -> float:
-    """Rounded to 6 significant digits: far below the noise of any measurement, readable in a diff.
+    """Returns the value rounded to 6 significant digits: far below the noise of any measurement, readable in a diff.
 
-    Raises RecordError for a NaN or an infinity, naming the entry ``where`` it would stand.
+    Raises RecordError, naming the entry ``where``, for a NaN or an infinity.
+
+    >>> significant(12.345678, "psnr")
+    12.3457
     """
     if not math.isfinite(value):
         raise RecordError(f"{where} is {value}, which a record has no number for: store None or find the cause")
@@ -101,7 +112,7 @@ def _encoded(value: object, where: str, exact: bool = False) -> Json:
 
 
 def _decoded(kind: object, value: Json, where: str) -> typing.Any:
-    """``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None, a plain type or any of several."""
+    """Returns ``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None, or one of plain types."""
     if is_dataclass(kind):
         return _decoded_dataclass(kind, value, where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
@@ -119,7 +130,7 @@ def _decoded(kind: object, value: Json, where: str) -> typing.Any:
 
 
 def _decoded_union(kinds: tuple[typing.Any, ...], value: Json, where: str) -> typing.Any:
-    """None beside one kind of any sort, or one of several plain kinds."""
+    """Returns ``value`` as a union: None and one kind of any sort, or several plain kinds."""
     if type(value) in kinds:
         return value
     others = [kind for kind in kinds if kind is not types.NoneType]
@@ -151,7 +162,7 @@ def _decoded_dataclass(kind: type, value: Json, where: str) -> typing.Any:
 
 
 def _of(kind: type, value: Json, where: str) -> typing.Any:
-    """``value`` if it is a ``kind`` (a bool is no int here)."""
+    """Returns ``value`` if it is a ``kind``; a bool is no int here. Raises RecordError otherwise."""
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise RecordError(f"{where}: expected {kind.__name__}, got {type(value).__name__} {value!r}")
     return value

@@ -1,7 +1,7 @@
-"""What identifies a run and what was measured of it, for other programs as for our report.
+"""``records/summary.json``: the identity of a run and its measurements, for other programs and for our report.
 
-``RUN/run.json`` is written once, by training: what made the run. ``RUN/records/summary.json`` is written by each
-evaluation and holds the first unchanged. Both are written whole or not at all.
+Training writes ``RUN/run.json`` once. Each evaluation writes ``RUN/records/summary.json``, which holds the content of
+the former unchanged. Both are written whole or not at all.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ FORMAT = 4
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What measured a run."""
+    """The command, machine and code that measured a run."""
 
     command: str
     machine: Machine
@@ -29,12 +29,12 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class GuardCounts:
-    """How many Gaussians the guards of the splat op acted on (``sparsestreet.ops.Guards``), summed over views."""
+    """Number of Gaussians that the guards of the splat op acted on (``sparsestreet.ops.Guards``), summed over views."""
 
     rows: dict[str, int]
     """Name of a guard -> Gaussians, 0 included."""
     alarms: dict[str, int]
-    """Those that a clean scene never needs and that acted; empty where all is well."""
+    """The guards that acted although a clean scene never needs them; empty if all is well."""
 
     def __post_init__(self) -> None:
         for name, count in self.alarms.items():
@@ -50,27 +50,27 @@ class RunSummary:
     run: RunDescription
     evaluated: Evaluation
     images: dict[str, int]
-    """Split ("held_out", "training") -> number of its images that were evaluated; a split without views is absent."""
+    """Split ("held_out", "training") -> number of its evaluated images; a split without views is absent."""
     resolutions: tuple[str, ...]
-    """"WIDTHxHEIGHT" of the evaluated images, each once."""
+    """The different sizes of the evaluated images, as "WIDTHxHEIGHT"."""
     quality: dict[str, dict[str, MetricSummary]]
     """Split -> id of a metric -> its summary over the split's images."""
     by_camera: dict[str, dict[str, dict[str, float | None]]]
     """Split -> number of a camera -> id of a metric -> its mean over the split's images of that camera."""
     definitions: dict[str, str]
-    """Id of a metric -> what it is, in words."""
+    """Id of a metric -> its definition in words."""
     absent: dict[str, str]
     """Quantity that could not be measured, such as "lpips_alex" -> why, and what to do about it."""
     gaussians: dict[str, int]
-    """Node -> Gaussians, all instances, visible or not."""
+    """Node -> number of Gaussians of all its instances, visible or not."""
     gaussians_total: int
     bytes_by_part: dict[str, int]
     bytes_total: int
     latency: Latency
-    """Over the views of ``main_split``, on the device it names."""
+    """Times over the views of ``main_split``, on the device that it names."""
     latency_protocol: str
     guards: GuardCounts
-    """Over the views of ``main_split``."""
+    """Counts over the views of ``main_split``."""
 
     def __post_init__(self) -> None:
         splits = [sorted(part) for part in (self.quality, self.by_camera, self.images)]
@@ -88,16 +88,16 @@ class RunSummary:
 
     @property
     def main_split(self) -> str:
-        """The held-out views, or the training views of a run that holds out none."""
+        """The held-out split, or the training split of a run that holds out no views."""
         return HELD_OUT if HELD_OUT in self.quality else TRAINING
 
     def mean(self, metric: str, split: str | None = None) -> float | None:
-        """Mean of a metric over the images of a split (of ``main_split``); None where it was not measured."""
+        """Returns the mean of a metric over the images of a split (default ``main_split``); None if not measured."""
         found = self.quality.get(split or self.main_split, {}).get(metric)
         return None if found is None else found.mean
 
     def camera_mean(self, metric: str, camera: str) -> float | None:
-        """Mean of a metric over the images of one camera of ``main_split``; None where it was not measured."""
+        """Returns the mean of a metric over one camera's images of ``main_split``; None if not measured."""
         return self.by_camera[self.main_split].get(camera, {}).get(metric)
 
 
