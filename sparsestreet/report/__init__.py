@@ -1,4 +1,4 @@
-"""Tables and a figure of many runs, from their records alone."""
+"""Tables and a figure that compare many runs, made from their records alone."""
 
 from sparsestreet.report.collect import RunRecord, collect
 from sparsestreet.report.drawing import figure, markdown, tables

@@ -1,4 +1,4 @@
-"""The arms of a sweep: runs that may be averaged, and those that an arm is compared with."""
+"""The arms of a sweep: groups of runs that may be averaged, and the plain arm that each is compared with."""
 
 import statistics
 from collections.abc import Callable, Iterable, Sequence
@@ -11,21 +11,21 @@ from sparsestreet.report.variants import CLIP_KEYS, control_of, in_few_words, lo
 
 Value = Callable[[RunSummary], float | None]
 Unit = tuple[tuple[str, str], int]
-"""A scene (and the part of its log), and a seed."""
+"""A scene with the part of its log, and a seed."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Repeats on one or more scenes: one configuration, data, device, number of threads and commit."""
+    """Repeats on one or more scenes, with one configuration, data, device, number of threads and commit."""
 
     name: str
     label: str
     method: str
     sparsify: str
     place: tuple[str, ...]
-    """Device, threads, commit; and where a sweep has several: data of one scene, options of the log, splits."""
+    """Device, threads and commit. Also the data of a scene, options of the log and split if the sweep has several."""
     records: tuple[RunRecord, ...]
-    """Of both kinds: trained without held-out views, and on all."""
+    """Runs of both kinds: trained without the held-out views, and trained on all views."""
 
     @property
     def control(self) -> str | None:
@@ -39,11 +39,14 @@ class Arm:
 
     @property
     def plain_label(self) -> str:
-        """The label of what it is compared with."""
+        """The label of the plain arm that it is compared with."""
         return self.label.partition("+")[0]
 
     def units(self, value: Value, whole: bool = False) -> dict[Unit, float]:
-        """Scene and seed -> the value of its run (the mean of several); those trained on all views, or the others."""
+        """Returns scene and seed -> the value of its run, or the mean of several runs.
+
+        ``whole`` selects the runs that were trained on all views; otherwise the other runs count.
+        """
         found: dict[Unit, list[float]] = {}
         for record in self.records:
             run = record.summary
@@ -52,23 +55,31 @@ class Arm:
         return {unit: statistics.fmean(numbers) for unit, numbers in found.items()}
 
     def mean(self, value: Value, whole: bool = False) -> float | None:
-        """Mean over scenes of the mean over each one's seeds; None where no run has the value."""
+        """Returns the mean over scenes of the mean over each scene's seeds; None if no run has the value."""
         return mean_over_scenes(self.units(value, whole))
 
 
 def unit_of(run: RunSummary) -> Unit:
-    """What pairs runs of two arms."""
+    """Returns the key by which runs of two arms are paired."""
     return (run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))), run.run.seed
 
 
 def mean_over_scenes(units: dict[Unit, float]) -> float | None:
-    """Each scene counts once."""
+    """Returns the mean in which each scene counts once; None without values.
+
+    >>> mean_over_scenes({(("street", ""), 0): 1.0, (("street", ""), 1): 3.0, (("park", ""), 0): 6.0})
+    4.0
+    """
     values = list(by_scene(units).values())
     return statistics.fmean(values) if values else None
 
 
 def by_scene(units: dict[Unit, float]) -> dict[tuple[str, str], float]:
-    """Scene -> mean over its seeds."""
+    """Returns scene -> mean over its seeds.
+
+    >>> by_scene({(("street", ""), 0): 1.0, (("street", ""), 1): 3.0})
+    {('street', ''): 2.0}
+    """
     scenes: dict[tuple[str, str], list[float]] = {}
     for (scene, _), value in units.items():
         scenes.setdefault(scene, []).append(value)
@@ -76,7 +87,7 @@ def by_scene(units: dict[Unit, float]) -> dict[tuple[str, str], float]:
 
 
 def arms(records: Sequence[RunRecord]) -> list[Arm]:
-    """The runs of a sweep in arms, those of a method together, plain before pruned before controls."""
+    """Groups the runs of a sweep into arms, sorted by method; plain arms come before pruned ones, controls last."""
     folder_of = {id(record.summary): record for record in records}
     of_log, of_split = _logs_in_words(records), _splits_in_words(records)
     places = {
@@ -99,7 +110,7 @@ def arms(records: Sequence[RunRecord]) -> list[Arm]:
 
 
 def plain_of(arm: Arm, among: Iterable[Arm]) -> Arm | None:
-    """The plain arm of the same method, made at the same place; None where there is none, or several."""
+    """Returns the plain arm of the same method at the same place; None if there is none or several."""
     plain = [
         other
         for other in among
@@ -109,7 +120,7 @@ def plain_of(arm: Arm, among: Iterable[Arm]) -> Arm | None:
 
 
 def why_apart(found: Sequence[Arm]) -> list[str]:
-    """Notes on what keeps runs of this page from being averaged or compared."""
+    """Returns notes on why some runs of this page are not averaged or compared."""
     if not found:
         return []
     said = []
@@ -136,7 +147,7 @@ def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
 
 
 def _logs_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
-    """Run (its id) -> the options of how its log is read, the part that is read aside, in which runs differ."""
+    """Returns id of a run -> the options of its log in which runs differ, except which part of the log is read."""
     logs = {id(record.summary): without(log_config(record.summary), CLIP_KEYS) for record in records}
     distinct = {config_hash(log): log for log in logs.values()}
     words = dict(zip(distinct, differing_options(list(distinct.values())), strict=True))
@@ -144,12 +155,12 @@ def _logs_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
 
 
 def _splits_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
-    """Run (its id) -> what it holds out, where runs that hold views out differ in it; else nothing."""
+    """Returns id of a run -> its held-out views in words; empty if all runs that hold views out agree."""
     splits = {id(record.summary): record.summary.run.split for record in records}
     return splits if len(set(splits.values()) - {"none"}) > 1 else dict.fromkeys(splits, "")
 
 
 def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:
-    """The hash of the data where one scene occurs with several; else nothing."""
+    """Returns the start of the data's hash if runs of the scene have different data; else an empty text."""
     alike = {record.summary.run.data_hash for record in records if unit_of(record.summary)[0] == unit_of(run)[0]}
     return f"data {run.run.data_hash[:6]}" if len(alike) > 1 else ""

@@ -1,4 +1,4 @@
-"""What was measured beside the recorded path (``records/novel.json``): distances to real images, and to the truth."""
+"""Measurements next to the recorded path (``records/novel.json``): distances to real images, and to the truth."""
 
 import statistics
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ _PSNR = {title: place for place, title in enumerate(TRUTH.values())}
 
 
 def shifts_of(run: Path) -> dict[float, dict[str, float]]:
-    """Meters beside the path -> name of a number -> its mean over both sides; empty where a run has no such record.
+    """Returns meters beside the path -> name of a number -> its mean over both sides; empty without such a record.
 
     Raises RecordError naming the file and the entry that is wrong.
     """
@@ -31,7 +31,7 @@ def shifts_of(run: Path) -> dict[float, dict[str, float]]:
 
 
 def mean_beside(arm: Arm, meters: float, name: str) -> float | None:
-    """The mean of an arm, each scene once; None where no run has it."""
+    """Returns the mean of an arm in which each scene counts once; None if no run has the number."""
     return _mean(arm, lambda run: shifts_of(run).get(meters, {}).get(name))
 
 
@@ -45,7 +45,7 @@ def _mean(arm: Arm, value: Callable[[Path], float | None]) -> float | None:
 
 
 def beside_the_path(arms: Sequence[Arm]) -> Grid | None:
-    """PSNR to the truth and every distance that a run recorded, by meters; None where none did."""
+    """Returns PSNR to the truth and every recorded distance, by meters; None if no run recorded any."""
     measured = [shifts_of(record.folder) for arm in arms for record in arm.records]
     found = {(name, meters) for shifts in measured for meters, numbers in shifts.items() for name in numbers}
     columns = sorted(found, key=lambda column: (column[0] not in _PSNR, _PSNR.get(column[0], 0), column))

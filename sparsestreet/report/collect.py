@@ -9,14 +9,14 @@ from sparsestreet.records.summary import SUMMARY, RunSummary
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run's folder and what its summary says."""
+    """A run's folder and its summary."""
 
     folder: Path
     summary: RunSummary
 
 
 def collect(roots: Iterable[Path]) -> list[RunRecord]:
-    """Every run below the given folders, sorted by path, each once.
+    """Returns every run below the given folders once, sorted by path.
 
     Raises FileNotFoundError for a root without records, RecordError (naming the file) for a malformed one.
     """
@@ -30,7 +30,7 @@ def collect(roots: Iterable[Path]) -> list[RunRecord]:
 
 
 def check_definitions(records: Sequence[RunRecord]) -> None:
-    """Raises ValueError if two records mean different things by one metric."""
+    """Raises ValueError if two records define one metric differently."""
     seen: dict[str, tuple[str, Path]] = {}
     for record in records:
         for name, definition in record.summary.definitions.items():

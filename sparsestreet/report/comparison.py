@@ -14,15 +14,15 @@ from sparsestreet.report.arms import Arm
 from sparsestreet.report.collect import RunRecord
 
 WIDTH = 640
-"""Pixels; wider pictures are scaled down to it."""
+"""Pixels; wider pictures are scaled down to this width."""
 VIEWS = 2
-"""Of each scene."""
+"""Number of views of each scene."""
 
 
 def comparison_data(arms: Sequence[Arm]) -> str | None:
-    """JSON of the views with their images, truth first, as data addresses; None where no two images show one view.
+    """Returns JSON of the views with their images as data URLs, truth first; None if there is no view to compare.
 
-    Of each scene the lowest seed, and of its views the first that evaluation drew.
+    Each scene shows its lowest seed and the first ``VIEWS`` views that evaluation drew.
     """
     views = []
     scenes = sorted({record.summary.run.scene for arm in arms for record in arm.records})

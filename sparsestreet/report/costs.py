@@ -1,4 +1,4 @@
-"""What each arm costs, in absolute numbers (``records/summary.json`` and ``records/cost.json``)."""
+"""The cost of each arm in absolute numbers (``records/summary.json`` and ``records/cost.json``)."""
 
 import statistics
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] 
 
 
 def what_arms_cost(arms: Sequence[Arm]) -> Grid:
-    """Size, speed, time and memory of every arm: means over its runs."""
+    """Returns size, speed, time and memory of every arm, as means over its runs."""
     shown = [column for column in _COLUMNS if any(_mean(arm, column[3]) is not None for arm in arms)]
     rows = []
     for arm in arms:

@@ -1,4 +1,4 @@
-"""Held-out PSNR over the seconds of training, and how long each arm takes to a quality."""
+"""Held-out PSNR over the seconds of training, and the time that each arm takes to reach a quality."""
 
 import statistics
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from sparsestreet.report.arms import Arm, Unit, plain_of, unit_of
 from sparsestreet.report.grid import Cell, Grid
 
 BELOW = (1.0, 0.5, 0.1)
-"""dB below the end of the plain run: the qualities whose time is asked for."""
+"""Qualities whose time is reported, dB below the last quality of the plain run."""
 
 
 @dataclass(frozen=True)
@@ -17,13 +17,13 @@ class QualityCurve:
     """One run's probe of held-out views."""
 
     seconds: tuple[float, ...]
-    """Of training, without evaluation."""
+    """Seconds of training without evaluation."""
     psnr: tuple[float, ...]
     """Full image, dB."""
 
 
 def curves_of(arm: Arm) -> dict[Unit, QualityCurve]:
-    """Scene and seed -> curve, of the runs that hold views out and have one."""
+    """Returns scene and seed -> curve, for the runs that hold views out and have a curve."""
     return {
         unit_of(record.summary): curve
         for record in arm.records
@@ -37,12 +37,16 @@ def _curve(looks: Sequence[HeldOutLook]) -> QualityCurve:
 
 
 def seconds_to(curve: QualityCurve, psnr: float) -> float | None:
-    """Training seconds at the first look that is as good; None: never. Nothing is interpolated between looks."""
+    """Returns the training seconds at the first look with at least this PSNR, or None; looks are not interpolated.
+
+    >>> seconds_to(QualityCurve(seconds=(10.0, 20.0), psnr=(22.0, 25.0)), 24.0)
+    20.0
+    """
     return next((at for at, value in zip(curve.seconds, curve.psnr, strict=True) if value >= psnr), None)
 
 
 def time_to_quality(arms: Sequence[Arm]) -> Grid | None:
-    """Median seconds to the plain run's last quality less 1, 0.5 and 0.1 dB; None where no run has a curve."""
+    """Returns median seconds to the plain run's last PSNR minus 1, 0.5 and 0.1 dB; None if no run has a curve."""
     curves = {arm.name: curves_of(arm) for arm in arms}
     if not any(curves.values()):
         return None

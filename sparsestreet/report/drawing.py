@@ -1,4 +1,4 @@
-"""Sections as tables in a terminal, as Markdown and as a figure."""
+"""Draws sections as tables in a terminal, as Markdown and as a figure."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,20 +18,20 @@ from sparsestreet.report.variants import variants
 ABSENT = "-"
 
 _MOST_COLUMNS = 5
-"""Variants and differences beside each other; more stand below each other where there is room."""
+"""Largest number of variants and differences that stand in columns; more become rows if the terminal is wide enough."""
 
 
 def tables(sections: Sequence[Section], width: int = 80) -> list[Table | Text]:
-    """The sections for a terminal of ``width`` characters, title, tables and notes; for ``rich.console.Console``.
+    """Returns title, tables and notes of the sections for ``rich.console.Console``, ``width`` characters wide.
 
-    Variants stand as columns, in as many tables below each other as it takes that no text is cut; many of them (a
-    sweep) stand as rows where the terminal is wide enough.
+    Variants are columns, spread over as many tables as needed to cut no text. Many variants (a sweep) are rows if the
+    terminal is wide enough.
     """
     return [part for section in sections for part in _drawn(section, width)]
 
 
 def markdown(sections: Sequence[Section]) -> str:
-    """The sections as Markdown tables with their notes; those by camera with a row for each camera and region."""
+    """Returns the sections as Markdown tables with notes; sections by camera have a row for each camera and region."""
     blocks = []
     for section in sections:
         lines = _lines(section)
@@ -47,7 +47,7 @@ def markdown(sections: Sequence[Section]) -> str:
 
 
 def figure(records: Sequence[RunRecord], path: Path) -> None:
-    """Write a scatter of all runs: PSNR of held-out views against Gaussians, one color for each variant.
+    """Writes a scatter of all runs: PSNR of held-out views against Gaussians, one color for each variant.
 
     Raises ValueError if no run has held-out views.
     """
@@ -70,13 +70,13 @@ def _drawn(section: Section, width: int) -> list[Table | Text]:
     else:
         labels, *columns = lines
         blocks = [list(zip(labels, *some, strict=True)) for some in _fitting(columns, width - 1 - _room(labels))]
-    # Texts, not strings, whose square brackets rich would read as markup.
+    # Texts, because rich would read the square brackets of strings as markup.
     title, notes = Text(section.title, style="bold"), Text("\n".join(section.notes) + "\n")
     return [title, *map(_table, blocks), notes]
 
 
 def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence[str]]]:
-    """Consecutive columns in groups that fit a width, at least one in each."""
+    """Returns consecutive columns in groups that fit a width, at least one column in each."""
     groups: list[list[Sequence[str]]] = []
     left = 0
     for column in columns:
@@ -89,7 +89,7 @@ def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence
 
 
 def _room(column: Sequence[str]) -> int:
-    """Characters that a column takes: its heading may break between words, its cells may not."""
+    """Returns the width of a column in characters: its heading may break between words, its cells may not."""
     heading, *cells = column
     return max(*map(len, heading.split()), *map(len, cells)) + 3
 
@@ -104,7 +104,7 @@ def _table(lines: Sequence[Sequence[str]]) -> Table:
 
 
 def _lines(section: Section) -> list[list[str]]:
-    """Header and rows as texts."""
+    """Returns header and rows as texts."""
     header = ["method", "runs", *(quantity.heading for quantity in section.quantities)]
     return [header, *(_texts(row, section.quantities) for row in section.rows)]
 
@@ -114,7 +114,7 @@ def _texts(row: Row, quantities: Sequence[Quantity]) -> list[str]:
 
 
 def _cell(cell: Spread | None, quantity: Quantity, row: Row) -> str:
-    """mean ± sd; a mark where a cap held the count down; n where it is not the row's."""
+    """Returns mean ± sd, a mark if a cap limited the count, and n if it differs from the row's."""
     if cell is None:
         return ABSENT
     percentage = row.difference and quantity.relative

@@ -17,7 +17,7 @@ from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Value, plain_of
 
-# Okabe and Ito's palette, its blue a little lighter: distinguishable with any color vision, on white and on black.
+# Okabe and Ito's palette with a slightly lighter blue: distinguishable with any color vision, on white and on black.
 COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GREY = "#8c8c8c"
 _MARKERS = {"none": "o", "paper": "s", "removal": "D", "masks": "^", "importance": "v", "random": "x", "opacity": "+"}
@@ -45,11 +45,11 @@ PARETO_COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] 
     ("frame", "milliseconds a frame", lambda run: run.latency.p50),
     ("training", "training minutes", lambda run: run.run.training_seconds and run.run.training_seconds / 60),
 )
-"""Name, axis and value of what quality is drawn against."""
+"""Name, axis label and value of each cost that quality is drawn against."""
 
 
 def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
-    """A figure with panels beside each other."""
+    """Returns a figure with panels in one row."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(width * columns, height), layout="constrained")
         figure.patch.set_alpha(0)
@@ -60,43 +60,51 @@ def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figur
 
 
 def write_svg(figure: Figure, path: Path) -> None:
-    """The figure as SVG whose ink is that of the page around it, the same bytes from the same numbers."""
+    """Writes the figure as SVG in the page's own text color; the same numbers give the same bytes."""
     buffer = io.StringIO()
     with matplotlib.rc_context(_STYLE | {"svg.hashsalt": path.stem}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Title": path.stem})
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(_INK, "currentColor")
-    # Names of groups, which several figures of one page would share; references are to definitions, named by content.
+    # Several figures of one page would share these names of groups. References use definitions, named by content.
     text = re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", text)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
 
 
 def colors(arms: Sequence[Arm]) -> dict[str, str]:
-    """Label of a plain method -> its color."""
+    """Returns label of a plain method -> its color."""
     labels = list(dict.fromkeys(arm.plain_label for arm in arms))
     return {label: COLORS[index % len(COLORS)] for index, label in enumerate(labels)}
 
 
 def of_sparsify(arm: Arm) -> str:
-    """The color of what was done to get small, where arms of one method are drawn."""
+    """Returns the color of an arm's sparsification, for figures of one method."""
     known = ("none", "paper", "removal", "masks", "importance")
     return COLORS[known.index(arm.sparsify) if arm.sparsify in known else len(known)]
 
 
 def short(value: float) -> str:
-    """12000 -> 12k, 1500000 -> 1.5M."""
+    """Returns a number in short form.
+
+    >>> short(12000), short(1500000), short(950)
+    ('12k', '1.5M', '950')
+    """
     unit, size = next(((unit, size) for unit, size in (("M", 1e6), ("k", 1e3)) if value >= size), ("", 1.0))
     return f"{value / size:g}{unit}"
 
 
 def marker(arm: Arm) -> str:
-    """Of its sparsification."""
+    """Returns the marker of an arm's sparsification."""
     return _MARKERS.get(arm.sparsify, "P")
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points that no other beats in both: no more cost (first) and more quality (second), by cost."""
+    """Returns the Pareto front of (cost, quality) points, sorted by cost.
+
+    >>> front([(1.0, 20.0), (2.0, 25.0), (3.0, 24.0)])
+    [(1.0, 20.0), (2.0, 25.0)]
+    """
     best: list[tuple[float, float]] = []
     for cost, quality in sorted(points, key=lambda point: (point[0], -point[1])):
         if not best or quality > best[-1][1]:
@@ -105,10 +113,10 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
-    """Quality of the full image, people and vehicles against one cost; whether there was anything to draw.
+    """Draws quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
 
-    Every run is a small mark, every arm's mean a large one, with an arrow from plain to pruned; the front is that of
-    the means, controls are grey and in no front.
+    Every run is a small mark, every arm's mean a large one, with an arrow from plain to pruned. The front is that of
+    the means; controls are gray and in no front.
     """
     wanted = {"full image": protocol.psnr, "people": protocol.human[0], "vehicles": protocol.vehicle[0]}
     regions = {name: _held_out(metric) for name, metric in wanted.items()}

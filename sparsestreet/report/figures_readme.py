@@ -1,4 +1,4 @@
-"""One figure of a sweep for a README: quality against the time of training, and against the time of a frame."""
+"""One figure of a sweep for a README: quality against training time, and against the time of a frame."""
 
 import statistics
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ _DASHES = {"none": "-", "paper": "--", "removal": ":"}
 
 
 def time_figure(arms: Sequence[Arm], protocol: Protocol, path: Path) -> None:
-    """Write a PNG: held-out PSNR over training seconds and over milliseconds a frame, controls left out.
+    """Writes a PNG: held-out PSNR over training seconds and over milliseconds a frame, without controls.
 
-    Curves are means over scenes and seeds at each look; without curves, the end of training is drawn alone. Raises
-    ValueError where no run has a held-out PSNR.
+    Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
+    ValueError if no run has a held-out PSNR.
     """
     shown = [arm for arm in arms if not arm.control and arm.mean(_psnr(protocol)) is not None]
     if not shown:
@@ -55,13 +55,17 @@ def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protoco
 
 
 def _paint(arm: Arm, shown: Sequence[Arm]) -> str:
-    """A color a method; where there is one only, a color for each way to get small."""
+    """Returns the color of the arm's method, or of its sparsification if there is only one method."""
     of_method = colors(shown)
     return of_method[arm.plain_label] if len(of_method) > 1 else of_sparsify(arm)
 
 
 def mean_curve(curves: Sequence[QualityCurve]) -> tuple[list[float], list[float]]:
-    """Mean seconds and mean dB at each look that all curves have."""
+    """Returns mean seconds and mean dB at each look that all curves have.
+
+    >>> mean_curve([QualityCurve((10.0, 20.0), (22.0, 25.0)), QualityCurve((14.0,), (24.0,))])
+    ([12.0], [23.0])
+    """
     looks = min(len(curve.seconds) for curve in curves)
     seconds = [statistics.fmean(curve.seconds[look] for curve in curves) for look in range(looks)]
     psnr = [statistics.fmean(curve.psnr[look] for curve in curves) for look in range(looks)]
@@ -69,7 +73,7 @@ def mean_curve(curves: Sequence[QualityCurve]) -> tuple[list[float], list[float]
 
 
 def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: Protocol) -> None:
-    """The mean, and every run small and pale."""
+    """Draws the mean, and every run small and pale."""
     costs, qualities = arm.units(cost), arm.units(_psnr(protocol))
     units = sorted(costs.keys() & qualities.keys())
     if not units:

@@ -1,4 +1,4 @@
-"""Figures of a sweep over time: held-out quality, counts, and what a frame's milliseconds are spent on."""
+"""Figures of a sweep over time: held-out quality, counts, and the parts of a frame's milliseconds."""
 
 import statistics
 import textwrap
@@ -17,7 +17,7 @@ from sparsestreet.report.figures import COLORS, GREY, LEGEND, of_sparsify, panel
 
 
 def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
-    """Held-out PSNR against training seconds, a panel a method, a line a run; whether any run has a curve."""
+    """Draws held-out PSNR over training seconds, a panel a method, a line a run. Returns whether a run has a curve."""
     found = {arm.name: curves_of(arm) for arm in arms}
     drawn = [arm for arm in arms if found[arm.name]]
     if not drawn:
@@ -35,7 +35,7 @@ def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
 
 
 def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
-    """All Gaussians over the steps, a panel a method, a line a run, with dots where masks or passes took some."""
+    """Draws the number of Gaussians over steps, a panel a method, a line a run; dots mark masks and pruning passes."""
     drawn = [arm for arm in arms if any(LEDGER.exists(record.folder) for record in arm.records)]
     if not drawn:
         return False
@@ -64,7 +64,7 @@ def _counts(axes: Axes, arm: Arm, folder: Path) -> None:
 
 
 def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
-    """What a frame takes longer with each node class and effect, a bar an arm; whether any run recorded it."""
+    """Draws the additional time of a frame with each node and effect, a bar an arm. Returns whether a run has it."""
     costs = {arm.name: _frame_costs(arm) for arm in arms}
     drawn = [arm for arm in arms if costs[arm.name]]
     if not drawn:
@@ -92,7 +92,7 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
 
 
 def _frame_costs(arm: Arm) -> dict[str, float]:
-    """Node or effect -> mean milliseconds over the runs that recorded it."""
+    """Returns node or effect -> mean milliseconds over the runs that recorded it."""
     found: dict[str, list[float]] = {}
     for costs in filter(None, (COSTS.find(record.folder) for record in arm.records)):
         parts = {name: node.ms for name, node in costs.nodes.items()}

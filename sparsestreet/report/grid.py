@@ -1,4 +1,4 @@
-"""Tables as plain cells, and as Markdown, LaTeX and CSV."""
+"""Tables of plain cells, written as Markdown, LaTeX and CSV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ class Cell:
     text: str = ABSENT
     bold: bool = False
     published: bool = False
-    """Whether it is the paper's, not ours."""
+    """Whether the paper published the number; otherwise it is ours."""
     runs: tuple[str, ...] = ()
-    """Names of the runs that it is of."""
+    """Names of the runs that the number comes from."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table."""
+    """A table. Raises ValueError if a row has another number of cells than the header."""
 
     name: str
     """An identifier, such as "differences"."""
     title: str
     header: tuple[tuple[str, str], ...]
-    """Of each column: the heading above several, and its own."""
+    """For each column: the heading that it shares with its neighbors, and its own."""
     rows: tuple[tuple[Cell, ...], ...]
     notes: tuple[str, ...]
 
@@ -40,12 +40,21 @@ class Grid:
 
     @property
     def spans(self) -> list[tuple[str, int]]:
-        """The upper headings, each with the number of its columns."""
+        """The shared headings, each with the number of its columns."""
         return [(text, len(list(group))) for text, group in groupby(group for group, _ in self.header)]
 
 
 def markdown(grids: Sequence[Grid]) -> str:
-    """All of them with their notes."""
+    """Returns the tables with their notes as Markdown.
+
+    >>> grid = Grid("size", "Size", (("", "arm"), ("", "MB")), ((Cell("plain"), Cell("3.2", bold=True)),), ())
+    >>> print(markdown([grid]).strip())
+    ### Size
+    <BLANKLINE>
+    | arm | MB |
+    | --- | ---: |
+    | plain | **3.2** |
+    """
     return "\n".join(_markdown(grid) for grid in grids)
 
 
@@ -59,7 +68,7 @@ def _markdown(grid: Grid) -> str:
 
 
 def latex(grids: Sequence[Grid]) -> str:
-    """All of them as tables for ``booktabs``; published figures in italics."""
+    """Returns the tables as LaTeX for ``booktabs``; published numbers are in italics."""
     return "% \\usepackage{booktabs,graphicx}\n" + "\n".join(_latex(grid) for grid in grids)
 
 
@@ -90,7 +99,12 @@ def _escaped(text: str) -> str:
 
 
 def comma_separated(grids: Sequence[Grid]) -> str:
-    """All of them in one file, a line a cell: table, row, column, value, whether published, whether proven, runs."""
+    """Returns the tables as one CSV, a line a cell: table, row, column, value, whether published, whether bold, runs.
+
+    >>> grid = Grid("size", "Size", (("", "arm"), ("", "MB")), ((Cell("plain"), Cell("3.2", runs=("run0",))),), ())
+    >>> comma_separated([grid]).splitlines()[1]
+    'size,plain,MB,3.2,0,0,run0'
+    """
     lines = []
     for grid in grids:
         for row in grid.rows:

@@ -12,11 +12,11 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A mean and the interval that holds the true one with ``CONFIDENCE``, if the differences are normal."""
+    """A mean with an interval that holds the true mean with ``CONFIDENCE`` if the differences are normal."""
 
     mean: float
     low: float | None
-    """None of a single value, which says nothing of its spread."""
+    """None for a single value, which says nothing about its spread."""
     high: float | None
     n: int
 
@@ -27,7 +27,12 @@ class ConfidenceInterval:
 
 
 def t_interval(values: Sequence[float]) -> ConfidenceInterval | None:
-    """Mean and t interval with n - 1 degrees of freedom; None of no values."""
+    """Returns the mean and the t interval with n - 1 degrees of freedom; None without values.
+
+    >>> interval = t_interval([0.2, 0.3, 0.4])
+    >>> f"{interval.mean:.2f} [{interval.low:.2f}, {interval.high:.2f}]", interval.proven
+    ('0.30 [0.05, 0.55]', True)
+    """
     if not values:
         return None
     mean, n = statistics.fmean(values), len(values)

@@ -1,4 +1,4 @@
-"""The tables of the paper from our records: its rows and columns, its figures in columns of their own."""
+"""The paper's tables made from our records. They keep its rows and columns, and its numbers have their own columns."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ _TEXTS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "fid": "{:.2f}"
 def paper_table(
     arms: Sequence[Arm], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, sweep: str | None
 ) -> Grid:
-    """The paper's table that a sweep makes again; for another sweep, its arms in the layout of Table 1."""
+    """Returns the paper's table that a sweep reproduces; for any other sweep, its arms in the layout of Table 1."""
     table = TABLES.get(sweep or "", LAYOUT)
     left = list(arms)
     rows = []
@@ -78,7 +78,7 @@ def _ours(arm: Arm, key: Key, protocol: Protocol) -> float | None:
     if value is None:
         return None
     if views == TRAINING:
-        # Trained on all views where the sweep has such runs, as in DriveStudio.
+        # As in DriveStudio, prefer runs that were trained on all views.
         whole = arm.mean(value, whole=True)
         return arm.mean(value) if whole is None else whole
     mean = arm.mean(value)
@@ -86,7 +86,7 @@ def _ours(arm: Arm, key: Key, protocol: Protocol) -> float | None:
 
 
 def _value(key: Key, protocol: Protocol) -> Value | None:
-    """Where a record holds the number of a column; None: no record does."""
+    """Returns the function that reads a column's number from a record; None if no record holds it."""
     views, region, quantity = key
     if quantity == "gaussians":
         return lambda run: float(run.gaussians_total)
@@ -97,7 +97,12 @@ def _value(key: Key, protocol: Protocol) -> Value | None:
 
 
 def metric_id(protocol: Protocol, region: str, quantity: str) -> str | None:
-    """The id of a metric under a protocol; None where it has none."""
+    """Returns the id of a metric under a protocol, or None.
+
+    >>> from sparsestreet.metrics.protocols import DRIVESTUDIO
+    >>> metric_id(DRIVESTUDIO, "full", "psnr") == DRIVESTUDIO.psnr
+    True
+    """
     pairs = {"human": protocol.human, "vehicle": protocol.vehicle, "full": (protocol.psnr, protocol.ssim)}
     if quantity == "lpips":
         return protocol.lpips[0] if region == "full" else None

@@ -1,4 +1,4 @@
-"""What stands below a table: what its numbers are, and where they are not alike."""
+"""The notes below a table: how its numbers are defined, and where runs differ."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -11,11 +11,11 @@ from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.variants import Variant
 
 CAPPED = "†"
-"""Marks counts that a node's ``max_gaussians`` held down."""
+"""Marks counts that a node's ``max_gaussians`` limited."""
 
 
 def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) -> list[str]:
-    """The notes of one table, the general ones first, then what a reader must know of these runs."""
+    """Returns the notes of one table: first the general ones, then those about its runs."""
     runs = [run for variant in variants for run in variant.runs]
     return [
         *_general(runs, over_scenes, protocol),
@@ -32,7 +32,7 @@ def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) ->
 
 
 def camera_notes(variants: Sequence[Variant]) -> list[str]:
-    """The notes of a table by camera; the others stand below the table that it goes with."""
+    """Returns the notes of a table by camera. All other notes stand below the table that precedes it."""
     runs = [run for variant in variants for run in variant.runs]
     return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
 
@@ -55,7 +55,7 @@ def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) 
 
 
 def _absent(runs: Sequence[RunSummary], protocol: Protocol) -> list[str]:
-    """Why a metric of the protocol is not there, once for each reason."""
+    """Says why a metric of the protocol is absent, once for each reason."""
     reasons = {
         (quantity, reason)
         for run in runs
@@ -70,7 +70,7 @@ def _views(runs: Sequence[RunSummary]) -> str:
 
 
 def _lidar(runs: Sequence[RunSummary]) -> list[str]:
-    """What near and beyond are, where a run has either."""
+    """Says what near and beyond are if a run has either."""
     names = ("psnr_near_lidar", "psnr_beyond_lidar")
     if all(run.mean(name) is None for run in runs for name in names):
         return []
@@ -81,7 +81,7 @@ def _lidar(runs: Sequence[RunSummary]) -> list[str]:
 
 
 def _timing(runs: Sequence[RunSummary]) -> list[str]:
-    """Where and with what the clock of ms/frame ran."""
+    """Says where and with what ms/frame was measured."""
     places = _places((run.latency.device, run.latency.threads, run.evaluated.machine) for run in runs)
     said = [("ms/frame are not comparable, measured on: " if len(places) > 1 else "measured on ") + "; ".join(places)]
     if len({run.latency.protocol for run in runs}) > 1:
@@ -90,14 +90,14 @@ def _timing(runs: Sequence[RunSummary]) -> list[str]:
 
 
 def _training(runs: Sequence[RunSummary]) -> list[str]:
-    """Where the clock of train s ran."""
+    """Says where train s was measured."""
     places = _places((run.run.device, run.run.threads, run.run.machine) for run in runs)
     said = [("train s are not comparable, trained on: " if len(places) > 1 else "trained on ") + "; ".join(places)]
     return said + _commits("trained", [run.run.source for run in runs])
 
 
 def _places(clocks: Iterable[tuple[str, int, Machine]]) -> list[str]:
-    """What a time depends on beside the code, each once."""
+    """Returns what a time depends on besides the code: each device, number of threads and machine once."""
     return sorted(
         {
             f"{device}, {threads} thread{'s' if threads != 1 else ''}, {host.cores} cores, torch {host.torch}"
@@ -125,7 +125,7 @@ def _long_names(variants: Sequence[Variant]) -> list[str]:
 
 
 def _repeated_seeds(variants: Sequence[Variant]) -> list[str]:
-    """The same run twice counts twice, but is no independent repeat."""
+    """Names seeds that occur twice: such a run counts twice, but it is no independent repeat."""
     said = []
     for variant in variants:
         times = Counter((run.run.scene, run.run.seed) for run in variant.runs)
@@ -145,7 +145,7 @@ def _unfinished(variants: Sequence[Variant]) -> list[str]:
 
 
 def _scenes(variants: Sequence[Variant]) -> list[str]:
-    """Which scenes a mean is over, and whose mean is over fewer."""
+    """Names the scenes of a mean, and the variants whose mean is over fewer."""
     every = sorted({run.run.scene for variant in variants for run in variant.runs})
     said = [f"scenes: {', '.join(every)}"]
     for variant in variants:
@@ -156,7 +156,7 @@ def _scenes(variants: Sequence[Variant]) -> list[str]:
 
 
 def _caps(variants: Sequence[Variant]) -> list[str]:
-    """Counts that a limit held down say little of what a scene needs, and shares of them less."""
+    """Names counts that a cap limited: they say little about what a scene needs, and their shares even less."""
     said = []
     for variant in variants:
         caps = sorted({(node, cap) for run in variant.runs for node, cap in run.run.caps.items()})
@@ -167,7 +167,7 @@ def _caps(variants: Sequence[Variant]) -> list[str]:
 
 
 def _guards(variants: Sequence[Variant]) -> str:
-    """The alarms of every run that has any."""
+    """Returns the alarms of every run that has any."""
     fired = [
         f"{_run(variant, run)} " + ", ".join(f"{name} {count:,}" for name, count in run.guards.alarms.items())
         for variant in variants

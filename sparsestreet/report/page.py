@@ -1,4 +1,4 @@
-"""A sweep's report as one HTML file: no network, no file beside it."""
+"""A sweep's report as one HTML file that needs no network and no other file."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,22 +16,22 @@ _NOTHING_FROM_OUTSIDE = "default-src 'none'; img-src data:; style-src 'unsafe-in
 
 @dataclass(frozen=True, kw_only=True)
 class Page:
-    """What stands on it."""
+    """The content of the page."""
 
     title: str
     notes: Sequence[str]
-    """What a reader must know of all runs."""
+    """Notes that concern all runs."""
     grids: Sequence[Grid]
     figures: Sequence[tuple[str, str]]
     """Caption and SVG."""
     pictures: str | None
-    """``comparison.comparison_data``."""
+    """The JSON of ``comparison.comparison_data``."""
     records: Sequence[RunRecord]
     failures: Sequence[tuple[Path, FailedRun]]
 
 
 def html(page: Page) -> str:
-    """The whole file."""
+    """Returns the whole file."""
     sets = _sets(page.grids)
     parts = [
         f"<h1>{escape(page.title)}</h1>",
@@ -77,7 +77,7 @@ def _notes(notes: Sequence[str]) -> str:
 
 
 def _sets(grids: Sequence[Grid]) -> dict[tuple[str, ...], str]:
-    """Names of the runs behind a number -> the place on the page that lists them."""
+    """Returns names of the runs that a number comes from -> the place on the page that lists them."""
     several = dict.fromkeys(cell.runs for grid in grids for row in grid.rows for cell in row if len(cell.runs) > 1)
     return {runs: f"of-{index}" for index, runs in enumerate(several)}
 
@@ -180,7 +180,7 @@ def _run(record: RunRecord) -> str:
 
 
 def _configurations(records: Sequence[RunRecord]) -> list[str]:
-    """Each once; what is not part of its identity as the first of its runs had it."""
+    """Returns each configuration once. Options outside its identity have the values of its first run."""
     once: dict[str, RunRecord] = {}
     for record in records:
         once.setdefault(record.summary.run.config_hash, record)

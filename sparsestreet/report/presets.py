@@ -1,4 +1,4 @@
-"""Trained one way and rendered another (``records/presets.json``): what that costs and saves."""
+"""Scenes rendered with other settings than in training (``records/presets.json``): quality and speed."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +19,7 @@ _COSTS: tuple[tuple[str, str, str, Number], ...] = (
 
 
 def rendered_otherwise(arms: Sequence[Arm], protocol: Protocol) -> Grid | None:
-    """A row for each arm and preset that its runs have; None where no run has any.
+    """Returns a row for each arm and preset that its runs have; None if no run has any.
 
     Raises RecordError for a malformed record.
     """
@@ -46,7 +46,7 @@ def _records(arm: Arm) -> dict[Unit, PresetRecord]:
 
 
 def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
-    """``several``: arms have this label; then the preset of training, if it is known, tells them apart."""
+    """``several``: whether several arms have this label. If so, the preset of training, if known, tells them apart."""
     runs = tuple(run.folder.name for run in arm.records)
     metrics = (protocol.psnr, protocol.human[0], protocol.vehicle[0])
     trained = {unit: one for unit, record in records.items() for one in record.rendered if one.trained}
@@ -66,7 +66,7 @@ def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol, sever
 def _quality(
     found: dict[Unit, RenderedAs], trained: dict[Unit, RenderedAs], metric: str, runs: tuple[str, ...]
 ) -> list[Cell]:
-    """The mean over scenes, and the paired difference to the way that training rendered."""
+    """Returns the mean over scenes, and the paired difference to the settings of training."""
     ours, theirs = (_values(one, lambda rendered: rendered.quality.get(metric)) for one in (found, trained))
     differences = {unit: ours[unit] - theirs[unit] for unit in ours.keys() & theirs.keys()}
     interval = None if found == trained else interval_over_scenes(differences)

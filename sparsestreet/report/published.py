@@ -1,7 +1,7 @@
-"""The figures that the paper published, for columns beside ours.
+"""The numbers that the paper published, for columns next to ours.
 
 Source: "SparseStreet: Sparse Gaussian Splatting for Real-Time Street Scene Simulation", tables 1 to 5, as printed. They
-are of another implementation, of its data, views and clock: nothing here was measured by this project.
+come from another implementation with its own data, views and clock. This project measured none of them.
 """
 
 from collections.abc import Mapping
@@ -13,15 +13,15 @@ Key = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A row as printed, and which of our arms it stands beside."""
+    """A row as printed, and the arm of ours that it is compared with."""
 
     name: str
     method: str | None
-    """None: a method that is not here."""
+    """None for a method that this project does not have."""
     sparsify: str
     values: tuple[float | None, ...]
     options: tuple[str, ...] = ()
-    """Words of an arm's name that tell it from others with this method and sparsification."""
+    """Words of an arm's name that distinguish it from others with this method and sparsification."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class PublishedTable:
     columns: tuple[Key, ...]
     rows: tuple[PublishedRow, ...]
     views: str
-    """What the paper says of the views that its numbers are of."""
+    """What the paper says about the views of its numbers."""
 
     def values(self, row: PublishedRow) -> Mapping[Key, float | None]:
-        """Column -> number."""
+        """Returns column -> number."""
         return dict(zip(self.columns, row.values, strict=True))
 
 
@@ -66,7 +66,7 @@ _SHIFTED = tuple(("novel", f"{meters} m", "fid") for meters in (1, 2, 3))
 
 
 def _rows(text: str) -> tuple[PublishedRow, ...]:
-    """Lines of: name | method | sparsification and words of the arm's name | numbers as printed, in their order."""
+    """Parses lines: name | method | sparsification and words of the arm's name | numbers as printed, in order."""
     return tuple(_row(*(part.strip() for part in line.split("|"))) for line in text.strip().splitlines())
 
 
@@ -145,7 +145,7 @@ TABLES: Mapping[str, PublishedTable] = {
     "table4_novel": _NOVEL,
     "table5_ablation": _STAGES,
 }
-"""Name of a sweep (conf/sweep) -> the table that it makes again."""
+"""Name of a sweep (conf/sweep) -> the table that it reproduces."""
 
 LAYOUT = _WAYMO
-"""The layout of sweeps that are of no table of the paper."""
+"""The layout of sweeps that reproduce no table of the paper."""

@@ -1,4 +1,4 @@
-"""What a table says of a run: heading, where the record holds it, how it is written."""
+"""The quantities of a table: heading, value in the record, and format."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -16,13 +16,17 @@ class Quantity:
     value: Callable[[RunSummary], float | None]
     text: Callable[[float], str]
     relative: bool
-    """How differences to the baseline read: in per cent of it (what remains), or as a signed difference."""
+    """True: a comparison with the baseline reads as per cent of it (what remains). False: as a signed difference."""
     count: bool = False
-    """Whether it counts Gaussians, which a cap holds down."""
+    """Whether it counts Gaussians, which a cap can limit."""
 
 
 def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
-    """Heading, id and format of each metric of a protocol, and of those by lidar."""
+    """Returns heading, id and format of each metric of a protocol, and of the metrics by lidar.
+
+    >>> [heading for heading, _, _ in protocol_metrics(DRIVESTUDIO)][:2]
+    ['PSNR', 'SSIM']
+    """
     return (
         ("PSNR", protocol.psnr, "{:.2f}"),
         ("SSIM", protocol.ssim, "{:.4f}"),
@@ -40,7 +44,7 @@ _CAMERA_METRICS = (("", "psnr_full"), (" near", "psnr_near_lidar"), (" beyond", 
 
 
 def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> tuple[Quantity, ...]:
-    """Those that at least one of the runs has, with the metrics of a protocol."""
+    """Returns the quantities that at least one of the runs has, with the metrics of a protocol."""
     metrics = protocol_metrics(protocol)
     nodes = dict.fromkeys(name for run in runs for name in run.gaussians)
     known = (
@@ -56,7 +60,7 @@ def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> 
 
 
 def camera_quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
-    """PSNR of each camera, in full and by lidar, where at least one of the runs has it; none for a single camera."""
+    """Returns PSNR of each camera, in full and by lidar, if at least one run has it; nothing for a single camera."""
     cameras = dict.fromkeys(camera for run in runs for camera in run.by_camera[run.main_split])
     known = [
         Quantity(f"camera {camera}{region}", _camera_metric(name, camera), "{:.2f}".format, False)
@@ -71,7 +75,7 @@ def _measured(known: Iterable[Quantity], runs: Sequence[RunSummary]) -> tuple[Qu
 
 
 def _training_metrics(runs: Sequence[RunSummary], metrics: Sequence[tuple[str, str, str]]) -> list[Quantity]:
-    """PSNR beside that of held-out views, which shows overfitting; everything where no run holds out a view."""
+    """Returns PSNR of the training views, which shows overfitting; all metrics if no run holds out a view."""
     shown = metrics if all(run.main_split == TRAINING for run in runs) else metrics[:1]
     return [
         Quantity(f"train-view {heading}", _metric(name, TRAINING), text.format, False) for heading, name, text in shown

@@ -1,4 +1,4 @@
-"""Runs that may stand in one table: rows of repeats, differences to a baseline, and means over scenes."""
+"""Sections of a report, a table each: rows of repeats, differences to a baseline, and means over scenes."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,23 +19,23 @@ class Row:
 
     label: str
     runs: str
-    """How many runs (and scenes) it is of, in words."""
+    """Number of its runs (and scenes), in words."""
     n: int
-    """Values behind a cell: runs, pairs of runs, or scenes."""
+    """Number of values that a cell averages: runs, pairs of runs, or scenes."""
     cells: tuple[Spread | None, ...]
     difference: bool
     capped: bool
-    """Whether a node's ``max_gaussians`` held down a count behind it."""
+    """Whether a node's ``max_gaussians`` limited one of its counts."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """One table: same images and split, or the mean over scenes of one split."""
+    """One table: runs on the same images of a split, or means over the scenes of a split."""
 
     title: str
     over_scenes: bool
     by_camera: bool
-    """Whether its quantities are those of single cameras."""
+    """Whether its quantities are for single cameras."""
     quantities: tuple[Quantity, ...]
     rows: tuple[Row, ...]
     notes: tuple[str, ...]
@@ -43,7 +43,7 @@ class Section:
 
 @dataclass(frozen=True)
 class _Group:
-    """What becomes a section."""
+    """The runs that become a section."""
 
     title: str
     log: dict[str, Setting]
@@ -54,19 +54,19 @@ class _Group:
 def sections(
     records: Sequence[RunRecord], baseline: str | None = None, protocol: Protocol = DRIVESTUDIO
 ) -> list[Section]:
-    """A section for each scene, split and resolution, then the means over scenes.
+    """Returns a section for each scene, split and resolution, then sections of means over scenes.
 
-    Within a scene, a row for each variant (runs of one label and configuration), mean and spread over its runs. Where
-    a variant occurs in at least two scenes of one split, a section of means follows, in which each scene counts once.
-    Behind a section whose logs have several cameras follows one of PSNR by camera.
+    A scene has a row for each variant (runs of one label and configuration) with mean and spread over its runs. If a
+    variant occurs in at least two scenes of a split, a section of means follows, in which each scene counts once. If
+    logs have several cameras, a section of PSNR by camera follows their section.
 
     Args:
         records: the runs.
         baseline: label or name of the variant that others are compared with, pairwise by scene and seed; None for no
-            differences. A section without it has none either and says so in its notes.
-        protocol: which definitions of PSNR, SSIM and LPIPS are shown.
+            differences. A section that lacks it has no differences and says so in its notes.
+        protocol: the definitions of PSNR, SSIM and LPIPS to show.
 
-    Raises ValueError if no record has the baseline, if it is a label of several variants, or if two records define one
+    Raises ValueError if no record has the baseline, if several variants have it as label, or if two records define one
     metric differently.
     """
     check_definitions(records)
@@ -84,7 +84,7 @@ def sections(
 
 
 def _by_scene(runs: Sequence[RunSummary]) -> list[_Group]:
-    """Runs that were measured on the same images."""
+    """Groups runs that were measured on the same images."""
     groups: dict[tuple[str, ...], list[RunSummary]] = {}
     for run in runs:
         key = (run.run.scene, run.run.split, " ".join(run.resolutions), config_hash(log_config(run)))
@@ -96,7 +96,7 @@ def _by_scene(runs: Sequence[RunSummary]) -> list[_Group]:
 
 
 def _over_scenes(runs: Sequence[RunSummary]) -> list[_Group]:
-    """Runs of one split over all scenes, of the variants that occur in at least two."""
+    """Groups the runs of a split over all scenes, for variants that occur in at least two scenes."""
     groups: dict[tuple[str, str], list[RunSummary]] = {}
     for run in runs:
         groups.setdefault((run.run.split, config_hash(_log_of_any_clip(run))), []).append(run)
@@ -117,7 +117,7 @@ def _log_of_any_clip(run: RunSummary) -> dict[str, Setting]:
 
 
 def _titles(groups: Sequence[_Group]) -> list[str]:
-    """Each group's title; those that would be alike name how their logs were read."""
+    """Returns each group's title; groups that would share a title add how their logs were read."""
     titles = []
     for group in groups:
         alike = [other for other in groups if other.title == group.title]
@@ -127,7 +127,7 @@ def _titles(groups: Sequence[_Group]) -> list[str]:
 
 
 def _reference(found: Sequence[Variant], baseline: str | None) -> Variant | None:
-    """The variant of a table that has the baseline's name, or alone its label; None where there is none."""
+    """Returns the variant with the baseline's name, or the only one with its label; None if there is none."""
     named = [variant for variant in found if variant.name == baseline]
     of_label = [variant for variant in found if variant.label == baseline]
     if not named and len(of_label) > 1:
@@ -139,7 +139,7 @@ def _reference(found: Sequence[Variant], baseline: str | None) -> Variant | None
 def _sections(
     group: _Group, title: str, found: Sequence[Variant], baseline: str | None, protocol: Protocol
 ) -> list[Section]:
-    """The table of a group, and the one by camera where there are several."""
+    """Returns the table of a group, and the one by camera if there are several cameras."""
     reference = _reference(found, baseline)
     ordered = sorted(found, key=lambda variant: (variant is not reference, variant.name))
     compared = ordered[1:] if reference is not None else []
@@ -163,7 +163,7 @@ def _sections(
 
 
 def _variant_row(variant: Variant, columns: Sequence[Quantity], over_scenes: bool) -> Row:
-    """Mean and spread over runs, or over scenes of the mean of each scene's runs."""
+    """Returns mean and spread over runs, or over the means of each scene's runs."""
     units = _units(variant.runs, _clip) if over_scenes else [[run] for run in variant.runs]
     cells = [_spread_of([[quantity.value(run) for run in unit] for unit in units]) for quantity in columns]
     runs = (
@@ -173,7 +173,7 @@ def _variant_row(variant: Variant, columns: Sequence[Quantity], over_scenes: boo
 
 
 def _difference_row(variant: Variant, reference: Variant, columns: Sequence[Quantity], over_scenes: bool) -> Row:
-    """Differences of runs of the same scene and seed; several runs of one seed count as their mean."""
+    """Returns differences between runs of the same scene and seed; several runs of one seed count as their mean."""
     ours, theirs = (
         {_clip_and_seed(unit[0]): unit for unit in _units(one.runs, _clip_and_seed)} for one in (variant, reference)
     )
@@ -191,7 +191,7 @@ def _difference_row(variant: Variant, reference: Variant, columns: Sequence[Quan
 
 
 def _clip(run: RunSummary) -> tuple[str, str]:
-    """What counts as one scene: the log, and the part of it that was read."""
+    """Returns what identifies a scene: the log, and the part of it that was read."""
     return run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))
 
 
@@ -207,7 +207,7 @@ def _units(runs: Iterable[RunSummary], key: Callable[[RunSummary], object]) -> l
 
 
 def _spread_of(units: Iterable[Iterable[float | None]]) -> Spread | None:
-    """The spread over units, each of which counts as the mean of the values it has."""
+    """Returns the spread over units; each unit counts as the mean of its values."""
     means = [spread([value for value in unit if value is not None]) for unit in units]
     return spread([unit.mean for unit in means if unit is not None])
 

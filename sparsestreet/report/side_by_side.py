@@ -1,4 +1,4 @@
-"""Finished runs side by side, from what they left on disk."""
+"""Compares finished runs side by side, from their files alone."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,10 +11,10 @@ from sparsestreet.report.variants import variants
 
 
 def compare_runs(runs: Sequence[Path], sheet: Path, *, legend: Legend | None = None) -> None:
-    """Write a sheet with a column for each run: renders, errors and centers of the images that all of them show.
+    """Writes a sheet with a column for each run: renders, errors and centers of the images that all of them show.
 
     Args:
-        runs: at least two run folders with records and pictures of the same images; the first is what shares are of.
+        runs: at least two run folders with records and pictures of the same images. Shares refer to the first.
         sheet: PNG to write.
         legend: node -> RGB of its centers, drawn on the sheet.
 
@@ -35,7 +35,7 @@ def compare_runs(runs: Sequence[Path], sheet: Path, *, legend: Legend | None = N
 
 
 def _names(summaries: Sequence[RunSummary]) -> list[str]:
-    """As in the report's tables, with the seed where it is what tells two runs apart."""
+    """Returns names as in the report's tables, with the seed if only the seed tells two runs apart."""
     found = variants(summaries)
     names = [next(variant.name for variant in found if summary in variant.runs) for summary in summaries]
     return [

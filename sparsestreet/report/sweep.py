@@ -1,4 +1,4 @@
-"""The report of a sweep: tables, figures and one page, from records alone."""
+"""Writes the report of a sweep from its records alone: tables, figures and one page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from sparsestreet.report.tradeoffs import differences, matched_budget, matched_q
 
 @dataclass(frozen=True)
 class SweepReport:
-    """What was written."""
+    """The folder and content of a written report."""
 
     folder: Path
     grids: tuple[Grid, ...]
@@ -32,15 +32,15 @@ class SweepReport:
 
 
 def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIVESTUDIO) -> SweepReport:
-    """Write ``sweep/report/``: tables.md, tables.tex, tables.csv, figures/ and index.html.
+    """Writes ``sweep/report/``: tables.md, tables.tex, tables.csv, figures/ and index.html.
 
     Args:
-        sweep: the folder of a sweep; runs that failed stand in it as ``failed.json``.
-        name: which of conf/sweep it is of, for the layout and the published figures; None: another one.
+        sweep: the folder of a sweep; runs that failed have a ``failed.json`` in it.
+        name: name of the sweep in conf/sweep, for the layout and the published numbers; None: any other sweep.
         protocol: chooses the metrics.
 
-    Raises FileNotFoundError where no run has a record, RecordError for a malformed one, ValueError where two records
-    mean different things by one metric.
+    Raises FileNotFoundError if no run has a record, RecordError for a malformed one, ValueError if two records define
+    one metric differently.
     """
     failures = read_failures(sweep)
     records = sweep_records(sweep)
@@ -66,8 +66,8 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
 
 
 def sweep_records(sweep: Path) -> list[RunRecord]:
-    """The records of the runs of a sweep that did not fail. Raises as ``write_report``."""
-    # A folder that says it failed may hold the record of an earlier configuration.
+    """Returns the records of a sweep's runs that did not fail. Raises the same errors as ``write_report``."""
+    # The folder of a failed run may hold the record of an earlier configuration.
     records = [record for record in collect([sweep]) if not FAILURE.exists(record.folder)]
     if not records:
         raise FileNotFoundError(f"{sweep} holds no run that did not fail: run the sweep again")
@@ -92,7 +92,7 @@ def _grids(
 
 
 def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
-    """Caption and SVG of each figure, and notes on those that the records do not hold."""
+    """Returns caption and SVG of each figure, and notes on figures that the records cannot give."""
     drawn, absent = [], []
 
     def take(written: bool, name: str, caption: str, lacking: str) -> None:

@@ -1,4 +1,4 @@
-"""What getting smaller costs: paired differences, and the best of a sweep at one quality or one size."""
+"""The cost of getting smaller: paired differences, and the best arm of a sweep at one quality or one size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from sparsestreet.report.grid import Cell, Grid
 from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
 
 LOSSES = (0.1, 0.3, 0.5)
-"""dB of held-out PSNR, full image, that a smaller arm may lose."""
+"""Losses of full-image held-out PSNR, dB, that a smaller arm may have."""
 SHARES = (0.25, 0.5, 0.75)
-"""Of the plain arm's Gaussians that a smaller one may have."""
+"""Shares of the plain arm's Gaussians that a smaller arm may keep."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Measure:
     value: Value
     text: str
     relative: bool
-    """In per cent of the plain run's."""
+    """Whether the difference is in per cent of the plain run's value."""
 
 
 def measures(protocol: Protocol) -> tuple[Measure, ...]:
-    """Quality by a protocol, and what it costs."""
+    """Returns the columns of quality under a protocol, and of its costs."""
     quality = (
         ("PSNR full", protocol.psnr, "{:+.2f}"),
         ("PSNR human", protocol.human[0], "{:+.2f}"),
@@ -50,7 +50,7 @@ def _held_out(metric: str) -> Value:
 
 
 def paired(arm: Arm, plain: Arm, value: Value, relative: bool = False) -> ConfidenceInterval | None:
-    """The difference to the plain arm over the pairs of scene and seed that both have."""
+    """Returns the difference to the plain arm over the pairs of scene and seed that both arms have."""
     ours, theirs = arm.units(value), plain.units(value)
     differences = {
         unit: 100 * (ours[unit] / theirs[unit] - 1) if relative else ours[unit] - theirs[unit]
@@ -61,13 +61,17 @@ def paired(arm: Arm, plain: Arm, value: Value, relative: bool = False) -> Confid
 
 
 def interval_over_scenes(values: dict[Unit, float]) -> ConfidenceInterval | None:
-    """Each scene counts once, with the mean of its seeds; with a single scene each seed does."""
+    """Returns the t interval over scenes, each with the mean of its seeds; over the seeds of a single scene.
+
+    >>> interval_over_scenes({(("street", ""), 0): 0.1, (("street", ""), 1): 0.3, (("park", ""), 0): 0.4}).n
+    2
+    """
     scenes = by_scene(values)
     return t_interval(list((scenes if len(scenes) > 1 else values).values()))
 
 
 def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """Every arm against the plain one of its method, at the same place."""
+    """Returns the table that compares every arm with the plain arm of its method at the same place."""
     shown = [one for one in measures(protocol) if any(arm.mean(one.value) is not None for arm in arms)]
     rows, alone = [], []
     for arm in arms:
@@ -94,7 +98,11 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
 
 
 def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
-    """Mean and interval, bold where it excludes 0; says its own n where that is not the row's."""
+    """Returns mean and interval, bold if it excludes 0; with its own n if that is not the row's.
+
+    >>> difference_cell(t_interval([-0.3, -0.2, -0.1]), "{:+.2f}", 3, ()).text
+    '-0.20 [-0.45, +0.05]'
+    """
     if interval is None:
         return Cell()
     text = form.format(interval.mean)
@@ -107,9 +115,9 @@ def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs
 class _Candidate:
     arm: Arm
     loss: float
-    """dB, positive where it is worse."""
+    """dB; positive if it is worse."""
     share: float
-    """Of the plain arm's Gaussians."""
+    """Share of the plain arm's Gaussians that remains."""
 
 
 def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Candidate]:
@@ -125,7 +133,7 @@ def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Ca
 
 
 def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """The fewest Gaussians that lose no more than so much."""
+    """Returns the table of the arms with the fewest Gaussians for each loss of ``LOSSES``."""
     rows = []
     for plain in (arm for arm in arms if arm.sparsify == "none"):
         for most in LOSSES:
@@ -137,7 +145,7 @@ def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
 
 
 def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """The best held-out PSNR with no more than so many Gaussians."""
+    """Returns the table of the arms with the best held-out PSNR for each share of ``SHARES``."""
     rows = []
     for plain in (arm for arm in arms if arm.sparsify == "none"):
         for share in SHARES:

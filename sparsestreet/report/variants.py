@@ -1,4 +1,4 @@
-"""Which runs are repeats of one another, and how those that are not get names of their own."""
+"""Groups runs that are repeats of one another into variants, and gives different variants different names."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -18,17 +18,17 @@ from sparsestreet.records.summary import RunSummary
 
 LOG_KEYS = ("data.log.*",)
 SECTION_KEYS = ("split.*", *LOG_KEYS)
-"""Options that settle which images a run is measured on: they set runs into different tables, not columns."""
+"""Options that determine the images a run is measured on. They put runs into different tables, not columns."""
 
 CLIP_KEYS = ("data.log.first_frame", "data.log.last_frame")
-"""Options that say which part of a log is read: where they differ, scenes differ, as where logs do."""
+"""Options that select a part of a log. Runs that differ in them have different scenes, as runs of different logs do."""
 
 _EARLIER_CONTROLS = {
     "random": "as many Gaussians, drawn at random",
     "opacity": "as many Gaussians, the most opaque",
     "capped": "the plain method, stopped at as many Gaussians",
 }
-"""Sparsifications of records made before a configuration said ``sparsify.control`` -> what that would be."""
+"""Sparsifications of records from before configurations had ``sparsify.control`` -> what that would be."""
 
 COUNT_KEYS = (
     "callback.pruning.rule.keep",
@@ -36,33 +36,33 @@ COUNT_KEYS = (
     "node.background.num_points",
     "node.background.max_gaussians",
 )
-"""Options of a control that follow from the run whose size it has, seed by seed."""
+"""Options of a control that follow from the run whose size it copies, seed by seed."""
 
 _MOST_NAMED = 3
-"""Options in the name of a column; what is beyond goes into a note."""
+"""Largest number of options in the name of a column; the rest go into a note."""
 _LONGEST = 40
-"""Characters of an option in a name."""
+"""Largest number of characters of an option in a name."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Repeats: runs with one label and one configuration, seeds aside."""
+    """Repeats: runs with one label and one configuration apart from seeds."""
 
     name: str
-    """The label, followed by the options that tell it from the label's other variants."""
+    """The label, followed by the options that distinguish it from the label's other variants."""
     label: str
     options: tuple[str, ...]
-    """All options that do so; the name holds the first few."""
+    """All distinguishing options; the name holds the first few."""
     runs: tuple[RunSummary, ...]
 
 
 def variants(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) -> list[Variant]:
-    """The runs of one table in groups of repeats, sorted by name.
+    """Groups the runs of one table into repeats, sorted by name.
 
     Args:
-        runs: of one table.
-        everywhere: of all tables that are read together, so that a variant has one name in all of them. Options under
-            ``data.`` are named only where they differ within the table, since every data set has its own.
+        runs: the runs of one table.
+        everywhere: the runs of all tables that are read together, so that a variant has one name in all of them.
+            Options under ``data.`` are named only if they differ within the table, since every data set has its own.
     """
     groups: dict[tuple[str, str], list[RunSummary]] = {}
     for run in runs:
@@ -75,7 +75,7 @@ def variants(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) 
         named = (*_not_of_data(given_anywhere), *_of_data(given_here))
         found.append((Variant(_name(label, named, identity), label, options, tuple(group)), identity))
     shared = Counter(variant.name for variant, _ in found)
-    # Differences that words cannot tell, such as an option that is null in one and absent in the other.
+    # Some differences have no words, such as an option that is null in one variant and absent in another.
     unique = [
         variant if shared[variant.name] == 1 else replace(variant, name=f"{variant.name} #{identity[:6]}")
         for variant, identity in found
@@ -84,26 +84,26 @@ def variants(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) 
 
 
 def control_of(run: RunSummary) -> str | None:
-    """What kind of control a run is, which is no way to get small but has the size of another run; None: it is none."""
+    """Returns the kind of control that a run is, or None. A control only copies the size of another run."""
     return run.run.config.get("sparsify.control", _EARLIER_CONTROLS.get(run.run.sparsify))
 
 
 def log_config(run: RunSummary) -> dict[str, Setting]:
-    """The options that say which images of which log a run saw."""
+    """Returns the options that select the log and the images that a run saw."""
     return only(without(run.run.config, IDENTITY_KEYS), LOG_KEYS)
 
 
 def _compared(run: RunSummary) -> dict[str, Setting]:
-    """The options by which runs of one table may differ."""
+    """Returns the options by which runs of one table may differ."""
     follows = COUNT_KEYS if control_of(run) and run.run.config.get("count_of") else ()
     return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS, *follows))
 
 
 def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The options by which a run differs from others of its label, itself among them; and those that are named.
+    """Returns the options by which a run differs from others of its label, and those of them that its name holds.
 
-    The latter are the ones that the commands gave, where these tell all configurations apart: the rest follows from
-    them. Else they are all.
+    If the options that the commands gave distinguish all configurations, the name holds those: the rest follows from
+    them. Otherwise it holds all. ``others`` includes the run itself.
     """
     alike = [other for other in others if other.run.label == run.run.label]
     distinct = {config_hash(_compared(other)): _compared(other) for other in alike}
@@ -128,7 +128,11 @@ def _name(label: str, options: Sequence[str], identity: str) -> str:
 
 
 def in_few_words(options: Sequence[str], identity: str) -> str:
-    """Options for a name: the first few, cut to a length; where there are more, a hash tells them apart."""
+    """Returns options for a name: the first few, cut to a length, with a hash if there are more.
+
+    >>> in_few_words(["split.stride=5", "seed=1"], identity="0123456789ab")
+    'split.stride=5, seed=1'
+    """
     named = [word if len(word) <= _LONGEST else f"{word[:_LONGEST]}..." for word in options[:_MOST_NAMED]]
     if len(options) > _MOST_NAMED:
         named.append(f"and {len(options) - _MOST_NAMED} more #{identity[:6]}")
