@@ -1,1 +1,1 @@
-"""Pictures of views, sheets of pictures and curves of a run, drawn without torch."""
+"""Draws pictures of views, sheets of pictures and curves of a run, without torch."""

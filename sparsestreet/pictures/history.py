@@ -1,4 +1,4 @@
-"""Curves of one training, drawn from the files it left."""
+"""Draws the curves of one training from its files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -10,7 +10,7 @@ from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
 from sparsestreet.records.logged import LOGGED
 
 MARKED = (MASK, PRUNING)
-"""Reasons of changes that the curves mark."""
+"""Reasons of the changes that the curves mark."""
 
 PSNR_COLUMNS = {"training, running mean": "psnr", "held out": "val/psnr"}
 """Curve -> its column in ``curves/metrics.csv``."""
@@ -21,10 +21,10 @@ HELD_OUT_COLUMNS = {"full image": "psnr_full", "humans": "psnr_human", "vehicles
 
 
 def draw_history(run: Path) -> None:
-    """Write ``counts.png``, ``psnr.png`` and ``held_out.png`` in ``curves``, from ``records/counts.csv`` and, beside
-    them, ``metrics.csv`` and ``held_out.csv``.
+    """Writes ``counts.png``, ``psnr.png`` and ``held_out.png`` to the run's folder ``curves``.
 
-    A file that the run was configured not to write leaves its picture out. Raises RecordError for a malformed one.
+    They show ``records/counts.csv``, ``curves/metrics.csv`` and ``curves/held_out.csv``. A run without one of these
+    files gets no picture of it. Raises RecordError for a malformed file.
     """
     changes = LEDGER.find(run)
     events = marks(changes or ())
@@ -41,11 +41,15 @@ def draw_history(run: Path) -> None:
 
 
 def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, list[int]]]:
-    """The steps at which any node changes, and node -> its Gaussians after each; constant between its own changes."""
+    """Returns the steps at which any node changes, and node -> its number of Gaussians after each of these steps.
+
+    >>> count_curves([CountChange(0, "road", 0, 9, "start"), CountChange(5, "cars", 0, 4, "start")])
+    ([0, 5], {'road': [9, 9], 'cars': [0, 4]})
+    """
     steps = sorted({change.step for change in changes})
     curves: dict[str, list[int]] = {change.node: [] for change in changes}
     for node, series in curves.items():
-        # Of several changes in one step the last one counts: the ledger is in order.
+        # The ledger is in order, so the last of several changes in one step counts.
         after = {change.step: change.after for change in changes if change.node == node}
         gaussians = 0
         for step in steps:
@@ -55,14 +59,22 @@ def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, l
 
 
 def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
-    """(step, reason) of the changes that make the scene small, each once, in order."""
+    """Returns (step, reason) of the changes that make the scene small, each once, in order.
+
+    >>> marks([CountChange(0, "road", 0, 9, "start"), CountChange(8, "road", 9, 6, PRUNING)])
+    [(8, 'pruning')]
+    """
     return list(dict.fromkeys((change.step, change.reason) for change in changes if change.reason in MARKED))
 
 
 def psnr_curves(
     rows: Sequence[Mapping[str, str | float | None]], columns: Mapping[str, str], along: str
 ) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
-    """Name of a curve -> (steps or seconds, dB), from the rows that hold it."""
+    """Returns name of a curve -> (steps or seconds, dB), from the rows that have a value.
+
+    >>> psnr_curves([{"step": 1, "psnr": 20.5}, {"step": 2, "psnr": None}], {"training": "psnr"}, "step")
+    {'training': ((1.0,), (20.5,))}
+    """
     curves = {}
     for label, column in columns.items():
         points = [(float(row[along]), float(row[column])) for row in rows if row.get(column) not in (None, "")]

@@ -1,6 +1,6 @@
-"""Pictures that let a person judge a run: truth, render, error and Gaussian centers of one view.
+"""Pictures by which a person judges a run: truth, render, error and Gaussian centers of one view.
 
-All images are uint8 [h, w, 3]. Errors share one fixed scale, so that pictures of different runs compare.
+All images are uint8 [h, w, 3]. Errors share one fixed scale, so pictures of different runs can be compared.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ ERROR_SCALE = 0.2
 """Mean absolute difference over RGB, in [0, 1], at which the error picture reaches its brightest color."""
 
 TILE_WIDTH = 480
-"""Pixels of a column of a sheet."""
+"""Width of a column of a sheet, pixels."""
 
 KINDS = ("truth", "render", "error", "centers")
 
 LIDAR_END = (0, 230, 230)
-"""RGB of the line in error pictures that runs where the lidar ends; no error has this color."""
+"""RGB of the line that marks the end of the lidar in error pictures; no error has this color."""
 
 # Perceptually uniform dark-to-bright map: 17 equally spaced samples of "inferno" (van der Walt and Smith, CC0).
 _INFERNO = np.array(
@@ -34,25 +34,29 @@ _INFERNO = np.array(
 
 @dataclass(frozen=True)
 class Picture:
-    """One recorded image with what a run made of it."""
+    """One recorded image with its render, error and centers."""
 
     frame: int
     camera: int
     truth: UInt8[np.ndarray, "h w 3"]
     render: UInt8[np.ndarray, "h w 3"]
     error: UInt8[np.ndarray, "h w 3"]
-    """``error_picture`` of render and truth; where the log has lidar, with the line at its end."""
+    """``error_picture`` of render and truth, with the line at the lidar's end if the log has lidar."""
     centers: UInt8[np.ndarray, "h w 3"]
-    """The Gaussians' centers, projected."""
+    """The projected centers of the Gaussians."""
 
     @property
     def shows_lidar_end(self) -> bool:
-        """Whether there is a line in its error."""
+        """Whether its error picture has the line at the lidar's end."""
         return bool((self.error == LIDAR_END).all(axis=-1).any())
 
 
 def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
-    """Values in [0, 1] (clipped) as colors from black through red to pale yellow."""
+    """Returns colors from black through red to pale yellow for values in [0, 1]; others are clipped.
+
+    >>> color_map(np.array([0.0, 1.0])).tolist()
+    [[0, 0, 4], [252, 255, 164]]
+    """
     position = np.clip(values, 0, 1) * (len(_INFERNO) - 1)
     knots = np.arange(len(_INFERNO))
     channels = [np.interp(position, knots, _INFERNO[:, channel]) for channel in range(3)]
@@ -62,7 +66,12 @@ def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 
 def error_picture(
     render: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], scale: float = ERROR_SCALE
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Mean absolute difference over RGB in [0, 1], divided by ``scale`` and colored."""
+    """Returns the mean absolute difference over RGB in [0, 1], divided by ``scale`` and colored.
+
+    >>> black, white = np.zeros((1, 2, 3), np.uint8), np.full((1, 2, 3), 255, np.uint8)
+    >>> error_picture(black, white)[0, 0].tolist()
+    [252, 255, 164]
+    """
     difference = np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1) / 255
     return color_map(difference / scale)
 
@@ -70,9 +79,9 @@ def error_picture(
 def draw_lidar_end(
     picture: UInt8[np.ndarray, "h w 3"], near: Bool[np.ndarray, "h w"], beyond: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with a line on those near pixels that touch a pixel beyond.
+    """Returns the picture with a line on the near pixels that touch a pixel beyond.
 
-    One pixel wide; wider above 720 pixels of image width, so that it is still seen in the tile of a sheet.
+    The line is one pixel wide. It is wider in images above 720 pixels, so that a sheet's tile still shows it.
     """
     reach = max(round(picture.shape[1] / TILE_WIDTH), 1)
     touched = Image.fromarray(beyond).convert("L").filter(ImageFilter.MaxFilter(2 * reach + 1))
@@ -80,32 +89,36 @@ def draw_lidar_end(
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write an RGB image, creating the folder."""
+    """Writes an RGB image and creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path)
 
 
 def picture_path(folder: Path, frame: int, camera: int, kind: str) -> Path:
-    """Where one image of a picture lies; ``kind`` is one of ``KINDS``."""
+    """Returns the path of one image of a picture; ``kind`` is one of ``KINDS``.
+
+    >>> picture_path(Path("pictures"), frame=7, camera=0, kind="render").name
+    '007_0_render.png'
+    """
     return folder / f"{frame:03d}_{camera}_{kind}.png"
 
 
 def write_picture(folder: Path, picture: Picture) -> None:
-    """Write truth, render, error and centers as single PNGs in their own resolution."""
+    """Writes truth, render, error and centers as single PNGs in their own resolution."""
     for kind in KINDS:
         write_png(picture_path(folder, picture.frame, picture.camera, kind), getattr(picture, kind))
 
 
 def drawn_views(folder: Path) -> list[tuple[int, int]]:
-    """Frame and camera of each picture in a folder, in order."""
+    """Returns frame and camera of each picture in a folder, in order."""
     stems = (path.stem.split("_") for path in folder.glob("*_truth.png"))
     return sorted((int(frame), int(camera)) for frame, camera, _ in stems)
 
 
 def read_pictures(folder: Path) -> list[Picture]:
-    """The pictures that a run left in its folder, in order of frame and camera.
+    """Returns the pictures in a folder in order of frame and camera.
 
-    Raises FileNotFoundError if there are none, or one lacks another of its images.
+    Raises FileNotFoundError if there are none, or if a picture lacks one of its images.
     """
     views = drawn_views(folder)
     if not views:

@@ -1,4 +1,4 @@
-"""Curves over training and the scatter of runs (matplotlib without a display)."""
+"""Draws curves over training and the scatter of runs (matplotlib without a display)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,13 +21,13 @@ def plot_counts(
     events: Sequence[tuple[int, str]] = (),
     title: str = "Gaussians per node",
 ) -> None:
-    """Draw the number of Gaussians of each node over training steps, with prune events marked.
+    """Draws the number of Gaussians of each node over training steps and marks events.
 
     Args:
         path: PNG to write.
         steps: training steps of the samples, increasing.
         counts: node -> number of Gaussians at each step (logarithmic axis; zeros are not drawn).
-        events: (step, what happened), e.g. (2800, "pruning"); events of one name share a color.
+        events: (step, name), e.g. (2800, "pruning"); events of one name share a line style.
     """
     for name, values in counts.items():
         if len(values) != len(steps):
@@ -36,7 +36,7 @@ def plot_counts(
     for index, (name, values) in enumerate(counts.items()):
         drawn = [(step, value) for step, value in zip(steps, values, strict=True) if value > 0]
         label = f"{name} ({values[-1]:,})" if len(values) else name
-        # Counts jump at a step and stay: a slope between two samples would show Gaussians that never were.
+        # Counts jump at a step and stay. A slope between two samples would show Gaussians that never existed.
         samples = zip(*drawn, strict=True) if drawn else ([], [])
         axes.plot(*samples, label=label, drawstyle="steps-post", **_line(index))
     _mark(axes, events)
@@ -52,9 +52,9 @@ def plot_psnr(
     title: str = "PSNR over training",
     along: str = "step",
 ) -> None:
-    """Draw PSNR in dB against training steps, one curve per name -> (steps, PSNR), with (step, name) events marked.
+    """Draws PSNR in dB over training steps, one curve per name -> (steps, PSNR), and marks (step, name) events.
 
-    ``along`` names the axis where it is not steps that the curves run over.
+    ``along`` names the horizontal axis.
     """
     figure, axes = _figure(title, along, "PSNR (dB)")
     for index, (name, (steps, values)) in enumerate(curves.items()):
@@ -66,7 +66,7 @@ def plot_psnr(
 def plot_runs(
     path: Path, points: Mapping[str, Sequence[tuple[int, float]]], title: str = "Quality against size"
 ) -> None:
-    """Draw every run as a point, name of a variant -> (Gaussians, held-out full-image PSNR in dB) of its runs."""
+    """Draws every run as a point; ``points``: name of a variant -> (Gaussians, held-out PSNR in dB) of its runs."""
     figure, axes = _figure(title, "Gaussians", "held-out PSNR, full image (dB)")
     for index, (name, runs) in enumerate(points.items()):
         gaussians, psnr = zip(*runs, strict=True)
@@ -99,7 +99,7 @@ def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 
 def _mark(axes: Axes, events: Sequence[tuple[int, str]]) -> None:
-    """A vertical line at each event, one style and one entry of the legend for each name."""
+    """Draws a vertical line at each event; events of one name share a style and an entry of the legend."""
     names = list(dict.fromkeys(name for _, name in events))
     style = {name: {"color": "0.55", "linewidth": 0.8, "linestyle": _DASHES[i % 3]} for i, name in enumerate(names)}
     for step, name in events:

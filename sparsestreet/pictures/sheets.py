@@ -1,6 +1,6 @@
-"""Sheets of pictures: one run's, or several runs' beside each other.
+"""Sheets of pictures, of one run or of several runs side by side.
 
-The scale of the errors is written on every sheet.
+Every sheet shows the scale of its errors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,20 +21,20 @@ _GAP, _HEADING, _MARGIN = 6, 26, 10
 
 @dataclass(frozen=True)
 class SheetColumn:
-    """One run of a comparison: its pictures and what is written above them."""
+    """One run of a comparison: its pictures and the text above them."""
 
     label: str
-    """Above its renders, such as "streetgs+paper, 31.31 dB"."""
+    """Text above its renders, such as "streetgs+paper, 31.31 dB"."""
     size: str
-    """Above its centers, such as "45,781 Gaussians (33 %)"."""
+    """Text above its centers, such as "45,781 Gaussians (33 %)"."""
     pictures: Sequence[Picture]
     psnr: Sequence[float]
-    """Of each picture, dB."""
+    """PSNR of each picture, dB."""
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One image of a sheet and what is written above it."""
+    """One image of a sheet and the text above it."""
 
     heading: str
     image: UInt8[np.ndarray, "h w 3"]
@@ -43,11 +43,11 @@ class Tile:
 def picture_sheet(
     pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """A sheet with one line per picture and the columns truth, render, error, centers.
+    """Returns a sheet with one line per picture and the columns truth, render, error, centers.
 
     Args:
         pictures: at least one.
-        title: printed on top, e.g. method, scene and PSNR.
+        title: text on top, e.g. method, scene and PSNR.
         legend: node -> its color in the centers, drawn at the foot.
         tile_width: pixels of each column; images are scaled to it.
     """
@@ -65,10 +65,10 @@ def picture_sheet(
 def comparison_sheet(
     columns: Sequence[SheetColumn], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Runs on the same images, one column each: for every picture a line of renders beside the truth, one of errors,
-    one of centers, so that what is to be compared stands side by side.
+    """Returns a sheet that compares runs on the same images, one column each.
 
-    Raises ValueError for fewer than two runs, or if they show different images.
+    Every picture has a line of renders next to the truth, a line of errors and a line of centers. Raises ValueError for
+    fewer than two runs, or if they show different images.
     """
     if len(columns) < 2:
         raise ValueError(f"a comparison needs at least two runs, got {len(columns)}")
@@ -100,7 +100,7 @@ def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _sheet(
     lines: list[list[Tile | None]], title: str, legend: Legend, tile_width: int, lidar_end: bool
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Lay tiles out on dark paper under their headings; the title on top, scale and legend at the foot."""
+    """Lays tiles out on dark paper under their headings, with the title on top and scale and legend at the foot."""
     if not lines:
         raise ValueError("a sheet needs at least one picture")
     heights = [max(_fitted(tile.image, tile_width).height for tile in line if tile) for line in lines]
@@ -122,7 +122,7 @@ def _sheet(
 
 
 def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, lidar_end: bool) -> None:
-    """The error colors with their values, and what the line in them is."""
+    """Draws the error colors with their values, and the meaning of the line at the lidar's end."""
     x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
     bar = color_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
     paper.paste(Image.fromarray(bar), (x, y))
@@ -134,7 +134,7 @@ def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, l
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:
-    """The nodes in the colors of their centers."""
+    """Writes the names of the nodes in the colors of their centers."""
     if legend:
         x = _write(draw, (x, y), "centers:", _QUIET, 13) + 12
     for name, color in legend.items():
@@ -143,7 +143,7 @@ def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> N
 
 
 def _fitted(image: UInt8[np.ndarray, "h w 3"], width: int) -> Image.Image:
-    """Scaled to the tile's width; small images keep hard pixels so that nobody takes blur for the render's."""
+    """Returns the image scaled to the tile's width; small images keep hard pixels, so scaling adds no blur."""
     height = max(round(image.shape[0] * width / image.shape[1]), 1)
     filter_ = Image.Resampling.LANCZOS if width < image.shape[1] else Image.Resampling.NEAREST
     return Image.fromarray(image).resize((width, height), filter_)
@@ -157,7 +157,7 @@ def _write(
     size: int,
     room: int | None = None,
 ) -> int:
-    """Write a line and return where it ends; short of room the type shrinks (not below 8 pixels)."""
+    """Writes a line and returns where it ends; if ``room`` is short, the type shrinks (not below 8 pixels)."""
     while room is not None and size > 8 and draw.textlength(text, font=_font(size)) > room:
         size -= 1
     draw.text(position, text, fill=color, font=_font(size))
