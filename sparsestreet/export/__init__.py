@@ -1,1 +1,1 @@
-"""A scene for others: Gaussians for viewers, the cameras of its log, camera paths and videos."""
+"""Exports a scene: Gaussians for viewers, camera paths and videos."""

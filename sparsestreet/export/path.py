@@ -1,4 +1,4 @@
-"""Where a camera drives: along the recorded views, beside them, and between them."""
+"""Camera paths: along the recorded views, next to them, and between them."""
 
 import math
 from bisect import bisect_right
@@ -14,17 +14,23 @@ from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera, View
 
 Rig = tuple[View, ...]
-"""The cameras of one instant, lowest index first unless they were chosen in another order."""
+"""The views of one instant, lowest camera index first unless another order was chosen."""
 
 CameraPath = tuple[Rig, ...]
 """Rigs in order of time."""
 
 _SAME = 1e-3
-"""Of a step: an instant so near a recorded one is the recorded one."""
+"""Fraction of a step; an instant that is this close to a recorded one is the recorded one."""
 
 
 def recorded(views: Sequence[View]) -> CameraPath:
-    """The views as they were recorded. Raises ValueError without any."""
+    """Returns the views as they were recorded. Raises ValueError without views.
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
+    >>> path = recorded([View(camera, 1.0, 1, 0), View(camera, 0.0, 0, 0)])
+    >>> [rig[0].frame_index for rig in path]
+    [0, 1]
+    """
     if not views:
         raise ValueError("a path needs views, got none: check that the log's views were written")
     instants = defaultdict(list)
@@ -34,7 +40,7 @@ def recorded(views: Sequence[View]) -> CameraPath:
 
 
 def of_frames(path: CameraPath, frames: slice) -> CameraPath:
-    """The instants whose frame index lies in start:stop. Raises ValueError where there is none."""
+    """Returns the instants whose frame index lies in start:stop. Raises ValueError if there is none."""
     indices = [rig[0].frame_index for rig in path]
     start = 0 if frames.start is None else frames.start
     stop = math.inf if frames.stop is None else frames.stop
@@ -45,16 +51,21 @@ def of_frames(path: CameraPath, frames: slice) -> CameraPath:
 
 
 def of_cameras(path: CameraPath, cameras: Sequence[int]) -> CameraPath:
-    """Only these cameras, in the order they are named. Raises ValueError for one that is unknown or missing once."""
+    """Returns only these cameras, in the given order. Raises ValueError for a camera that any instant lacks."""
     return tuple(tuple(_view_of(rig, index) for index in cameras) for rig in path)
 
 
 def left_to_right(rig: Rig) -> list[int]:
-    """Camera indices by the yaw of their optical axes, seen from the first camera of the rig: leftmost first."""
+    """Returns camera indices, leftmost first, by the yaw of their optical axes relative to the rig's first camera.
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
+    >>> left_to_right((View(camera, 0.0, 0, 0), View(camera, 0.0, 0, 1)))
+    [0, 1]
+    """
     front_from_world = rig[0].camera.camera_from_world[:3, :3].double()
 
     def yaw(view: View) -> float:
-        """To the right of the first camera, radians; the third row of camera_from_world is the axis in the world."""
+        """Returns the angle to the right of the first camera, radians; row 3 of camera_from_world is the world axis."""
         x, _, z = (front_from_world @ view.camera.camera_from_world[2, :3].double()).tolist()
         return round(math.atan2(x, z), 6)
 
@@ -62,9 +73,14 @@ def left_to_right(rig: Rig) -> list[int]:
 
 
 def shifted(path: CameraPath, offset: float) -> CameraPath:
-    """Every rig moved sideways as one, ``offset`` meters to the right of its camera of the lowest index.
+    """Returns every rig moved sideways as one, ``offset`` meters to the right of its camera with the lowest index.
 
-    The views keep time and camera, but lose their frame index: nobody recorded them. Shift before choosing cameras.
+    The views keep time and camera index. They lose their frame index, because nobody recorded them. Shift before you
+    choose cameras.
+
+    >>> path = recorded([View(Camera(torch.eye(4), torch.eye(3), width=8, height=6), 0.0, 0, 0)])
+    >>> shifted(path, 2.0)[0][0].camera.position.tolist()
+    [2.0, 0.0, 0.0]
     """
 
     front = min(view.camera_index for view in path[0])
@@ -77,10 +93,15 @@ def shifted(path: CameraPath, offset: float) -> CameraPath:
 
 
 def resampled(path: CameraPath, step: float) -> CameraPath:
-    """An instant every ``step`` in normalized time from the first to the last, poses interpolated between the given.
+    """Returns an instant every ``step`` of normalized time from the first to the last.
 
-    Positions are interpolated linearly, rotations by slerp. Where an instant of the path is met, it is taken as it is;
+    Positions are interpolated linearly, rotations by slerp. An instant that coincides with one of the path is that one;
     the others have no frame index. Raises ValueError for a step that is not above 0.
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
+    >>> path = resampled(recorded([View(camera, 0.0, 0, 0), View(camera, 1.0, 1, 0)]), step=0.5)
+    >>> [(rig[0].time, rig[0].frame_index) for rig in path]
+    [(0.0, 0), (0.5, None), (1.0, 1)]
     """
     if not step > 0:
         raise ValueError(f"a path is resampled in steps above 0, got {step}: use more frames a second")
@@ -90,7 +111,12 @@ def resampled(path: CameraPath, step: float) -> CameraPath:
 
 
 def resized(path: CameraPath, width: int) -> CameraPath:
-    """All cameras with images ``width`` pixels wide, the height in proportion."""
+    """Returns all cameras with images ``width`` pixels wide, the height in proportion.
+
+    >>> path = recorded([View(Camera(torch.eye(4), torch.eye(3), width=8, height=6), 0.0, 0, 0)])
+    >>> resized(path, 4)[0][0].camera.height
+    3
+    """
     if width < 1:
         raise ValueError(f"an image is at least 1 pixel wide, got width {width}")
     return _each_camera(path, lambda camera: _scaled(camera, width))
@@ -107,7 +133,7 @@ def _view_of(rig: Rig, camera: int) -> View:
 
 
 def _bare(view: View) -> View:
-    """Without a Frame's pixels, which belong to its recorded pose."""
+    """Returns the view without a Frame's pixels, which belong to its recorded pose."""
     return View(view.camera, view.time, view.frame_index, view.camera_index, view.seconds, view.stamp)
 
 
@@ -118,7 +144,7 @@ def _each_camera(path: CameraPath, change: Callable[[Camera], Camera]) -> Camera
 def _scaled(camera: Camera, width: int) -> Camera:
     height = max(round(camera.height * width / camera.width), 1)
     factors = torch.tensor([width / camera.width, height / camera.height, 1.0], dtype=camera.intrinsics.dtype)
-    # Pixel centers lie at +0.5, so a change of size is a change of unit and nothing else.
+    # Pixel centers lie at +0.5, so a change of size only changes the unit.
     return replace(camera, intrinsics=factors[:, None] * camera.intrinsics, width=width, height=height)
 
 

@@ -1,4 +1,4 @@
-"""Gaussians as a .ply file in the layout of 3DGS, which viewers and converters of the field read."""
+"""Writes Gaussians as a .ply file in the layout of 3DGS, which the field's viewers and converters read."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -17,23 +17,23 @@ from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians, View
 
 _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
-"""Nodes ask a view without indices for its time alone."""
+"""A camera for views without indices, of which nodes use only the time."""
 
 _FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 
 _LARGEST_OPACITY = 1 - 2.0**-25
-"""Halfway between the largest float32 below 1 and 1: its logit is finite, and the sigmoid of that is 1 again."""
+"""Halfway between 1 and the largest float32 below 1. Its logit is finite, and the sigmoid of this logit is 1 again."""
 
 _SMALLEST_SCALE = 1e-30
-"""Meters; a scale of 0 has no logarithm."""
+"""Smallest scale that is written, meters; a scale of 0 has no logarithm."""
 
 
 def write_ply(path: Path | str, gaussians: Gaussians) -> int:
-    """Write the Gaussians whose opacity is above 0, the whole file or nothing; returns their number.
+    """Writes the Gaussians whose opacity is above 0 and returns their number; writes the whole file or nothing.
 
     Binary, little endian, float32, one vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (all of red,
     then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). Raises ValueError for
-    values that are not finite or where no Gaussian is left, OSError where the file cannot be written.
+    values that are not finite or if no Gaussian is left, OSError if the file cannot be written.
     """
     table = _vertices(gaussians)
     if not len(table):
@@ -58,15 +58,15 @@ def scene_gaussians(
     nodes: Collection[str] | None = None,
     instances: Collection[str] | None = None,
 ) -> Gaussians:
-    """The scene's Gaussians in the world at a time in [0, 1], all of them or some.
+    """Returns all or some of the scene's Gaussians in the world frame at a time in [0, 1].
 
     Args:
         stored: an opened scene file.
         time: normalized; 0 is the log's first frame, 1 its last.
-        nodes: names of the nodes whose Gaussians are wanted (``["background"]``: nothing that moves); None: all.
-        instances: names of tracks; only their Gaussians are given. Not together with ``nodes``.
+        nodes: names of the nodes to return (``["background"]``: nothing that moves); None: all.
+        instances: names of tracks; only their Gaussians are returned. Not together with ``nodes``.
 
-    Raises ValueError, naming what there is, for an unknown node or instance and for one that is absent at that time.
+    Raises ValueError, naming the available ones, for an unknown node or instance, or one absent at that time.
     """
     if not 0 <= time <= 1:
         raise ValueError(f"time runs from 0 (first frame of the log) to 1 (its last), got {time}")
@@ -82,7 +82,7 @@ def scene_gaussians(
 
 
 def instance_names(stored: StoredScene) -> list[str]:
-    """The tracks whose Gaussians can be had by themselves."""
+    """Returns the names of the tracks whose Gaussians can be exported alone."""
     objects = [node.instances() for node in stored.scene.nodes.values()]
     return [name for some in objects if some is not None for name in some.names]
 
@@ -113,7 +113,7 @@ def _rows_of_instances(
 
 
 def _presence(stored: StoredScene, node: Node, rows: Bool[Tensor, " n"]) -> str:
-    """From when to when some Gaussians have an opacity, asked at the frames of the log."""
+    """Says between which frames of the log some Gaussians have an opacity."""
     last = max(stored.num_frames - 1, 1)
     times = [frame / last for frame in range(stored.num_frames)]
     seen = [time for time in times if bool((_at(node, time).opacities[rows] > 0).any())]
@@ -132,7 +132,7 @@ def _known(kind: str, names: Collection[str], known: Collection[str]) -> None:
 
 
 def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
-    """One row a vertex, its properties in the order of the header, little endian."""
+    """Returns one row a vertex, its properties in the order of the header, little endian."""
     keep = gaussians.opacities > 0
     values = {name: getattr(gaussians, name).detach()[keep].cpu() for name in _FIELDS}
     opacities = values["opacities"].double().clamp(max=_LARGEST_OPACITY)
@@ -140,7 +140,7 @@ def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
         values["means"],
         torch.zeros_like(values["means"]),
         values["sh"][:, 0],
-        # From [term, color] to [color, term]: all terms of red come first.
+        # [term, color] becomes [color, term], because all terms of red come first.
         values["sh"][:, 1:].mT.flatten(1),
         torch.logit(opacities)[:, None],
         values["scales"].double().clamp(min=_SMALLEST_SCALE).log(),

@@ -1,4 +1,4 @@
-"""What a scene shows along a path of cameras, as a video or as single pictures."""
+"""Renders a scene along a camera path, as a video or as single pictures."""
 
 import itertools
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -18,19 +18,23 @@ Picture = UInt8[np.ndarray, "_h _w 3"]
 
 _COLORS = "color_primaries=bt709:color_trc=bt709:colorspace=bt709"
 _FILTERS = ["-vf", f"scale=out_color_matrix=bt709,format=yuv420p,setparams={_COLORS}"]
-"""The colors are said in the file, because players guess differently where nothing is said."""
+"""States the color space in the file, because players guess differently without it."""
 _STREAMABLE = ["-movflags", "+faststart"]
 
 
 def path_pictures(stored: StoredScene, path: CameraPath) -> Iterator[Picture]:
-    """One picture an instant, the images of its cameras side by side; rendered when it is asked for."""
+    """Yields one picture an instant with the images of its cameras side by side; each is rendered on demand."""
     for rig in path:
         images = [stored.render(view).rgb for view in rig]
         yield side_by_side([(image.clamp(0, 1) * 255).round().byte().cpu().numpy() for image in images])
 
 
 def side_by_side(images: Sequence[Picture]) -> Picture:
-    """One row of images; lower ones stand in the middle, between black."""
+    """Returns one row of images; lower images are centered between black bars.
+
+    >>> side_by_side([np.zeros((4, 6, 3), np.uint8), np.zeros((2, 3, 3), np.uint8)]).shape
+    (4, 9, 3)
+    """
     height = max(image.shape[0] for image in images)
 
     def framed(image: Picture) -> Picture:
@@ -41,7 +45,7 @@ def side_by_side(images: Sequence[Picture]) -> Picture:
 
 
 def check_destination(out: Path) -> None:
-    """Raise ValueError for a name that is neither a .mp4 nor without an ending, ImportError where ffmpeg is missing."""
+    """Raises ValueError for a name with an ending other than .mp4, ImportError for a .mp4 if ffmpeg is missing."""
     if out.suffix == ".mp4":
         _ffmpeg()
     elif out.suffix:
@@ -49,16 +53,16 @@ def check_destination(out: Path) -> None:
 
 
 def write_pictures(out: Path | str, pictures: Iterable[Picture], *, fps: float, quality: float = 7.0) -> int:
-    """A .mp4 where ``out`` ends so, else a folder of PNGs, whole or not at all; returns how many pictures there were.
+    """Writes a .mp4 if ``out`` ends so, else a folder of PNGs, whole or not at all. Returns the number of pictures.
 
     Args:
         out: the file, or a folder that is new or empty.
         pictures: all of one size.
         fps: pictures a second of the video.
-        quality: of the video, 1 to 10 (10 hardly loses anything).
+        quality: quality of the video, 1 to 10 (10 hardly loses anything).
 
-    Raises ValueError for another ending, no pictures or pictures of different sizes, ImportError where ffmpeg is
-    missing, OSError where nothing can be written.
+    Raises ValueError for another ending, no pictures or pictures of different sizes, ImportError if ffmpeg is missing,
+    OSError if nothing can be written.
     """
     out = Path(out)
     check_destination(out)
@@ -103,7 +107,7 @@ def _write_pngs(folder: Path, pictures: Iterable[Picture]) -> int:
 
 
 def _even(picture: Picture) -> Picture:
-    """H.264 stores color for pairs of pixels: a last odd row or column is shown twice."""
+    """Repeats a last odd row or column, because H.264 stores color for pairs of pixels."""
     height, width = picture.shape[:2]
     return np.ascontiguousarray(np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
 
