@@ -1,7 +1,8 @@
-"""Scores of Gaussians over all training views, and the rules that select which to keep.
+"""Scores Gaussians over all training views and selects which to keep.
 
-``rule`` is what every rule is; ``importance`` the paper's score; ``rules`` the paper's rule and ours (leave one out);
-``controls`` keep a given number at random or by opacity; ``select`` and ``floors`` say what is kept in any case.
+``rule`` is the interface of the rules, ``importance`` the paper's score, ``rules`` the paper's rule and ours (leave
+one out). ``controls`` keep a given number at random or by opacity. ``select`` drops rows by scores but respects the
+``floors`` of a node and its instances.
 """
 
 from sparsestreet.pruning.controls import OpacityRule, RandomRule

@@ -1,4 +1,4 @@
-"""Controls of the other rules: as many Gaussians, chosen without looking at what they do in the images."""
+"""Controls for the other rules: they keep a given number of Gaussians without looking at the images."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -17,11 +17,11 @@ from sparsestreet.types import Frame
 
 @dataclass(frozen=True)
 class CountRule(PruningRule):
-    """A given number of rows stays of each node, those of the highest score; more where a floor asks for more."""
+    """Keeps a given number of each node's rows, those with the highest scores, or more if a floor demands it."""
 
     keep: int | float | Mapping[str, int | float]
-    """Of each node alike, or by its name (a node without number keeps all): up to 1 a fraction of the rows that it has
-    before the pass, above 1 their number."""
+    """One value for every node, or name of a node -> its value; a node without a value keeps all rows. Values up to 1
+    are fractions of the rows before the pass; larger ones are numbers of rows."""
 
     def __post_init__(self) -> None:
         wrong = [value for value in self._numbers() if not value >= 0]
@@ -30,7 +30,7 @@ class CountRule(PruningRule):
 
     @abstractmethod
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
-        """What a node's rows are ranked by."""
+        """Returns the scores that rank a node's rows."""
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
@@ -38,7 +38,7 @@ class CountRule(PruningRule):
         for name, floors in self.floors(scene, frames, context).items():
             scores = self.scores(name, scene.nodes[name].rows)
             unwanted = torch.ones_like(scores, dtype=torch.bool)
-            # Of equals the lower row stays, as at the floors.
+            # Among equal scores the lower row stays, as at the floors.
             unwanted[torch.sort(scores, descending=True, stable=True).indices[: self._count(name, len(scores))]] = False
             selections[name] = keep_best(scores, unwanted, *floors)
         return selections
@@ -53,19 +53,19 @@ class CountRule(PruningRule):
 
 @dataclass(frozen=True)
 class RandomRule(CountRule):
-    """Which rows stay is drawn."""
+    """Keeps rows at random."""
 
     seed: int = 0
 
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
-        """Each node draws from a stream of its own; the same rows meet the same numbers."""
+        """Returns random numbers from the node's own stream, the same in every pass over the same rows."""
         drawn = torch.rand(len(rows), generator=named_generator(self.seed, f"pruning {name}"))
         return drawn.to(rows.means.device)
 
 
 @dataclass(frozen=True)
 class OpacityRule(CountRule):
-    """The most opaque rows stay, as they are learned, without their mask."""
+    """Keeps the most opaque rows by their learned opacity, without the mask."""
 
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
         return rows.opacity_logits

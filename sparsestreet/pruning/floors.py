@@ -1,4 +1,4 @@
-"""What pruning must leave: K_min of a node, and for each of its instances a number that follows from its area."""
+"""The rows that pruning must leave: K_min of a node, and a number for each instance that follows from its area."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -12,18 +12,22 @@ from sparsestreet.types import Contribution
 
 
 class Floors(NamedTuple):
-    """What must stay of a node, as ``keep_best`` takes it."""
+    """The least numbers of rows of a node and its instances, as ``keep_best`` takes them.
+
+    >>> Floors(min_gaussians=100)
+    Floors(min_gaussians=100, instances=None)
+    """
 
     min_gaussians: int
     instances: InstanceFloors | None = None
 
 
 class InstanceAreas:
-    """Accumulates, view by view, the largest area that each instance of some nodes fills, and answers their floors.
+    """Accumulates, view by view, the largest area that each instance of some nodes fills, and returns their floors.
 
-    The area is the sum of the blend weights of the instance's rows over the pixels: what is drawn of it, in pixels, in
-    front of what stands behind it. An object that is hidden, far or transparent in all views fills little and keeps
-    little; one that fills anything keeps at least one row.
+    The area is the sum of the blend weights of the instance's rows over the pixels: the visible area in pixels. An
+    object that is hidden, far or transparent in all views fills little and keeps little. One that fills anything keeps
+    at least one row.
     """
 
     def __init__(self, nodes: Mapping[str, Node]) -> None:
@@ -41,14 +45,14 @@ class InstanceAreas:
         return bool(self._instances)
 
     def add(self, view: Contribution, spans: Mapping[str, slice]) -> None:
-        """Count one view of the whole scene in; ``spans``: name of a node -> its rows."""
+        """Adds one view of the whole scene; ``spans``: name of a node -> its rows."""
         for name, instances in self._instances.items():
             largest = self._pixels[name]
             filled = torch.zeros_like(largest).index_add(0, instances.ids, view.weight[spans[name]].to(largest))
             self._pixels[name] = torch.maximum(largest, filled)
 
     def floors(self) -> dict[str, Floors]:
-        """Name of every node -> its floors. Raises ValueError for an area that is no number."""
+        """Returns name of every node -> its floors. Raises ValueError for an area that is not finite."""
         return {
             name: Floors(node.settings.min_gaussians, self._of_instances(name)) for name, node in self._nodes.items()
         }

@@ -1,4 +1,4 @@
-"""How much each Gaussian matters to the training views: the paper's global importance of background Gaussians."""
+"""The paper's global importance of background Gaussians: how much each contributes to the training views."""
 
 from collections.abc import Iterable
 
@@ -16,27 +16,33 @@ class Importance:
 
         I_i = 1/M sum_m [dominant_i^(m) > 0] w_i^(m) / max(S_i^(m), 1)
 
-    w is the row's summed blend weight in the view and S the number of pixels it was blended into, so that w/S is its
-    mean blend weight. The indicator is the paper's delta(i in I_max): the row is the largest contributor of at least
-    one pixel of that view (Mini-Splatting, Fang & Wang 2024, whose score the paper takes over). The paper's background
-    formula leaves it out, but without it only rows that touch no training pixel at all score zero.
+    w is the row's summed blend weight in the view. S is the number of pixels it was blended into, so w/S is its mean
+    blend weight. The indicator is the paper's delta(i in I_max): the row is the largest contributor of at least one
+    pixel of the view. The paper takes this score from Mini-Splatting (Fang & Wang 2024). Its background formula omits
+    the indicator, but without it only rows that touch no training pixel score zero.
 
-    Score zero does not mean invisible: where many soft rows overlap, those that lead nowhere still add light, and the
-    training steps after the removal make up for it. Render the whole scene, all nodes, for the contributions: what
-    stands in front decides what is dominant; then select the background rows of ``scores()``.
+    A row with score zero may still be visible. Where many soft rows overlap, a row that dominates no pixel still adds
+    light; the training steps after the removal make up for it. Render all nodes of the scene for the contributions,
+    because what stands in front decides what dominates. Then select the background rows of ``scores()``.
+
+    >>> view = Contribution(torch.tensor([3.0, 1.0]), torch.tensor([4, 4]), torch.tensor([4, 0]))
+    >>> importance = Importance()
+    >>> importance.add(view)
+    >>> importance.scores().tolist()
+    [0.75, 0.0]
     """
 
     def __init__(self, gate: bool = True) -> None:
-        """``gate=False`` drops the indicator."""
+        """``gate=False`` omits the indicator."""
         self.gate = gate
         self.views = 0
-        # float64: float32 sums of many views depend on their order, and thresholds sit at exactly zero.
+        # float64, because float32 sums of many views depend on their order, and thresholds are exactly zero.
         self._total: Float64[Tensor, " n"] | None = None
 
     def add(self, contribution: Contribution) -> None:
-        """Count one view in.
+        """Adds one view.
 
-        Raises ValueError if the view has another number of rows than the ones before, or a weight that is NaN,
+        Raises ValueError if the view has another number of rows than the views before, or a weight that is NaN,
         infinite or negative.
         """
         weight = contribution.weight.double()
@@ -59,14 +65,19 @@ class Importance:
         self.views += 1
 
     def scores(self) -> Float64[Tensor, " n"]:
-        """I_i in [0, 1]. Raises ValueError before the first view: zero for every row would remove the whole scene."""
+        """Returns I_i in [0, 1]. Raises ValueError before the first view: zero scores would remove the whole scene."""
         if self._total is None:
             raise ValueError("importance needs at least one view, got none: add the training views first")
         return self._total / self.views
 
 
 def measure_importance(views: Iterable[Contribution], gate: bool = True) -> Float64[Tensor, " n"]:
-    """Scores of all rows over all views; see ``Importance`` for the formula and the errors raised."""
+    """Returns the scores of all rows over all views; see ``Importance`` for the formula and the errors raised.
+
+    >>> view = Contribution(torch.tensor([3.0, 1.0]), torch.tensor([4, 4]), torch.tensor([4, 0]))
+    >>> measure_importance([view], gate=False).tolist()
+    [0.75, 0.25]
+    """
     importance = Importance(gate)
     for view in views:
         importance.add(view)

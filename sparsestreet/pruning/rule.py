@@ -1,4 +1,4 @@
-"""Interface of the pruning rules: which nodes they may take from, and which rows they keep."""
+"""Interface of the pruning rules: the nodes that a rule may remove rows from, and the rows that it keeps."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from sparsestreet.types import Contribution, Frame
 
 @dataclass(frozen=True)
 class RenderContext:
-    """How a rule looks at the scene: as training does."""
+    """How a rule renders the scene: with the state and options of training."""
 
     state: SceneState = FINISHED
     options: RenderOptions = DEFAULT_OPTIONS
@@ -25,30 +25,30 @@ class RenderContext:
 
 @dataclass(frozen=True, kw_only=True)
 class PruningRule(ABC):
-    """Decides which rows of some nodes stay."""
+    """A rule that decides which rows of some nodes stay."""
 
     nodes: Sequence[str] | None = None
-    """Names of the nodes that it may take from, if they are ``prunable``; None: of all these."""
+    """Names of the nodes that it may remove rows from, if they are ``prunable``; None: all prunable nodes."""
 
     @abstractmethod
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
-        """What stays of every node that the rule touches, by name: never less than its floors. Without gradients.
+        """Returns name of every node that the rule touches -> the rows that stay, never fewer than its floors.
 
-        ``frames`` are all training views; each is read when it is indexed.
+        Computes no gradients. ``frames`` are all training views; each is read when it is indexed.
         """
 
     def touches(self, name: str, settings: NodeSettings) -> bool:
-        """Whether the rule may take from a node."""
+        """Whether the rule may remove rows from a node."""
         return settings.prunable and (self.nodes is None or name in self.nodes)
 
     def areas(self, scene: SceneGraph) -> InstanceAreas:
-        """Measures the floors of all nodes that the rule touches."""
+        """Returns an accumulator for the floors of all nodes that the rule touches."""
         return InstanceAreas({name: node for name, node in scene.nodes.items() if self.touches(name, node.settings)})
 
     def floors(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Floors]:
-        """Name of every node that the rule touches -> what must stay of it; renders only where instances have floors.
+        """Returns name of every node that the rule touches -> its floors; renders only if instances have floors.
 
-        A rule that goes through ``contributions`` anyway measures the ``areas`` on the way.
+        A rule that needs ``contributions`` anyway adds them to its own ``areas`` instead.
         """
         areas = self.areas(scene)
         if areas.needed:
@@ -58,14 +58,14 @@ class PruningRule(ABC):
 
 
 def on_device(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
-    """One frame at a time on the scene's device."""
+    """Yields one frame at a time on the scene's device."""
     return (to_device(frame, scene.device) for frame in frames)
 
 
 def contributions(
     scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
 ) -> Iterator[tuple[Contribution, dict[str, slice]]]:
-    """What every row of the whole scene adds to each view, and name of a node -> its rows."""
+    """Yields for each view the contribution of every row of the whole scene, and name of a node -> its rows."""
     for frame in on_device(scene, frames):
         placed = scene.gaussians_at(frame, context.state)
         options = context.options

@@ -1,4 +1,4 @@
-"""What decides which rows of some nodes go, given all training views: by the paper's importance or by removal."""
+"""Rules that select rows from all training views: the paper's importance, and our leave-one-out cost."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,21 +18,21 @@ from sparsestreet.scene.rendering import render
 from sparsestreet.types import Frame, LeaveOneOut
 
 LEAST_ERROR = 1e-12
-"""Squared error (images lie in [0, 1]) that stands for none; its inverse fits into float32."""
+"""Squared error (images lie in [0, 1]) that stands for no error; its inverse fits into float32."""
 
 
 @dataclass(frozen=True)
 class ImportanceRule(PruningRule):
-    """The paper's: rows whose global importance is zero go (see ``Importance``).
+    """The paper's rule: removes rows whose global importance is zero (see ``Importance``).
 
-    The whole scene is rendered for the scores: cars hide the road behind them.
+    The scores come from renders of the whole scene, because cars hide the road behind them.
     """
 
     gate: bool = True
-    """Count a view only for rows that are the largest contributor of one of its pixels."""
+    """Whether a view counts only for rows that are the largest contributor of one of its pixels."""
     remove: int | float | None = None
-    """For comparisons at equal count: so many rows go instead, the least important of all nodes together that the rule
-    may take from; up to 1 a fraction of the rows of the whole scene, above 1 their number."""
+    """For comparisons at equal count: the rule removes this many rows instead, the least important of all its nodes
+    together. A value up to 1 is a fraction of the rows of the whole scene; a larger one is a number of rows."""
 
     def __post_init__(self) -> None:
         if self.remove is not None and not self.remove >= 0:
@@ -53,23 +53,25 @@ class ImportanceRule(PruningRule):
 
 @dataclass(frozen=True)
 class LeaveOneOutRule(PruningRule):
-    """Rows go that the training images miss least, as many as cost ``allowed_db`` of their PSNR.
+    """Removes the rows that change the training images least, until ``allowed_db`` of their PSNR is spent.
 
-    The cost of a row is the sum over views, pixels and channels of the squared change when it alone is taken away,
-    relative to the present squared error: of the whole images, plus the same of the pixels that show vehicles and of
-    those that show people, where the log marks them. These are few, and a loss there would drown in the whole. The row
-    of least cost goes first, as long as the sum stays below the 10^(dB / 10) - 1 that ``allowed_db`` stands for: so
-    neither the images nor their vehicles nor their people pay more. That takes changes as independent of each other and
-    of the error; what overlapping rows lose together is more, and is made up for by the steps that follow. Unlike
-    the importance gate this asks whether a row would be missed, not whether it leads somewhere.
+    The cost of a row is the sum over views, pixels and channels of the squared change when this row alone is removed,
+    relative to the present squared error. The cost adds this ratio for the whole images, for the pixels of vehicles
+    and for those of people, where the log marks them. These regions are small, and a loss there would drown in the
+    whole.
 
-    Images are those behind the scene's effects, which change them by their slopes (``effects.linearized``).
+    Rows are removed from the least cost upwards while the sum of costs stays within 10^(dB / 10) - 1. So neither the
+    images nor their vehicles nor their people lose more than ``allowed_db``. This treats changes as independent of each
+    other and of the error. Overlapping rows lose more together; the training steps that follow make up for it. Unlike
+    the importance gate, the cost asks whether a row would be missed, not whether it dominates a pixel.
 
-    A row that moves no channel of any pixel by more than ``noticeable`` costs nothing.
+    Images are compared after the scene's effects, whose slopes scale the changes (``effects.linearized``).
+
+    A row that changes no channel of any pixel by more than ``noticeable`` costs nothing.
     """
 
     allowed_db: float
-    """Decibels a pass may cost before the scene is trained on, >= 0; 0: only rows that nobody sees go."""
+    """Decibels that a pass may cost before training continues, >= 0; 0: only rows that cost nothing are removed."""
     noticeable: float = 1 / 255
     """One step of an 8-bit image; 0: every change counts."""
 
@@ -101,7 +103,7 @@ class LeaveOneOutRule(PruningRule):
 
 
 def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
-    """1 where a pixel belongs to the whole image, to vehicles, to people."""
+    """Returns 1 where a pixel belongs to the whole image, to vehicles, to people."""
     everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool, device=frame.image.device)
     nowhere = torch.zeros_like(everywhere)
     marked = [nowhere if mask is None else mask for mask in (frame.vehicle, frame.human)]
@@ -109,11 +111,11 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
 
 
 def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], context: RenderContext) -> LeaveOneOut:
-    """Behind the effects; squared changes are relative to the error of the regions that a pixel belongs to.
+    """Returns the change without each row, after the effects, relative to the error of the regions of each pixel.
 
-    The largest change is multiplied by the largest slope of any pixel: at least as much as is seen of it.
+    The largest change is multiplied by the largest slope of any pixel, an upper bound of the visible change.
     """
-    # Where no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
+    # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
     share = 1 / errors.clamp(min=LEAST_ERROR)
     weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
     placed = scene.gaussians_at(frame, context.state)
@@ -132,7 +134,7 @@ def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"],
 
 
 def _squared_errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:
-    """Sum over pixels and channels of the squared error of one frame, in each of its regions."""
+    """Returns the squared error of one frame, summed over pixels and channels, for each of its regions."""
     image = render(scene, frame, context.state, context.options).rgb
     squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
     return (_regions(frame).double() * squared).sum((1, 2))
