@@ -1,4 +1,4 @@
-"""Which node takes which object: decided once, before any node is built."""
+"""Assigns each object to a node, once, before any node is built."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from sparsestreet.types import Track
 
 @dataclass(frozen=True)
 class Assignment:
-    """Every track of a log in at most one node."""
+    """The tracks of each node; every track of a log belongs to at most one node."""
 
     by_node: dict[str, tuple[Track, ...]]
     unclaimed: tuple[Track, ...]
-    """Objects that no node takes: they are part of what stands still."""
+    """Objects that no node takes; they become part of the static scene."""
 
     @property
     def claimed(self) -> tuple[Track, ...]:
@@ -22,7 +22,7 @@ class Assignment:
 
 
 def assign_tracks(tracks: Sequence[Track], nodes: Mapping[str, NodeSettings]) -> Assignment:
-    """Give each track to the node that takes it. Raises ValueError naming both where two nodes claim one track."""
+    """Gives each track to the node that takes it. Raises ValueError naming the nodes if two claim one track."""
     by_node: dict[str, list[Track]] = {name: [] for name in nodes}
     unclaimed = []
     for track in tracks:

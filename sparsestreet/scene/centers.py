@@ -1,4 +1,4 @@
-"""Where the Gaussians are: a dot for every center, colored by node class."""
+"""Draws the Gaussians as dots: one for every center, colored by node class."""
 
 from collections.abc import Iterable
 
@@ -11,13 +11,17 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import View
 
 NODE_COLORS = ((0.30, 0.60, 0.90), (0.98, 0.60, 0.15), (0.35, 0.80, 0.40), (0.90, 0.35, 0.60), (0.80, 0.75, 0.25))
-"""RGB of the nodes in their order in the scene, repeated where there are more nodes."""
+"""RGB of the nodes in their order in the scene; the colors repeat if there are more nodes."""
 
 BACKGROUND_COLOR = 0.05
 
 
 def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
-    """Name of a node, in the order of the scene -> 8-bit RGB of its dots."""
+    """Returns name of a node, in the order of the scene -> 8-bit RGB of its dots.
+
+    >>> node_legend(["background"])
+    {'background': (76, 153, 230)}
+    """
     return {
         name: tuple(round(255 * channel) for channel in NODE_COLORS[position % len(NODE_COLORS)])
         for position, name in enumerate(nodes)
@@ -26,9 +30,9 @@ def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
 
 @torch.no_grad()
 def project_centers(scene: SceneGraph, view: View, *, min_opacity: float = 0.005) -> Float[Tensor, "h w 3"]:
-    """An image in [0, 1] with one pixel per center in view, the nearest center on top.
+    """Returns an image in [0, 1] with one pixel per center in view, the nearest center on top.
 
-    Rows below ``min_opacity`` are left out: those of absent instances, those masked, those about to be culled.
+    It omits rows below ``min_opacity``: those of absent instances, masked ones, and those about to be culled.
     """
     placed = scene.gaussians_at(view)
     camera = placed.view.camera
@@ -47,7 +51,7 @@ def project_centers(scene: SceneGraph, view: View, *, min_opacity: float = 0.005
 def _nearest_per_pixel(
     pixels: Int[Tensor, " n"], depth: Float[Tensor, " n"], num_pixels: int
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """The pixels hit, and for each the point with the smallest depth."""
+    """Returns the pixels that are hit, and for each the point with the smallest depth."""
     order = depth.argsort(stable=True)
     rank = torch.empty_like(order)
     rank[order] = torch.arange(order.shape[0], device=order.device)

@@ -1,7 +1,7 @@
-"""Settings as JSON and back: frozen dataclasses with the name of their class, and nothing that can run.
+"""Converts settings to JSON and back: frozen dataclasses with the name of their class, and nothing executable.
 
-A class is found by its module's name, which must be one of this package or already imported: a file never imports
-foreign code by itself.
+A class is found by its module's name. The module must belong to this package or be imported already, so a file never
+imports foreign code by itself.
 """
 
 import importlib
@@ -20,9 +20,12 @@ _Settings = TypeVar("_Settings")
 
 
 def encode(value: Any) -> Any:
-    """Strict JSON of plain values, lists, mappings and frozen dataclasses; every float comes back to the last bit.
+    """Returns plain values, lists, mappings and frozen dataclasses as strict JSON; floats keep every bit.
 
-    Raises TypeError, naming it, for anything else, ValueError for a mapping with the key ``class``.
+    Raises TypeError, naming the type, for anything else, ValueError for a mapping with the key ``class``.
+
+    >>> encode({"width": 64, "limit": float("inf")})
+    {'width': 64, 'limit': {'class': 'float', 'value': 'inf'}}
     """
     if is_dataclass(value) and not isinstance(value, type):
         entries = {field.name: encode(getattr(value, field.name)) for field in fields(value)}
@@ -41,7 +44,12 @@ def encode(value: Any) -> Any:
 
 
 def decode(value: Any) -> Any:
-    """What ``encode`` was given, tuples as lists. Raises ValueError for a class that is not known or does not fit."""
+    """Returns what ``encode`` was given, tuples as lists. Raises ValueError for an unknown or unsuitable class.
+
+    >>> from sparsestreet.scene.learning_rate import LearningRate
+    >>> decode(encode(LearningRate(0.01))) == LearningRate(0.01)
+    True
+    """
     if isinstance(value, list):
         return [decode(entry) for entry in value]
     if not isinstance(value, dict):
@@ -59,7 +67,7 @@ def decode(value: Any) -> Any:
 
 
 def decode_as(kind: type[_Settings], value: Any) -> _Settings:
-    """What ``encode`` was given, which must be of a class. Raises TypeError where it is not."""
+    """Returns what ``encode`` was given. Raises TypeError if it is not a ``kind``."""
     decoded = decode(value)
     if not isinstance(decoded, kind):
         raise TypeError(f"a {type(decoded).__name__} stands where a {kind.__name__} belongs")

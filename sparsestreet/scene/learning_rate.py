@@ -1,4 +1,4 @@
-"""A learning rate over a run; every node says which of its parameters takes which."""
+"""A learning rate over a run; every node assigns one to each of its parameters."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -7,15 +7,20 @@ from typing import Any
 
 @dataclass(frozen=True)
 class LearningRate:
-    """Decays log-linearly from ``initial`` to ``final``. Raises ValueError for rates or a start out of range."""
+    """A rate that decays log-linearly from ``initial`` to ``final``. Raises ValueError for rates or start out of range.
+
+    >>> rate = LearningRate(initial=0.01, final=0.0001, start=0.1)
+    >>> rate.factor(0.0), round(rate.factor(0.5), 3), round(rate.factor(1.0), 3)
+    (0.0, 0.1, 0.01)
+    """
 
     initial: float
     final: float | None = None
-    """None: constant."""
+    """Rate at the end of the run; None: the rate is constant."""
     scale_by_scene_radius: bool = False
-    """True: multiplied by the scene radius (meters), as 3DGS does for the means."""
+    """Whether the rate is multiplied by the scene radius (meters), as 3DGS does for the means."""
     start: float = 0.0
-    """Fraction of the run before which the parameter rests (rate 0); the decay counts from the start of the run."""
+    """Fraction of the run before which the rate is 0; the decay still counts from the start of the run."""
 
     def __post_init__(self) -> None:
         if not self.initial > 0 or (self.final is not None and not self.final > 0):
@@ -34,7 +39,7 @@ class LearningRate:
         return cls(**said)
 
     def factor(self, progress: float) -> float:
-        """Multiplier of the initial rate at a progress in [0, 1]."""
+        """Returns the multiplier of the initial rate at a progress in [0, 1]."""
         if progress < self.start:
             return 0.0
         if self.final is None:
@@ -70,11 +75,15 @@ def usual_rates() -> dict[str, LearningRate]:
 
 
 def matching_rate(name: str, rates: Mapping[str, LearningRate], where: str) -> LearningRate:
-    """The rate of a parameter by its dotted name.
+    """Returns the rate of a parameter by its dotted name.
 
-    A key matches where its words stand in the name one after the other: a column (``means`` in ``rows.means``) as
-    well as a module (``mlp`` in ``mlp.0.weight``). The longest key wins. Raises ValueError, naming ``where`` to add
-    one, for a parameter without a rate.
+    A key matches if the name contains its words in a row. It can be a column (``means`` in ``rows.means``) or a module
+    (``mlp`` in ``mlp.0.weight``). The longest key wins. Raises ValueError, naming ``where`` to add one, for a parameter
+    without a rate.
+
+    >>> rates = {"means": LearningRate(0.01), "mlp": LearningRate(0.1)}
+    >>> matching_rate("rows.means", rates, where="node.background.learning_rates").initial
+    0.01
     """
     found = [key for key in rates if f".{key}." in f".{name}."]
     if not found:

@@ -1,20 +1,24 @@
-"""How far a training has come: what a scene has to know beside the view."""
+"""The progress of training, which a scene needs in addition to the view."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class SceneState:
-    """The state of training while a view is rendered."""
+    """The state of training while a view is rendered.
+
+    >>> SceneState(progress=0.5, training=True) == FINISHED
+    False
+    """
 
     progress: float = 1.0
     """Fraction of the run in [0, 1]; 1 for a finished scene."""
     sh_degree: int = 3
     """Highest degree of spherical harmonics in use; a node that stores fewer uses what it has."""
     training: bool = False
-    """True inside a training step: noise and sampling of a node are on."""
+    """Whether a training step renders the view; if so, noise and sampling of a node are on."""
     screen_gradients: bool = False
-    """Whether somebody will ask how far the image wants Gaussians to move on screen: density control, while it runs."""
+    """Whether density control is running and will read the gradients of the Gaussians' positions on screen."""
 
 
 FINISHED = SceneState()

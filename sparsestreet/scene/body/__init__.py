@@ -1,4 +1,4 @@
-"""Bodies of people: a surface on a skeleton, ours or the user's own."""
+"""Bodies of people: a surface on a skeleton, either built in or from the user's file."""
 
 from sparsestreet.scene.body.builtin import BuiltinBody
 from sparsestreet.scene.body.smpl_file import SmplFile

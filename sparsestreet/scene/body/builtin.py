@@ -1,4 +1,4 @@
-"""A body of our own for whoever has no licensed one: capsules along the bones, melted into one closed surface."""
+"""A built-in body for users without a licensed one: capsules along the bones, blended into one closed surface."""
 
 import functools
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from sparsestreet.scene.body.surface_net import surface_net
 from sparsestreet.scene.body.template import Body, BodyTemplate
 
 _BLEND = 0.01
-"""Meters over which two capsules melt into each other."""
+"""Meters over which two capsules blend into each other."""
 _MOST_JOINTS = 4
-"""That move one vertex, as in SMPL."""
+"""Largest number of joints that move one vertex, as in SMPL."""
 _FALLOFF = 4
-"""Power of the distance with which a bone loses its hold on the surface."""
+"""Power of the distance by which a bone's weight falls off."""
 
 _BOX = ((-0.96, -0.1, -0.25), (0.96, 1.85, 0.25))
-"""Corners of a box around the body, meters; room for a cell of the coarsest grid."""
+"""Corners of a box around the body, meters, with room for a cell of the coarsest grid."""
 _CELLS_TIMES_AREA = 2.5
-"""Square meters: the number of cells that the surface passes through, times the area of a cell's face."""
+"""Number of cells that the surface passes through, times the area of a cell's face, square meters."""
 
 _MIDDLE = (
-    # Joint that moves it, ends (x, y, z in meters at rest; a name is a joint), radius.
+    # The joint that moves the capsule, its two ends (x, y, z in meters at rest; a name is a joint), its radius.
     ("pelvis", (-0.06, 0.93, 0.0), (0.06, 0.93, 0.0), 0.12),
     ("spine1", "spine1", "spine2", 0.125),
     ("spine2", "spine2", "spine3", 0.13),
@@ -47,7 +47,11 @@ _LEFT = (
 
 @dataclass(frozen=True)
 class BuiltinBody(Body):
-    """About ``num_vertices`` vertices. Raises ValueError where they are too few for arms and legs."""
+    """A body with about ``num_vertices`` vertices. Raises ValueError if they are too few for arms and legs.
+
+    >>> BuiltinBody().load().joints.shape
+    torch.Size([24, 3])
+    """
 
     num_vertices: int = 700
 
@@ -89,19 +93,19 @@ class _Capsules:
         return _Capsules(joints, starts, ends, radii)
 
     def distances(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """From the melted surface, meters, negative inside; exact far from where capsules meet."""
+        """Returns signed distances from the surface, meters, negative inside; exact far from where capsules meet."""
         each = self._from_axes(points) - self.radii
         nearest = each.min(1, keepdims=True)
         return nearest[:, 0] - _BLEND * np.log(np.exp((nearest - each) / _BLEND).sum(1))
 
     def weights(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 24"]:
-        """A bone holds the surface by the inverse distance from its axis, in radii, to a power."""
+        """Returns weights by the inverse distance from each bone's axis, in radii, to a power."""
         hold = (self.radii / self._from_axes(points)) ** _FALLOFF
         weights = np.zeros((len(points), NUM_JOINTS))
         for joint, column in zip(self.joints, hold.T, strict=True):
             weights[:, joint] += column
         weakest = np.sort(weights, 1)[:, -_MOST_JOINTS - 1, None]
-        # Less the strongest that is left out: where another joint takes its place, both hold nothing.
+        # Subtract the strongest weight that is left out: a joint then has weight 0 where another takes its place.
         kept = np.clip(weights - weakest, 0, None)
         return kept / kept.sum(1, keepdims=True)
 

@@ -1,4 +1,4 @@
-"""The people of a log on a template: how they are shaped, and how they stand and move at training frames."""
+"""The people of a log on a body template: their shapes, and their poses at training frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,23 +19,23 @@ class People:
     """Shapes and poses of i people."""
 
     vertices: Float[Tensor, "i v 3"]
-    """At rest, about the pelvis, meters."""
+    """Vertices at rest, relative to the pelvis, meters."""
     joints: Float[Tensor, "i 24 3"]
-    """At rest; the pelvis is 0."""
+    """Joints at rest, meters; the pelvis is at the origin."""
     keyframes: Trajectories
-    """World from body: the pelvis, and how the body is turned about it."""
+    """Poses world from body, at the pelvis."""
     rotations: Float[Tensor, "i k 23 4"]
-    """Of the joints but the pelvis at the keyframes, relative to their parents."""
+    """Rotations of all joints but the pelvis at the keyframes, relative to their parents."""
     places: Float[Tensor, "i v 3"]
-    """Where the vertices are in the box on average over the frames, meters: near what was measured of them."""
+    """Mean positions of the vertices in the box over the frames, meters; measured points lie near them."""
 
 
 def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozenset[int], num_frames: int) -> People:
-    """Poses of frames that are not held out; between and around frames with a pose it is interpolated, in the box.
+    """Returns shapes and poses at frames that are not held out; missing poses are interpolated in the box.
 
-    The pelvis stays at one place in a person's box: where the boxes around the posed body are in its middle on average.
-    (DriveStudio puts each frame's in the middle, so that a body rocks to and fro as its limbs reach out.) Every track
-    has a valid pose in a training frame.
+    The pelvis stays at one place in a person's box, so that the posed bodies are centered in the box on average.
+    (DriveStudio centers each frame's body, so a body rocks to and fro as its limbs reach out.) Every track needs a
+    valid pose in a training frame.
     """
     shaped = [template.shaped(_body(track).shape, float(track.size[2])) for track in tracks]
     vertices, joints = (torch.stack(parts) for parts in zip(*shaped, strict=True))
@@ -61,7 +61,7 @@ def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozens
 
 
 def trained_poses(track: Track, held_out: frozenset[int]) -> Bool[Tensor, " f"]:
-    """Annotated frames with a pose that training may see."""
+    """Returns whether each annotated frame has a pose that training may see."""
     trained = torch.tensor([int(frame) not in held_out for frame in track.frames])
     return trained & _body(track).valid
 
@@ -75,9 +75,9 @@ def _body(track: Track) -> BodyPoses:
 
 
 def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
-    """Joints at all annotated frames, the first one box_from_body, by slerp between the frames with a pose.
+    """Returns joints at all annotated frames, the first one box_from_body, by slerp between the frames with a pose.
 
-    In the box a turn of the heading does not count: a person without a pose turns with the box.
+    Poses are relative to the box, so a person without a pose turns with the box.
     """
     body, usable, frames = _body(track), trained_poses(track, held_out), track.frames
     world_from_box = quat.from_matrix(track.world_from_object[:, :3, :3]).to(body.rotations.dtype)
@@ -97,6 +97,6 @@ def _posed(
     attached: Int[Tensor, "v k"],
     weights: Float[Tensor, "v k"],
 ) -> Float[Tensor, "v 3"]:
-    """The body about its pelvis, along the axes of its annotated box."""
+    """Returns the body's vertices relative to its pelvis, along the axes of its annotated box."""
     still = torch.zeros(len(vertices), 4)
     return skin(vertices, still, Bones(bones.transforms[frame], bones.quaternions[frame]), attached, weights)[0]

@@ -1,4 +1,4 @@
-"""SMPL's body from the user's own licensed file; the package brings none."""
+"""SMPL's body from the user's own licensed file; the package contains none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ _NUM_SHAPES = 10
 
 @dataclass(frozen=True)
 class SmplFile(Body):
-    """SMPL_NEUTRAL as .npz or .pkl, from https://smpl.is.tue.mpg.de; nothing in a .pkl is run."""
+    """SMPL_NEUTRAL as .npz or .pkl, from https://smpl.is.tue.mpg.de; no code in a .pkl is run."""
 
     path: str
 
     def load(self) -> BodyTemplate:
-        """The template. Raises FileNotFoundError with the remedy, ValueError where the file is no such body."""
+        """Returns the template. Raises FileNotFoundError with the remedy, ValueError if the file is no such body."""
         path = Path(self.path)
         if not path.is_file():
             raise FileNotFoundError(
@@ -51,7 +51,7 @@ def _template(stored: Mapping[str, Any]) -> BodyTemplate:
         raise ValueError(f"its joints are connected in another way, with parents {parents.tolist()}")
     vertices = _numbers(stored, "v_template", (-1, 3))
     regressor = _numbers(stored, "J_regressor", (NUM_JOINTS, len(vertices)))
-    # Files of today have 300 coefficients; people are estimated with the first ten.
+    # Current files have 300 coefficients; people are estimated with the first ten.
     directions = _numbers(stored, "shapedirs", (len(vertices), 3, -1))[..., :_NUM_SHAPES]
     joint_directions = np.einsum("jv,vcs->jcs", regressor, directions)
     return BodyTemplate(

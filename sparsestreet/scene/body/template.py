@@ -1,4 +1,4 @@
-"""A body at rest: its surface, its joints, and which joints move which part of the surface."""
+"""A body at rest: its surface, its joints, and the weights by which joints move the surface."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from torch import Tensor
 class BodyTemplate:
     """A closed surface on the joints of ``geometry.skeleton``, in their frame: y up, x to the left, meters.
 
-    Raises ValueError where the weights of a vertex do not sum to 1, or only one of the two directions is given.
+    Raises ValueError if the weights of a vertex do not sum to 1, or if only one of the two directions is given.
     """
 
     vertices: Float[Tensor, "v 3"]
@@ -20,11 +20,11 @@ class BodyTemplate:
     """Triangles, counterclockwise from outside."""
     joints: Float[Tensor, "24 3"]
     weights: Float[Tensor, "v 24"]
-    """Part of each joint in what moves a vertex, >= 0."""
+    """Weight of each joint for each vertex, >= 0."""
     shape_directions: Float[Tensor, "v 3 10"] | None = None
-    """How each coefficient of a person's shape moves the vertices; None: only the height is known to differ."""
+    """Displacement of the vertices per coefficient of a person's shape; None: bodies differ in height only."""
     joint_directions: Float[Tensor, "24 3 10"] | None = None
-    """How it moves the joints."""
+    """Displacement of the joints per coefficient."""
 
     def __post_init__(self) -> None:
         sums = self.weights.sum(1)
@@ -36,13 +36,13 @@ class BodyTemplate:
 
     @property
     def height(self) -> float:
-        """Meters from the soles to the crown."""
+        """Height from the soles to the crown, meters."""
         return float(self.vertices[:, 1].amax() - self.vertices[:, 1].amin())
 
     def shaped(self, shape: Float[Tensor, "10"], height: float) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "24 3"]]:
-        """Vertices and joints of one person, the pelvis at the origin.
+        """Returns vertices and joints of one person, with the pelvis at the origin.
 
-        A template with directions takes the coefficients of the ``shape``, any other is scaled to the ``height``.
+        A template with directions uses the coefficients of ``shape``; any other is scaled to ``height``.
         """
         if self.shape_directions is None or self.joint_directions is None:
             scale = height / self.height
@@ -53,26 +53,26 @@ class BodyTemplate:
         return vertices - joints[0], joints - joints[0]
 
     def influences(self) -> tuple[Int[Tensor, "v k"], Float[Tensor, "v k"]]:
-        """The joints that move each vertex, the strongest first, and their parts; k as many as any vertex has."""
+        """Returns the joints that move each vertex, strongest first, and their weights; k is the most of any vertex."""
         most = int((self.weights > 0).sum(1).amax())
         parts, joints = self.weights.sort(dim=1, descending=True, stable=True)
         return joints[:, :most].contiguous(), parts[:, :most].contiguous()
 
 
 class Body(ABC):
-    """Where a template comes from; a frozen dataclass, which a scene file holds as settings."""
+    """The source of a template, as a frozen dataclass that a scene file holds as settings."""
 
     @abstractmethod
     def load(self) -> BodyTemplate:
-        """The template. Raises OSError or ValueError where it comes from a file that cannot be read."""
+        """Returns the template. Raises OSError or ValueError for a file that cannot be read."""
 
 
 def surface(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "t 3"]
 ) -> tuple[Float[Tensor, " v"], Float[Tensor, "v 3"]]:
-    """A third of the area of the triangles around each vertex, square meters, and its unit normal, outwards."""
+    """Returns a third of the area of the triangles around each vertex, square meters, and its outward unit normal."""
     a, b, c = vertices[faces].unbind(1)
-    # Twice the area long, so larger triangles count more for the normal.
+    # Its length is twice the area, so larger triangles count more for the normal.
     across = torch.linalg.cross(b - a, c - a)
     shares = across.norm(dim=1, keepdim=True) / 6
     per_corner = torch.cat((shares, across), 1).repeat_interleave(3, 0)

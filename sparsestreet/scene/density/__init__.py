@@ -1,7 +1,7 @@
-"""Where a node needs more Gaussians and where fewer: strategies of a node, pure functions that answer with a RowPlan.
+"""Density control: strategies that decide where a node needs more or fewer Gaussians, and return a RowPlan.
 
-``strategy`` is what each of them answers; ``statistics`` what the Gaussians did on screen since the last refinement;
-``gradient`` the strategy of 3DGS, ``vibrating`` that of PVG.
+``strategy`` is the interface. ``statistics`` accumulates screen gradients and sizes since the last refinement.
+``gradient`` is the strategy of 3DGS, ``vibrating`` that of PVG.
 """
 
 from sparsestreet.scene.density.gradient import GradientDensity, outside_boxes

@@ -1,7 +1,7 @@
 """Gradient-based density control (3DGS, Kerbl et al. 2023; absolute gradients as in AbsGS, Ye et al. 2024).
 
-Pure decisions: they read rows and statistics, and answer with a RowPlan. All tests see
-unmasked values: a closed mask would make the scale 0.
+The decisions are pure functions of rows and statistics, and return a RowPlan. They use unmasked values, because a
+closed mask would make the scale 0.
 """
 
 import math
@@ -19,9 +19,14 @@ from sparsestreet.scene.gaussians import RowPlan, Rows
 
 @dataclass(frozen=True)
 class GradientDensity:
-    """Clone, split, cull and reset by thresholds; the defaults are DriveStudio's for its background node.
+    """Clones, splits, culls and resets by thresholds; the defaults are DriveStudio's for its background node.
 
     Raises ValueError for thresholds that contradict each other.
+
+    >>> scales = torch.full((2, 3), 0.1).log()
+    >>> rows = Rows({"log_scales": scales, "opacity_logits": torch.tensor([2.0, -9.0])})
+    >>> GradientDensity().cull(rows, DensityStatistics(2), radius=10.0, progress=0.5).source.tolist()
+    [0]
     """
 
     grad_threshold: float = 0.0003
@@ -31,23 +36,23 @@ class GradientDensity:
     split_screen: float = 0.05
     """Fraction of the longer image side: rows that were larger on screen are split at any scale."""
     cull_opacity: float = 0.005
-    """Fainter rows go."""
+    """Rows with a lower opacity are culled."""
     cull_scale: float = 0.5
-    """Fraction of the scene radius: larger rows go."""
+    """Fraction of the scene radius: larger rows are culled."""
     cull_scale_from: float = 0.1
-    """Fraction of the run after which ``cull_scale`` counts: early Gaussians are large for lack of others."""
+    """Fraction of the run after which ``cull_scale`` applies: early Gaussians are large because there are few."""
     cull_screen: float = 0.15
-    """Fraction of the longer image side: rows that were larger on screen go."""
+    """Fraction of the longer image side: rows that were larger on screen are culled."""
     screen_size_until: float = 0.0
-    """Fraction of the run up to which ``split_screen`` and ``cull_screen`` count; 0: never. (DriveStudio: 0.133 for
+    """Fraction of the run up to which ``split_screen`` and ``cull_screen`` apply; 0: never. (DriveStudio: 0.133 for
     its background, 1 for its rigid node.)"""
     split_children: int = 2
     split_shrink: float = 1.6
-    """Children (and a parent that stays) have this much smaller scales."""
+    """Factor by which the scales of children (and of a parent that stays) are divided."""
     keep_parent: bool = True
-    """DriveStudio keeps the shrunk parent beside its children; the original 3DGS replaces it."""
+    """Whether the shrunk parent stays next to its children, as in DriveStudio; the original 3DGS replaces it."""
     reset_opacity_to: float = 0.01
-    """What a reset leaves of an opacity at most."""
+    """Largest opacity after a reset."""
 
     watched: ClassVar[tuple[str, ...]] = ()
 
@@ -69,17 +74,16 @@ class GradientDensity:
         max_gaussians: int | None,
         generator: torch.Generator,
     ) -> RowPlan:
-        """Clone small rows and split large ones where the image asks for detail.
+        """Clones small rows and splits large ones where the image asks for detail.
 
-        With g the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the
-        scene radius in meters: a row with g > grad_threshold (``urgency`` > 1) is split if s_max > split_scale R (or,
+        Let g be the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the
+        scene radius in meters. A row with g > grad_threshold (``urgency`` > 1) is split if s_max > split_scale R (or,
         up to ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are
-        at mu + R(q) (s * z) with z ~ N(0, I), that is, drawn from their parent, with scales s / split_shrink. Copies
-        inherit all other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep
-        theirs.
+        drawn from their parent: at mu + R(q) (s * z) with z ~ N(0, I), with scales s / split_shrink. Copies inherit all
+        other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep theirs.
 
-        New order: the surviving rows in theirs, then clones, then children, siblings side by side. Raises ValueError
-        if the statistics do not belong to the rows or hold a gradient that is not finite.
+        The new order is: the surviving rows in their old order, then clones, then children, siblings side by side.
+        Raises ValueError if the statistics do not belong to the rows or hold a gradient that is not finite.
         """
         _check_same_rows(rows, statistics)
         urgency = self.urgency(statistics)
@@ -91,17 +95,17 @@ class GradientDensity:
         return self.grow(rows, wanted & large, wanted & ~large, generator)
 
     def urgency(self, statistics: DensityStatistics) -> Float[Tensor, " n"]:
-        """How much detail the image asks of each row: above 1 it is cloned or split, the highest first."""
+        """Returns how much detail the image asks of each row; rows above 1 are cloned or split, the highest first."""
         return statistics.mean_gradients() / self.grad_threshold
 
     def split_size(self, rows: Rows, radius: float) -> float | Float[Tensor, " n"]:
-        """The largest scale, meters, up to which a row is cloned."""
+        """Returns the largest scale, meters, up to which a row is cloned."""
         return self.split_scale * radius
 
     def grow(
         self, rows: Rows, split: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], generator: torch.Generator
     ) -> RowPlan:
-        """The plan that splits and clones the given rows; the children stand last in it."""
+        """Returns the plan that splits and clones the given rows; the children come last."""
         survivors = torch.nonzero(torch.ones_like(split) if self.keep_parent else ~split).squeeze(-1)
         clones = torch.nonzero(clone).squeeze(-1)
         children = torch.nonzero(split).squeeze(-1).repeat_interleave(self.split_children)
@@ -116,10 +120,11 @@ class GradientDensity:
         return RowPlan(len(rows), source, fresh, edits={"means": means, "log_scales": log_scales})
 
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
-        """Drop rows that are faint (opacity < cull_opacity), after ``cull_scale_from`` those that are huge (largest
-        scale > cull_scale * ``radius``, meters), up to ``screen_size_until`` those that were huge on screen.
+        """Drops rows that are faint (opacity < cull_opacity) or too large.
 
-        Raises ValueError if the statistics do not belong to the rows.
+        After ``cull_scale_from`` it drops rows whose largest scale exceeds cull_scale * ``radius``, meters. Up to
+        ``screen_size_until`` it drops rows that were larger than ``cull_screen`` on screen. Raises ValueError if the
+        statistics do not belong to the rows.
         """
         _check_same_rows(rows, statistics)
         drop = torch.sigmoid(rows.opacity_logits.detach()) < self.cull_opacity
@@ -130,8 +135,7 @@ class GradientDensity:
         return RowPlan.keep(~drop)
 
     def reset(self, rows: Rows) -> RowPlan:
-        """Lower every opacity to at most ``reset_opacity_to`` and forget the opacities' moments; rows that matter
-        grow back."""
+        """Lowers every opacity to at most ``reset_opacity_to`` and clears its moments; rows that matter grow back."""
         logits = rows.opacity_logits.detach()
         source = torch.arange(len(rows), device=logits.device)
         lowered = logits.clamp(max=math.log(self.reset_opacity_to / (1 - self.reset_opacity_to)))
@@ -147,9 +151,14 @@ class GradientDensity:
 def outside_boxes(
     means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], sizes: Float[Tensor, "i 3"], margin: float
 ) -> Bool[Tensor, " n"]:
-    """Whether each row's center (meters, in the frame of its instance's box) is more than ``margin`` meters outside.
+    """Returns whether each row's center lies more than ``margin`` meters outside the box of its instance.
 
-    ``sizes``: length, width, height of each instance's box, which is centered at the origin.
+    ``means`` are in the frame of the box, meters. ``sizes`` are length, width and height of each instance's box, which
+    is centered at the origin.
+
+    >>> means, size = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]), torch.tensor([[4.0, 2.0, 1.5]])
+    >>> outside_boxes(means, torch.tensor([0, 0]), size, margin=0.1).tolist()
+    [False, True]
     """
     return (means.detach().abs() > sizes[instances] / 2 + margin).any(dim=-1)
 
@@ -172,7 +181,7 @@ def _within_cap(
     settings: GradientDensity,
     max_gaussians: int | None,
 ) -> Bool[Tensor, " n"]:
-    """Which rows may grow under the cap: most urgent first, ties by row, until one has no room."""
+    """Returns the rows that may grow under the cap: most urgent first, ties by row, until one has no room."""
     if max_gaussians is None:
         return torch.ones_like(wanted)
     split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
@@ -185,9 +194,9 @@ def _within_cap(
 
 
 def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:
-    """One draw from each listed row's Gaussian, relative to its mean, meters."""
+    """Returns one draw from each listed row's Gaussian, relative to its mean, meters."""
     scales = rows.log_scales.detach()[children].exp()
-    # Drawn where the generator lives: a CPU generator gives the same children on every device.
+    # Draw on the generator's device, because a CPU generator gives the same children on every device.
     normal = torch.randn(scales.shape, dtype=scales.dtype, generator=generator, device=generator.device)
     rotations = to_matrix(rows.quaternions.detach()[children])
     return (rotations @ (scales * normal.to(scales.device))[..., None]).squeeze(-1)

@@ -1,4 +1,4 @@
-"""What each Gaussian of a node did on screen since the last refinement."""
+"""Screen gradients and sizes of each Gaussian of a node since the last refinement."""
 
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -11,16 +11,22 @@ from sparsestreet.scene.gaussians import RowPlan
 
 
 class DensityStatistics:
-    """Per-row accumulators that density control thresholds; one instance per node."""
+    """Per-row accumulators that density control thresholds; one instance per node.
+
+    >>> statistics = DensityStatistics(rows=2)
+    >>> statistics.add(torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([5.0, 0.0]), width=2, height=2)
+    >>> statistics.mean_gradients().tolist()
+    [5.0, 0.0]
+    """
 
     gradient_sum: Float[Tensor, " n"]
-    """Sum over the visits of the scaled screen gradient's norm."""
+    """Sum of the scaled screen gradient's norm over the visits."""
     visits: Int[Tensor, " n"]
     """Number of views in which the row was drawn."""
     largest_screen: Float[Tensor, " n"]
-    """Largest radius on screen, as a fraction of the longer image side."""
+    """Largest radius on screen as a fraction of the longer image side."""
     watched: dict[str, Float[Tensor, " n"]]
-    """Name of a column with one number a row -> sum over the visits of its absolute gradient."""
+    """Name of a column with one number a row -> sum of its absolute gradient over the visits."""
 
     def __init__(self, rows: int, device: torch.device | str = "cpu", watched: Collection[str] = ()) -> None:
         self.gradient_sum = torch.zeros(rows, device=device)
@@ -40,13 +46,12 @@ class DensityStatistics:
         height: int,
         gradients: Mapping[str, Float[Tensor, " n"]] | None = None,
     ) -> None:
-        """Count one view in, after its backward pass; rows with radius 0 were not drawn and do not change.
+        """Adds one view after its backward pass; rows with radius 0 were not drawn and do not change.
 
-        ``screen_gradient``: absolute gradient of the loss per pixel of the projected mean
-        (``Rendering.screen_offsets.grad``), ``radii``: pixels, both for this node's rows. As in 3DGS and DriveStudio
-        the gradient is taken per half image, |(g_x W/2, g_y H/2)|_2, so that one threshold fits all image sizes.
-        ``gradients``: of the watched columns, as they are.
-        Raises ValueError if the number of rows differs.
+        ``screen_gradient`` is the absolute gradient of the loss per pixel of the projected mean
+        (``Rendering.screen_offsets.grad``), ``radii`` are pixels, both for this node's rows. As in 3DGS and DriveStudio
+        the gradient is scaled to half the image, |(g_x W/2, g_y H/2)|_2, so one threshold fits all image sizes.
+        ``gradients`` are those of the watched columns, unscaled. Raises ValueError if the number of rows differs.
         """
         if radii.shape[0] != len(self):
             raise ValueError(
@@ -62,8 +67,10 @@ class DensityStatistics:
             total += torch.where(drawn, gradients[name].abs(), 0.0)
 
     def mean_gradients(self, column: str | None = None) -> Float[Tensor, " n"]:
-        """Mean norm on screen over the visits, or mean absolute gradient of a watched column; 0 for rows never drawn.
-        Raises ValueError where it is NaN or infinite."""
+        """Returns the mean norm on screen over the visits, or the mean absolute gradient of a watched column.
+
+        Rows that were never drawn have 0. Raises ValueError if a sum is NaN or infinite.
+        """
         total = self.gradient_sum if column is None else self.watched[column]
         if not total.isfinite().all():
             row = int((~total.isfinite()).nonzero()[0])
@@ -74,31 +81,31 @@ class DensityStatistics:
         return total / self.visits.clamp(min=1)
 
     def resize(self, plan: RowPlan) -> None:
-        """Follow the node's rows; fresh ones have seen nothing yet and start at zero."""
+        """Applies the plan of the node's rows; fresh rows start at zero."""
         self._each(lambda values: values[plan.source].masked_fill(plan.fresh, 0))
 
     def reset(self) -> None:
-        """Forget all views (after each refinement)."""
+        """Clears all accumulators (after each refinement)."""
         self._each(torch.zeros_like)
 
     def to(self, device: torch.device) -> None:
-        """Move to the device of the rows."""
+        """Moves the accumulators to the device of the rows."""
         self._each(lambda values: values.to(device))
 
     def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint: a run resumed between two refinements densifies as the uninterrupted one."""
+        """Returns the state for a checkpoint; a run resumed between refinements densifies like an uninterrupted one."""
         return vars(self) | {"watched": dict(self.watched)}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> "DensityStatistics":
-        """Continue from a checkpoint, with as many rows as it has."""
+        """Returns the statistics of a checkpoint, with its number of rows."""
         statistics = DensityStatistics(0)
         vars(statistics).update(state)
         statistics._each(torch.clone)
         return statistics
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> None:
-        """Replace every accumulator."""
+        """Replaces every accumulator."""
         self.gradient_sum = change(self.gradient_sum)
         self.visits = change(self.visits)
         self.largest_screen = change(self.largest_screen)

@@ -1,4 +1,4 @@
-"""What every density strategy of a node answers: where the scene needs more Gaussians, and where fewer."""
+"""The interface of a node's density strategy, which decides where it needs more or fewer Gaussians."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
@@ -11,13 +11,13 @@ from sparsestreet.scene.gaussians import RowPlan, Rows
 
 @runtime_checkable
 class DensityStrategy(Protocol):
-    """Pure decisions about one node's rows from what its Gaussians did on screen; when to ask is a callback's matter.
+    """Pure decisions about one node's rows from their screen statistics; a callback decides when to ask.
 
-    ``radius`` is the scene's, meters; ``progress`` the fraction of the run.
+    ``radius`` is the scene radius in meters, ``progress`` the fraction of the run.
     """
 
     watched: Sequence[str]
-    """Columns with one number a row whose gradients the statistics have to follow."""
+    """Names of columns with one number a row whose gradients the statistics must accumulate."""
 
     def densify(
         self,
@@ -29,13 +29,13 @@ class DensityStrategy(Protocol):
         max_gaussians: int | None,
         generator: torch.Generator,
     ) -> RowPlan:
-        """Rows that are cloned and split; the table never grows beyond ``max_gaussians``."""
+        """Returns the plan that clones and splits rows; the table never grows beyond ``max_gaussians``."""
         ...
 
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
-        """Rows that are of no use any more."""
+        """Returns the plan that drops useless rows."""
         ...
 
     def reset(self, rows: Rows) -> RowPlan:
-        """Opacities pulled down, so that what is not needed can be told from what grows back."""
+        """Returns the plan that lowers opacities; needed rows grow back, and the others stay faint."""
         ...

@@ -1,4 +1,4 @@
-"""Density control of PVG (Chen et al. 2023): Gaussians that are missing at some time are grown over time as well."""
+"""Density control of PVG (Chen et al. 2023), which also grows Gaussians along time."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -13,21 +13,21 @@ from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.vibration import mean_velocities
 
 NEAREST = 1.0
-"""Meters; what lies nearer to the center of the scene may be as large as what lies here."""
+"""Meters; rows nearer to the middle than this may be as large as rows at this distance."""
 
 
 @dataclass(frozen=True)
 class VibratingDensity(GradientDensity):
-    """As 3DGS, for rows with velocities, life peaks and life spans.
+    """The strategy of 3DGS for rows with velocities, life peaks and life spans.
 
-    A row also grows where the image pulls at its life peak, and is split above ``split_scale`` times its distance from
-    the middle of the rows: streets reach far, and what is far is large. Children are spread over their parent's life.
+    A row also grows if the gradient of its life peak is large. It is split above ``split_scale`` times its distance
+    from the middle of the rows, because far things in a street are large. Children are spread over their parent's life.
     """
 
     peak_threshold: float = 0.002
     """Mean absolute gradient of the life peak above which a row is cloned or split."""
     cycle: float = 0.2
-    """That of the node."""
+    """The cycle of the node."""
 
     watched: ClassVar[tuple[str, ...]] = ("life_peaks",)
 
@@ -43,8 +43,11 @@ class VibratingDensity(GradientDensity):
     def grow(
         self, rows: Rows, split: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], generator: torch.Generator
     ) -> RowPlan:
-        """Children peak at tau + s z, z ~ N(0, 1), with s their parent's life span, and are moved there by its mean
-        velocity."""
+        """Returns the plan of 3DGS with children spread over time.
+
+        Children peak at tau + s z, z ~ N(0, 1), where s is their parent's life span. They are moved to that time by the
+        parent's mean velocity.
+        """
         plan = super().grow(rows, split, clone, generator)
         first_child = len(plan.source) - self.split_children * int(split.sum())
         children = plan.source[first_child:]

@@ -1,4 +1,4 @@
-"""Rows of Gaussian parameters, and the one way to add, drop and replace them."""
+"""Tables of Gaussian parameters, and the only way to add, drop and replace their rows."""
 
 from sparsestreet.scene.gaussians.plan import RowPlan
 from sparsestreet.scene.gaussians.rows import Rows, drop_parameter

@@ -1,4 +1,4 @@
-"""What a pure function answers when asked which Gaussians to keep, copy or split."""
+"""The result of a pure function that decides which Gaussians to keep, copy or split."""
 
 from dataclasses import dataclass, field
 
@@ -9,18 +9,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RowPlan:
-    """New row i is a copy of old row source[i]; parameters, optimizer moments and buffers all follow it.
+    """A plan by which new row i is a copy of old row source[i]; parameters, optimizer moments and buffers follow it.
 
-    Raises ValueError if a source is no row of the table that the plan was made for.
+    Raises ValueError if a source is not a row of the table that the plan was made for.
+
+    >>> plan = RowPlan(rows=2, source=torch.tensor([0, 1, 1]), fresh=torch.tensor([False, False, True]))
+    >>> len(plan.source)
+    3
     """
 
     rows: int
-    """Number of rows the plan was made for: a stale plan must not be applied to another table."""
+    """Number of rows of the table that the plan was made for; a stale plan must not be applied to another table."""
     source: Int[Tensor, " new"]
     fresh: Bool[Tensor, " new"]
-    """True: the row's optimizer moments start at zero."""
+    """Whether a new row's optimizer moments start at zero."""
     edits: dict[str, Tensor] = field(default_factory=dict)
-    """Name of a parameter or buffer -> full replacement values [new, ...], for rows that are no plain copies."""
+    """Name of a parameter or buffer -> values [new, ...] that replace its column, for rows that are not copies."""
     reset_moments: frozenset[str] = frozenset()
     """Names of parameters whose moments start at zero in every row (an opacity reset)."""
 
@@ -33,6 +37,10 @@ class RowPlan:
 
     @staticmethod
     def keep(mask: Bool[Tensor, " old"]) -> "RowPlan":
-        """Keep the rows where ``mask`` is true, in order."""
+        """Returns the plan that keeps the rows where ``mask`` is true, in order.
+
+        >>> RowPlan.keep(torch.tensor([True, False, True])).source.tolist()
+        [0, 2]
+        """
         source = torch.nonzero(mask).squeeze(-1)
         return RowPlan(len(mask), source, torch.zeros_like(source, dtype=torch.bool))

@@ -1,4 +1,4 @@
-"""A table of Gaussians: every parameter and buffer in it has one entry per row."""
+"""A table of Gaussians, in which every parameter and buffer has one entry per row."""
 
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
@@ -14,6 +14,10 @@ class Rows(nn.Module):
     """Named per-row parameters (means, log_scales, mask_logits ...) and buffers (instances ...).
 
     Raises ValueError without any column, or if the columns disagree in their number of rows.
+
+    >>> rows = Rows({"means": torch.zeros(3, 3)}, buffers={"instances": torch.tensor([0, 0, 1])})
+    >>> len(rows), sorted(rows.columns())
+    (3, ['instances', 'means'])
     """
 
     if TYPE_CHECKING:
@@ -26,7 +30,7 @@ class Rows(nn.Module):
         buffers: Mapping[str, Tensor] | None = None,
         transient: Collection[str] = (),
     ) -> None:
-        """``transient``: columns that training may drop (a mask's); a checkpoint may come without them."""
+        """``transient``: columns that training may drop (those of a mask); a checkpoint may lack them."""
         super().__init__()
         self.transient = frozenset(transient)
         for name, value in parameters.items():
@@ -41,15 +45,21 @@ class Rows(nn.Module):
         return next(iter(self.columns().values())).shape[0]
 
     def columns(self) -> dict[str, Tensor]:
-        """All parameters and buffers by name."""
+        """Returns all parameters and buffers by name."""
         return dict(self.named_parameters(recurse=False)) | dict(self.named_buffers(recurse=False))
 
     @torch.no_grad()
     def resize(self, plan: RowPlan, optimizer: Optimizer | None = None) -> None:
-        """Apply a plan once, to values, optimizer moments and buffers; gradients are dropped.
+        """Applies a plan to values, optimizer moments and buffers, and drops gradients.
 
-        Raises KeyError or ValueError, with nothing changed, if the plan was made for another number of rows, edits a
-        column that does not exist or in another shape, or if the optimizer does not hold a trainable column.
+        Raises KeyError or ValueError and changes nothing if the plan does not fit: it was made for another number of
+        rows, or edits an unknown column or one of another shape. The same holds if the optimizer lacks a trainable
+        column.
+
+        >>> rows = Rows({"opacity_logits": torch.tensor([1.0, 2.0, 3.0])})
+        >>> rows.resize(RowPlan.keep(torch.tensor([True, False, True])))
+        >>> rows.opacity_logits.tolist()
+        [1.0, 3.0]
         """
         columns = self.columns()
         self._check(plan, optimizer)
@@ -66,7 +76,7 @@ class Rows(nn.Module):
 
     @torch.no_grad()
     def drop_column(self, name: str, optimizer: Optimizer | None = None) -> None:
-        """Remove a parameter from the table and from the optimizer (a mask that has done its work)."""
+        """Removes a parameter from the table and from the optimizer (the column of a finished mask)."""
         parameter = self.get_parameter(name)
         delattr(self, name)
         if optimizer is not None:
@@ -92,9 +102,9 @@ class Rows(nn.Module):
             raise ValueError(f"the optimizer does not hold the columns {missing}: build it after the scene was loaded")
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        """Take the number of rows, and whether there are still masks, from the checkpoint.
+        """Takes the number of rows from the checkpoint, and drops transient columns that it lacks.
 
-        Load before building an optimizer: parameters of another length are replaced.
+        Load before you build an optimizer, because parameters of another length are replaced.
         """
         for name, column in self.columns().items():
             saved = state_dict.get(prefix + name)
@@ -108,7 +118,14 @@ class Rows(nn.Module):
 
 
 def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
-    """Take a parameter with its moments out of an optimizer; one that it does not hold is left alone."""
+    """Removes a parameter and its moments from an optimizer; does nothing if the optimizer does not hold it.
+
+    >>> parameter = nn.Parameter(torch.zeros(2))
+    >>> optimizer = torch.optim.Adam([parameter])
+    >>> drop_parameter(optimizer, parameter)
+    >>> optimizer.param_groups
+    []
+    """
     optimizer.state.pop(parameter, None)
     for group in optimizer.param_groups:
         group["params"] = [other for other in group["params"] if other is not parameter]
@@ -116,7 +133,7 @@ def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
 
 
 def _replace_in_optimizer(optimizer: Optimizer, old: Tensor, new: nn.Parameter, source: Tensor, zero: Tensor) -> None:
-    """Put ``new`` where ``old`` was and carry every per-row moment along, zeroed where ``zero``."""
+    """Puts ``new`` in the place of ``old`` and carries every per-row moment along, set to 0 where ``zero`` is true."""
     for group in optimizer.param_groups:
         group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
     state = optimizer.state.pop(old, None)

@@ -1,4 +1,4 @@
-"""Which rows of a table stay, and the floors that no rule goes below."""
+"""Selects the rows of a table that stay, never fewer than the floors."""
 
 from dataclasses import dataclass
 
@@ -11,21 +11,21 @@ from sparsestreet.scene.gaussians.plan import RowPlan
 
 @dataclass(frozen=True)
 class Selection:
-    """Which rows stay."""
+    """The rows that stay."""
 
     keep: Bool[Tensor, " n"]
     floor_hit: bool
-    """True: the rule wanted to remove more, but K_min or the floor of an instance kept some of its candidates."""
+    """Whether K_min or the floor of an instance kept rows that the rule wanted to remove."""
     removed: int
 
     def plan(self) -> RowPlan:
-        """The kept rows, in order, with their optimizer moments."""
+        """Returns the plan that keeps these rows in order, with their optimizer moments."""
         return RowPlan.keep(self.keep)
 
 
 @dataclass(frozen=True)
 class InstanceFloors:
-    """How many rows each instance of a node keeps; one that has fewer keeps all."""
+    """The least number of rows of each instance of a node; an instance that has fewer keeps all."""
 
     ids: Int[Tensor, " n"]
     """Row -> its instance."""
@@ -38,11 +38,16 @@ def keep_best(
     min_gaussians: int,
     instances: InstanceFloors | None = None,
 ) -> Selection:
-    """Drop the unwanted rows, but keep enough of them to meet the floors.
+    """Drops the unwanted rows, but keeps enough of them to meet the floors.
 
-    Each instance first fills up to its own floor, then the best of what is left fill up to ``min_gaussians``. The
-    highest scores stay and, among rows of equal score, the lower row. Raises ValueError for scores that are NaN or a
-    negative floor.
+    Each instance first fills up to its own floor. Then the best of the rest fill up to ``min_gaussians``. The highest
+    scores stay and, among rows of equal score, the lower row. Raises ValueError for scores that are NaN or a negative
+    floor.
+
+    >>> scores = torch.tensor([0.9, 0.1, 0.2])
+    >>> selection = keep_best(scores, unwanted=scores < 0.5, min_gaussians=2)
+    >>> selection.keep.tolist(), selection.floor_hit, selection.removed
+    ([True, False, True], True, 1)
     """
     if min_gaussians < 0:
         raise ValueError(f"min_gaussians must be >= 0, got {min_gaussians}")
@@ -62,7 +67,7 @@ def keep_best(
 
 
 def _within_floors(ids: Int[Tensor, " n"], least: Int[Tensor, " i"]) -> Bool[Tensor, " n"]:
-    """Rows, the best first, of which fewer than the floor of their instance stand before them in it."""
+    """Returns whether each row, given the best first, is among the first rows of its instance up to that floor."""
     by_instance = torch.sort(ids, stable=True)
     counts = torch.bincount(ids, minlength=len(least))
     place = torch.arange(len(ids), device=ids.device) - (counts.cumsum(0) - counts)[by_instance.values]

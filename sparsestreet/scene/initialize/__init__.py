@@ -1,5 +1,5 @@
-"""Where the Gaussians of a node start, from what training may see.
+"""Starts the Gaussians of a node from the data that training may see.
 
-``training_data`` is what a node may look at; ``points`` colored points from lidar and at random; ``boxes`` which points
-lie in which object; ``gaussians`` a table from points.
+``training_data`` is that data. ``points`` are colored points, ``boxes`` finds the points in each object, ``coverage``
+measures what the images show, and ``gaussians`` makes a table from points.
 """

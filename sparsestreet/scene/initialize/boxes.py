@@ -1,4 +1,4 @@
-"""Which points lie in which object's box."""
+"""Finds the points that lie in objects' boxes."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,7 +12,7 @@ from sparsestreet.types import Sweep, Track
 
 
 def points_in_box_frame(track: Track, frame: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
-    """World points in the track's box frame at an integer frame, meters; None where it is not annotated."""
+    """Returns world points in the track's box frame at an integer frame, meters; None if the track has no box there."""
     found = torch.nonzero(track.frames == frame).flatten()
     if found.numel() == 0:
         return None
@@ -23,14 +23,18 @@ def points_in_box_frame(track: Track, frame: int, points: Float[Tensor, "n 3"]) 
 def inside_box(
     points_in_box: Float[Tensor, "n 3"], size: Float[Tensor, "3"], enlargement: float = 1.0
 ) -> Bool[Tensor, " n"]:
-    """Whether points of the box frame lie in the box, its sides multiplied by ``enlargement``."""
+    """Returns whether points of the box frame lie in the box, whose sides are multiplied by ``enlargement``.
+
+    >>> inside_box(torch.tensor([[1.9, 0.0, 0.0], [2.1, 0.0, 0.0]]), torch.tensor([4.0, 2.0, 1.5])).tolist()
+    [True, False]
+    """
     return (points_in_box.abs() <= 0.5 * enlargement * size).all(1)
 
 
 def outside_boxes(
     tracks: Sequence[Track], frame: int, points: Float[Tensor, "n 3"], enlargement: float
 ) -> Bool[Tensor, " n"]:
-    """Whether world points lie in none of the tracks' boxes at an integer frame."""
+    """Returns whether world points lie in none of the tracks' boxes at an integer frame."""
     outside = torch.ones(points.shape[0], dtype=torch.bool)
     for track in tracks:
         in_box_frame = points_in_box_frame(track, frame, points)
@@ -40,7 +44,13 @@ def outside_boxes(
 
 
 def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Random points on the faces of a box about the origin, spread evenly over its area."""
+    """Returns random points on the faces of a box about the origin, spread evenly over its area.
+
+    >>> size = torch.tensor([4.0, 2.0, 1.5])
+    >>> points = box_surface_points(10, size, torch.Generator().manual_seed(0))
+    >>> bool(((2 * points.abs() / size).amax(1) == 1).all())
+    True
+    """
     length, width, height = size.tolist()
     areas = torch.tensor([width * height, length * height, length * width])
     axis = torch.multinomial(areas, count, replacement=True, generator=generator)
@@ -51,9 +61,9 @@ def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Ge
 
 
 def lidar_in_boxes(tracks: Sequence[Track], sweeps: Iterable[Sweep]) -> list[Points]:
-    """For each object, the colored returns inside its box at their own instant, in the box frame.
+    """Returns for each object the colored returns inside its box at their own instant, in the box frame.
 
-    One pass over the sweeps, which may be read from disk while it lasts.
+    It passes once over the sweeps, which may be read from disk on the way.
     """
     parts: list[list[Points]] = [[] for _ in tracks]
     for sweep in sweeps:

@@ -1,4 +1,4 @@
-"""What the training images show, by what could tell where it is: lidar returns, points from images, or nothing."""
+"""Shares of the training images that lidar returns, points from images, or neither can locate."""
 
 from dataclasses import dataclass
 
@@ -14,26 +14,30 @@ from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Frame
 
 VIEWS = 48
-"""Training views that are looked at, spread evenly; neighbors show nearly the same."""
+"""Number of training views that are measured, spread evenly; neighbors show nearly the same."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares of the pixels that are not sky; they add up to 1."""
+    """Shares of the pixels that are not sky; they add up to 1.
+
+    >>> Coverage(lidar=0.5, images=0.25).nothing
+    0.25
+    """
 
     lidar: float
-    """Near a return."""
+    """Share near a return."""
     images: float
-    """Beyond the lidar, and near a point from images that was seen there."""
+    """Share beyond the lidar that is near a point from images seen there."""
 
     @property
     def nothing(self) -> float:
-        """Near neither."""
+        """Share near neither."""
         return 1 - self.lidar - self.images
 
 
 def coverage(data: TrainingData) -> Coverage:
-    """Look at training views; "near" is the window of ``near_returns``. Without any pixel all is uncovered."""
+    """Returns the coverage of training views; "near" is the window of ``near_returns``. No pixels: all is uncovered."""
     static = None if data.image_points is None else data.image_points.static
     pixels = by_lidar = by_images = 0
     for place in spread(len(data.frames), VIEWS):
@@ -48,7 +52,7 @@ def coverage(data: TrainingData) -> Coverage:
 
 
 def beyond_lidar(data: TrainingData, points: TriangulatedPoints) -> Bool[Tensor, " n"]:
-    """Which points no view that shows them has a return near."""
+    """Returns whether no view that shows a point has a return near it."""
     seen_near = torch.zeros(len(points), dtype=torch.bool)
     for place in range(len(data.frames)):
         own = points.views == place
@@ -73,6 +77,6 @@ def _near_points(points: TriangulatedPoints, place: int, frame: Frame) -> Bool[T
 def _shown_at(
     points: TriangulatedPoints, observations: Bool[np.ndarray, " o"]
 ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
-    """Row and column of the pixels of some observations."""
+    """Returns row and column of the pixels of some observations."""
     column, row = torch.from_numpy(points.pixels[observations]).long().unbind(1)
     return row, column

@@ -1,4 +1,4 @@
-"""From colored points to a table of Gaussians."""
+"""Makes a table of Gaussians from colored points."""
 
 import math
 from collections.abc import Mapping
@@ -13,22 +13,25 @@ from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.gaussians import Rows
 
 SH_CONSTANT = 0.5 / math.sqrt(math.pi)
-"""The basis function of degree 0."""
+"""Value of the spherical harmonic of degree 0."""
 
 MINIMUM_SCALE = 1e-3
-"""Meters; coincident points are no distance apart, and a scale has to have a logarithm."""
+"""Meters; coincident points have distance 0, but a scale needs a logarithm."""
 
 
 def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Mean distance to the three nearest other points (fewer where there are no three), at least 1 mm.
+    """Returns the mean distance to the three nearest other points (or fewer if there are fewer), at least 1 mm.
 
     A point without any neighbor gets 1 mm.
+
+    >>> neighbor_scales(torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])).tolist()
+    [2.0, 2.0]
     """
     num_points = points.shape[0]
     neighbors = min(3, num_points - 1)
     if neighbors < 1:
         return torch.full((num_points,), MINIMUM_SCALE)
-    # The nearest is the point itself, or a coincident one: both are 0 away, so dropping the first is right.
+    # The nearest is the point itself or a coincident one. Both have distance 0, so the first can be dropped.
     positions = points.double().numpy()
     distances, _ = KDTree(positions).query(positions, k=np.arange(2, neighbors + 2))
     return torch.from_numpy(distances.mean(1)).float().clamp(min=MINIMUM_SCALE)
@@ -46,12 +49,15 @@ def init_gaussians(
     mask_columns: Mapping[str, Tensor] | None = None,
     buffers: Mapping[str, Tensor] | None = None,
 ) -> Rows:
-    """Isotropic Gaussians with random rotations (as in 3DGS), one per point; colors RGB in [0, 1], scales meters.
+    """Returns isotropic Gaussians with random rotations (as in 3DGS), one per point; RGB in [0, 1], scales in meters.
 
-    ``columns`` are further parameters of a node, ``mask_columns`` those that a mask learns, ``buffers`` what else is
-    known of each row.
+    ``columns`` are further parameters of a node, ``mask_columns`` those that a mask learns, ``buffers`` further data of
+    each row. Raises ValueError if an opacity is outside (0, 1) or the degree outside 0 to 3.
 
-    Raises ValueError if an opacity is outside (0, 1) or the degree outside 0 to 3.
+    >>> points, start = torch.rand(5, 3), {"opacities": torch.full((5,), 0.1), "sh_degree": 1}
+    >>> rows = init_gaussians(points, points, torch.ones(5), generator=torch.Generator(), **start)
+    >>> rows.sh_rest.shape
+    torch.Size([5, 3, 3])
     """
     if not bool(((opacities > 0) & (opacities < 1)).all()):
         raise ValueError(

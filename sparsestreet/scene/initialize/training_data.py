@@ -1,4 +1,4 @@
-"""What a node may look at when it starts: the part of a log that training sees."""
+"""The part of a log that training sees, from which nodes start."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,23 +11,23 @@ from sparsestreet.types import Track, View
 
 @dataclass(frozen=True)
 class TrainingData:
-    """A log seen through its split, and which of its objects move on their own."""
+    """The training part of a log, and the objects that nodes move."""
 
     log: DrivingLog
     frames: Frames
-    """Views to train on; pixels are read when one is indexed."""
+    """Views to train on; pixels are read when a view is indexed."""
     held_out: frozenset[int]
     """Integer frames whose sweeps and boxes must not be used."""
     tracks: tuple[Track, ...] = ()
-    """The objects that were assigned to the node that asks."""
+    """The objects that were assigned to the node that is built."""
     moving: tuple[Track, ...] = ()
-    """The objects of all nodes: what lies in their boxes belongs to no static node."""
+    """The objects of all nodes; points in their boxes belong to no static node."""
     image_points: StreetPoints | None = None
-    """Points triangulated from ``frames``; None where a run makes none."""
+    """Points triangulated from ``frames``; None if the run makes none."""
 
     @property
     def views(self) -> Sequence[View]:
-        """Cameras and times of the training views."""
+        """Cameras and times of the training views, without pixels."""
         return self.frames.views
 
     @property
@@ -37,5 +37,5 @@ class TrainingData:
 
     @property
     def sweeps(self) -> Sweeps:
-        """Lidar of the training instants; one is read when it is indexed."""
+        """Lidar of the training instants; a sweep is read when it is indexed."""
         return self.log.sweeps.where(lambda index: index not in self.held_out)

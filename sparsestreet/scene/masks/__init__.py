@@ -1,7 +1,7 @@
-"""Learnable masks: which Gaussians a scene can do without.
+"""Learnable masks that find the Gaussians which a scene can do without.
 
-``mask`` is what every mask answers; ``static`` one score per Gaussian, the same at all times; ``temporal`` one per
-Gaussian and time, by a network; ``baked`` what it leaves behind: a bit per Gaussian and training frame.
+``mask`` is the interface. ``static`` has one score per Gaussian for all times. ``temporal`` has a network that gives
+one score per Gaussian and time. ``baked`` is its result, a bit per Gaussian and training frame.
 """
 
 from sparsestreet.scene.masks.baked import BakedMask, BakedMaskSettings

@@ -1,4 +1,4 @@
-"""What a trained mask over time leaves behind: a bit per Gaussian and training frame, and no network."""
+"""The result of a trained mask over time: a bit per Gaussian and training frame, without the network."""
 
 from bisect import bisect_left
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ BITS = "mask_bits"
 
 @dataclass(frozen=True)
 class BakedMaskSettings:
-    """Nothing is left to choose."""
+    """Settings of a baked mask, which has no options."""
 
     def restored(self, times: Float[Tensor, " t"]) -> "BakedMask":
-        """The mask of a scene file, whose table has the bits."""
+        """Returns the mask of a scene file, whose table has the bits."""
         return BakedMask(times)
 
 
 class BakedMask(Mask):
     """M of every row at every training frame; between two frames a row shows if it shows at either.
 
-    Before the first and behind the last frame the nearest one counts.
+    Before the first and after the last frame the nearest one counts.
     """
 
     times: Tensor
@@ -36,7 +36,7 @@ class BakedMask(Mask):
     sparsity_weight = 0.0
 
     def __init__(self, times: Float[Tensor, " t"]) -> None:
-        """``times``: normalized, of the training frames, in order."""
+        """``times``: normalized times of the training frames, in order."""
         super().__init__()
         self.settings = BakedMaskSettings()
         self.register_buffer("times", times)
@@ -52,20 +52,20 @@ class BakedMask(Mask):
         return shown.to(rows.means.dtype)
 
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Nothing is learned any more."""
+        """Returns 0, because nothing is learned any more."""
         return rows.means.new_zeros(())
 
     def keep(self, rows: Rows) -> Selection:
-        """All: what shows at no time went when the mask was finished."""
+        """Keeps all rows. Those that never show were removed when the mask was finished."""
         everything = torch.ones(len(rows), dtype=torch.bool, device=rows.mask_bits.device)
         return keep_best(everything.float(), ~everything, 0)
 
     def finish(self, rows: Rows) -> tuple[Mask, dict[str, Tensor]]:
-        """It is finished."""
+        """Returns itself, because it is finished."""
         return self, {}
 
     def _frames_around(self, time: float) -> tuple[int, int]:
-        """The frame at a time, twice; or those before and after it."""
+        """Returns the frame at a time twice, or the frames before and after it."""
         times = self.times.tolist()
         after = bisect_left(times, time - TIME_TOLERANCE)
         if after == len(times):
@@ -75,7 +75,11 @@ class BakedMask(Mask):
 
 
 def packed(shown: Bool[Tensor, "n t"]) -> UInt8[Tensor, "n b"]:
-    """Eight frames a byte."""
+    """Returns the bits with eight frames a byte, the first frame in the lowest bit.
+
+    >>> packed(torch.tensor([[True, False, True]])).tolist()
+    [[5]]
+    """
     rows, frames = shown.shape
     width = -(-frames // 8)
     padded = torch.zeros(rows, 8 * width, dtype=torch.uint8, device=shown.device)

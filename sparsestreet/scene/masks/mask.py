@@ -1,4 +1,4 @@
-"""What every mask of a node answers."""
+"""The interface of a node's mask."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -13,69 +13,76 @@ from sparsestreet.scene.gaussians import Rows, Selection
 
 
 class Mask(nn.Module, ABC):
-    """Learned scores of one node's Gaussians: which of them show, and which stay.
+    """Learned scores that decide which of a node's Gaussians show, and which stay.
 
-    What a mask learns per Gaussian are columns of the node's table, so that they follow every RowPlan; what it learns
-    once (a network) are its own parameters.
+    What a mask learns per Gaussian is a column of the node's table, so it follows every RowPlan. What it learns once (a
+    network) is its own parameter.
     """
 
     columns: tuple[str, ...]
-    """Names of the columns that are the mask's; they are dropped when mask training ends."""
+    """Names of the mask's columns; they are dropped when mask training ends."""
     sparsity_weight: float
     """lambda_n of the paper."""
     floor_firings: int = 0
-    """How often K_min kept rows open that had fallen below the threshold, since somebody last asked."""
+    """Number of times that K_min kept rows open below the threshold, since the count was last read."""
 
     @abstractmethod
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
-        """The mask's columns for a table that is being made."""
+        """Returns the mask's columns for a new table."""
 
     @abstractmethod
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
-        """M in {0, 1} of every row at a normalized time, for opacity and scale, with a straight-through gradient."""
+        """Returns M in {0, 1} of every row at a normalized time, with a straight-through gradient.
+
+        Opacity and scale are multiplied by it.
+        """
 
     @abstractmethod
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Sum of the scores that the sparsity loss pushes down, in a view of ``time`` that draws the ``visible``."""
+        """Returns the sum of scores that the sparsity loss lowers; the view at ``time`` draws the ``visible`` rows."""
 
     @abstractmethod
     def keep(self, rows: Rows) -> Selection:
-        """Which rows are open at any time that training sees; never fewer than the node's K_min."""
+        """Selects the rows that are open at any training time, never fewer than the node's K_min."""
 
     @abstractmethod
     def finish(self, rows: Rows) -> "tuple[Mask | None, dict[str, Tensor]]":
-        """What stays of the mask when its training ends and the rows that ``keep`` closes are gone; None: M = 1.
+        """Returns the mask that remains after training, and the buffers of the table that it needs from then on.
 
-        And what it has to know of every row from then on: buffers of the table. What stays has no columns.
+        Called when the rows that ``keep`` closes are gone. None stands for M = 1. The remaining mask has no columns.
         """
 
 
 @dataclass(frozen=True)
 class MaskScope:
-    """Where and when the instances of a node are; a node without instances is one that is everywhere, always.
+    """Where and when the instances of a node are. A node without instances counts as one instance everywhere, always.
 
-    Rows belong to the instance that the buffer ``instances`` of their table names, or to the first without one.
+    Rows belong to the instance that the table's buffer ``instances`` names, or to the first instance without it.
     """
 
     times: Float[Tensor, "i k"]
-    """Normalized times of the training frames that show the instance, in order; anything where not valid."""
+    """Normalized times of the training frames that show the instance, in order; arbitrary where not valid."""
     valid: Bool[Tensor, "i k"]
-    """The valid ones come first; at least one each."""
+    """Whether a time is valid; the valid ones come first, at least one for each instance."""
     centers: Float[Tensor, "i 3"]
     half_sizes: Float[Tensor, "i 3"]
-    """Meters, in the frame of the rows: (mean - center) / half size lies in [-1, 1] for most rows."""
+    """Meters, in the frame of the rows; (mean - center) / half size lies in [-1, 1] for most rows."""
 
     @staticmethod
     def whole(times: Sequence[float], center: Float[Tensor, "3"], radius: float) -> "MaskScope":
-        """One instance that fills the scene and is seen at all training times."""
+        """Returns one instance that fills the scene and shows at all training times.
+
+        >>> MaskScope.whole([0.0, 0.5, 1.0], torch.zeros(3), radius=20.0).times.tolist()
+        [[0.0, 0.5, 1.0]]
+        """
         every = torch.tensor([list(times)], dtype=torch.float32)
         return MaskScope(every, torch.ones_like(every, dtype=torch.bool), center[None], torch.full((1, 3), radius))
 
 
 @runtime_checkable
 class MaskSettings(Protocol):
-    """What is configured of a mask."""
+    """The interface of a mask's settings."""
 
     def build(self, min_gaussians: int, scope: MaskScope) -> Mask:
-        """A mask that never leaves fewer rows open than ``min_gaussians``, the K_min of its node."""
+        """Returns a mask that never leaves fewer rows open than ``min_gaussians``, the K_min of its node."""
         ...

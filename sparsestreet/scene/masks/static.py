@@ -14,17 +14,17 @@ COLUMN = "mask_logits"
 
 @dataclass(frozen=True)
 class StaticMaskSettings:
-    """Raises ValueError for a negative weight or a threshold that is no value of a sigmoid."""
+    """Settings of a static mask. Raises ValueError for a negative weight or a threshold outside [0, 1)."""
 
     sparsity_weight: float
-    """lambda_n of the paper: how strongly the node's Gaussians are pushed out."""
+    """lambda_n of the paper: how strongly the sparsity loss lowers the scores of the node's Gaussians."""
     threshold: float = 0.01
-    """epsilon of the paper (value of Compact-3DGS, whose mask the paper repeats)."""
+    """epsilon of the paper (the value of Compact-3DGS, whose mask the paper uses)."""
     initial_logit: float = 1.0
     visible_only: bool = False
-    """True: the loss pushes a row only in views that draw it. Adam forgets the size of a gradient, so that with the
-    paper's sum over all rows one that few images see is pushed out between two visits, at any lambda; with this one
-    lambda is weighed against the image error. Rows that no image sees are then left to pruning."""
+    """True: the loss lowers a row's score only in views that draw the row. The paper sums over all rows. But Adam
+    ignores the size of a gradient, so this sum closes rows that few images show between two visits, at any lambda. With
+    visible rows only, lambda is weighed against the image error. Rows that no image shows are then left to pruning."""
 
     def __post_init__(self) -> None:
         if not self.sparsity_weight >= 0:
@@ -33,12 +33,18 @@ class StaticMaskSettings:
             raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
 
     def build(self, min_gaussians: int, scope: MaskScope | None = None) -> "StaticMask":
-        """``scope`` does not matter: the same at all times."""
+        """Returns the mask; ``scope`` has no effect, because the mask is the same at all times."""
         return StaticMask(self, min_gaussians)
 
 
 class StaticMask(Mask):
-    """sigma(m_k) > epsilon, with the logits m as the column ``mask_logits``."""
+    """sigma(m_k) > epsilon, with the logits m as the column ``mask_logits``.
+
+    >>> mask = StaticMaskSettings(sparsity_weight=0.01, threshold=0.5).build(min_gaussians=0)
+    >>> rows = Rows({"mask_logits": torch.tensor([2.0, -2.0])})
+    >>> mask.multipliers(rows, time=0.0).tolist(), mask.keep(rows).removed
+    ([1.0, 0.0], 1)
+    """
 
     columns = (COLUMN,)
 
@@ -52,12 +58,12 @@ class StaticMask(Mask):
         return {COLUMN: torch.full((num_rows,), self.settings.initial_logit, dtype=torch.float32)}
 
     def scores(self, rows: Rows) -> Float[Tensor, " n"]:
-        """sigma(m), float32 under any precision: in bfloat16 logits stop moving at -4.0, above the threshold."""
+        """Returns sigma(m) as float32, because bfloat16 logits stop moving at -4.0, above the threshold."""
         with torch.autocast(rows.mask_logits.device.type, enabled=False):
             return torch.sigmoid(rows.mask_logits.float())
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
-        """If fewer than K_min scores pass the threshold, the highest ones count as passing."""
+        """Returns M; if fewer than K_min scores pass the threshold, the highest ones count as passing."""
         scores = self.scores(rows)
         return straight_through(scores, self._effective_threshold(scores.detach()))
 
@@ -66,16 +72,16 @@ class StaticMask(Mask):
         return (scores * visible if self.settings.visible_only else scores).sum()
 
     def keep(self, rows: Rows) -> Selection:
-        # Compared in the scores' own dtype, as the multipliers are: both must agree on who is closed.
+        # Compare in the scores' own dtype, as the multipliers do: both must close the same rows.
         scores = self.scores(rows).detach()
         return keep_best(scores, scores <= self.settings.threshold, self.min_gaussians)
 
     def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
-        """Nothing: M = 1 for all rows that stayed."""
+        """Returns no mask: M = 1 for all rows that stayed."""
         return None, {}
 
     def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float:
-        """The threshold, lowered where needed so that K_min (or all) rows pass; ties all pass."""
+        """Returns the threshold, lowered if needed so that K_min (or all) rows pass; ties all pass."""
         rows, threshold = scores.shape[0], self.settings.threshold
         floor = min(self.min_gaussians, rows)
         if floor == 0 or int((scores > threshold).sum()) >= floor:
@@ -87,9 +93,13 @@ class StaticMask(Mask):
 
 
 def straight_through(scores: Float[Tensor, " n"], threshold: float | Float[Tensor, ""]) -> Float[Tensor, " n"]:
-    """1[score > threshold] forward, d/dscore = 1 backward (the paper's M_k; Bengio et al. 2013).
+    """Returns 1[score > threshold] forward, d/dscore = 1 backward (the paper's M_k; Bengio et al. 2013).
 
-    Scores are sigmoids already: no second one here.
+    Scores are sigmoids already, so this applies none.
+
+    >>> scores = torch.tensor([0.25, 0.75], requires_grad=True)
+    >>> straight_through(scores, 0.5).tolist()
+    [0.0, 1.0]
     """
     # score - score.detach() is exactly 0, so the product with a closed mask is exactly 0 in every dtype.
     hard = (scores > threshold).to(scores.dtype)

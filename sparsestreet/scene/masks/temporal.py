@@ -1,4 +1,4 @@
-"""A keep score for every Gaussian and time (the paper's mask of nodes that change their shape)."""
+"""A keep score for every Gaussian and time (the paper's mask for nodes that change their shape)."""
 
 import math
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from sparsestreet.scene.masks.static import straight_through
 FEATURES = "mask_features"
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
-"""Multiples of it, modulo 1, fill the unit interval evenly: the frames of successive steps."""
+"""Golden ratio - 1. Its multiples modulo 1 fill the unit interval evenly and choose the frames of successive steps."""
 
 _ALWAYS = -1.0
-"""Every score exceeds it."""
+"""A limit that every score exceeds."""
 
 _TIMES_AT_ONCE = 8
-"""Scores of all training frames are computed for so many frames at a time, to bound the memory."""
+"""Number of training frames whose scores are computed at once, to bound the memory."""
 
 
 @dataclass(frozen=True)
 class TemporalMaskSettings:
-    """Raises ValueError for a negative weight, a threshold that is no value of a sigmoid, or sizes below 1."""
+    """Settings of a temporal mask. Raises ValueError for a negative weight, or a threshold or sizes out of range."""
 
     sparsity_weight: float
     """lambda_n of the paper."""
@@ -34,19 +34,19 @@ class TemporalMaskSettings:
     """epsilon of the paper."""
     initial_logit: float = 1.0
     features: int = 8
-    """d of the paper: numbers that are learned of each Gaussian."""
+    """d of the paper: number of learned features of each Gaussian."""
     frames: int = 4
-    """T of the paper: training frames at which the loss looks in a step, beside the current one."""
+    """T of the paper: number of training frames in the loss of a step, in addition to the current one."""
     width: int = 64
-    """Of the two hidden layers."""
+    """Width of the two hidden layers."""
     octaves: int = 4
-    """Of the sines and cosines that encode time and position."""
+    """Number of octaves of the sines and cosines that encode time and position."""
     visible_only: bool = False
-    """True: the loss pushes a row only in views that draw it (see ``StaticMaskSettings``)."""
+    """True: the loss lowers a row's scores only in views that draw the row (see ``StaticMaskSettings``)."""
     image_closes: bool = True
-    """False: the image's gradient may only raise scores, so that nothing but the sparsity loss closes masks. What an
-    image asks of all rows alike (thinner limbs, say) otherwise runs away with the network, which is one for all: a
-    mask that is 0 or 1 cannot answer it, and closes people at most of their times."""
+    """False: the image's gradient may only raise scores, so only the sparsity loss closes masks. All rows share one
+    network. If the image asks the same of all rows (thinner limbs, say), a mask of 0 or 1 cannot provide it, and the
+    network closes people at most times."""
 
     def __post_init__(self) -> None:
         if not self.sparsity_weight >= 0:
@@ -67,8 +67,9 @@ class TemporalMask(Mask):
     """sigma(MLP(f_k, t, p_k)) > epsilon, with the features f as the column ``mask_features``.
 
     p is the mean in units of its instance's half size, without gradient; t and p are encoded by sines and cosines. The
-    network answers a logit: with a sigmoid at its end, as the paper writes it, and another one behind it no score would
-    be below 0.5. The first layer is a sum of what row and time bring, so that several times cost little more than one.
+    network returns a logit. The paper's formula ends the network with a sigmoid; a second sigmoid after it would keep
+    every score above 0.5. The first layer is a sum of a part for the row and a part for the time, so several times cost
+    little more than one.
     """
 
     settings: TemporalMaskSettings
@@ -95,17 +96,17 @@ class TemporalMask(Mask):
         nn.init.constant_(self.last.bias, settings.initial_logit)
         for name in ("times", "valid", "centers", "half_sizes"):
             self.register_buffer(name, getattr(scope, name))
-        # What a score must exceed now; ``keep`` lowers it where K_min holds.
+        # The limit that a score must exceed now; ``keep`` lowers it if K_min holds.
         self.register_buffer("limit", torch.tensor(settings.threshold))
         self.register_buffer("draws", torch.zeros((), dtype=torch.float64))
 
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
-        """Random features of a hundredth: rows in one place learn masks of their own."""
+        """Returns random features of standard deviation 0.01, so that rows in one place can learn different masks."""
         generator = torch.Generator().manual_seed(num_rows)
         return {FEATURES: 0.01 * torch.randn(num_rows, self.settings.features, generator=generator)}
 
     def scores(self, rows: Rows, times: Float[Tensor, "#n t"]) -> Float[Tensor, "n t"]:
-        """sigma of every row at its times, float32 under any precision."""
+        """Returns sigma of every row at its times, float32 under any precision."""
         with torch.autocast(rows.mask_features.device.type, enabled=False):
             of_row = self.of_row(torch.cat((rows.mask_features, self._encoded(self._places(rows))), dim=1))
             of_time = self.of_time(self._encoded(times[..., None]))
@@ -120,7 +121,7 @@ class TemporalMask(Mask):
         return multipliers
 
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Means over the current time and T training frames of the row's own instance, summed over the rows."""
+        """Returns the mean over the current time and T training frames of the row's instance, summed over rows."""
         drawn = self._drawn_frames()[_instances(rows)]
         now = drawn.new_full((len(rows), 1), time)
         scores = self.scores(rows, torch.cat((now, drawn), dim=1)).mean(1)
@@ -128,18 +129,21 @@ class TemporalMask(Mask):
 
     @torch.no_grad()
     def keep(self, rows: Rows) -> Selection:
-        """Rows that are open in any training frame of their instance. Where that were fewer than K_min the best of
-        the others stay, and the whole node shows at all times until scores have recovered."""
+        """Selects the rows that are open in any training frame of their instance.
+
+        If these are fewer than K_min, the best of the others stay too. Then the whole node shows at all times until the
+        scores have recovered.
+        """
         best = self._at_training_frames(rows).masked_fill(~self.valid[_instances(rows)], -1.0).amax(1)
         selection = keep_best(best, best <= self.settings.threshold, self.min_gaussians)
         self.floor_firings += selection.floor_hit
-        # At the floor nothing is masked: what it keeps would else show at the best of its times alone.
+        # At the floor nothing is masked: otherwise the rows that the floor keeps would show at their best times only.
         self.limit.fill_(_ALWAYS if selection.floor_hit else self.settings.threshold)
         return selection
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> tuple[BakedMask, dict[str, Tensor]]:
-        """A bit per row and training frame, of all instances together."""
+        """Returns a bit per row and training frame, over the training frames of all instances."""
         times = torch.unique(self.times[self.valid])
         chunks = [self.scores(rows, part[None].expand(1, -1)) > self.limit for part in times.split(_TIMES_AT_ONCE)]
         return BakedMask(times), {BITS: packed(torch.cat(chunks, dim=1))}
@@ -149,7 +153,7 @@ class TemporalMask(Mask):
         return torch.cat([self.scores(rows, part) for part in times.split(_TIMES_AT_ONCE, dim=1)], dim=1)
 
     def _drawn_frames(self) -> Float[Tensor, "i t"]:
-        """T training frames of every instance, spread over all of its own; others in every step."""
+        """Returns T training frames of every instance, spread evenly over its frames, different ones in every step."""
         self.draws += 1
         spread = torch.arange(self.settings.frames, device=self.times.device) / max(self.settings.frames, 1)
         places = (spread + self.draws * _GOLDEN) % 1.0
@@ -161,7 +165,7 @@ class TemporalMask(Mask):
         return (rows.means.detach() - self.centers[instances]) / self.half_sizes[instances]
 
     def _encoded(self, values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b e"]:
-        """The values, and sine and cosine of pi, 2 pi, 4 pi ... times them."""
+        """Returns the values, and sine and cosine of pi, 2 pi, 4 pi ... times them."""
         octaves = [math.pi * 2**octave * values for octave in range(self.settings.octaves)]
         return torch.cat([values, *map(torch.sin, octaves), *map(torch.cos, octaves)], dim=-1)
 

@@ -23,11 +23,15 @@ from sparsestreet.types import View
 _log = logging.getLogger(__name__)
 
 _EXTREMES = (Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0))
-"""All is near the lidar, all is near points from images, all is near neither; linear shares are largest at one."""
+"""Everything is near lidar, near points from images, or near neither. Linear shares are largest at one of these."""
 
 
 def usual_sources() -> dict[str, PointSource]:
-    """The lidar, images, and guesses where neither sees anything; as in conf/source."""
+    """Returns the sources of conf/source: lidar, images, and guesses where neither sees anything.
+
+    >>> list(usual_sources())
+    ['lidar', 'images', 'near', 'far']
+    """
     return {
         "lidar": LidarPoints(),
         "images": ImagePoints(initial_opacity=0.5),
@@ -38,15 +42,15 @@ def usual_sources() -> dict[str, PointSource]:
 
 @dataclass(frozen=True, kw_only=True)
 class BackgroundSettings(NodeSettings):
-    """Starts from what its sources give.
+    """Settings of a background that starts from the points of its sources.
 
     Raises ValueError for limits that contradict each other, and for sources that ask for more than all points.
     """
 
     num_points: int = 40_000
-    """Of all sources together, at most; each is asked for its share, by what the training images show."""
+    """Largest number of points of all sources together. The coverage of the training images sets each one's share."""
     sources: Mapping[str, PointSource] = field(default_factory=usual_sources)
-    """Each draws from its own stream, so a change of one leaves the points of the others as they are."""
+    """Name -> source of points. Each draws from its own stream, so changing one leaves the points of the others."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,7 +74,7 @@ class BackgroundSettings(NodeSettings):
         return Background(self, *self.start_from(self.seeds(data, generator), data, generator))
 
     def seeds(self, data: TrainingData, generator: torch.Generator) -> Seeds:
-        """What the sources give. Raises ValueError if there is not a single point."""
+        """Returns the points of the sources. Raises ValueError if there is not a single point."""
         seen = coverage(data)
         drawn = {
             name: source.draw(
@@ -100,7 +104,7 @@ class BackgroundSettings(NodeSettings):
         generator: torch.Generator,
         columns: Mapping[str, Tensor] | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """``start`` with the scales, meters, that seeds and their neighbors allow."""
+        """Calls ``start`` with the scales, meters, that seeds and their neighbors allow."""
         scales = neighbor_scales(seeds.points.positions).clamp(seeds.smallest, seeds.largest)
         return self.start(data, seeds.points, scales, seeds.opacities, generator, columns=columns)
 
@@ -109,8 +113,8 @@ class BackgroundSettings(NodeSettings):
 
 
 class Background(Node):
-    """Static Gaussians; their rows are in the world frame already."""
+    """Static Gaussians, whose rows are in the world frame."""
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """The same Gaussians in every view, but for the mask."""
+        """Returns the same Gaussians for every view, except for the mask."""
         return self.stored(view)

@@ -19,26 +19,26 @@ from sparsestreet.types import View
 
 @dataclass(frozen=True, kw_only=True)
 class DeformableSettings(TrackedSettings):
-    """As ``TrackedSettings``, and how the objects are deformed."""
+    """``TrackedSettings`` with options of the deformation."""
 
     network: NetworkSettings = field(default_factory=lambda: NetworkSettings(scales=False))
     features: int = 16
-    """Numbers that are learned of each instance, for the network that all of them share."""
+    """Number of learned features of each instance, for the network that all instances share."""
     deform_from: float = 0.1
-    """Fraction of the run from which rows are deformed: first there must be something to deform."""
+    """Fraction of the run from which rows are deformed; before, the rows take shape without a network."""
     detach_means: bool = True
-    """From then on rows keep their place in the box, and only the network moves them (DriveStudio)."""
+    """Whether rows then keep their place in the box and only the network moves them, as in DriveStudio."""
     refine_boxes: bool = True
-    """Whether the annotated poses are corrected. DriveStudio means to, and does not."""
+    """Whether the annotated poses are corrected. DriveStudio intends to, but does not."""
     outside_weight: float = 1.0
-    """Of the regularizer: meters by which the coordinates of deformed rows lie outside their box, on average."""
+    """Weight of the regularizer: mean distance, meters, by which coordinates of deformed rows lie outside their box."""
 
     @property
     def node_class(self) -> "type[Deformable]":
         return Deformable
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Deformable | None":
-        """Boxes of frames without training image (held out, or outside the training range) are not used."""
+        """Builds the node without boxes of frames that have no training image (held out, or outside the range)."""
         node = super().build(data, generator)
         if node is not None:
             node.start_network(generator.initial_seed())
@@ -46,26 +46,25 @@ class DeformableSettings(TrackedSettings):
 
 
 class Deformable(Tracked):
-    """Rows in their boxes that one network deforms, by place, time and instance; ``embeddings`` [i, f] tell the
-    instances apart."""
+    """Rows in their boxes that one network deforms by place, time and the ``embeddings`` [i, f] of their instance."""
 
     settings: DeformableSettings
 
     def __init__(self, *args: Any, **keywords: Any) -> None:
-        """Takes what ``Tracked`` takes; the network starts from seed 0."""
+        """Takes the arguments of ``Tracked``; the network starts from seed 0."""
         super().__init__(*args, **keywords)
         for corrections in (self.rotation_deltas, self.translation_deltas):
             corrections.requires_grad_(self.settings.refine_boxes)
         self.start_network(0)
 
     def start_network(self, seed: int) -> None:
-        """Weights and embeddings, uniform in [0, 1), of a seed's own stream."""
+        """Draws weights, and embeddings uniform in [0, 1), from the seed's own stream."""
         features, generator = self.settings.features, torch.Generator().manual_seed(seed)
         self.embeddings = nn.Parameter(torch.rand(len(self.names), features, generator=generator).to(self.sizes))
         self.network = DeformationNetwork(self.settings.network, features, seed).to(self.sizes)
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Every instance's Gaussians, deformed and at its pose; opacity exactly 0 where the instance is absent."""
+        """Returns every instance's Gaussians, deformed and at its pose; opacity is exactly 0 if it is absent."""
         placed = self.placed(view)
         if state.progress < self.settings.deform_from:
             return placed
@@ -83,7 +82,7 @@ class Deformable(Tracked):
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """``out_of_box`` in place of a cull: arms and legs may leave a box for a moment."""
+        """Returns ``out_of_box``, which replaces a cull because arms and legs may leave a box for a moment."""
         beyond = torch.relu(raw.means.abs() - self.sizes.index_select(0, self.rows.instances) / 2)
         return {"out_of_box": self.settings.outside_weight * beyond.sum() / max(beyond.numel(), 1)}
 

@@ -1,4 +1,4 @@
-"""A whole street that one network deforms over time (Deformable 3DGS, Yang et al. 2024): what moves needs no box."""
+"""A whole street that one network deforms over time (Deformable 3DGS, Yang et al. 2024). Moving objects need no box."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -22,26 +22,26 @@ from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
 
 _MARGIN = 0.25
-"""Of the image size, for what lenses and shutters show beyond the image of a pinhole."""
+"""Fraction of the image size that lenses and shutters may show beyond the image of a pinhole."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FieldSettings(BackgroundSettings):
-    """Starts from the points of a background.
+    """Settings of a field that starts from the points of a background.
 
-    Raises ValueError for a reach that cannot be.
+    Raises ValueError for an impossible reach.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
     deform_from: float = 0.1
-    """Fraction of the run from which rows are deformed: first there must be something to deform."""
+    """Fraction of the run from which rows are deformed; before, the rows take shape without a network."""
     time_noise: float = 0.1
-    """Standard deviation of the time that a training step shows the network, in frames; falls linearly to 0."""
+    """Standard deviation, in frames, of noise on the time that the network sees in training; falls linearly to 0."""
     time_noise_until: float = 0.667
-    """Fraction of the run at which it is 0."""
+    """Fraction of the run at which the noise reaches 0."""
     reach: float | None = 5.0
-    """Meters; rows of which the view would see nothing if they came nearer by so much are left as they are, because the
-    network is most of the cost. None: all rows are deformed (and no GPU waits for their number)."""
+    """Meters. A row that the view could not see even if it came nearer by this distance stays undeformed, because the
+    network is most of the cost. None: all rows are deformed, and no GPU waits for their number."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,7 +67,7 @@ class FieldSettings(BackgroundSettings):
 
 
 class Field(Node):
-    """Canonical rows in the world, and the network that moves, turns and scales them."""
+    """Canonical rows in the world frame, and the network that moves, turns and scales them."""
 
     settings: FieldSettings
     center: Tensor
@@ -83,8 +83,8 @@ class Field(Node):
         seed: int = 0,
         mask: Mask | None = None,
     ) -> None:
-        """``center`` and ``radius`` of the scene, meters, are the ball in which the network's positions are linear;
-        ``seed`` is that of weights and noise."""
+        """``center`` and ``radius``, meters, are the ball of the scene in which the network's positions are linear;
+        ``seed`` is the seed of weights and noise."""
         super().__init__(settings, rows, mask)
         self.radius = radius
         self.num_frames = num_frames
@@ -93,7 +93,7 @@ class Field(Node):
         self.network = DeformationNetwork(settings.network, seed=seed)
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """The rows in or near the view deformed, the others as they are."""
+        """Returns all rows; those in or near the view are deformed."""
         stored = self.stored(view)
         if state.progress < self.settings.deform_from:
             return stored
@@ -123,7 +123,7 @@ class Field(Node):
 
     @torch.no_grad()
     def _near(self, view: View) -> Int[Tensor, " k"] | None:
-        """Rows that the view may see once they are deformed; a row ends three standard deviations from its center."""
+        """Returns the rows that the view may see once deformed; a row ends three standard deviations from its center."""
         if self.settings.reach is None:
             return None
         sizes = 3 * self.rows.log_scales.amax(1).exp()
@@ -131,13 +131,13 @@ class Field(Node):
         return torch.nonzero(distances < sizes + self.settings.reach).squeeze(1)
 
     def _contracted(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """The ball of the scene as [0.25, 0.75] in each direction, everything beyond it within [0, 1]."""
+        """Maps the ball of the scene to [0.25, 0.75] in each direction, and everything beyond it into [0, 1]."""
         scaled = (positions - self.center) / self.radius
         lengths = scaled.norm(dim=1, keepdim=True).clamp(min=1.0)
         return scaled * (2 - 1 / lengths) / lengths / 4 + 0.5
 
     def _time_noise(self, state: SceneState) -> float:
-        """From the step alone, so that a resumed run draws what the uninterrupted one does."""
+        """Returns noise that depends on the step alone, so a resumed run draws the same as an uninterrupted one."""
         settings = self.settings
         left = max(1 - state.progress / settings.time_noise_until, 0.0) if settings.time_noise_until > 0 else 0.0
         normal = torch.randn((), generator=named_generator(self.seed, f"time noise {state.progress}")).item()

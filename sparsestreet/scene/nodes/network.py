@@ -1,4 +1,4 @@
-"""A network that says how each Gaussian of a node is deformed at a time (Deformable 3DGS, Yang et al. 2024)."""
+"""A network that deforms each Gaussian of a node at a time (Deformable 3DGS, Yang et al. 2024)."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """Sizes of a deformation network; the defaults are DriveStudio's. Raises ValueError for sizes that cannot be."""
+    """Sizes of a deformation network; the defaults are DriveStudio's. Raises ValueError for impossible sizes."""
 
     width: int = 256
     depth: int = 8
-    """Hidden layers."""
+    """Number of hidden layers."""
     skip: int = 5
-    """Behind this layer the inputs come again; 0: nowhere."""
+    """The inputs are added again after this layer; 0: nowhere."""
     position_octaves: int = 10
-    """Of the sines and cosines that encode a position: wavelengths of 2 pi, pi, pi / 2 ..."""
+    """Number of octaves of sines and cosines that encode a position: wavelengths 2 pi, pi, pi / 2 ..."""
     time_octaves: int = 10
     scales: bool = True
-    """Whether scales are deformed too."""
+    """Whether the network deforms scales too."""
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.depth < 1 or min(self.position_octaves, self.time_octaves) < 0:
@@ -37,28 +37,32 @@ class NetworkSettings:
 
 @dataclass(frozen=True)
 class Deformation:
-    """What is added to the rows."""
+    """The values that are added to the rows."""
 
     means: Float[Tensor, "n 3"]
     quaternions: Float[Tensor, "n 4"]
-    """To quaternions of unit length."""
+    """Added to quaternions of unit length."""
     log_scales: Float[Tensor, "n 3"] | None
     """None: the scales stay."""
 
 
 class DeformationNetwork(nn.Module):
-    """(position, time, what is learned of the instance) -> Deformation, all rows at once, zero at the start.
+    """A network (position, time, features of the instance) -> Deformation for all rows at once, zero at the start.
 
-    A layer that sees the inputs is a sum of what the row and what the instant brings: time and instance are the same
-    for many rows, so that their part is computed once for each instance.
+    A layer that sees the inputs sums a part for the row and a part for the instant. Many rows share time and instance,
+    so the latter part is computed once for each instance.
+
+    >>> network = DeformationNetwork(NetworkSettings(width=8, depth=2, skip=1))
+    >>> network(torch.rand(5, 3), time=0.5).means.abs().max().item()
+    0.0
     """
 
     def __init__(self, settings: NetworkSettings, features: int = 0, seed: int = 0) -> None:
-        """``features`` are numbers that are learned of an instance; ``seed`` is that of the weights."""
+        """``features``: number of learned features of an instance; ``seed``: seed of the weights."""
         super().__init__()
         self.settings = settings
         width = settings.width
-        # Weights of its own stream, whatever else was drawn.
+        # Draw weights from their own stream, so that other draws do not change them.
         with torch.random.fork_rng(devices=()):
             torch.default_generator.manual_seed(seed)
             self.first = _Inputs(settings, features)
@@ -75,7 +79,7 @@ class DeformationNetwork(nn.Module):
         features: Float[Tensor, "i f"] | None = None,
         instances: Int[Tensor, " n"] | None = None,
     ) -> Deformation:
-        """``features`` of the instances and the instance of each row, or neither."""
+        """Takes ``features`` of the instances and the instance of each row, or neither."""
         rows = encoded(positions, self.settings.position_octaves)
         instants = encoded(positions.new_full((1, 1), time), self.settings.time_octaves)
         if features is not None:
@@ -91,7 +95,7 @@ class DeformationNetwork(nn.Module):
 
 
 class _Inputs(nn.Module):
-    """The part of a layer that sees the inputs: one linear layer of them all, computed in two parts."""
+    """The part of a layer that sees the inputs: one linear layer of all inputs, computed in two parts."""
 
     def __init__(self, settings: NetworkSettings, features: int) -> None:
         super().__init__()
@@ -100,14 +104,18 @@ class _Inputs(nn.Module):
 
     def forward(self, rows: Tensor, instants: Tensor, instances: Tensor | None) -> Tensor:
         if instances is None:
-            # One instant for all rows is a bias.
+            # A single instant for all rows acts as a bias.
             bias = self.of_row.bias + self.of_instant(instants)[0]
             return nn.functional.linear(rows, self.of_row.weight, bias)
         return self.of_row(rows) + self.of_instant(instants).index_select(0, instances)
 
 
 def encoded(values: Float[Tensor, "n c"], octaves: int) -> Float[Tensor, "n e"]:
-    """The values, and sines and cosines of 1, 2, 4 ... times them, each octave from the one before."""
+    """Returns the values, and sines and cosines of 1, 2, 4 ... times them; each octave is computed from the last.
+
+    >>> encoded(torch.zeros(1, 1), octaves=2).tolist()
+    [[0.0, 0.0, 1.0, 0.0, 1.0]]
+    """
     parts = [values]
     for octave in range(octaves):
         if octave == 0:

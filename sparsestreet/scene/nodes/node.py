@@ -24,12 +24,12 @@ from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Gaussians, Track, View
 
 BYTES_PER_NUMBER = 4
-"""Sizes are stated as float32, whatever precision a test or an optimizer holds them in."""
+"""Sizes are stated as float32, even if a test or an optimizer holds another precision."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NodeSettings(ABC):
-    """Everything that is said about one node class; callbacks, losses and rules read it here and nowhere else.
+    """All settings of one node class; callbacks, losses and rules read them here and nowhere else.
 
     Raises ValueError for limits that contradict each other.
     """
@@ -37,34 +37,34 @@ class NodeSettings(ABC):
     classes: Sequence[str] = ()
     """Class names of the log whose tracks the node takes."""
     min_path_length: float = 0.0
-    """Meters; a track that travels no farther is left to the static nodes."""
+    """Meters; tracks that travel no farther are left to the static nodes."""
     has_body_pose: bool | None = None
-    """True: only tracks that come with body poses; False: only those without; None: both."""
+    """True: the node takes only tracks with body poses; False: only tracks without; None: both."""
     min_gaussians: int = 0
     """K_min of the paper: neither masks nor pruning leave fewer Gaussians in the node class."""
     min_instance_gaussians: float = 0.0
-    """What pruning leaves of each object: so many Gaussians per 1,000 pixels that it fills in the training view that
-    shows it largest, or all that it has."""
+    """Least number of Gaussians that pruning leaves of each object, per 1,000 pixels that it fills in the training view
+    that shows it largest. An object that has fewer keeps all."""
     max_gaussians: int | None = None
     """Density control stops here; None: no limit."""
     sh_degree: int = 3
     mask: MaskSettings | None = None
-    """None: this node knows no mask."""
+    """None: the node has no mask."""
     masked: bool = True
     """Whether the mask, if there is one, is trained in this run."""
     density: DensityStrategy | None = None
-    """None: the node keeps the Gaussians it starts with."""
+    """None: density control never changes the node."""
     densify_until: float | None = None
-    """Fraction of the run after which none are added any more; None: the schedule says."""
+    """Fraction of the run after which no Gaussians are added; None: the schedule decides."""
     prunable: bool = True
-    """Whether pruning rules may take Gaussians of this node."""
+    """Whether pruning rules may remove Gaussians of this node."""
     sharp_shape: float = 0.0
-    """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: it is not computed."""
+    """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: the term is not computed."""
     max_axis_ratio: float = 10.0
-    """Ratio of a Gaussian's longest to its shortest axis from which that term counts."""
+    """Ratio of a Gaussian's longest to its shortest axis above which that term counts."""
     learning_rates: Rates = field(default_factory=usual_rates)
-    """Column, parameter or module of the node -> its rate; the longest name that matches wins. A mapping of its fields
-    is taken for a rate and becomes one."""
+    """Column, parameter or module of the node -> its rate; the longest name that matches wins. A mapping of a rate's
+    fields becomes a rate."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "learning_rates", rates_of(self.learning_rates))
@@ -99,11 +99,11 @@ class NodeSettings(ABC):
 
     @abstractmethod
     def build(self, data: TrainingData, generator: torch.Generator) -> "Node | None":
-        """Make the node from what training may see; None where it would have no instance."""
+        """Makes the node from training data; returns None if it would have no instance."""
 
     @abstractmethod
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Node":
-        """The node of a scene file: its table, all its tensors by name, and what ``Node.header`` said."""
+        """Returns the node of a scene file from its table, all its tensors by name, and its ``Node.header``."""
 
     def start(
         self,
@@ -117,10 +117,11 @@ class NodeSettings(ABC):
         buffers: Mapping[str, Tensor] | None = None,
         scope: MaskScope | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """The table of a node that begins, one Gaussian a point, and its mask.
+        """Returns the table of a new node, one Gaussian a point, and its mask.
 
-        ``scales`` are meters, ``opacities`` in (0, 1); ``columns`` are learned beside those of every node, ``buffers``
-        what else is known of each row; ``scope`` where and when the mask's instances are, None: everywhere, always.
+        ``scales`` are meters, ``opacities`` lie in (0, 1). ``columns`` are learned in addition to those of every node;
+        ``buffers`` are further data of each row. ``scope`` says where and when the mask's instances are (None:
+        everywhere, always).
         """
         if scope is None:
             scope = MaskScope.whole(data.times, data.log.center, data.log.radius)
@@ -151,7 +152,7 @@ class Instances:
     """Length, width, height of their boxes, meters."""
 
     def counts(self) -> Int[Tensor, " i"]:
-        """Number of rows of every instance."""
+        """Returns the number of rows of every instance."""
         return torch.bincount(self.ids, minlength=len(self.names))
 
 
@@ -159,9 +160,9 @@ class Node(nn.Module, ABC):
     """One node class: a table of Gaussians with an optional mask.
 
     The rows hold ``means``, ``log_scales``, ``quaternions``, ``opacity_logits``, ``sh_dc`` [n, 1, 3],
-    ``sh_rest`` [n, k - 1, 3] and, while a mask is being trained, the mask's columns. They stay unmasked: only
-    activation applies the mask, so densification, culling and regularizers see what the mask hides
-    (a scale of 0 has no logarithm and no ratio).
+    ``sh_rest`` [n, k - 1, 3] and, while a mask is being trained, the mask's columns. They stay unmasked, because a
+    scale of 0 has no logarithm and no ratio. Only activation applies the mask, so densification, culling and
+    regularizers see the hidden rows.
     """
 
     settings: NodeSettings
@@ -182,55 +183,55 @@ class Node(nn.Module, ABC):
 
     @abstractmethod
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """The node's Gaussians as a view sees them, before activation, and how they are masked and placed.
+        """Returns the node's Gaussians in a view before activation, and how they are masked and placed.
 
-        A view without frame and camera index is a novel one: it is answered from its time alone.
+        A view without frame and camera index is novel, and only its time counts.
         """
 
     def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
-        """The node's Gaussians in the world, activated, with the mask applied."""
+        """Returns the node's Gaussians in the world, activated, with the mask applied."""
         return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)
 
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Terms of the loss that concern the node alone, by name, each with its weight.
+        """Returns terms of the loss that concern only the node, by name, each with its weight.
 
-        ``raw`` is what the node answered for the view of this step, so that nothing need be computed twice. ``drawn``:
-        rows that the view shows. A term that always pulls, at all rows, wins over the image at those that few views
-        show: Adam steps by its learning rate however small a lone gradient is.
+        ``raw`` is what the node returned for the view of this step, so nothing is computed twice. ``drawn`` are the
+        rows that the view shows. A term that pulls at all rows in every step beats the image at rows that few views
+        show, because Adam steps by its learning rate however small a lone gradient is.
         """
         return {}
 
     def regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """``regularizers``, and the terms that every node has whose settings give them a weight."""
+        """Returns the node's own terms, and those of every node that have a weight in the settings."""
         settings = self.settings
         shape = {}
         if settings.sharp_shape > 0:
-            # The mask is applied at activation: what it hides has its shape here.
+            # Activation applies the mask, so hidden Gaussians still have their shape here.
             shape["sharp_shape"] = settings.sharp_shape * sharp_shape(self.rows.log_scales, settings.max_axis_ratio)
         return shape | self.own_regularizers(raw, drawn, state)
 
     def outside(self) -> Bool[Tensor, " n"] | None:
-        """Rows that left the bounds of their instance; None for a node without bounds."""
+        """Returns whether each row left the bounds of its instance; None for a node without bounds."""
         return None
 
     def instances(self) -> Instances | None:
-        """The node's objects; None for a node that is no collection of objects."""
+        """Returns the node's objects; None for a node without objects."""
         return None
 
     def header(self) -> dict[str, Any]:
-        """What a scene file has to know beside settings and tensors; JSON values only."""
+        """Returns what a scene file needs in addition to settings and tensors; JSON values only."""
         return {}
 
     def pose_bytes(self) -> int:
-        """float32 bytes of what moves the rows over time; 0 for a node that stands still."""
+        """Returns the float32 bytes of what moves the rows over time; 0 for a static node."""
         return 0
 
     def stored(self, view: View) -> RawGaussians:
-        """The rows as they are learned, with the mask as it is at the time of a view."""
+        """Returns the learned rows, with the mask at the time of a view."""
         rows = self.rows
         return RawGaussians(
             rows.means,
@@ -243,9 +244,9 @@ class Node(nn.Module, ABC):
         )
 
     def finish_mask(self, optimizer: Optimizer | None = None) -> None:
-        """The mask has done its work: what it learned goes, from the optimizer too, and what it says stays is left.
+        """Replaces the mask by its result, and removes what it learned from the table and the optimizer.
 
-        A node whose mask is finished already, or that has none, stays as it is.
+        A node without a mask, or with a finished one, stays unchanged.
         """
         if self.mask is None or not self.mask.columns:
             return
@@ -259,14 +260,14 @@ class Node(nn.Module, ABC):
             self.rows.register_buffer(name, values)
 
     def row_bytes(self) -> int:
-        """float32 bytes of the rows without their masks (an instance number counts as one number; bits are packed)."""
+        """Returns the float32 bytes of the rows without their masks; an instance id is one number, bits are packed."""
         columns = self.rows.columns()
         return sum(_bytes(columns[name]) for name in columns.keys() - self.rows.transient)
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        """A checkpoint from after the mask stage comes without the mask's columns: then the mask is finished here too.
+        """Finishes the mask first if the checkpoint lacks the mask's columns, because it is from after the mask stage.
 
-        Its rows are those of the start still; what they say is replaced by what the checkpoint says.
+        The buffers of the finished mask come from the initial rows; the checkpoint then replaces them.
         """
         if self.mask is not None and not any(f"{prefix}rows.{name}" in state_dict for name in self.mask.columns):
             self.finish_mask()

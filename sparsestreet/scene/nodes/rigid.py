@@ -14,10 +14,10 @@ from sparsestreet.types import View
 
 @dataclass(frozen=True, kw_only=True)
 class RigidSettings(TrackedSettings):
-    """As ``TrackedSettings``, and how far a Gaussian may leave its box."""
+    """``TrackedSettings`` with the distance by which a Gaussian may leave its box."""
 
     box_margin: float = 0.1
-    """Meters by which a row's center may lie outside its box: annotated boxes are about this tight."""
+    """Meters by which a row's center may lie outside its box; annotated boxes are about this tight."""
 
     @property
     def node_class(self) -> "type[Rigid]":
@@ -30,9 +30,9 @@ class Rigid(Tracked):
     settings: RigidSettings
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Every instance's Gaussians at its pose; opacity exactly 0 where the instance is absent."""
+        """Returns every instance's Gaussians at its pose; opacity is exactly 0 if the instance is absent."""
         return self.placed(view)
 
     def outside(self) -> Bool[Tensor, " n"]:
-        """Rows whose center left its box by more than ``box_margin``."""
+        """Returns whether each row's center left its box by more than ``box_margin``."""
         return outside_boxes(self.rows.means, self.rows.instances, self.sizes, margin=self.settings.box_margin)

@@ -31,28 +31,28 @@ from sparsestreet.types import Track, View
 _log = logging.getLogger(__name__)
 
 _COLORED_BY = 4
-"""Measured points that give a vertex its first color."""
+"""Number of measured points that give a vertex its first color."""
 
 _APART = 100.0
-"""Meters between people when neighbors are looked for: nobody's neighbor is on somebody else."""
+"""Meters between people in the search for neighbors, so that no neighbor is on another person."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmplSettings(TrackedSettings):
-    """Starts with one Gaussian at each vertex of a body, in the color of what was measured near it in the box."""
+    """Settings of people, who start with a Gaussian at each vertex, in the color of points measured near it."""
 
     has_body_pose: bool | None = True
     initial_opacity: float = 0.99
     body: Body = field(default_factory=BuiltinBody)
-    """The surface, and which joints move it."""
+    """The surface, and the joints that move it."""
     neighbors: int = 3
-    """K: a Gaussian and those next to it on the body should be alike."""
+    """K: number of neighboring Gaussians on the body, itself included, that should be alike."""
     neighbor_weight: float = 1.0e-3
-    """Of the mean spread among neighbors, for each of rotations, scales, opacities and harmonics."""
+    """Weight of the mean spread among neighbors, for each of rotations, scales, opacities and harmonics."""
     scale_weight: float = 0.05
-    """Of the mean squared longest axis, square meters."""
+    """Weight of the mean squared longest axis, square meters."""
     smoothness_weight: float = 0.0
-    """Of how far joints, as unit quaternions, are from the middle between the keyframes before and after."""
+    """Weight of the distance of joints, as unit quaternions, from the middle of the keyframes before and after."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,7 +68,7 @@ class SmplSettings(TrackedSettings):
         return Smpl
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Smpl | None":
-        """A person without a pose in a training frame is left out, and the program's log says so."""
+        """Builds the node without people who have no pose in a training frame; a warning counts them."""
         tracks = [track for track in data.tracks if bool(trained_poses(track, data.held_out).any())]
         if len(tracks) < len(data.tracks):
             _log.warning("%d people have no pose in a training frame and are left out", len(data.tracks) - len(tracks))
@@ -104,7 +104,7 @@ class SmplSettings(TrackedSettings):
         people: People,
         generator: torch.Generator,
     ) -> tuple[Rows, Mask | None]:
-        """Discs along the surface, each as large as the part of it that belongs to its vertex, and half as thick."""
+        """Starts with discs along the surface, each as large as its vertex's part of it, and half as thick."""
         count, per_person = people.vertices.shape[:2]
         surfaces = [surface(vertices, template.faces) for vertices in people.vertices]
         areas, normals = (torch.cat(parts) for parts in zip(*surfaces, strict=True))
@@ -129,9 +129,9 @@ class SmplSettings(TrackedSettings):
 
 
 def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "i v 3"]) -> Float[Tensor, "n 3"]:
-    """Of each vertex the mean color of the measured points of its box that are nearest to it; gray without any.
+    """Returns for each vertex the mean color of the nearest measured points of its box; gray without any.
 
-    Measured are returns and points from images, pooled over all frames: limbs swing about where they are on average.
+    Measured points are returns and points from images, pooled over all frames; limbs swing about their mean places.
     """
     colors = []
     for track, returns, vertices in zip(tracks, lidar_in_boxes(tracks, data.sweeps), places, strict=True):
@@ -152,9 +152,9 @@ def _measured(found: TriangulatedPoints) -> Points:
 
 
 def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """The shortest turn that takes the z axis to each unit direction."""
+    """Returns the shortest rotation that takes the z axis to each unit direction."""
     x, y, z = directions.unbind(1)
-    # Half of the turn lies between the axis and the direction; straight down any axis will do.
+    # Half of the turn lies between the axis and the direction; straight down, any axis works.
     turn = torch.stack((1 + z, -y, x, torch.zeros_like(z)), 1)
     down = torch.tensor([0.0, 1.0, 0.0, 0.0])
     return quat.normalized(torch.where((z < -0.9999)[:, None], down, turn))
@@ -162,17 +162,17 @@ def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
 
 @dataclass(frozen=True)
 class Anatomy:
-    """What moves v vertices of i people, with k keyframes each."""
+    """The data that move v vertices of i people, with k keyframes each."""
 
     vertices: Float[Tensor, "v 3"]
-    """Of the template at rest: who is whose neighbor."""
+    """Vertices of the template at rest, which define neighbors."""
     attached: Int[Tensor, "v m"]
-    """The joints that move a vertex."""
+    """Joints that move each vertex."""
     weights: Float[Tensor, "v m"]
     joints: Float[Tensor, "i 24 3"]
-    """At rest, about the pelvis, meters."""
+    """Joints at rest, relative to the pelvis, meters."""
     keyframes: Float[Tensor, "i k 23 4"]
-    """Rotations of the joints but the pelvis relative to their parents."""
+    """Rotations of all joints but the pelvis, relative to their parents."""
 
     @staticmethod
     def of(template: BodyTemplate, people: People) -> "Anatomy":
@@ -180,7 +180,7 @@ class Anatomy:
 
 
 class Smpl(Tracked):
-    """Rows at rest about their person's pelvis; the skeleton moves them, and the pose of the pelvis places them.
+    """Rows at rest, relative to their person's pelvis. The skeleton moves them; the pose of the pelvis places them.
 
     Poses of the pelvis are those of ``Tracked``. The other joints have keyframes at the same times, with learned
     corrections as rotation vectors, zero at the start.
@@ -205,7 +205,7 @@ class Smpl(Tracked):
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
-        """As ``Tracked``; rows have the buffer ``vertex_ids`` [n] int64 too: their vertex of the template."""
+        """Takes the arguments of ``Tracked``; rows also have the buffer ``vertex_ids`` [n] int64, template vertices."""
         super().__init__(settings, rows, keyframes, sizes, names=names, max_gap=max_gap, mask=mask)
         self.register_buffer("vertices", anatomy.vertices)
         self.register_buffer("attached", anatomy.attached)
@@ -213,11 +213,11 @@ class Smpl(Tracked):
         self.register_buffer("joints", anatomy.joints)
         self.register_buffer("joint_keyframes", anatomy.keyframes)
         self.joint_deltas = nn.Parameter(torch.zeros_like(anatomy.keyframes[..., 1:]))
-        # Of which vertices, and the rows next to each.
+        # The vertices of the last search, and the rows next to each.
         self._neighbors: tuple[Tensor, Tensor] | None = None
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Every person's Gaussians as the skeleton moves them; opacity exactly 0 where the person is absent."""
+        """Returns every person's Gaussians, moved by the skeleton; opacity is exactly 0 if the person is absent."""
         raw = self.placed(view)
         bones = posed_bones(self.joints, self.joint_rotations(view.time))
         all_bones = Bones(bones.transforms.flatten(0, 1), bones.quaternions.flatten(0, 1))
@@ -227,7 +227,7 @@ class Smpl(Tracked):
         return replace(raw, means=means, quaternions=quaternions)
 
     def joint_rotations(self, time: float) -> Float[Tensor, "i 24 4"]:
-        """Of every person's joints relative to their parents at a time; the pelvis, which is placed, is at rest."""
+        """Returns the joints of every person relative to their parents at a time; the pelvis is at rest."""
         table = self.keyframes
         at = keyframe_interval(table.times, table.valid, table.spans, time, self.max_gap)
         each = torch.arange(len(at.lower), device=at.lower.device)
@@ -243,7 +243,7 @@ class Smpl(Tracked):
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """``neighbors``, ``scale`` and ``smoothness``, those that have a weight."""
+        """Returns those of ``neighbors``, ``scale`` and ``smoothness`` that have a weight."""
         terms, settings = {}, self.settings
         if len(self.rows) and settings.neighbor_weight > 0:
             terms["neighbors"] = settings.neighbor_weight * self._spread(raw, drawn)
@@ -254,13 +254,13 @@ class Smpl(Tracked):
         return terms
 
     def pose_bytes(self) -> int:
-        """As ``Tracked``, with 23 quaternions a keyframe, and what moves the rows: joints and weights."""
+        """Returns the bytes of ``Tracked`` with 23 quaternions a keyframe, and the body's vertices, joints, weights."""
         per_keyframe = 4 * (NUM_JOINTS - 1) * int(self.keyframe_valid.sum())
         body = sum(part.numel() for part in (self.vertices, self.attached, self.weights, self.joints))
         return super().pose_bytes() + BYTES_PER_NUMBER * (per_keyframe + body)
 
     def _spread(self, raw: RawGaussians, drawn: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Sum over the attributes of their mean standard deviation among neighbors of rows that are drawn."""
+        """Returns the mean standard deviation among neighbors of drawn rows, summed over attributes."""
         attributes = (
             quat.normalized(self.rows.quaternions),
             raw.log_scales.exp(),
@@ -270,16 +270,16 @@ class Smpl(Tracked):
         )
         widths = [attribute.shape[1] for attribute in attributes if attribute.shape[1]]
         near = torch.cat(attributes, 1)[self._nearest()]
-        # Written out: torch's std and norm take ten times as long on the CPU. Equal neighbors have a slope, of 0.
+        # Written out, because torch's std and norm are ten times slower on the CPU. Equal neighbors have gradient 0.
         variance = (near - near.mean(1, keepdim=True)).square().sum(1) / (near.shape[1] - 1)
         spread = (variance + 1e-12).sqrt()
         return torch.stack([_mean_of(part.mean(1), drawn) for part in spread.split(widths, 1)]).sum()
 
     def _unevenness(self) -> Float[Tensor, ""]:
-        """Mean squared distance of joints from what their neighbors in time say of them."""
+        """Returns the mean squared distance of joints from the interpolation of their neighbors in time."""
         turned = quat.multiply(self.joint_keyframes, quat.from_rotation_vector(self.joint_deltas))
         before, here, after = (self.keyframe_times[:, start : start - 2 or None] for start in range(3))
-        # Frames that are held out leave gaps: the middle is where time says.
+        # Held-out frames leave gaps, so the times decide where the middle is.
         fraction = (here - before) / torch.where(after > before, after - before, 1.0)
         first, middle, last = (turned[:, start : start - 2 or None] for start in range(3))
         distance = torch.lerp(first, last, fraction[..., None, None]) - middle
@@ -287,9 +287,9 @@ class Smpl(Tracked):
         return (distance.square().sum((2, 3)) * counts).sum() / ((NUM_JOINTS - 1) * counts.sum()).clamp(min=1)
 
     def _nearest(self) -> Int[Tensor, "n k"]:
-        """The rows next to each row on the body at rest, itself among them; looked for when the rows have changed."""
+        """Returns the nearest rows on the body at rest, itself included; searches again when the rows have changed."""
         vertices = self.rows.vertex_ids
-        # A plan puts another tensor here, also where as many rows come as go.
+        # Every plan replaces this tensor, even if the number of rows stays the same.
         if self._neighbors is None or self._neighbors[0] is not vertices:
             apart = _APART * self.rows.instances[:, None].float()
             places = torch.cat((self.vertices[vertices], apart), 1).cpu().numpy()

@@ -1,4 +1,4 @@
-"""What all nodes of annotated objects have in common: where they start, and the poses along their tracks."""
+"""The common part of nodes of annotated objects: their initialization, and the poses along their tracks."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
@@ -26,18 +26,18 @@ from sparsestreet.types import Track, View
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedSettings(NodeSettings):
-    """Starts from the lidar returns of all training instants, pooled in the frame of each object's box, and from the
-    points that images gave there."""
+    """Settings of objects. They start from lidar returns of all training instants, pooled in the frame of each object's
+    box, and from points from images there."""
 
     points_per_instance: int = 5000
     box_points: int = 1000
-    """An instance with fewer points than this is filled up with random points on the faces of its box."""
+    """An instance with fewer points than this gets additional random points on the faces of its box."""
     initial_opacity: float = 0.1
     max_gap: int = 2
-    """Frames; an object is present within its span up to this far from a training annotation."""
+    """Frames; within its span, an object is present up to this far from a training annotation."""
     temporal_smooth: float = 0.0
-    """Weight of the term that keeps the learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: it is not
-    computed."""
+    """Weight of the term that keeps learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: the term is
+    not computed."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -47,10 +47,10 @@ class TrackedSettings(NodeSettings):
     @property
     @abstractmethod
     def node_class(self) -> "type[Tracked]":
-        """The class of the node that the settings are of."""
+        """The node class of these settings."""
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Tracked | None":
-        """Boxes of frames without training image (held out, or outside the training range) are not used."""
+        """Builds the node without boxes of frames that have no training image (held out, or outside the range)."""
         tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
         if not tracks:
             return None
@@ -65,7 +65,7 @@ class TrackedSettings(NodeSettings):
         rows, mask = self.start(
             data,
             Points.concatenate(objects),
-            # Per instance: in their own frames all objects lie on top of each other.
+            # Per instance, because in their own frames all objects lie on top of each other.
             torch.cat([neighbor_scales(points.positions) for points in objects]),
             torch.full((int(counts.sum()),), self.initial_opacity),
             generator,
@@ -88,7 +88,7 @@ class TrackedSettings(NodeSettings):
         return self.node_class(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
 
     def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
-        """One object's colored points in its box frame, filled up where there are too few."""
+        """Returns one object's colored points in its box frame, filled up if there are too few."""
         points = measured.sampled(self.points_per_instance, generator)
         missing = min(self.box_points, self.points_per_instance) - len(points)
         if missing <= 0:
@@ -99,7 +99,7 @@ class TrackedSettings(NodeSettings):
 
 
 def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
-    """The annotated poses of a scene file."""
+    """Returns the annotated poses of a scene file."""
     return Trajectories(
         tensors["keyframe_times"],
         tensors["keyframe_quaternions"],
@@ -110,7 +110,7 @@ def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
 
 
 def _from_images(track: Track, data: TrainingData) -> Points:
-    """What images gave inside the track's box, in its frame."""
+    """Returns the points from images inside the track's box, in its frame."""
     if data.image_points is None:
         return Points.concatenate([])
     found = data.image_points.in_boxes[track.name]
@@ -142,20 +142,20 @@ class Tracked(Node):
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
-        """Make a node of the tables.
+        """Makes a node from its tables.
 
         Args:
-            settings: what is said about the node.
+            settings: the settings of the node.
             rows: columns as in ``Node``, and the buffer ``instances`` [n] int64: row of ``keyframes``.
             keyframes: training poses of every instance.
             sizes: length, width, height of every instance's box, meters.
-            names: of the instances' tracks; None: their numbers.
+            names: names of the instances' tracks; None: their numbers.
             max_gap: normalized time to the nearest keyframe beyond which an instance counts as absent.
             mask: the mask, if the rows have its columns.
 
         Raises:
-            ValueError: if sizes, names and keyframes disagree in their number of instances, or a row names none of
-                them.
+            ValueError: if sizes, names and keyframes disagree in their number of instances, or a row names an unknown
+                instance.
         """
         super().__init__(settings, rows, mask)
         num_instances = keyframes.times.shape[0]
@@ -181,11 +181,11 @@ class Tracked(Node):
         self.translation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
 
     def placed(self, view: View) -> RawGaussians:
-        """The stored rows, each in the box of its instance at the view's time; opacity 0 where it is absent."""
+        """Returns the stored rows, each placed by its instance's box at the view's time; opacity 0 if it is absent."""
         return replace(self.stored(view), placement=Placement(self.pose_at(view.time), self.rows.instances))
 
     def pose_at(self, time: float) -> Poses:
-        """Pose and presence of every instance at a normalized time."""
+        """Returns pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
     def regularizers(
@@ -199,7 +199,7 @@ class Tracked(Node):
 
     @property
     def keyframes(self) -> Trajectories:
-        """The annotated poses of the training frames, without corrections."""
+        """Returns the annotated poses of the training frames, without corrections."""
         return Trajectories(
             self.keyframe_times,
             self.keyframe_quaternions,
@@ -209,12 +209,12 @@ class Tracked(Node):
         )
 
     def instances(self) -> Instances:
-        """The objects, named as their tracks."""
+        """Returns the objects, named like their tracks."""
         return Instances(self.names, self.rows.instances, self.sizes)
 
     def header(self) -> dict[str, Any]:
         return {"names": list(self.names), "max_gap": self.max_gap}
 
     def pose_bytes(self) -> int:
-        """float32 bytes of the keyframes: a time, a quaternion and a translation each, corrections folded in."""
+        """Returns the float32 bytes of the keyframes: each a time, a quaternion and a translation with corrections."""
         return BYTES_PER_NUMBER * 8 * int(self.keyframe_valid.sum())

@@ -1,4 +1,4 @@
-"""A whole street of Gaussians that swing and fade (PVG, Chen et al. 2023): what moves needs no box."""
+"""A whole street of Gaussians that swing and fade (PVG, Chen et al. 2023). Moving objects need no box."""
 
 import math
 from collections.abc import Mapping
@@ -23,26 +23,26 @@ from sparsestreet.types import View
 
 @dataclass(frozen=True, kw_only=True)
 class VibratingSettings(BackgroundSettings):
-    """Starts from the points of a background, at rest; a return of the lidar peaks at the time of its sweep, any other
-    point at a random one.
+    """Settings of a node that starts from the points of a background, at rest.
 
-    Raises ValueError for times or a probability that cannot be.
+    A lidar return peaks at the time of its sweep, any other point at a random time. Raises ValueError for impossible
+    times or probabilities.
     """
 
     frame_time: float = 0.02
-    """The node's time from one frame to the next; cycle and life spans are in this unit."""
+    """The node's time from one frame to the next; cycle and life spans are in the node's time."""
     cycle: float = 0.2
     """Period of a swing."""
     initial_life_span: float = math.sqrt(0.1)
-    """Standard deviation of the opacity over time."""
+    """Initial standard deviation of the opacity over time."""
     min_factor: float = 0.05
-    """A row whose opacity has faded to this fraction of its peak, or below, is not drawn."""
+    """A row whose opacity has faded to this fraction of its peak or below is not drawn."""
     velocity_weight: float = 0.001
-    """Of the regularizer: the mean length of the mean velocities."""
+    """Weight of the regularizer, which is the mean length of the mean velocities."""
     smoothing_probability: float = 0.5
-    """Of a training step in which rows are taken from another time nearby, and moved here by their mean velocity."""
+    """Probability that a training step takes rows from a nearby time and moves them back by their mean velocity."""
     smoothing_frames: float = 1.5
-    """How far that time is away at most."""
+    """Largest distance of that time, in frames."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -73,21 +73,21 @@ class VibratingSettings(BackgroundSettings):
 
 
 class Vibrating(Node):
-    """Rows in the world with three more columns: ``velocities`` [n, 3] at the life peak, meters per unit of the node's
-    time, ``life_peaks`` [n] and ``log_life_spans`` [n]."""
+    """Rows in the world frame with three more columns: ``velocities`` [n, 3], ``life_peaks`` [n] and ``log_life_spans``
+    [n]. Velocities are those at the life peak, meters per unit of the node's time."""
 
     settings: VibratingSettings
 
     def __init__(
         self, settings: VibratingSettings, rows: Rows, *, num_frames: int, seed: int = 0, mask: Mask | None = None
     ) -> None:
-        """``num_frames`` of the log say how long the drive lasts; ``seed`` is that of the temporal smoothing."""
+        """``num_frames``: number of frames of the log; ``seed``: seed of the temporal smoothing."""
         super().__init__(settings, rows, mask)
         self.num_frames = num_frames
         self.seed = seed
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Every row where it has swung to, as opaque as it is at that age; faded rows are hidden."""
+        """Returns every row at its place and with its opacity at the view's time; faded rows are hidden."""
         rows, settings, stored = self.rows, self.settings, self.stored(view)
         shift = self._shift(state) if state.training else 0.0
         ages = view.time * settings.frame_time * (self.num_frames - 1) + shift - rows.life_peaks
@@ -104,13 +104,13 @@ class Vibrating(Node):
         )
 
     def mean_velocities(self) -> Float[Tensor, "n 3"]:
-        """By which a row moves on average, meters per unit of the node's time."""
+        """Returns the average velocity of each row, meters per unit of the node's time."""
         return mean_velocities(self.rows.velocities, self.rows.log_life_spans, self.settings.cycle)
 
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """``velocity`` holds still what need not move."""
+        """Returns ``velocity``, which keeps rows still that need not move."""
         lengths = self.mean_velocities().norm(dim=1) * drawn
         return {"velocity": self.settings.velocity_weight * lengths.sum() / drawn.sum().clamp(min=1)}
 
@@ -118,8 +118,10 @@ class Vibrating(Node):
         return {"num_frames": self.num_frames, "seed": self.seed}
 
     def _shift(self, state: SceneState) -> float:
-        """From the view's time to that from which its rows are taken; from the step alone, so that a resumed run
-        draws what the uninterrupted one does."""
+        """Returns the difference from the view's time to the time that rows are taken from.
+
+        It depends on the step alone, so a resumed run draws the same as an uninterrupted one.
+        """
         settings = self.settings
         chance, place = torch.rand(2, generator=named_generator(self.seed, f"smoothing {state.progress}")).tolist()
         if chance >= settings.smoothing_probability:
