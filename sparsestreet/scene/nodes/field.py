@@ -123,7 +123,7 @@ class Field(Node):
 
     @torch.no_grad()
     def _near(self, view: View) -> Int[Tensor, " k"] | None:
-        """Returns the rows that the view may see once deformed; a row ends three standard deviations from its center."""
+        """Returns rows that the view may see once deformed; a row ends three standard deviations from its center."""
         if self.settings.reach is None:
             return None
         sizes = 3 * self.rows.log_scales.amax(1).exp()
