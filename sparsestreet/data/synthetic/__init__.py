@@ -1,13 +1,13 @@
 """Synthetic streets: a ray-traced drive with exact truth, written as a log on disk. In reading order:
 
-1. what is asked for: ``settings``, with the lidar's ``sensor``; ``reader`` makes a street when it is first needed,
-   ``street`` writes it whole or not at all;
-2. the world: what stands where and who moves how (``world``, ``layout``, ``motion``), things built from parts
-   (``models``, ``parts``), convex solids (``shapes``);
-3. how it looks: ``textures`` with ``coverage`` and ``noise``, light (``sky``, ``shading``);
-4. one instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
-   ``lidar``), all of it to pictures and truth (``render``), frames to disk (``write``), and whatever a camera beside
-   the path would have seen (``truth``).
+1. The request: ``settings``, with the lidar's ``sensor``. ``reader`` makes a street when it is first needed, and
+   ``street`` writes it whole or not at all.
+2. The world: places and motions of all things (``world``, ``layout``, ``motion``), things built from parts
+   (``models``, ``parts``), and convex solids (``shapes``).
+3. Its look: ``textures`` with ``coverage`` and ``noise``, and light (``sky``, ``shading``).
+4. One instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
+   ``lidar``). ``render`` makes pictures and truth, ``write`` writes frames to disk, and ``truth`` shows what a camera
+   next to the path would have seen.
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader

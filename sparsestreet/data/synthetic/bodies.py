@@ -1,4 +1,4 @@
-"""Body poses of the street's pedestrians, as DriveStudio keeps those that a network estimated."""
+"""Body poses of the street's pedestrians, in the format in which DriveStudio keeps estimated poses."""
 
 import pickle
 from dataclasses import dataclass, field
@@ -18,15 +18,16 @@ from sparsestreet.data.synthetic.world import World
 from sparsestreet.geometry.skeleton import JOINTS, NUM_JOINTS, rest_joints
 
 _BOX_FROM_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-"""Columns: a body's x (left), y (up), z (forward) in box axes (x forward, y left, z up)."""
+"""Columns are a body's x (left), y (up), z (forward) in box axes (x forward, y left, z up)."""
 _TOE = (0.13, 0.0, -0.01)
-"""From the foot of a pedestrian to its toe, in the box."""
+"""Vector from the foot of a pedestrian to its toe, in the box frame, meters."""
 
 
 def joint_rotations(person: Pedestrian, traveled: float) -> Float64[np.ndarray, "24 3 3"]:
-    """Of joint 0 the rotation box_from_body, of the others that relative to their parent, after so many meters.
+    """Returns the rotations of the joints after ``traveled`` meters: box_from_body, then each relative to its parent.
 
-    Limbs point where those of the rendered person do, by the shortest turn; the trunk and the hands are at rest.
+    Limbs point in the directions of the rendered person's limbs, by the shortest turn. The trunk and the hands are at
+    rest.
     """
     rotations = np.tile(np.eye(3), (NUM_JOINTS, 1, 1))
     rotations[0] = _BOX_FROM_BODY
@@ -39,7 +40,7 @@ def joint_rotations(person: Pedestrian, traveled: float) -> Float64[np.ndarray, 
 
 
 def _point(rotations: Float64[np.ndarray, "24 3 3"], chain: list[str], places: tuple[Point, ...]) -> None:
-    """Turn the joints of a chain, whose root is at rest, so that each next one lies where the places say."""
+    """Turns the joints of a chain with its root at rest, so that the limbs point along ``places``."""
     joints = [JOINTS.index(name) for name in chain]
     bones = np.diff(rest_joints().double().numpy()[joints], axis=0)
     wanted = np.diff(np.array(places), axis=0) @ _BOX_FROM_BODY
@@ -50,7 +51,7 @@ def _point(rotations: Float64[np.ndarray, "24 3 3"], chain: list[str], places: t
 
 
 def _shortest_turn(start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """The rotation by less than half a turn that takes one direction to another."""
+    """Returns the rotation by less than half a turn that takes one direction to another."""
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis)
@@ -60,17 +61,17 @@ def _shortest_turn(start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"
 
 @dataclass
 class BodyWriter:
-    """Collects the poses of annotated pedestrians, each with noise, from the camera that sees most of the person."""
+    """Collects the poses of annotated pedestrians with noise, from the camera that sees most of each person."""
 
     settings: StreetSettings
     world: World
     min_pixels: int
-    """A person that no camera sees with so many has no pose in a frame."""
+    """A person has a pose in a frame only if a camera sees it with at least this many pixels."""
     _people: dict[int, dict[str, Any]] = field(default_factory=dict)
-    """By instance id, as DriveStudio names its parts."""
+    """Instance id -> its data under DriveStudio's names."""
 
     def record(self, key: int, actor: int, frame: StreetFrame) -> None:
-        """The pose of an actor in a frame, if it is a pedestrian and seen; ``key`` is its instance id."""
+        """Records the pose of an actor in a frame if it is a visible pedestrian; ``key`` is its instance id."""
         person = self.world.actors[actor]
         pixels = [np.count_nonzero(image.object_indices == actor) for image in frame.images]
         camera = int(np.argmax(pixels))
@@ -78,7 +79,7 @@ class BodyWriter:
             return
         rotations = joint_rotations(person.model, person.path.traveled(frame.index / self.settings.frame_rate))
         rng = stream(self.settings.seed, f"body of {person.name} {frame.index}")
-        # Root mean square of the angle, which is the length of three components.
+        # The setting is the root mean square of the angle, which is the length of three components.
         spread = np.radians(self.settings.body_pose_noise) / np.sqrt(3)
         rotations = rotations @ Rotation.from_rotvec(spread * rng.standard_normal((NUM_JOINTS, 3))).as_matrix()
         world_from_camera = frame.images[camera].camera.world_from_camera[:3, :3]
@@ -91,7 +92,7 @@ class BodyWriter:
             stored[mask][frame.index] = True
 
     def write(self, path: Path) -> None:
-        """The file, if anybody was seen. Arrays are NumPy's: DriveStudio's own files have tensors of torch."""
+        """Writes the file if anybody was seen. It holds NumPy arrays; DriveStudio's own files hold torch tensors."""
         if self._people:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(pickle.dumps(self._people, protocol=4))

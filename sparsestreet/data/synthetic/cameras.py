@@ -1,4 +1,4 @@
-"""The camera rig: where the cameras sit on the ego car and which rays they send."""
+"""The camera rig: places of the cameras on the ego car, and their rays."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,7 +13,7 @@ from sparsestreet.data.synthetic.tracer import Rays
 from sparsestreet.geometry.distortion import undistort
 
 _EGO_AXES_FROM_CAMERA = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
-"""Columns: camera x (right), y (down), z (forward) in ego axes (x forward, y left, z up)."""
+"""Columns are camera x (right), y (down), z (forward) in ego axes (x forward, y left, z up)."""
 _MOUNT = (1.6, 0.0, 1.65)
 """Camera position on the ego car, meters."""
 
@@ -30,13 +30,13 @@ class StreetCamera:
     """Brown-Conrady k1, k2, p1, p2, k3; empty: a pinhole."""
 
     def rays(self, supersampling: int) -> Rays:
-        """supersampling x supersampling rays per pixel, evenly spread; one ray goes through the pixel's center."""
+        """Returns supersampling x supersampling evenly spread rays per pixel; a single ray goes through its center."""
         local = self._directions(supersampling)
         world = np.einsum("ij,jhw->ihw", self.world_from_camera[:3, :3], local)
         return Rays(self.world_from_camera[:3, 3].astype(np.float32), np.ascontiguousarray(world, np.float32))
 
     def axis_cosines(self) -> Float64[np.ndarray, "h w"]:
-        """Depth along the optical axis per meter along the ray through each pixel's center."""
+        """Returns the depth along the optical axis per meter along the ray through each pixel's center."""
         return self._directions(1)[2]
 
     def _directions(self, supersampling: int) -> Float64[np.ndarray, "3 a b"]:
@@ -52,7 +52,7 @@ class StreetCamera:
 
 
 def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) -> StreetCamera:
-    """Camera ``index`` of the rig."""
+    """Returns camera ``index`` of the rig."""
     ego_from_camera = at(*_MOUNT, yaw=float(np.radians(CAMERA_YAWS_DEGREES[index])))
     ego_from_camera[:3, :3] = ego_from_camera[:3, :3] @ _EGO_AXES_FROM_CAMERA
     focal = settings.width / 2 / np.tan(np.radians(settings.field_of_view) / 2)
@@ -65,9 +65,9 @@ def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) ->
 def _undistorted(
     columns: tuple[float, ...], rows: tuple[float, ...], distortion: tuple[float, ...]
 ) -> Float64[np.ndarray, "2 a b"]:
-    """x and y at which a pinhole would image what the lens images in these columns and rows, all normalized.
+    """Returns x and y at which a pinhole images what the lens images in these columns and rows, all normalized.
 
-    Kept, as all frames of a rig share them: Newton's method over all rays takes as long as tracing them.
+    The result is cached because all frames of a rig share it: Newton's method takes as long as tracing the rays.
     """
     y, x = np.meshgrid(rows, columns, indexing="ij")
     imaged = torch.from_numpy(np.stack((x, y), -1))

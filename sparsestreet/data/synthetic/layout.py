@@ -18,4 +18,4 @@ DASHED_LINES = (1.75,)
 BEHIND = 40.0
 """The street starts this many meters behind the first frame."""
 AHEAD = 95.0
-"""and goes on this many meters after the last one."""
+"""The street ends this many meters after the last frame."""

@@ -1,4 +1,4 @@
-"""A spinning lidar on the roof. The whole turn is taken at the instant of the images."""
+"""A spinning lidar on the roof, which takes the whole turn at the instant of the images."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.tracer import Rays, first_hits
 
 _AHEAD = 0.9
-"""Of the rear axle, meters: the middle of the roof."""
+"""Meters ahead of the rear axle, in the middle of the roof."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class StreetSweep:
 
 
 def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: int) -> StreetSweep:
-    """One turn of the sensor in frame ``frame`` (which only seeds dropout and noise)."""
+    """Returns one turn of the sensor; ``frame`` only seeds dropout and noise."""
     sensor = settings.lidar
     world_from_lidar = world_from_ego @ at(_AHEAD, 0.0, sensor.height)
     local = _directions(sensor)
@@ -36,7 +36,7 @@ def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: i
     returned = kept & (hits.distances < sensor.max_range)
     ranges = hits.distances[returned] + sensor.noise * rng.standard_normal(int(returned.sum()))
     objects = scene.object_indices[hits.parts[returned]]
-    # Reflectance falls with range; paint of cars returns more than asphalt and brick.
+    # Intensity falls with range; car paint reflects more than asphalt and brick.
     intensity = np.clip(np.where(objects == BACKGROUND, 0.3, 0.6) * np.exp(-ranges / 60), 0, 1)
     points = np.concatenate((local[:, returned] * ranges, intensity[None])).T
     return StreetSweep(np.ascontiguousarray(points, np.float32), objects, world_from_lidar)

@@ -1,4 +1,4 @@
-"""Where things are at a time: straight along the street, with one smooth change of lane."""
+"""Positions of things over time: straight along the street, with one smooth change of lane."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,16 @@ from sparsestreet.data.synthetic.parts import Pose, at
 
 @dataclass(frozen=True)
 class Path:
-    """x = start + speed t; y moves by ``shift`` around ``shift_time`` (world frame, meters and seconds)."""
+    """x = start + speed t; y moves by ``shift`` around ``shift_time`` (world frame, meters and seconds).
+
+    >>> Path(start=5.0, y=1.0, speed=2.0).position(3.0)
+    (11.0, 1.0)
+    """
 
     start: float
     y: float
     speed: float
-    """Signed, along x, meters per second; 0 stands still and takes its heading from ``rest_heading``."""
+    """Signed speed along x, meters per second; a thing with speed 0 has the heading ``rest_heading``."""
     shift: float = 0.0
     shift_time: float = 0.0
     shift_duration: float = 2.5
@@ -24,7 +28,7 @@ class Path:
         return self.start + self.speed * time, self.y + self.shift * self._eased(time)
 
     def heading(self, time: float) -> float:
-        """Angle of the path's tangent from +x, radians."""
+        """Returns the angle of the path's tangent from +x, radians."""
         if self.speed == 0:
             return self.rest_heading
         s = self._phase(time)
@@ -32,11 +36,11 @@ class Path:
         return float(np.arctan2(sideways, self.speed))
 
     def traveled(self, time: float) -> float:
-        """Meters along x since time 0 (the sideways part is left out: it turns wheels by less than a percent)."""
+        """Returns meters along x since time 0; the sideways part would turn wheels by less than a percent."""
         return abs(self.speed) * time
 
     def pose(self, time: float, height: float) -> Pose:
-        """World from object, the object's origin ``height`` meters above the road."""
+        """Returns world from object, with the object's origin ``height`` meters above the road."""
         x, y = self.position(time)
         return at(x, y, height, self.heading(time))
 
@@ -50,12 +54,12 @@ class Path:
 
 @dataclass(frozen=True)
 class EgoDrive:
-    """The recording car: at y = 0 on average, swaying a little, with a slowly changing speed."""
+    """The recording car. It drives at y = 0 on average, sways a little and changes its speed slowly."""
 
     speed: float
 
     def pose(self, time: float) -> Pose:
-        """World from ego: x forward, y left, z up, origin on the road under the rear axle."""
+        """Returns world from ego: x forward, y left, z up, origin on the road under the rear axle."""
         x = self.speed * (time + 0.15 * np.sin(0.9 * time))
         y = 0.12 * np.sin(0.8 * time)
         slope = 0.12 * 0.8 * np.cos(0.8 * time) / (self.speed * (1 + 0.15 * 0.9 * np.cos(0.9 * time)))

@@ -1,4 +1,4 @@
-"""Band-limited randomness for textures: smooth value noise from a table and random numbers per cell."""
+"""Band-limited randomness for textures: smooth value noise from a table, and random numbers per cell."""
 
 import functools
 import zlib
@@ -12,13 +12,17 @@ _SIZE = _CELLS * _TEXELS_PER_CELL
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """The random numbers of one element of the street: adding an element does not change the others."""
+    """Returns the random numbers of one element of the street; adding an element does not change the others.
+
+    >>> stream(0, "houses").random() == stream(0, "houses").random()
+    True
+    """
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 @functools.cache
 def _table() -> Float32[np.ndarray, " m"]:
-    """One tile of periodic value noise, mean 0 and standard deviation 1; fine enough to be read without filtering."""
+    """Returns one tile of periodic value noise, mean 0 and standard deviation 1, fine enough to read unfiltered."""
     lattice = np.random.default_rng(20240229).standard_normal((_CELLS, _CELLS))
     rows = _interpolated(lattice)
     tile = _interpolated(np.ascontiguousarray(rows.T)).T
@@ -26,7 +30,7 @@ def _table() -> Float32[np.ndarray, " m"]:
 
 
 def _interpolated(values: Float64[np.ndarray, "a b"]) -> Float64[np.ndarray, "c b"]:
-    """Rows between rows, periodic, by the quintic fade of Perlin (2002), whose second derivative is continuous."""
+    """Interpolates rows periodically by the quintic fade of Perlin (2002), whose second derivative is continuous."""
     t = np.arange(_TEXELS_PER_CELL)[None, :, None] / _TEXELS_PER_CELL
     fade = t**3 * (t * (6 * t - 15) + 10)
     following = np.roll(values, -1, axis=0)
@@ -36,7 +40,7 @@ def _interpolated(values: Float64[np.ndarray, "a b"]) -> Float64[np.ndarray, "c 
 def smooth_noise(
     u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"], cell: float, footprint: Float32[np.ndarray, " n"]
 ) -> Float32[np.ndarray, " n"]:
-    """Noise with features of ``cell`` meters, faded out where a pixel covers (``footprint``, meters) half a cell."""
+    """Returns noise with features of ``cell`` meters, faded out if a pixel's ``footprint`` (meters) is half a cell."""
     scale = np.float32(_TEXELS_PER_CELL / cell)
     column = np.floor(u * scale).astype(np.int32) & (_SIZE - 1)
     row = np.floor(v * scale).astype(np.int32) & (_SIZE - 1)
@@ -47,7 +51,7 @@ def smooth_noise(
 def cell_random(
     column: Float32[np.ndarray, " n"], row: Float32[np.ndarray, " n"], seed: int
 ) -> Float32[np.ndarray, " n"]:
-    """A number in [0, 1) per integer cell, the same wherever the cell is asked for (a multiply-xorshift hash)."""
+    """Returns a number in [0, 1) that depends only on the integer cell and the seed (a multiply-xorshift hash)."""
     with np.errstate(over="ignore"):
         h = column.astype(np.int32).view(np.uint32) * np.uint32(0x9E3779B1)
         h ^= row.astype(np.int32).view(np.uint32) * np.uint32(0x85EBCA77)

@@ -1,4 +1,4 @@
-"""A part: a convex solid with a surface, somewhere in an object's (or the world's) frame."""
+"""A part is a convex solid with a surface, placed in the frame of an object or of the world."""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +9,7 @@ from sparsestreet.data.synthetic.shapes import Capsule, Shape
 from sparsestreet.data.synthetic.textures.appearance import Surface
 
 BACKGROUND = -1
-"""Object index of what is no annotated object."""
+"""Object index of parts that belong to no annotated object."""
 
 Pose = Float64[np.ndarray, "4 4"]
 Point = tuple[float, float, float]
@@ -20,12 +20,12 @@ class Part:
     shape: Shape
     surface: Surface
     frame_from_part: Pose
-    """Frame: the object's while a model is built, the world once it stands in the street."""
+    """The frame is the object's while a model is built, and the world once the part stands in the street."""
     object_index: int = BACKGROUND
 
 
 def placed(parts: list[Part], world_from_object: Pose, object_index: int = BACKGROUND) -> list[Part]:
-    """The parts of an object, moved to the world."""
+    """Returns the parts of an object, moved to the world."""
     return [
         replace(part, frame_from_part=world_from_object @ part.frame_from_part, object_index=object_index)
         for part in parts
@@ -33,7 +33,11 @@ def placed(parts: list[Part], world_from_object: Pose, object_index: int = BACKG
 
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
-    """A pose turned by ``yaw`` radians about z."""
+    """Returns a pose at a position, turned by ``yaw`` radians about z.
+
+    >>> at(1.0, 2.0, 0.0)[:3, 3].tolist()
+    [1.0, 2.0, 0.0]
+    """
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     pose[:3, 3] = x, y, z
@@ -41,7 +45,7 @@ def at(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
 
 
 def axis_along_y(x: float, y: float, z: float) -> Pose:
-    """A pose whose z axis is the frame's y axis: axles of wheels."""
+    """Returns a pose whose z axis is the frame's y axis, as for wheels on an axle."""
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     pose[:3, 3] = x, y, z
@@ -49,7 +53,7 @@ def axis_along_y(x: float, y: float, z: float) -> Pose:
 
 
 def limb(start: Point, end: Point, radius: float, surface: Surface) -> Part:
-    """A capsule whose axis runs from one point to another, meters."""
+    """Returns a capsule whose axis runs from one point to another, meters."""
     a, b = np.array(start, np.float64), np.array(end, np.float64)
     length = float(np.linalg.norm(b - a))
     axis = (b - a) / length

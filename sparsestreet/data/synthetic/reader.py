@@ -1,4 +1,4 @@
-"""The embedded default: a street that is made when it is first asked for, and read like any other log."""
+"""The built-in default log: a street that is made when it is first needed, and read like any other log."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -17,21 +17,21 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StreetReader(LogReader):
-    """Makes the street in its folder, unless it is there, and reads it as a recorded drive is read.
+    """Makes the street in its folder unless it is there, and reads it like a recorded drive.
 
-    Both verbs raise FileExistsError where the folder holds anything else.
+    ``check`` and ``read`` raise FileExistsError if the folder holds anything else.
     """
 
     settings: StreetSettings
     root: Path | str | None = None
-    """The street's folder; None: one under ``parent`` that is named after the settings, all of them."""
+    """The street's folder; None: a folder under ``parent`` that is named after all settings."""
     parent: Path | str = "outputs/streets"
     lidar: bool = True
-    """False: as if the street had none, though it is traced with its own."""
+    """False: the log has no lidar, although the street is traced with it."""
     bodies: bool = True
-    """False: as if the street had no body poses of its pedestrians."""
+    """False: the log has no body poses of the street's pedestrians."""
     min_lens_shift: float | None = 0.5
-    """Pixels; the settings' lens is simulated where it moves some pixel by at least so much; 0: always, None: never."""
+    """Pixels; the settings' lens is simulated if it moves some pixel by at least this much; 0: always, None: never."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
@@ -47,7 +47,7 @@ class StreetReader(LogReader):
         return replace(log, truth=street_truth(self.settings, log.dataset_from_world))
 
     def data_hash(self) -> str:
-        """The street's name, which holds a hash of all of its settings: what they say is what it shows."""
+        """Returns the street's name, which holds a hash of all settings: they determine what the street shows."""
         return street_name(self.settings)
 
     def _made(self) -> DriveStudioReader:
@@ -57,6 +57,6 @@ class StreetReader(LogReader):
         )
 
     def _report(self, done: int, total: int) -> None:
-        """A line when a quarter more is traced."""
+        """Reports each time another quarter of the frames is traced."""
         if done * 4 // total > (done - 1) * 4 // total:
             log.info("tracing a street into %s: %d of %d frames", self.folder.absolute(), done, total)

@@ -1,4 +1,4 @@
-"""One instant of the street: pictures, exact truth per pixel, and the lidar's turn."""
+"""Renders one instant of the street: pictures, exact truth per pixel, and the lidar's turn."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class StreetImage:
     camera: StreetCamera
     rgb: UInt8[np.ndarray, "h w 3"]
     depth: Float32[np.ndarray, "h w"]
-    """Along the optical axis, meters; 0 in the sky."""
+    """Depth along the optical axis, meters; 0 in the sky."""
     object_indices: Int16[np.ndarray, "h w"]
     """Position in World.actors, or BACKGROUND."""
     sky: Bool[np.ndarray, "h w"]
@@ -41,7 +41,7 @@ class StreetFrame:
 
 @dataclass(frozen=True)
 class Instant:
-    """The street as it stands at a time, in its light."""
+    """The street at a time, with its light."""
 
     scene: Scene
     sunlit: SunView
@@ -51,13 +51,13 @@ class Instant:
 
     @staticmethod
     def at(world: World, time: float) -> "Instant":
-        """``time`` in seconds."""
+        """Returns the street at ``time``, seconds."""
         scene = Scene.of(world.parts_at(time))
         actors = tuple((actor.pose(time), actor.model.size) for actor in world.actors)
         return Instant(scene, SunView.of(scene, world.weather.sun), world.weather, actors)
 
     def inside_an_actor(self, camera: StreetCamera, margin: float = 0.3) -> bool:
-        """Whether the camera would sit in (or within ``margin`` meters of) the box of something annotated."""
+        """Whether the camera lies in, or within ``margin`` meters of, the box of an annotated object."""
         for pose, size in self.actors:
             local = np.linalg.inv(pose) @ camera.world_from_camera[:, 3]
             if (np.abs(local[:3]) < np.array(size) / 2 + margin).all():
@@ -65,13 +65,13 @@ class Instant:
         return False
 
     def actors_within(self, meters: float, camera: StreetCamera) -> list[int]:
-        """Positions in World.actors of those that are no farther from the camera, seen from above."""
+        """Returns positions in World.actors of actors at most ``meters`` from the camera, seen from above."""
         here = camera.world_from_camera[:2, 3]
         return [at for at, (pose, _) in enumerate(self.actors) if np.linalg.norm(pose[:2, 3] - here) <= meters]
 
 
 def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFrame:
-    """Everything that is seen at frame ``index``."""
+    """Renders all images and the lidar of frame ``index``."""
     time = index / settings.frame_rate
     instant = Instant.at(world, time)
     ego = world.ego.pose(time)
@@ -86,7 +86,7 @@ def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFr
 
 
 def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:
-    """What a camera sees at an instant; of the settings the number of rays a pixel."""
+    """Renders what a camera sees at an instant; of the settings it uses only the number of rays per pixel."""
     samples = settings.supersampling
     scene = instant.scene
     center_rays = camera.rays(1)

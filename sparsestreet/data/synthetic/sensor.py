@@ -1,4 +1,4 @@
-"""What a spinning lidar is: where its beams point, how far they reach and what they lose."""
+"""A spinning lidar: the directions of its beams, their range and their losses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,18 +10,18 @@ class LidarSensor:
 
     name: str
     elevations: Sequence[float]
-    """(lowest, highest) beam, degrees above the horizon; the others are evenly spread between them."""
+    """(lowest, highest) beam, degrees above the horizon; the other beams are evenly spread between them."""
     beams: int
     azimuth_steps: int
-    """Rays of one beam in a full turn; about 40 percent of them look where three cameras of 60 degrees appearance."""
+    """Number of rays of one beam in a full turn; three cameras of 60 degrees see about 40 percent of them."""
     max_range: float
-    """Meters; what is farther away gives no return."""
+    """Meters; farther surfaces give no return."""
     noise: float
     """Standard deviation of the measured range, meters."""
     dropout: float
-    """Share of the returns that is lost, each by its own chance, in [0, 1)."""
+    """Probability that a return is lost, independently of the others, in [0, 1)."""
     height: float
-    """Above the ground on the ego car, meters."""
+    """Height above the ground on the ego car, meters."""
 
     def __post_init__(self) -> None:
         for name in ("beams", "azimuth_steps", "max_range", "height"):
@@ -31,7 +31,7 @@ class LidarSensor:
             raise ValueError(f"LidarSensor.noise must not be negative but is {self.noise}")
         if not 0 <= self.dropout < 1:
             raise ValueError(f"LidarSensor.dropout must lie in [0, 1) but is {self.dropout}")
-        # A list (as a config file gives it) becomes a tuple, so that equal sensors compare equal.
+        # A list from a config file becomes a tuple, so that equal sensors compare equal.
         object.__setattr__(self, "elevations", tuple(float(elevation) for elevation in self.elevations))
         ends = (-90.0, *self.elevations, 90.0)
         if len(ends) != 4 or not ends[0] < ends[1] <= ends[2] < ends[3]:
@@ -51,4 +51,4 @@ WAYMO_TOP = LidarSensor(
     dropout=0.05,
     height=1.9,
 )
-"""The default; conf/data/lidar/waymo_top.yaml says where the numbers come from."""
+"""The default sensor; conf/data/lidar/waymo_top.yaml names the source of the numbers."""

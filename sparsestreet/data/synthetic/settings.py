@@ -1,4 +1,4 @@
-"""What a synthetic street is made from; two equal settings give the same bytes."""
+"""Settings of a synthetic street; equal settings give the same bytes."""
 
 import math
 from collections.abc import Sequence
@@ -10,28 +10,32 @@ from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
 from sparsestreet.geometry.distortion import fold_radius_squared, undistort
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
-"""Front, front left, front right; with 60 degrees of view each, neighbors overlap by 10."""
+"""Front, front left, front right. With 60 degrees of view each, neighbors overlap by 10."""
 
 
 @dataclass(frozen=True)
 class StreetSettings:
-    """A short drive along a straight street, seen by up to three cameras and a spinning lidar."""
+    """A short drive along a straight street, seen by up to three cameras and a spinning lidar.
+
+    >>> StreetSettings(num_frames=21, frame_rate=10.0).duration
+    2.0
+    """
 
     seed: int = 0
-    """Decides the houses, colors, traffic, weather: everything but the sensors."""
+    """Decides houses, colors, traffic, weather and everything else but the sensors."""
     num_frames: int = 40
     width: int = 320
     """Image width, pixels."""
     height: int = 192
     """Image height, pixels."""
     num_cameras: int = 3
-    """1: front; 2: and front left; 3: and front right."""
+    """1: front; 2: also front left; 3: also front right."""
     field_of_view: float = 60.0
     """Horizontal field of view of every camera, degrees; a lens changes it and keeps the focal length."""
     lens: Sequence[float | int] = ()
     """Brown-Conrady k1, k2, p1, p2, k3 of every camera, in OpenCV's order; empty: pinholes."""
     supersampling: int = 2
-    """Rays per pixel and axis: a pixel's color is the mean of supersampling^2 rays."""
+    """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
     """Frames per second."""
     ego_speed: float = 8.0
@@ -42,7 +46,7 @@ class StreetSettings:
     num_pedestrians: int = 6
     num_cyclists: int = 2
     body_pose_noise: float = 3.0
-    """Degrees, root mean square over the joints, by which the body pose of a pedestrian is wrong in each frame."""
+    """Error of a pedestrian's body pose in each frame: root mean square over the joints, degrees."""
     lidar: LidarSensor = WAYMO_TOP
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, meters."""
@@ -64,7 +68,7 @@ class StreetSettings:
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
-        # Equal lenses compare equal, in whatever sequence of whatever numbers they were given.
+        # Equal lenses compare equal, whatever type of sequence or number they were given as.
         object.__setattr__(self, "lens", tuple(float(value) for value in self.lens))
         if self.lens and not (len(self.lens) == 5 and self._sees_every_pixel()):
             raise ValueError(
@@ -78,7 +82,7 @@ class StreetSettings:
         return (self.num_frames - 1) / self.frame_rate
 
     def _sees_every_pixel(self) -> bool:
-        """Whether every place in the image has a ray that the polynomial describes: one before its fold."""
+        """Whether every place in the image has a ray that the polynomial describes, before its fold."""
         coefficients = torch.tensor(self.lens, dtype=torch.float64)
         side = torch.linspace(-1, 1, 17, dtype=torch.float64) * math.tan(math.radians(self.field_of_view) / 2)
         try:

@@ -1,4 +1,4 @@
-"""Color of what the rays hit: sun with hard shadows, light of the sky and the ground, a mirrored sky, haze."""
+"""Colors of the surfaces that rays hit: sun with hard shadows, light of sky and ground, a mirrored sky, haze."""
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -10,17 +10,17 @@ from sparsestreet.data.synthetic.textures.appearance import column, mix
 from sparsestreet.data.synthetic.tracer import NOTHING, Hits, Rays, sunlit
 
 _HAZE_LENGTH = 900.0
-"""Meters in which haze takes all but 1/e of a surface's color."""
+"""Meters after which haze leaves 1/e of a surface's color."""
 _HAZE = (0.62, 0.70, 0.80)
 _STREET_MIRROR = (0.22, 0.21, 0.20)
-"""What a mirror sees below the roofs: the other side of the street."""
+"""Color that a mirror reflects below the roofs, from the other side of the street."""
 _EXPOSURE = 0.62
 
 
 def radiance(
     scene: Scene, view: SunView, weather: Weather, rays: Rays, hits: Hits, pixel_angle: float
 ) -> Float32[np.ndarray, "3 h w"]:
-    """Linear RGB of every ray. ``pixel_angle``: angle between neighboring rays, radians."""
+    """Returns linear RGB of every ray. ``pixel_angle`` is the angle between neighboring rays, radians."""
     directions = rays.directions.reshape(3, -1)
     parts, distances = hits.parts.ravel(), hits.distances.ravel()
     colors = np.empty(directions.shape, np.float32)
@@ -49,7 +49,7 @@ def _shade(
     distances: Scalars,
     pixel_angle: float,
 ) -> Vectors:
-    """Light from the points of one part towards the viewer."""
+    """Returns the light from the points of one part towards the viewer."""
     points = origin[:, None] + distances * directions
     part = scene.parts[index]
     local_directions, local_points = scene.turn_to_part(index, directions), scene.to_part(index, points)
@@ -64,10 +64,10 @@ def _shade(
 
 
 def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vectors:
-    """Extents along the axes of what a pixel covers of a plane.
+    """Returns the extents, along the axes, of the area that a pixel covers on a plane.
 
-    A cone of width r around direction d meets the plane with normal n so that, along an axis a, it covers
-    r |a - n (d.a) / (d.n)|: the gradient of the hit point's coordinate with respect to the ray.
+    A cone of width r around direction d covers r |a - n (d.a) / (d.n)| along an axis a of the plane with normal n. This
+    is the gradient of the hit point's coordinate with respect to the ray.
     """
     cosine = (directions * normals).sum(0)
     cosine = np.where(np.abs(cosine) < 0.02, np.float32(-0.02), cosine)
@@ -76,7 +76,7 @@ def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vecto
 
 
 def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
-    """Sky and sun in glossy surfaces (Schlick's Fresnel term); the street's far side below the roofs."""
+    """Returns sky and sun mirrored in glossy surfaces (Schlick's Fresnel term); below roofs, the street's far side."""
     colors = np.zeros_like(directions)
     shiny = np.flatnonzero(gloss > 0.01)
     if len(shiny) == 0:
@@ -94,7 +94,7 @@ def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Sc
 
 
 def to_srgb(linear: Float32[np.ndarray, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Eight-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping."""
+    """Returns 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping."""
     exposed = np.maximum(linear * np.float32(_EXPOSURE), 0)
     exposed = exposed * (1 + exposed / 4) / (1 + exposed)
     exposed = np.clip(exposed * np.float32(1.45), 0, 1)

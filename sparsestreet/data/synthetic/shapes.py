@@ -1,7 +1,7 @@
-"""Convex solids in their own frames and where rays enter them.
+"""Convex solids in their own frames, and the distances at which rays enter them.
 
-Arrays hold one coordinate per row ([3, n]), so that each is contiguous. Directions have unit length; distances are
-meters; a ray that misses, starts inside or points away has distance infinity.
+Arrays hold one coordinate per row ([3, n]), so that each coordinate is contiguous. Directions have unit length and
+distances are meters. A ray that misses, starts inside or points away has distance infinity.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ _TINY = np.float32(1e-12)
 
 
 def rotated(rows: Float32[np.ndarray, "k 3"], vectors: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "k m"]:
-    """rows @ vectors. Not by matmul: the BLAS behind it starts threads for products too small to gain from them."""
+    """Returns rows @ vectors without matmul, whose BLAS starts threads for products too small to gain from them."""
     return np.einsum("kj,jm->km", rows, vectors)
 
 
@@ -28,15 +28,15 @@ class Shape(Protocol):
 
     @property
     def half_extent(self) -> Vector:
-        """Half the sides of a box around the origin that contains the solid."""
+        """Half sides of a box around the origin that contains the solid, meters."""
         ...
 
     def enter(self, origins: Float32[np.ndarray, "3 m"], directions: Vectors) -> Scalars:
-        """Distance at which each ray enters; ``origins`` has one column per ray or one for all (m in {1, n})."""
+        """Returns the distance at which each ray enters; ``origins`` has a column per ray or one for all."""
         ...
 
     def normals(self, points: Vectors) -> Vectors:
-        """Outward unit normals at points on the surface."""
+        """Returns outward unit normals at points on the surface."""
         ...
 
 
@@ -45,12 +45,12 @@ def _entered(near: Scalars, far: Scalars) -> Scalars:
 
 
 def _away_from_zero(values: np.ndarray) -> np.ndarray:
-    """The same values, but at least 1e-12 in size, so that they can divide."""
+    """Returns the values with magnitudes of at least 1e-12, so that they can divide."""
     return np.where(np.abs(values) < _TINY, _TINY, values)
 
 
 def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) -> tuple[Scalars, Scalars]:
-    """Distances at which rays enter and leave |coordinate| <= half."""
+    """Returns the distances at which rays enter and leave |coordinate| <= half."""
     inverse = np.float32(1) / _away_from_zero(directions)
     center = -origins * inverse
     reach = np.float32(half) * np.abs(inverse)
@@ -59,7 +59,7 @@ def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) 
 
 @dataclass(frozen=True)
 class Box:
-    """|x|, |y|, |z| <= half_extent (Kay and Kajiya's slabs)."""
+    """A box: |x|, |y|, |z| <= half_extent (Kay and Kajiya's slabs)."""
 
     half_extent: Vector
 
@@ -79,7 +79,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Polytope:
-    """{p: normals_out @ p <= offsets}; bounded by ``half_extent``."""
+    """A convex polytope {p: normals_out @ p <= offsets}, bounded by ``half_extent``."""
 
     normals_out: Float32[np.ndarray, "k 3"]
     """Unit length."""
@@ -95,7 +95,7 @@ class Polytope:
         return _entered(near, far)
 
     def depths(self, points: Vectors) -> Float32[np.ndarray, "k n"]:
-        """Distance of each point inside each face plane, meters (negative outside)."""
+        """Returns the depth of each point inside each face plane, meters (negative outside)."""
         return self.offsets[:, None] - rotated(self.normals_out, points)
 
     def normals(self, points: Vectors) -> Vectors:
@@ -104,7 +104,7 @@ class Polytope:
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """(x/a)^2 + (y/b)^2 + (z/c)^2 <= 1 with half axes ``half_extent``."""
+    """An ellipsoid (x/a)^2 + (y/b)^2 + (z/c)^2 <= 1 with half axes ``half_extent``."""
 
     half_extent: Vector
 
@@ -113,7 +113,7 @@ class Ellipsoid:
         origins, directions = origins * scale, directions * scale
         a = (directions * directions).sum(0)
         middle = -(origins * directions).sum(0) / a
-        # The closest point to the center, not b^2 - 4ac: far origins would lose all digits in float32.
+        # Uses the point closest to the center instead of b^2 - 4ac, which loses all digits in float32 at far origins.
         closest = origins + middle * directions
         room = np.float32(1) - (closest * closest).sum(0)
         half_chord = np.sqrt(np.maximum(room, 0) / a)
@@ -125,7 +125,7 @@ class Ellipsoid:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """x^2 + y^2 <= radius^2, |z| <= half_length."""
+    """A cylinder: x^2 + y^2 <= radius^2, |z| <= half_length."""
 
     radius: float
     half_length: float
@@ -151,7 +151,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Capsule:
-    """All points within ``radius`` of the segment |z| <= half_length on the z axis."""
+    """A capsule: all points within ``radius`` of the segment |z| <= half_length on the z axis."""
 
     radius: float
     half_length: float
@@ -161,7 +161,7 @@ class Capsule:
         return np.array([self.radius, self.radius, self.half_length + self.radius], np.float32)
 
     def enter(self, origins: Float32[np.ndarray, "3 m"], directions: Vectors) -> Scalars:
-        # A convex union: the first entry into the wall between the caps or into one of the two balls.
+        # The union is convex, so this is the first entry into the wall between the caps or into one of the balls.
         near, far = _round_wall(origins, directions, self.radius)
         wall = np.where(near < far, near, np.float32(np.inf))
         z = origins[2] + np.where(np.isfinite(wall), wall, 0) * directions[2]
@@ -170,7 +170,7 @@ class Capsule:
         for end in (-self.half_length, self.half_length):
             shifted = origins - np.array([[0], [0], [end]], np.float32)
             wall = np.minimum(wall, ball.enter(shifted, directions))
-        # Inside the solid every branch above may still report a later inner surface.
+        # For a ray that starts inside, the branches above may still report a later inner surface.
         inside = self._distance_to_axis(origins) < self.radius
         return np.where(inside, np.float32(np.inf), wall)
 
@@ -184,7 +184,7 @@ class Capsule:
 
 
 def _round_wall(origins: Float32[np.ndarray, "3 m"], directions: Vectors, radius: float) -> tuple[Scalars, Scalars]:
-    """Where rays enter and leave the endless cylinder about z; an empty interval for those that miss."""
+    """Returns where rays enter and leave the infinite cylinder about z; an empty interval for rays that miss."""
     a = np.maximum(directions[0] ** 2 + directions[1] ** 2, _TINY)
     middle = -(origins[0] * directions[0] + origins[1] * directions[1]) / a
     x, y = origins[0] + middle * directions[0], origins[1] + middle * directions[1]
@@ -199,12 +199,20 @@ def _unit(vectors: Vectors) -> Vectors:
 
 
 def box(length: float, width: float, height: float) -> Box:
-    """A box by its full sides along x, y, z, meters."""
+    """Returns a box with the given full sides along x, y, z, meters.
+
+    >>> side = box(4.0, 2.0, 1.5)
+    >>> side.enter(np.float32([[-5], [0], [0]]), np.float32([[1], [0], [0]])).tolist()
+    [3.0]
+    """
     return Box(np.array([length, width, height], np.float32) / 2)
 
 
 def extrusion(profile: list[tuple[float, float]], bottom_width: float, top_width: float) -> Polytope:
-    """A convex profile in x and z (counter-clockwise as seen from -y), as wide as given at its lowest and highest z."""
+    """Returns a solid with a convex profile in x and z, and the given widths at its lowest and highest z.
+
+    The profile is counter-clockwise as seen from -y.
+    """
     corners = np.array(profile, np.float64)
     edges = np.roll(corners, -1, axis=0) - corners
     out = np.stack((edges[:, 1], np.zeros(len(edges)), -edges[:, 0]), axis=1)

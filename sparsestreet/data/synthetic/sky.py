@@ -1,4 +1,4 @@
-"""Sun, sky and clouds; what light a surface gets."""
+"""Sun, sky and clouds, and the light that they give to a surface."""
 
 from dataclasses import dataclass
 
@@ -15,18 +15,18 @@ GROUND_AMBIENT = (0.34, 0.31, 0.27)
 
 @dataclass(frozen=True)
 class Weather:
-    """Light of the whole drive (linear RGB radiance, 1 is about white on the picture)."""
+    """The light of the whole drive, in linear RGB radiance; 1 is about white in the picture."""
 
     sun: Float32[np.ndarray, "3"]
     """Unit direction towards the sun, world frame."""
     zenith: Color
     horizon: Color
     cloudiness: float
-    """Share of the sky under cloud, roughly."""
+    """Approximate share of the sky that clouds cover."""
     cloud_offset: float
 
     def radiance(self, directions: Vectors) -> Vectors:
-        """The sky in unit directions of the world frame; below the horizon it keeps the horizon's color."""
+        """Returns the sky in unit directions of the world frame; it has the horizon's color below the horizon."""
         up = np.maximum(directions[2], 0)
         sky = mix(column(self.horizon), column(self.zenith), 1 - np.exp(np.float32(-3.2) * up))
         sky = mix(sky, column((0.98, 0.98, 0.99)), self._clouds(directions, up))
@@ -35,7 +35,7 @@ class Weather:
         return sky + column((1.0, 0.9, 0.72)) * glow
 
     def _clouds(self, directions: Vectors, up: Scalars) -> Scalars:
-        """Opacity of clouds on a plane 1 unit above; gone towards the horizon, where they would turn to noise."""
+        """Returns the opacity of clouds on a plane 1 unit above, faded out at the horizon, where they would be noise."""
         reach = np.float32(1) / (up + np.float32(0.22))
         u, v = directions[0] * reach, directions[1] * reach
         shift, none = np.float32(self.cloud_offset), np.zeros_like(u)
@@ -47,15 +47,15 @@ class Weather:
         return np.float32(0.85) * cover * np.clip(up * 7, 0, 1)
 
     def ambient(self, normals: Vectors) -> Vectors:
-        """Light from the sky and from the ground on a surface with these normals."""
+        """Returns the light from sky and ground on a surface with these normals."""
         return mix(column(GROUND_AMBIENT), column(SKY_AMBIENT), np.float32(0.5) + np.float32(0.5) * normals[2])
 
 
 def random_weather(seed: int) -> Weather:
-    """A sun near enough to the street's direction that houses do not shade all of the road."""
+    """Returns weather with a sun close enough to the street's direction that houses do not shade all of the road."""
     rng = stream(seed, "weather")
     azimuth = float(rng.uniform(0.12, 0.30)) * np.pi * (1 if rng.random() < 0.5 else -1)
-    if rng.random() < 0.6:  # from behind: more of what the front camera sees is lit
+    if rng.random() < 0.6:  # from behind, so that more of the front camera's view is lit
         azimuth = np.pi - azimuth
     elevation = np.radians(float(rng.uniform(38, 56)))
     sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])

@@ -1,4 +1,4 @@
-"""Making a street: all frames rendered and written, or nothing."""
+"""Makes a street: renders and writes all frames, or nothing."""
 
 import dataclasses
 import hashlib
@@ -17,18 +17,17 @@ from sparsestreet.data.synthetic.world import World, build_world
 from sparsestreet.data.synthetic.write import StreetWriter
 
 GENERATOR = 3
-"""Raised whenever equal settings would give another street."""
+"""Version of the generator; raised whenever equal settings would give another street."""
 _WORKERS = 2
 
 
 def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, int], None] | None = None) -> Path:
     """Writes the street that ``settings`` describe to ``root`` (DriveStudio's layout) and returns ``root``.
 
-    A street of the same settings that is there already is kept as it is. The street is written beside ``root`` and
-    renamed when complete: an interruption leaves nothing behind. ``progress`` is called with the number of frames
-    done and the number of all frames.
+    An existing street of the same settings is kept. The street is written next to ``root`` and renamed when complete,
+    so an interruption leaves nothing. ``progress`` is called with the number of finished frames and of all frames.
 
-    Raises FileExistsError where ``root`` holds anything else.
+    Raises FileExistsError if ``root`` holds anything else.
     """
     root = Path(root)
     if _holds_street(root, settings):
@@ -40,7 +39,7 @@ def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, i
         try:
             os.rename(partial, root)
         except OSError:
-            # Someone else may have finished the same street meanwhile; anything else in the way is an error.
+            # Another process may have finished the same street meanwhile; anything else in the way is an error.
             if not _holds_street(root, settings):
                 raise
     finally:
@@ -50,7 +49,11 @@ def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, i
 
 
 def street_name(settings: StreetSettings) -> str:
-    """A folder's name for the street: its size, a hash of all that makes it but the seed, and the seed."""
+    """Returns a folder's name for the street: its size, a hash of all settings but the seed, and the seed.
+
+    >>> street_name(StreetSettings(num_frames=5, seed=7)).startswith("320x192x5_")
+    True
+    """
     label = _label(settings)
     label["settings"].pop("seed")
     digest = hashlib.sha256(json.dumps(label, sort_keys=True).encode()).hexdigest()[:8]
@@ -58,7 +61,7 @@ def street_name(settings: StreetSettings) -> str:
 
 
 def _holds_street(root: Path, settings: StreetSettings) -> bool:
-    """Whether ``root`` is this very street; False where nothing is there yet."""
+    """Whether ``root`` holds this very street; False if nothing is there yet."""
     if not root.exists() or (root.is_dir() and not any(root.iterdir())):
         return False
     label = root / "street.json"
@@ -71,7 +74,7 @@ def _holds_street(root: Path, settings: StreetSettings) -> bool:
 
 
 def _label(settings: StreetSettings) -> dict:
-    """What street.json says; through JSON, so that tuples compare as the lists they become."""
+    """Returns the content of street.json, converted by JSON so that tuples compare as the lists they become."""
     return json.loads(json.dumps({"generator": GENERATOR, "settings": dataclasses.asdict(settings)}))
 
 
@@ -87,13 +90,13 @@ def _write(settings: StreetSettings, folder: Path, progress: Callable[[int, int]
 
 
 def _frames(settings: StreetSettings, world: World) -> Iterator[StreetFrame]:
-    """All frames in order, rendered by threads: NumPy lets go of the interpreter while it computes."""
+    """Yields all frames in order, rendered by threads, because NumPy releases the interpreter while it computes."""
     pending: deque[Future[StreetFrame]] = deque()
     executor = ThreadPoolExecutor(_WORKERS)
     try:
         for index in range(settings.num_frames):
             pending.append(executor.submit(render_frame, settings, world, index))
-            # Few frames ahead of the writer, so that a long street does not pile up in memory.
+            # Render few frames ahead of the writer, so that a long street does not fill the memory.
             if len(pending) > _WORKERS + 1:
                 yield pending.popleft().result()
         while pending:

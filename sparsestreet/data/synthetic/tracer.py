@@ -1,4 +1,4 @@
-"""First hits of ray bundles, and which points the sun reaches."""
+"""First hits of ray bundles, and shadow rays towards the sun."""
 
 from dataclasses import dataclass
 
@@ -12,15 +12,15 @@ NOTHING = np.int16(-1)
 """Part index of a ray that leaves the street."""
 
 _TILE = 64
-"""Side of the bundles that share one list of candidate parts, rays: small enough for the cache and for culling,
-large enough that NumPy's cost per call does not count."""
+"""Side of the bundles that share one list of candidate parts, in rays. It is small enough for the cache and for
+culling, and large enough that NumPy's cost per call does not matter."""
 _LIFT = np.float32(2e-3)
-"""Shadow rays start this far above the surface, meters: more than the rounding of a hit 250 m away."""
+"""Height above the surface at which shadow rays start, meters; more than the rounding of a hit 250 m away."""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """A grid of rays from one point, as a camera's pixels or a lidar's beams and azimuth steps."""
+    """A grid of rays from one point, such as a camera's pixels or a lidar's beams and azimuth steps."""
 
     origin: Float32[np.ndarray, "3"]
     directions: Float32[np.ndarray, "3 h w"]
@@ -30,13 +30,13 @@ class Rays:
 @dataclass(frozen=True)
 class Hits:
     distances: Float32[np.ndarray, "h w"]
-    """Meters along the ray; infinity where nothing was hit."""
+    """Meters along the ray; infinity if nothing was hit."""
     parts: Int16[np.ndarray, "h w"]
     """Index of the part that was hit, or NOTHING."""
 
 
 def first_hits(scene: Scene, rays: Rays) -> Hits:
-    """The nearest part along every ray."""
+    """Returns the nearest part along every ray."""
     _, height, width = rays.directions.shape
     distances = np.empty((height, width), np.float32)
     parts = np.empty((height, width), np.int16)
@@ -75,10 +75,10 @@ def _trace_tile(
 
 
 def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, "k 3"]:
-    """Inward normals of up to four planes through the origin with all rays of the tile on one side.
+    """Returns inward normals of up to four planes through the origin with all rays of the tile on one side.
 
-    Sides of a lidar's tile are cones, and a lens bends those of a camera's: a plane that would cut off rays is turned
-    towards the middle until it does not, or left out of a tile too wide for that.
+    Sides of a lidar's tile are cones, and a lens bends those of a camera's tile. So a plane that would cut off rays is
+    turned until it does not, or omitted if the tile is too wide for that.
     """
     corners = tile[:, [0, 0, -1, -1], [0, -1, -1, 0]].T
     normals = np.cross(corners, np.roll(corners, -1, axis=0))
@@ -94,7 +94,7 @@ def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, 
 
 
 def sunlit(scene: Scene, view: SunView, points: Vectors, normals: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
-    """Whether one shadow ray from each point reaches the sun. All points lie on the convex part ``owner``.
+    """Returns whether the shadow ray from each point reaches the sun. All points lie on the convex part ``owner``.
 
     ``normals`` are outward and in the world frame, as ``points`` are.
     """
@@ -107,7 +107,7 @@ def sunlit(scene: Scene, view: SunView, points: Vectors, normals: Vectors, owner
 
 def _blocked(scene: Scene, view: SunView, points: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
     seen = rotated(view.axes, points)
-    # Sorted along one axis of the sun's view, the points that a part may shade are one short run.
+    # When sorted along one axis of the sun's view, the points that a part may shade form one short run.
     order = np.argsort(seen[1])
     points, seen = points[:, order], seen[:, order]
     dark = np.zeros(points.shape[1], bool)

@@ -1,4 +1,4 @@
-"""What a camera anywhere in a street sees: the truth that no recorded drive has."""
+"""The true image of a camera anywhere in a street, which no recorded drive has."""
 
 from functools import lru_cache
 
@@ -18,11 +18,11 @@ from sparsestreet.types import Frame, View
 
 
 def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]) -> Truth:
-    """A camera and a time in the log's world -> what the street's own camera would have recorded there.
+    """Returns a function: a camera and a time in the log's world -> what the street's camera would record there.
 
-    None where the camera is inside of something annotated. People and vehicles count as far as boxes reach
-    (``annotation_range``, here from the camera), seen or not. A view's lens is followed, its shutter ignored, as no
-    street has any.
+    It returns None if the camera is inside an annotated object. Masks hold people and vehicles up to
+    ``annotation_range`` from the camera, annotated or not. A view's lens is applied; its shutter is ignored, because
+    streets have none.
     """
     world = build_world(settings)
     instant_at = lru_cache(maxsize=1)(lambda seconds: Instant.at(world, seconds))

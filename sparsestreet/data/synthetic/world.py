@@ -1,4 +1,4 @@
-"""The street itself: what stands where, who moves how, all decided by the seed."""
+"""The street itself: the places and motions of all things, decided by the seed."""
 
 from dataclasses import dataclass
 
@@ -26,10 +26,10 @@ class Actor:
     model: Model
     path: Path
     ground: float
-    """Height of what it stands on, meters."""
+    """Height of the ground under it, meters."""
 
     def pose(self, time: float) -> Pose:
-        """World from object: the object's origin is the center of its box."""
+        """Returns world from object; the object's origin is the center of its box."""
         return self.path.pose(time, self.ground + self.model.size[2] / 2)
 
 
@@ -37,13 +37,13 @@ class Actor:
 class World:
     ego: EgoDrive
     scenery: tuple[Part, ...]
-    """Everything that is no annotated object, in the world frame."""
+    """Parts of everything but annotated objects, in the world frame."""
     actors: tuple[Actor, ...]
-    """An actor's position in this tuple is the object index of its parts."""
+    """Annotated objects; an actor's position in this tuple is the object index of its parts."""
     weather: Weather
 
     def parts_at(self, time: float) -> list[Part]:
-        """All parts in the world frame at a time in seconds."""
+        """Returns all parts in the world frame at a time in seconds."""
         parts = list(self.scenery)
         for index, actor in enumerate(self.actors):
             parts += placed(actor.model.parts(actor.path.traveled(time)), actor.pose(time), index)
@@ -80,7 +80,7 @@ def _ground(seed: int, end: float) -> list[Part]:
     tone = float(rng.uniform(0.24, 0.34))
     for side, curb in ((1, layout.CURB_RIGHT), (-1, layout.CURB_LEFT)):
         footway = Footway((tone, tone * 0.97, tone * 0.91), half, side, float(rng.uniform(0, 30)))
-        # Sunk into the ground; wider at the back, so that set-back houses leave no gap to the road surface.
+        # Sunk into the ground, and wider at the back, so that set-back houses leave no gap to the road surface.
         solid = box(2 * half_length, 2 * half, 2 * layout.CURB_HEIGHT)
         parts.append(Part(solid, footway, at((start + stop) / 2.0, curb - side * half, 0.0)))
         back = Footway((tone * 0.9, tone * 0.88, tone * 0.8), 50.0, side, float(rng.uniform(0, 30)))
@@ -90,12 +90,12 @@ def _ground(seed: int, end: float) -> list[Part]:
 
 
 def _crossing(seed: int, end: float) -> float:
-    """x of the near end of the zebra crossing."""
+    """Returns x of the near end of the zebra crossing."""
     return float(stream(seed, "crossing").uniform(0.35, 0.6)) * end + 16
 
 
 def _houses(seed: int, end: float) -> list[Part]:
-    """Two rows along the street, with a few gaps, and a row across its end."""
+    """Returns two rows of houses along the street, with a few gaps, and a row across its end."""
     rng = stream(seed, "houses")
     stop = end + layout.AHEAD
     fronts = ((1, layout.CURB_RIGHT - layout.FOOTWAY_WIDTH), (-1, layout.CURB_LEFT + layout.FOOTWAY_WIDTH))
@@ -116,14 +116,14 @@ def _houses(seed: int, end: float) -> list[Part]:
     y = layout.CURB_RIGHT - 12.0
     while y < layout.CURB_LEFT + 12:
         width = float(rng.uniform(9, 14))
-        # Turned by a quarter: the front looks back along the street.
+        # Turned by a quarter, so that the front looks back along the street.
         parts += placed(house(rng, width, 10.0, 1), at(stop + 14.0, y + width / 2.0, 0.0, np.pi / 2.0))
         y += width
     return parts
 
 
 def _footway_things(seed: int, end: float) -> list[Part]:
-    """Trees, lamp posts and bins by turns along both curbs."""
+    """Returns trees, lamp posts and bins in turn along both curbs."""
     rng = stream(seed, "footway")
     parts: list[Part] = []
     for side, y in ((1, layout.CURB_RIGHT - 0.75), (-1, layout.CURB_LEFT + 0.75)):
@@ -139,11 +139,11 @@ def _footway_things(seed: int, end: float) -> list[Part]:
 
 
 def _parked_cars(settings: StreetSettings, end: float) -> list[Actor]:
-    """Cars in randomly chosen places of both parking strips, most of them where the drive passes."""
+    """Returns cars in random places of both parking strips, most of them where the drive passes."""
     rng = stream(settings.seed, "parked cars")
     spacing = 6.4
     places = [
-        # Nobody parks on the crossing: the places beyond it start one crossing later.
+        # Nobody parks on the crossing, so the places beyond it start one crossing later.
         (x + 9.0 * (x > _crossing(settings.seed, end) - 4), y, heading)
         for y, heading, shift in ((layout.PARKING_RIGHT, 0.0, -1.0), (layout.PARKING_LEFT, np.pi, 2.0))
         for x in shift + spacing * np.arange(max(int((end + 36) / spacing), (settings.num_parked_cars + 1) // 2))
@@ -163,14 +163,14 @@ def _parked_cars(settings: StreetSettings, end: float) -> list[Actor]:
 
 
 def _moving_cars(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
-    """Oncoming and overtaking by turns. All of one kind share a speed and keep a distance, so none can collide."""
+    """Returns oncoming and overtaking cars in turn. Each kind shares a speed and keeps a distance, so none collide."""
     rng = stream(settings.seed, "moving cars")
     oncoming, overtaking = -float(rng.uniform(8, 11)), settings.ego_speed + float(rng.uniform(3.5, 5))
     spacing = 11.0
     last = {oncoming: -np.inf, overtaking: np.inf}
     actors = []
     for number in range(settings.num_moving_cars):
-        # When the car is beside the ego car: spread evenly over the drive.
+        # Times when the cars pass the ego car, spread evenly over the drive.
         meeting = settings.duration * (number + 0.7) / max(settings.num_moving_cars, 1)
         beside = float(ego.pose(meeting)[0, 3])
         if number % 2 == 0:
@@ -189,7 +189,7 @@ def _moving_cars(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
 
 
 def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
-    """People on both footways, each on a line of their own between the trees and the houses."""
+    """Returns people on both footways, each on their own line between the trees and the houses."""
     rng = stream(settings.seed, "pedestrians")
     actors = []
     for number in range(settings.num_pedestrians):
@@ -204,7 +204,7 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
 
 
 def _cyclists(settings: StreetSettings) -> list[Actor]:
-    """Cyclists in the lane to the right of the ego car, one after the other at one speed; the ego car passes them."""
+    """Returns cyclists in a row at one speed, in the lane to the right of the ego car, which passes them."""
     rng = stream(settings.seed, "cyclists")
     speed = settings.ego_speed * float(rng.uniform(0.5, 0.65))
     actors = []

@@ -1,4 +1,4 @@
-"""Frames of a street on disk: DriveStudio's processed layout in its nuScenes flavor, and the exact truth beside it."""
+"""Writes frames of a street in DriveStudio's processed layout (nuScenes flavor), together with the exact truth."""
 
 import json
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from sparsestreet.data.synthetic.world import Actor, World
 
 MINIMUM_PIXELS = 6
 MINIMUM_RETURNS = 3
-"""An object is annotated where at least so many pixels (of all cameras) or lidar returns fall on it."""
+"""Least number of lidar returns on an annotated object; ``MINIMUM_PIXELS`` over all cameras suffice too."""
 
 HUMAN_CLASSES = ("Pedestrian", "Cyclist")
 VEHICLE_CLASSES = ("Vehicle",)
@@ -24,14 +24,14 @@ VEHICLE_CLASSES = ("Vehicle",)
 
 @dataclass
 class StreetWriter:
-    """Writes frames in order; ids of instances are given in order of first appearance."""
+    """Writes frames in order, and numbers instances in order of first appearance."""
 
     root: Path
     settings: StreetSettings
     world: World
     _bodies: BodyWriter = field(init=False)
     _ids: dict[int, int] = field(default_factory=dict)
-    """Id of every actor annotated so far, by its position in the world."""
+    """Position of an actor in the world -> its id, for actors annotated so far."""
     _instances: dict[str, dict] = field(default_factory=dict)
     _frames: dict[str, list[int]] = field(default_factory=dict)
 
@@ -48,7 +48,7 @@ class StreetWriter:
         np.savetxt(self._file("lidar_pose", f"{frame.index:03d}.txt"), frame.sweep.world_from_lidar)
 
     def finish(self) -> None:
-        """The files about the whole drive."""
+        """Writes the files about the whole drive."""
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
         self._bodies.write(self.root / "humanpose" / "smpl.pkl")
@@ -60,7 +60,7 @@ class StreetWriter:
         return self.root / folder / name
 
     def _annotate(self, frame: StreetFrame) -> list[int]:
-        """Records the boxes of this frame; answers with the annotated actors."""
+        """Records the boxes of this frame and returns the annotated actors."""
         actors = self.world.actors
         pixels, returns = np.zeros(len(actors), int), np.zeros(len(actors), int)
         for image in frame.images:
@@ -90,7 +90,7 @@ class StreetWriter:
 
     def _write_image(self, image: StreetImage, name: str, annotated: list[int]) -> None:
         picture = Image.fromarray(image.rgb)
-        # 4:4:4: halved color would smear the edges that a 320-pixel image has few pixels for.
+        # 4:4:4, because halved color would smear edges, for which a 320-pixel image has few pixels.
         picture.save(self._file("images", f"{name}.jpg"), quality=97, subsampling=0)
         np.savetxt(self._file("extrinsics", f"{name}.txt"), image.camera.world_from_camera)
         _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)
@@ -101,7 +101,7 @@ class StreetWriter:
             chosen = [index for index, class_name in classes.items() if class_name in members]
             mask = np.isin(image.object_indices, np.array(chosen, np.int16))
             _write_mask(self._file(f"dynamic_masks/{folder}", f"{name}.png"), mask)
-        ids = np.full(len(self.world.actors) + 1, -1, np.int16)  # the last entry answers for BACKGROUND = -1
+        ids = np.full(len(self.world.actors) + 1, -1, np.int16)  # the last entry is that of BACKGROUND = -1
         for index in annotated:
             ids[index] = self._ids[index]
         truth = self._file("depth", f"{name}.npz")
@@ -114,7 +114,7 @@ class StreetWriter:
 
 
 def _count(indices: Int16[np.ndarray, "..."], actors: int) -> np.ndarray:
-    """How often each actor's index occurs."""
+    """Returns how often each actor's index occurs."""
     return np.bincount(indices[indices >= 0], minlength=actors)
 
 

@@ -18,11 +18,11 @@ class BodyStyle:
     width: float
     height: float
     bonnet: float
-    """Where the windscreen starts."""
+    """Start of the windscreen."""
     roof_start: float
     roof_end: float
     tail: float
-    """Where the rear window ends."""
+    """End of the rear window."""
     belt: float
     """Lower edge of the windows."""
     nose: float
@@ -40,7 +40,7 @@ STYLES = (SALOON, HATCHBACK, ESTATE, TALL, VAN)
 _CLEARANCE = 0.20
 _WHEEL_RADIUS = 0.33
 _BODY_INSET = 0.02
-"""The wheels stand this much out of the body's side, and still within the box."""
+"""Meters by which the wheels stand out from the body's sides, still within the box."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Car:
         return (self._x(0.19), self._x(0.80))
 
     def _x(self, share: float) -> float:
-        """x in the box frame from a share of the length behind the front bumper."""
+        """Returns x in the box frame for a share of the length, measured from the front bumper."""
         return self.style.length * (0.5 - share)
 
     def _body(self) -> Part:

@@ -1,4 +1,4 @@
-"""What the street asks of everything that moves."""
+"""The interface of everything that moves in the street."""
 
 from typing import Protocol, runtime_checkable
 
@@ -18,5 +18,5 @@ class Model(Protocol):
         ...
 
     def parts(self, traveled: float) -> list[Part]:
-        """The parts after ``traveled`` meters: wheels turn and legs walk with the distance."""
+        """Returns the parts after ``traveled`` meters; wheels turn and legs walk with the distance."""
         ...

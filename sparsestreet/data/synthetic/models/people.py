@@ -46,7 +46,7 @@ class Pedestrian:
     height: float
     clothes: Clothes
     stride: float = 1.4
-    """Meters of one full gait cycle (two steps)."""
+    """Length of one full gait cycle (two steps), meters."""
 
     class_name = "Pedestrian"
 
@@ -72,7 +72,7 @@ class Pedestrian:
         return parts
 
     def leg(self, side: int, traveled: float) -> tuple[Point, Point, Point]:
-        """Hip, knee and foot of the left (1) or right (-1) leg after so many meters."""
+        """Returns hip, knee and foot of the left (1) or right (-1) leg after ``traveled`` meters."""
         h, scale = self.height, self.height / 1.75
         ground, y = -h / 2, side * 0.085 * scale
         swing, lift = self._swing(side, traveled)
@@ -82,7 +82,7 @@ class Pedestrian:
         return (0.0, y, ground + 0.50 * h), knee, foot
 
     def arm(self, side: int, traveled: float) -> tuple[Point, Point, Point]:
-        """Shoulder, elbow and hand of an arm, which swings against its leg."""
+        """Returns shoulder, elbow and hand of an arm, which swings against its leg."""
         h, scale = self.height, self.height / 1.75
         shoulder, y = -h / 2 + 0.80 * h, side * 0.19 * scale
         swing = -self._swing(side, traveled)[0]
@@ -91,7 +91,7 @@ class Pedestrian:
         return (0.0, y, shoulder - 0.03 * h), elbow, hand
 
     def _swing(self, side: int, traveled: float) -> tuple[float, float]:
-        """Of a leg: how far it is ahead and how high it is lifted, both in -1 to 1."""
+        """Returns how far a leg is ahead and how high it is lifted, both from -1 to 1."""
         gait = 2 * np.pi * traveled / self.stride
         return float(np.sin(gait)) * side, float(np.cos(gait)) * side
 

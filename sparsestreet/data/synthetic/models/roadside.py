@@ -9,7 +9,7 @@ from sparsestreet.data.synthetic.textures.plain import Grainy, Plain
 
 
 def tree(rng: np.random.Generator) -> list[Part]:
-    """A trunk with a crown of overlapping balls; origin at the foot."""
+    """Returns a trunk with a crown of overlapping balls; origin at the foot."""
     height, reach = float(rng.uniform(5.0, 7.5)), float(rng.uniform(1.1, 1.6))
     stem = height - 1.6 * reach
     bark = Grainy((0.16, 0.11, 0.07), 0.12, 0.25, float(rng.uniform(0.0, 20.0)))
@@ -30,7 +30,7 @@ def tree(rng: np.random.Generator) -> list[Part]:
 
 
 def lamp_post(towards: int) -> list[Part]:
-    """A post with an arm over the road; origin at the foot, ``towards`` +1 where the road lies at +y."""
+    """Returns a post with an arm over the road; origin at the foot, ``towards`` is +1 if the road lies at +y."""
     steel, head = Plain((0.13, 0.14, 0.15), 0.15), Plain((0.55, 0.55, 0.52))
     return [
         Part(Cylinder(0.10, 0.4), steel, at(0.0, 0.0, 0.4)),
@@ -41,7 +41,7 @@ def lamp_post(towards: int) -> list[Part]:
 
 
 def bin_box(rng: np.random.Generator) -> list[Part]:
-    """A litter bin; origin at the foot."""
+    """Returns a litter bin; origin at the foot."""
     color = ((0.05, 0.16, 0.08), (0.40, 0.10, 0.03), (0.10, 0.12, 0.16))[rng.integers(3)]
     return [
         Part(box(0.45, 0.45, 0.9), Grainy(color, 0.3, 0.05), at(0.0, 0.0, 0.45)),
@@ -50,9 +50,9 @@ def bin_box(rng: np.random.Generator) -> list[Part]:
 
 
 def house(rng: np.random.Generator, width: float, depth: float, road_side: int) -> list[Part]:
-    """A house with its front on the plane y = 0 and its body away from the road; centered in x.
+    """Returns a house with its front on the plane y = 0 and its body away from the road; centered in x.
 
-    ``road_side`` is +1 where the road lies at +y.
+    ``road_side`` is +1 if the road lies at +y.
     """
     walls = (
         (0.52, 0.42, 0.30), (0.46, 0.19, 0.13), (0.58, 0.53, 0.45), (0.40, 0.42, 0.45),

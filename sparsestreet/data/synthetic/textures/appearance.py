@@ -1,4 +1,4 @@
-"""What a surface tells the renderer about its points."""
+"""The appearance of surface points, which the renderer asks of a surface."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -25,7 +25,7 @@ class Appearance:
 @runtime_checkable
 class Surface(Protocol):
     def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
-        """Appearance at points of the part's own frame; ``footprints`` are a pixel's extents along its axes, meters."""
+        """Returns the appearance at points of the part's frame; ``footprints`` are a pixel's extents in it, meters."""
         ...
 
 
@@ -34,5 +34,9 @@ def column(color: Color) -> Float32[np.ndarray, "3 1"]:
 
 
 def mix(below: Float32[np.ndarray, "3 _"], above: Float32[np.ndarray, "3 _"], share: Scalars) -> Vectors:
-    """``above`` painted over ``below`` where ``share`` is 1."""
+    """Returns ``below`` with ``above`` painted over it where ``share`` is 1.
+
+    >>> mix(column((0.0, 0.0, 0.0)), column((1.0, 1.0, 1.0)), np.float32([0.25]))[0].tolist()
+    [0.25]
+    """
     return below + (above - below) * share

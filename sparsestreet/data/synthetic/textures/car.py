@@ -80,7 +80,7 @@ class BodyPaint:
 
 @dataclass(frozen=True)
 class Cabin:
-    """Painted pillars and roof around glass: every steep face is a pane set in by ``pillar`` meters."""
+    """Painted pillars and roof around glass; every steep face is a pane inset by ``pillar`` meters."""
 
     color: Color
     shape: Polytope
@@ -89,7 +89,7 @@ class Cabin:
     """x of the posts between side windows."""
 
     def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
-        # The smallest depth is that of the point's own face; the second smallest is the way to the nearest edge.
+        # The smallest depth belongs to the point's own face; the second smallest is the distance to the nearest edge.
         rim = np.partition(self.shape.depths(points), 1, axis=0)[1]
         pane = beyond(rim, self.pillar, footprints.max(0))
         for post in self.posts:
@@ -102,7 +102,7 @@ class Cabin:
 
 @dataclass(frozen=True)
 class Wheel:
-    """Tyre and five-spoked rim about the part's z axis, turned by ``angle`` radians."""
+    """Tire and five-spoked rim about the part's z axis, turned by ``angle`` radians."""
 
     radius: float
     angle: float
@@ -122,7 +122,7 @@ class Wheel:
 
 
 def metallic(rng: np.random.Generator) -> Color:
-    """A car color: mostly white, silver, gray, black; sometimes red, blue, green, yellow."""
+    """Returns a car color: mostly white, silver, gray, black; sometimes red, blue, green, yellow."""
     palette = (
         (0.62, 0.62, 0.62), (0.40, 0.41, 0.42), (0.17, 0.18, 0.19), (0.03, 0.03, 0.035), (0.36, 0.03, 0.03),
         (0.03, 0.08, 0.30), (0.04, 0.16, 0.10), (0.55, 0.36, 0.05), (0.10, 0.25, 0.42), (0.42, 0.33, 0.24),

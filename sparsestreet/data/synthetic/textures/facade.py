@@ -15,7 +15,7 @@ ROOF = (0.16, 0.14, 0.13)
 
 @dataclass(frozen=True)
 class FacadeStyle:
-    """How one house is built; lengths in meters, shares of a window's cell in [0, 1]."""
+    """The look of one house; lengths in meters, shares of a window's cell in [0, 1]."""
 
     wall: Color
     frame: Color
@@ -25,7 +25,7 @@ class FacadeStyle:
     """Sign board and doors."""
     storey: float
     pitch: float
-    """Wanted distance of window centers; the face's width is divided evenly."""
+    """Wanted distance between window centers; the face's width is divided evenly."""
     window_width: float
     window_low: float
     window_high: float
@@ -38,7 +38,7 @@ class FacadeStyle:
 
 @dataclass(frozen=True)
 class _Face:
-    """Coordinates on whichever face a point lies: u along it, z up from the ground, and the footprints there."""
+    """Coordinates on the face of each point: u along it, z up from the ground, and the footprints there."""
 
     u: Scalars
     z: Scalars
@@ -103,7 +103,7 @@ class Facade:
         return wall * (np.float32(0.78) + np.float32(0.22) * np.clip(face.z / np.float32(0.7), 0, 1))
 
     def _upper(self, face: _Face, albedo: Vectors, s: Scalars, fs: Scalars) -> Vectors:
-        """Ledges between storeys, sills under windows and the cornice."""
+        """Returns the wall with ledges between storeys, sills under windows and the cornice."""
         style = self.style
         z, fz = face.z - np.float32(style.ground_floor), face.fz
         low = style.window_low * style.storey
@@ -116,7 +116,7 @@ class Facade:
     def _windows(
         self, face: _Face, s: Scalars, fs: Scalars, column_index: Scalars
     ) -> tuple[tuple[Float32[np.ndarray, "3 1"], Scalars, Vectors], Scalars]:
-        """Frame color, frame coverage and glass color; and the coverage of the glass."""
+        """Returns frame color, frame coverage and glass color; and the coverage of the glass."""
         style = self.style
         z = (face.z - np.float32(style.ground_floor)) / np.float32(style.storey)
         fz = face.fz / np.float32(style.storey)
@@ -139,7 +139,7 @@ class Facade:
     def _ground_floor(
         self, face: _Face, s: Scalars, fs: Scalars, column_index: Scalars, wall: Vectors
     ) -> tuple[Vectors, Scalars]:
-        """Color of the ground floor and the coverage of its glass."""
+        """Returns the color of the ground floor and the coverage of its glass."""
         style = self.style
         z, fz = face.z, face.fz
         kind = cell_random(column_index, np.full_like(s, -7), style.seed)
@@ -152,7 +152,7 @@ class Facade:
         albedo = mix(albedo, column(style.shop), door.astype(np.float32))
         if style.has_shops:
             albedo = mix(albedo, column(style.shop), strip(z, 2.85, 3.4, fz))
-            # Letters of the sign, as blocks.
+            # Blocks stand for the letters of the sign.
             letters = stripes(face.u, 0.55, 0.1, 0.42, face.fu) * strip(z, 2.98, 3.27, fz)
             written = cell_random(np.floor(face.u / np.float32(0.55)), face.seed, style.seed) < 0.55
             albedo = mix(albedo, column((0.8, 0.78, 0.7)), (letters * written * np.float32(0.8)).astype(np.float32))

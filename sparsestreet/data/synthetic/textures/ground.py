@@ -1,4 +1,4 @@
-"""Asphalt with lane markings, and paved footways with curbs. Points are in the world frame but for a shift in z."""
+"""Asphalt with lane markings, and paved footways with curbs. Points are in the world frame except for a shift in z."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ WHITE = (0.72, 0.72, 0.70)
 
 @dataclass(frozen=True)
 class Lines:
-    """Where paint lies on the road, meters; x along the road."""
+    """Positions of paint on the road, meters; x is along the road."""
 
     solid: tuple[float, ...]
     dashed: tuple[float, ...]
@@ -69,7 +69,7 @@ class Asphalt:
 
 @dataclass(frozen=True)
 class Footway:
-    """Slabs with joints; a curb stone along the road. ``curb_side`` is +1 where the road lies towards +y."""
+    """Slabs with joints, and a curb stone along the road. ``curb_side`` is +1 if the road lies towards +y."""
 
     color: Color
     half_width: float

@@ -10,7 +10,7 @@ from sparsestreet.data.synthetic.textures.appearance import Appearance, Color, V
 
 @dataclass(frozen=True)
 class Plain:
-    """Paint, metal, cloth seen from far."""
+    """A single color, as of paint, metal, or cloth seen from far."""
 
     color: Color
     gloss: float = 0.0
@@ -30,10 +30,10 @@ class Grainy:
     contrast: float
     """Standard deviation of the relative brightness."""
     offset: float = 0.0
-    """Shifts the pattern, so that copies differ, meters."""
+    """Meters by which the pattern is shifted, so that copies differ."""
 
     def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
-        # Each point takes the section of the noise that its surface faces most: no section is seen edge-on.
+        # Each point uses the section of the noise that its surface faces most, so no section is seen edge-on.
         x, y, z = points + np.float32(self.offset)
         facing = np.abs(normals).argmax(0)
         u, v = np.where(facing == 0, y, x), np.where(facing == 2, y, z)
