@@ -72,7 +72,7 @@ def psnr_curves(
 ) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
     """Returns name of a curve -> (steps or seconds, dB), from the rows that have a value.
 
-    >>> psnr_curves([{"step": 1, "psnr": 20.5}, {"step": 2, "psnr": None}], {"training": "psnr"}, "step")
+    >>> psnr_curves([{"step": 1.0, "psnr": 20.5}, {"step": 2.0, "psnr": None}], {"training": "psnr"}, "step")
     {'training': ((1.0,), (20.5,))}
     """
     curves = {}

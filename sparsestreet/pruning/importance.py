@@ -25,7 +25,7 @@ class Importance:
     light; the training steps after the removal make up for it. Render all nodes of the scene for the contributions,
     because what stands in front decides what dominates. Then select the background rows of ``scores()``.
 
-    >>> view = Contribution(torch.tensor([3.0, 1.0]), torch.tensor([4, 4]), torch.tensor([4, 0]))
+    >>> view = Contribution(torch.tensor([3.0, 1.0]).double(), torch.tensor([4, 4]), torch.tensor([4, 0]))
     >>> importance = Importance()
     >>> importance.add(view)
     >>> importance.scores().tolist()
@@ -74,7 +74,7 @@ class Importance:
 def measure_importance(views: Iterable[Contribution], gate: bool = True) -> Float64[Tensor, " n"]:
     """Returns the scores of all rows over all views; see ``Importance`` for the formula and the errors raised.
 
-    >>> view = Contribution(torch.tensor([3.0, 1.0]), torch.tensor([4, 4]), torch.tensor([4, 0]))
+    >>> view = Contribution(torch.tensor([3.0, 1.0]).double(), torch.tensor([4, 4]), torch.tensor([4, 0]))
     >>> measure_importance([view], gate=False).tolist()
     [0.75, 0.25]
     """

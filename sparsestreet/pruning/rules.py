@@ -55,10 +55,10 @@ class ImportanceRule(PruningRule):
 class LeaveOneOutRule(PruningRule):
     """Removes the rows that change the training images least, until ``allowed_db`` of their PSNR is spent.
 
-    The cost of a row is the sum over views, pixels and channels of the squared change when this row alone is removed,
-    relative to the present squared error. The cost adds this ratio for the whole images, for the pixels of vehicles
-    and for those of people, where the log marks them. These regions are small, and a loss there would drown in the
-    whole.
+    The change of a row is the squared change of the images when this row alone is removed, summed over views, pixels
+    and channels. Its cost is this change relative to the present squared error, for the whole images, plus the same for
+    the pixels of vehicles and for those of people, where the log marks them. These regions are small, and a loss there
+    would drown in the whole.
 
     Rows are removed from the least cost upwards while the sum of costs stays within 10^(dB / 10) - 1. So neither the
     images nor their vehicles nor their people lose more than ``allowed_db``. This treats changes as independent of each
@@ -90,7 +90,7 @@ class LeaveOneOutRule(PruningRule):
     def costs(
         self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
     ) -> dict[str, Float64[Tensor, " _"]]:
-        """Name of a node -> what each of its rows costs, relative to the present squared error."""
+        """Returns name of a node -> the cost of each of its rows, relative to the present squared error."""
         errors = sum(_squared_errors(scene, frame, context) for frame in on_device(scene, frames))
         spans = scene.gaussians_at(frames[0], context.state).spans
         rows = max(span.stop for span in spans.values())

@@ -20,8 +20,8 @@ HELD_OUT, TRAINING = "held_out", "training"
 class RegionQuality:
     """Errors within one region of one image.
 
-    All metrics are None if the region has no pixels. Those with defaults are also None if they are not defined for the
-    region, if the image is smaller than their window, or if LPIPS has no weights.
+    All metrics are None if the region has no pixels. Those with defaults are also None in three cases: they are not
+    defined for the region, the image is smaller than their window, or LPIPS has no weights.
     """
 
     pixels: int

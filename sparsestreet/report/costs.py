@@ -48,7 +48,7 @@ def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float
 
 
 def _forward(costs: CostRecord) -> tuple[str, ...]:
-    """Parts of a step's forward pass: effects go by their names."""
+    """Returns the parts of a step's forward pass; effects have their own names."""
     return ("scene", "splat", *costs.effects, "losses", "regularizers")
 
 

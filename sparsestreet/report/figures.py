@@ -87,7 +87,7 @@ def of_sparsify(arm: Arm) -> str:
 def short(value: float) -> str:
     """Returns a number in short form.
 
-    >>> short(12000), short(1500000), short(950)
+    >>> short(12e3), short(1.5e6), short(950.0)
     ('12k', '1.5M', '950')
     """
     unit, size = next(((unit, size) for unit, size in (("M", 1e6), ("k", 1e3)) if value >= size), ("", 1.0))

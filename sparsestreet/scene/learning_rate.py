@@ -57,8 +57,13 @@ def rates_of(said: Rates) -> dict[str, LearningRate]:
 
 
 def usual_rates() -> dict[str, LearningRate]:
-    """Those of 3DGS (Kerbl et al. 2023) for Gaussians; for masks and tracks those of conf/schedule/paper.yaml and
-    conf/node/rigid.yaml, for runs of 30,000 steps."""
+    """Returns rates for runs of 30,000 steps: those of 3DGS (Kerbl et al. 2023) for Gaussians.
+
+    Rates of masks and tracks are those of conf/schedule/paper.yaml and conf/node/rigid.yaml.
+
+    >>> usual_rates()["opacity_logits"].initial
+    0.05
+    """
     return {
         "means": LearningRate(1.6e-4, 1.6e-6, scale_by_scene_radius=True),
         "log_scales": LearningRate(5e-3),

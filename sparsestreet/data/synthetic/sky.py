@@ -35,7 +35,7 @@ class Weather:
         return sky + column((1.0, 0.9, 0.72)) * glow
 
     def _clouds(self, directions: Vectors, up: Scalars) -> Scalars:
-        """Returns the opacity of clouds on a plane 1 unit above, faded out at the horizon, where they would be noise."""
+        """Returns the opacity of clouds on a plane 1 unit above, faded at the horizon, where it would be noise."""
         reach = np.float32(1) / (up + np.float32(0.22))
         u, v = directions[0] * reach, directions[1] * reach
         shift, none = np.float32(self.cloud_offset), np.zeros_like(u)

@@ -52,9 +52,8 @@ class Rows(nn.Module):
     def resize(self, plan: RowPlan, optimizer: Optimizer | None = None) -> None:
         """Applies a plan to values, optimizer moments and buffers, and drops gradients.
 
-        Raises KeyError or ValueError and changes nothing if the plan does not fit: it was made for another number of
-        rows, or edits an unknown column or one of another shape. The same holds if the optimizer lacks a trainable
-        column.
+        Raises ValueError if the plan was made for another number of rows, edits a column in another shape, or if the
+        optimizer lacks a trainable column; KeyError if it edits an unknown column. An error changes nothing.
 
         >>> rows = Rows({"opacity_logits": torch.tensor([1.0, 2.0, 3.0])})
         >>> rows.resize(RowPlan.keep(torch.tensor([True, False, True])))
@@ -118,14 +117,7 @@ class Rows(nn.Module):
 
 
 def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
-    """Removes a parameter and its moments from an optimizer; does nothing if the optimizer does not hold it.
-
-    >>> parameter = nn.Parameter(torch.zeros(2))
-    >>> optimizer = torch.optim.Adam([parameter])
-    >>> drop_parameter(optimizer, parameter)
-    >>> optimizer.param_groups
-    []
-    """
+    """Removes a parameter and its moments from an optimizer; does nothing if the optimizer does not hold it."""
     optimizer.state.pop(parameter, None)
     for group in optimizer.param_groups:
         group["params"] = [other for other in group["params"] if other is not parameter]

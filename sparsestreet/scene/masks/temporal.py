@@ -45,7 +45,7 @@ class TemporalMaskSettings:
     """True: the loss lowers a row's scores only in views that draw the row (see ``StaticMaskSettings``)."""
     image_closes: bool = True
     """False: the image's gradient may only raise scores, so only the sparsity loss closes masks. All rows share one
-    network. If the image asks the same of all rows (thinner limbs, say), a mask of 0 or 1 cannot provide it, and the
+    network. If the image asks the same of all rows (thinner limbs, say), a mask of 0 or 1 cannot provide it. Then the
     network closes people at most times."""
 
     def __post_init__(self) -> None:
@@ -68,8 +68,8 @@ class TemporalMask(Mask):
 
     p is the mean in units of its instance's half size, without gradient; t and p are encoded by sines and cosines. The
     network returns a logit. The paper's formula ends the network with a sigmoid; a second sigmoid after it would keep
-    every score above 0.5. The first layer is a sum of a part for the row and a part for the time, so several times cost
-    little more than one.
+    every score above 0.5. The first layer sums a part for the row and a part for the time, so several times cost little
+    more than one.
     """
 
     settings: TemporalMaskSettings

@@ -2,7 +2,7 @@
 
 ``node`` is the interface shared by all. Three classes hold a whole street: ``background`` stands still, Gaussians of
 ``vibrating`` swing and fade, and a ``network`` deforms those of ``field``. Three classes hold objects and move them
-along their tracks (``tracked``): ``rigid`` keeps their shape, ``deformable`` changes it with a network, and ``smpl``
+along their tracks (``tracked``). ``rigid`` keeps their shape, ``deformable`` changes it with a network, and ``smpl``
 moves people by their skeletons.
 """
 

@@ -40,8 +40,8 @@ class FieldSettings(BackgroundSettings):
     time_noise_until: float = 0.667
     """Fraction of the run at which the noise reaches 0."""
     reach: float | None = 5.0
-    """Meters. A row that the view could not see even if it came nearer by this distance stays undeformed, because the
-    network is most of the cost. None: all rows are deformed, and no GPU waits for their number."""
+    """Meters. A row that the view could not see even this much nearer stays undeformed, because the network is most of
+    the cost. None: all rows are deformed, and no GPU waits for their number."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

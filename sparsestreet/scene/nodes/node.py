@@ -199,7 +199,7 @@ class Node(nn.Module, ABC):
 
         ``raw`` is what the node returned for the view of this step, so nothing is computed twice. ``drawn`` are the
         rows that the view shows. A term that pulls at all rows in every step beats the image at rows that few views
-        show, because Adam steps by its learning rate however small a lone gradient is.
+        show. The reason: Adam steps by its learning rate however small a lone gradient is.
         """
         return {}
 

@@ -1,6 +1,6 @@
-"""Where the points of a background come from, one source a module: lidar, images, and guesses near and far.
+"""Sources of a background's points, one a module: lidar, images, and guesses near and far.
 
-A run's sources are a list of its configuration. Each claims a share of the node's points, by what the images show
+A run's configuration lists its sources. Each claims a share of the node's points by what the images show
 (``Coverage``), and draws them.
 """
 

@@ -1,4 +1,4 @@
-"""Guesses far away."""
+"""Random points far away."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from torch import Tensor
 from sparsestreet.scene.initialize.sources.guesses import Guesses, directions
 
 FARTHEST_RATIO = 0.02
-"""Far points are drawn at radius / u with u from here to 1 (DriveStudio): out to 50 times the scene's radius."""
+"""Smallest u of far points, which are drawn at radius / u (DriveStudio): out to 50 times the scene's radius."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FarPoints(Guesses):
-    """Random points outside of the ball around the scene."""
+    """Random points outside the ball around the scene."""
 
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """In uniform directions at distance radius / u, u uniform: density falls with the distance."""
+        """Returns points in uniform directions at distance radius / u with u uniform; density falls with distance."""
         u = FARTHEST_RATIO + (1 - FARTHEST_RATIO) * torch.rand(count, 1, generator=generator)
         return center + radius / u * directions(count, generator)

@@ -1,4 +1,4 @@
-"""Random points where nothing else says what is there."""
+"""Random points where neither lidar nor images give points."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
@@ -18,27 +18,27 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.types import Frame, View
 
 CANDIDATES_PER_POINT = 3
-"""Random positions drawn at once for each one wanted, since most lie in no view (DriveStudio)."""
+"""Number of random positions drawn at once for each wanted point, since most lie in no view (DriveStudio)."""
 
 VIEWS_PER_ROUND = 24
-"""Views that each draw is tested against, chosen anew: neighboring views see nearly the same space."""
+"""Number of views that each draw is tested against, chosen anew; neighboring views see nearly the same space."""
 
 ROUNDS = 10
-"""Draws before a scene whose cameras see a small part of the space makes do with fewer points."""
+"""Largest number of draws. A scene whose cameras see little of the space may then have fewer points."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Guesses(PointSource):
-    """Positions drawn at random, of which those count that some training view sees, and not as sky.
+    """Random positions that some training view sees, and not as sky.
 
-    Raises ValueError for settings that cannot be.
+    Raises ValueError for impossible settings.
     """
 
     part: float
-    """Of the share of the pixels that nothing covers."""
+    """Fraction of the share of pixels that nothing covers."""
     largest_scale: float = 0.02
-    """Of a point's distance from the nearest camera. Their neighbors are meters away, so without a limit (here 1.1
-    degrees) they start as a fog that hides the other points and makes every early step slow."""
+    """Largest scale as a fraction of a point's distance from the nearest camera, here 1.1 degrees. Neighbors of guesses
+    are meters away. Without a limit, guesses start as a fog that hides other points and slows every early step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,7 +61,7 @@ class Guesses(PointSource):
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """So many random positions in a scene of a center and a radius, meters."""
+        """Returns ``count`` random positions in a scene with this center and radius, meters."""
 
 
 def random_points(
@@ -72,7 +72,7 @@ def random_points(
     frames: Sequence[Frame],
     generator: torch.Generator,
 ) -> Points:
-    """``count`` points of the distribution ``draw`` that the frames see; fewer if they see too little of it."""
+    """Returns ``count`` points of the distribution ``draw`` that the frames see; fewer if they see too little of it."""
     found = Points.concatenate([])
     for _ in range(ROUNDS):
         if len(found) >= count:
@@ -84,7 +84,7 @@ def random_points(
 
 
 def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Points:
-    """Those positions that the first view looking at them does not show as sky, with the color they have there.
+    """Returns the positions that the first view looking at them does not show as sky, with their color in that view.
 
     A ray that ends in the sky meets nothing, so a Gaussian on it could only learn to vanish. Without sky masks every
     position inside some view is kept.
@@ -100,12 +100,16 @@ def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Poi
 
 
 def directions(count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Uniform on the sphere."""
+    """Returns unit vectors, uniform on the sphere.
+
+    >>> directions(3, torch.Generator().manual_seed(0)).norm(dim=1).round(decimals=3).tolist()
+    [1.0, 1.0, 1.0]
+    """
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
 
 
 def _camera_distances(positions: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[Tensor, " n"]:
-    """Meters to the nearest camera."""
+    """Returns the distance to the nearest camera, meters."""
     cameras = torch.stack([view.camera.position for view in views]).double().numpy()
     distances, _ = KDTree(cameras).query(positions.double().numpy())
     return torch.from_numpy(distances).float()

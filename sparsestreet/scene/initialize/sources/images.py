@@ -15,17 +15,20 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePoints(PointSource):
-    """Points of what stands still.
+    """Points of static things.
 
-    Raises ValueError for settings that cannot be.
+    Raises ValueError for impossible settings.
+
+    >>> ImagePoints().share(Coverage(lidar=0.5, images=0.25))
+    0.25
     """
 
     order: Literal["beyond_first", "beyond_only", "random"] = "beyond_first"
-    """Which points are taken: those beyond the lidar before the others, those alone, or any."""
+    """Points to take: those beyond the lidar before the others, those beyond it alone, or any."""
     voxel: float | None = None
-    """Meters: of the points in a cube of this side one is taken; None: all."""
+    """Side of a cube, meters, from which one point is taken; None: all points."""
     smallest_pixels: float = 0.5
-    """Limits of a Gaussian's scale, in pixels of the view that sees the point from nearest."""
+    """Limits of a Gaussian's scale, in pixels of the view nearest to the point."""
     largest_pixels: float = 8.0
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Returns of the lidar that do not belong to a moving object."""
+"""Lidar returns that do not belong to a moving object."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 class LidarPoints(PointSource):
     """Colored returns of the training sweeps outside all moving boxes of their instant.
 
-    Raises ValueError for settings that cannot be.
+    Raises ValueError for impossible settings.
     """
 
     box_enlargement: float = 1.1
-    """Of a moving object's box, for points that lie just outside an imprecise one."""
+    """Factor on the sides of a moving object's box, because points may lie just outside an imprecise box."""
     voxel: float | None = None
-    """Meters: of the returns in a cube of this side one is taken; None: all."""
+    """Side of a cube, meters, from which one return is taken; None: all returns."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Guesses around the drive."""
+"""Random points around the drive."""
 
 from dataclasses import dataclass
 
@@ -16,6 +16,6 @@ class NearPoints(Guesses):
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """Uniform in the ball."""
+        """Returns points that are uniform in the ball."""
         distance = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
         return center + distance * directions(count, generator)

@@ -1,4 +1,4 @@
-"""What every source of points has in common."""
+"""The interface of the sources of points."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 
 @dataclass(frozen=True)
 class Seeds:
-    """Points, and what their source knows of the Gaussians that start there."""
+    """Points, and what their source knows about the Gaussians that start there."""
 
     points: Points
     smallest: Float[Tensor, " n"]
-    """Limits of a Gaussian's scale, meters; between them the distance to its neighbors decides."""
+    """Limits of a Gaussian's scale, meters; between them the distance to its neighbors sets the scale."""
     largest: Float[Tensor, " n"]
     opacities: Float[Tensor, " n"]
     times: Float[Tensor, " n"]
-    """Normalized time at which each was measured; NaN where it is known of no time."""
+    """Normalized time at which each point was measured; NaN if unknown."""
 
     def __len__(self) -> int:
         return len(self.points)
@@ -45,7 +45,7 @@ class Seeds:
 class PointSource(ABC):
     """One source of initial points.
 
-    Raises ValueError for settings that cannot be.
+    Raises ValueError for impossible settings.
     """
 
     initial_opacity: float = 0.1
@@ -56,14 +56,14 @@ class PointSource(ABC):
 
     @abstractmethod
     def share(self, coverage: Coverage) -> float:
-        """The fraction of the node's points that the source is asked for.
+        """Returns the fraction of the node's points that the source is asked for.
 
-        Those of a node's sources add up to 1 at most; what none of them asks for is left out.
+        The fractions of a node's sources add up to 1 at most; the rest of the points is left out.
         """
 
     @abstractmethod
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
-        """``count`` points, or all there are."""
+        """Returns ``count`` points, or all points if there are fewer."""
 
     def seeds(
         self,
@@ -72,8 +72,8 @@ class PointSource(ABC):
         largest: Float[Tensor, " n"] | None = None,
         times: Float[Tensor, " n"] | None = None,
     ) -> Seeds:
-        """Points with the source's opacity; limits of the scale in meters, None: none on that side; normalized times
-        of their measurement, None: not known."""
+        """Returns seeds with the source's opacity; limits of the scale are meters (None: no limit on that side),
+        ``times`` are normalized times of measurement (None: unknown)."""
         count = len(points)
         return Seeds(
             points,
