@@ -143,7 +143,7 @@ def key_of(option: str) -> str:
 def _missing_part(key: str, configs: Sequence[Configuration]) -> str | None:
     """Returns the largest part of the tree around ``key`` that is absent from every configuration without the key.
 
-    None where none lacks it, or where those that lack it have its siblings.
+    None if only the key itself is absent, or if no configuration lacks it.
     """
     lacking = [config for config in configs if key not in config]
     names = key.split(".")

@@ -67,7 +67,7 @@ def keep_best(
 
 
 def _within_floors(ids: Int[Tensor, " n"], least: Int[Tensor, " i"]) -> Bool[Tensor, " n"]:
-    """Returns whether each row, given the best first, is among the first rows of its instance up to that floor."""
+    """Returns whether each row is within its instance's floor, counted from the first row; rows come best first."""
     by_instance = torch.sort(ids, stable=True)
     counts = torch.bincount(ids, minlength=len(least))
     place = torch.arange(len(ids), device=ids.device) - (counts.cumsum(0) - counts)[by_instance.values]
