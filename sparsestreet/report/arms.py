@@ -29,7 +29,7 @@ class Arm:
 
     @property
     def control(self) -> str | None:
-        """What kind of control this is, sized to match another arm; None for any other arm."""
+        """The kind of control, which is sized to match another arm; None for any other arm."""
         return control_of(self.records[0].summary)
 
     @property

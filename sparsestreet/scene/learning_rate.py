@@ -48,11 +48,15 @@ class LearningRate:
 
 
 Rates = Mapping[str, LearningRate | Mapping[str, Any]]
-"""Rates by name, each as it is or as a mapping of its fields."""
+"""Name -> rate, or a mapping of the rate's fields."""
 
 
 def rates_of(said: Rates) -> dict[str, LearningRate]:
-    """All as ``LearningRate``. Raises ValueError for what is none."""
+    """Returns every rate as a ``LearningRate``. Raises ValueError for anything else.
+
+    >>> rates_of({"means": {"initial": 0.01}})["means"].initial
+    0.01
+    """
     return {name: LearningRate.of(rate) for name, rate in said.items()}
 
 
