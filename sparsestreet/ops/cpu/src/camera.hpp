@@ -20,8 +20,8 @@ struct Camera {
   T fx, fy, cx, cy, slope_min[2], slope_max[2];
   T k1, k2, p1, p2, k3, fold;  // Brown-Conrady; fold: the r^2 at which the radial polynomial turns back
   Vector<T> shutter_translation, shutter_rotation;
-  T alpha_min, log2_alpha_min, blur, near_plane, width, height;
-  T box_squared;  // the largest |L d|^2 that is drawn
+  T alpha_min, log2_alpha_min, eps2d, near_plane, width, height;
+  T max_sigma_squared;  // the largest |L d|^2 that is drawn
   bool antialias, half_colors, every_tile;
   int depth_bits;
 
@@ -30,8 +30,8 @@ struct Camera {
         k1(v.distortion[0]), k2(v.distortion[1]), p1(v.distortion[2]), p2(v.distortion[3]), k3(v.distortion[4]),
         fold(v.fold),
         shutter_translation(vector(v.shutter_translation)), shutter_rotation(vector(v.shutter_rotation)),
-        alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), blur(v.blur),
-        near_plane(v.near_plane), width(v.width), height(v.height), box_squared(T(v.box) * T(v.box)),
+        alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), eps2d(v.eps2d),
+        near_plane(v.near_plane), width(v.width), height(v.height), max_sigma_squared(T(v.max_sigma) * T(v.max_sigma)),
         antialias(v.antialias), half_colors(v.half_colors), every_tile(v.every_tile), depth_bits(int(v.depth_bits)) {
     for (int i = 0; i < 3; ++i) rotation.rows[i] = vector(v.rotation + 3 * i);
     const T margin_x = T(0.3) * width / (2 * fx), margin_y = T(0.3) * height / (2 * fy);
@@ -40,7 +40,7 @@ struct Camera {
   }
   // Whether boxes and lists of tiles end where splats do.
   bool bounded() const {
-    return !every_tile && (alpha_min > 0 || box_squared <= std::numeric_limits<T>::max());
+    return !every_tile && (alpha_min > 0 || max_sigma_squared <= std::numeric_limits<T>::max());
   }
 
  private:

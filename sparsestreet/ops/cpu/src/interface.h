@@ -16,8 +16,8 @@ struct View {
   double rotation[9];     // camera from world
   double position[3];     // of the camera in the world, meters
   double fx, fy, cx, cy;  // pixels
-  double alpha_min, alpha_max, transmittance_min, blur, near_plane;
-  double box;             // standard deviations
+  double alpha_min, alpha_max, transmittance_min, eps2d, near_plane;
+  double max_sigma;       // standard deviations at which a splat ends
   double distortion[5];   // k1, k2, p1, p2, k3
   double fold;            // r^2 past which the lens does not see
   double shutter_translation[3], shutter_rotation[3];  // over the readout, camera frame

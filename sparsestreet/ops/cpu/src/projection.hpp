@@ -10,7 +10,7 @@ namespace SPLAT_VARIANT {
 constexpr double BOX_MARGIN = 0.01;               // pixels; rounding must never cull a touched pixel
 constexpr double COMPENSATION_FLOOR = 2.5e-5;     // least det / det_blurred of the antialias compensation
 constexpr double LEAST_OPACITY = 0x1p-126;        // below it log2 and its power of two are no inverses in float
-constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without blur: thinner splats touch no pixel center
+constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without eps2d: thinner splats touch no pixel center
 constexpr double LOG2_SCALE = 0.84932180028801907;  // sqrt(log2(e) / 2)
 constexpr double TWO_LN2 = 1.3862943611198906;
 
@@ -28,7 +28,7 @@ struct Effects {
   using Moves = std::conditional_t<SHUTTER, Motion<V, LENS>, Nothing>;
 };
 
-// The covariance C = F F^T + blur of a footprint, and its determinant.
+// The covariance C = F F^T + eps2d I of a footprint, and its determinant.
 template <class V, int K>
 struct Covariance {
   V xx, xy, yy, determinant, bare_determinant;
@@ -43,8 +43,8 @@ struct Covariance {
         bare_determinant += minor * minor;
       }
     }
-    determinant = bare_determinant + camera.blur * (xx + yy) + camera.blur * camera.blur;
-    xx += camera.blur, yy += camera.blur;
+    determinant = bare_determinant + camera.eps2d * (xx + yy) + camera.eps2d * camera.eps2d;
+    xx += camera.eps2d, yy += camera.eps2d;
   }
 };
 
@@ -112,10 +112,10 @@ template <class T, class V, int K>
 inline void bound(const Camera<T>& camera, const Covariance<V, K>& c, const V& opacity, Splat<V>& s) {
   s.log2_opacity = log2_positive<T>(opacity);
   s.least_exponent = V{} + camera.log2_alpha_min;
-  V reach = V{} + camera.box_squared;
+  V reach = V{} + camera.max_sigma_squared;
   if (camera.alpha_min > 0) reach = positive_part(T(TWO_LN2) * log2_positive<T>(opacity / camera.alpha_min));
-  if (camera.box_squared <= std::numeric_limits<T>::max()) {
-    const V end = s.log2_opacity - camera.box_squared / T(TWO_LN2), box = V{} + camera.box_squared;
+  if (camera.max_sigma_squared <= std::numeric_limits<T>::max()) {
+    const V end = s.log2_opacity - camera.max_sigma_squared / T(TWO_LN2), box = V{} + camera.max_sigma_squared;
     const auto boxed = box <= reach && end > s.least_exponent;
     s.least_exponent = boxed ? end : s.least_exponent;
     reach = box < reach ? box : reach;

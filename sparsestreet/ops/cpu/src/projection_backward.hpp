@@ -35,7 +35,7 @@ inline ScreenGradient<V> screen_gradient(const Slot<V>& sum, const Splat<V>& s) 
 }
 
 // Through l11 = sqrt(C_yy / det), l21 = -C_xy / sqrt(C_yy det), l22 = 1 / sqrt(C_yy) and the antialias compensation
-// sqrt(bare / det) to the footprint, with det = bare + blur |F|^2 + blur^2 and bare the sum of squared minors.
+// sqrt(bare / det) to the footprint, with det = bare + eps2d |F|^2 + eps2d^2 and bare the sum of squared minors.
 template <class T, class V, int K>
 inline Footprint<V, K> footprint_backward(const Camera<T>& camera, const Footprint<V, K>& f,
                                           const ScreenGradient<V>& g) {
@@ -44,13 +44,13 @@ inline Footprint<V, K> footprint_backward(const Camera<T>& camera, const Footpri
   const V l11 = root(c.yy / c.determinant), l21 = -c.xy / deviations, l22 = 1 / root(c.yy);
   const V v_yy = (g.l11 * l11 - g.l21 * l21 - g.l22 * l22) / (2 * c.yy), v_xy = -g.l21 / deviations;
   V v_bare = -(g.l11 * l11 + g.l21 * l21) / (2 * c.determinant);
-  V v_square = v_bare * camera.blur;  // of |F|^2
+  V v_square = v_bare * camera.eps2d;  // of |F|^2
   if (camera.antialias) {
-    // d ratio = ((1 - ratio) d bare - ratio blur d|F|^2) / det, and the logarithm of the opacity holds ln(ratio) / 2.
+    // d ratio = ((1 - ratio) d bare - ratio eps2d d|F|^2) / det, and the logarithm of the opacity holds ln(ratio) / 2.
     const V ratio = c.bare_determinant / c.determinant;
     const V v_ratio = ratio > T(COMPENSATION_FLOOR) ? g.log_opacity / (2 * ratio) : V{};
     v_bare += v_ratio * (1 - ratio) / c.determinant;
-    v_square -= v_ratio * ratio * camera.blur / c.determinant;
+    v_square -= v_ratio * ratio * camera.eps2d / c.determinant;
   }
   Footprint<V, K> out;
   out.x = g.x, out.y = g.y;
