@@ -1,5 +1,7 @@
-"""Projection and rays outside the splat op, through the lens where there is one: lidar coloring, visibility of seeds,
-sky rays; and where the camera is, for both."""
+"""Projection and rays outside the splat op, through the lens if there is one, and the camera's position.
+
+Used to color lidar points, to test whether seeds are visible, and for rays to the sky.
+"""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -14,17 +16,27 @@ from sparsestreet.types import Camera
 
 
 def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
-    """The c in R (m - c) = R m + t, meters, in float64 whatever the pose's dtype.
+    """The camera's center c in R (m - c) = R m + t, meters, in float64 for any dtype of the pose.
 
-    Solved for, so that it holds for a rotation that is orthonormal only to its dtype's last digit: over 20 km that
-    digit of a float32 is 1 mm.
+    It solves for c, because a rotation is orthonormal only to its dtype's last digit. Over 20 km that digit of a
+    float32 is 1 mm.
+
+    >>> camera_from_world = torch.eye(4)
+    >>> camera_from_world[:3, 3] = torch.tensor([0.0, 0.0, 2.0])
+    >>> exact_position(Camera(camera_from_world, torch.eye(3), width=4, height=4)).tolist()
+    [0.0, 0.0, -2.0]
     """
     pose = camera.camera_from_world.detach().double()
     return torch.linalg.solve(pose[:3, :3], -pose[:3, 3])
 
 
 def moved(camera: Camera, vector: Float64[Tensor, "3"]) -> Camera:
-    """The camera elsewhere: moved in the world, meters, turned as it was."""
+    """The camera moved by ``vector`` in the world, meters; its rotation stays.
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=4, height=4)
+    >>> moved(camera, torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)).position.tolist()
+    [1.0, 0.0, 0.0]
+    """
     pose = camera.camera_from_world.double().clone()
     pose[:3, 3] -= pose[:3, :3] @ vector
     return replace(camera, camera_from_world=pose.to(camera.camera_from_world.dtype))
@@ -33,8 +45,17 @@ def moved(camera: Camera, vector: Float64[Tensor, "3"]) -> Camera:
 def project(
     camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Pixel coordinates, depth along the optical axis (meters) and whether each world point is in the image; on any
-    device, while the camera is on the host. A point past the fold of a lens (``geometry.distortion``) is not."""
+    """Returns pixel coordinates, depths along the optical axis (meters), and whether each world point is in the image.
+
+    A point past the fold of a lens (``geometry.distortion``) is not in the image. The points may be on any device; the
+    camera is on the host.
+
+    >>> intrinsics = torch.tensor([[10.0, 0.0, 2.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])
+    >>> camera = Camera(torch.eye(4), intrinsics, width=4, height=4)
+    >>> pixels, depth, inside = project(camera, torch.tensor([[0.0, 0.0, 5.0], [5.0, 0.0, 5.0], [0.0, 0.0, -5.0]]))
+    >>> pixels[:2].tolist(), depth.tolist(), inside.tolist()
+    ([[2.0, 2.0], [12.0, 2.0]], [5.0, 5.0, -5.0], [True, False, False])
+    """
     in_camera = transform_points(camera.camera_from_world.to(points), points)
     depth = in_camera[:, 2]
     safe = depth.clamp(min=near)
@@ -49,18 +70,30 @@ def project(
 
 
 def ray_matrix(camera: Camera) -> list[list[float]]:
-    """The 3x3 matrix, in float64, that takes a place (x, y, 1) in the image of a pinhole, pixels, to its direction in
-    the world: R^T K^-1. The directions are not of unit length."""
+    """The matrix R^T K^-1 of a pinhole, 3x3 in float64: from an image point (x, y, 1) in pixels to its world direction.
+
+    The directions are not of unit length.
+
+    >>> intrinsics = torch.tensor([[10.0, 0.0, 2.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])
+    >>> matrix = torch.tensor(ray_matrix(Camera(torch.eye(4), intrinsics, width=4, height=4)))
+    >>> (matrix @ torch.tensor([2.0, 2.0, 1.0])).tolist()
+    [0.0, 0.0, 1.0]
+    """
     pose, ((fx, _, cx), (_, fy, cy), _) = camera.camera_from_world.tolist(), camera.intrinsics.tolist()
     columns = zip(*(row[:3] for row in pose[:3]), strict=True)
     return [[right / fx, down / fy, ahead - right * cx / fx - down * cy / fy] for right, down, ahead in columns]
 
 
 def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[Tensor, "h w 3"]:
-    """Unit directions in the world through the pixel centers, in the camera's dtype on a device.
+    """Unit directions in the world through the pixel centers, in the camera's dtype, on a device.
 
-    Those of a lens take a second or two per million pixels, once for all views of a camera. Raises ValueError where the
-    lens has no inverse.
+    The rays of a lens take one or two seconds per million pixels, once for all views of a camera. Raises ValueError
+    where the lens has no inverse.
+
+    >>> intrinsics = torch.tensor([[10.0, 0.0, 1.5], [0.0, 10.0, 1.5], [0.0, 0.0, 1.0]])
+    >>> rays = ray_directions(Camera(torch.eye(4), intrinsics, width=3, height=3))
+    >>> rays.shape, rays[1, 1].tolist()
+    (torch.Size([3, 3, 3]), [0.0, 0.0, 1.0])
     """
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     image = ((fx, fy, cx, cy), camera.width, camera.height, camera.intrinsics.dtype, torch.device(device))
@@ -75,7 +108,7 @@ def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[
 def _pinhole_rays(
     intrinsics: tuple[float, ...], width: int, height: int, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "h w 3"]:
-    """(x, y, 1) in the camera through the pixel centers; ``intrinsics`` are fx, fy, cx, cy."""
+    """Directions (x, y, 1) in the camera through the pixel centers; ``intrinsics`` are fx, fy, cx, cy."""
     fx, fy, cx, cy = intrinsics
     x = (torch.arange(width, dtype=dtype, device=device) + 0.5 - cx) / fx
     y = (torch.arange(height, dtype=dtype, device=device) + 0.5 - cy) / fy
@@ -98,10 +131,15 @@ def _lens_rays(
 
 
 def distance_to_view(camera: Camera, points: Float[Tensor, "n 3"], margin: float = 0.0) -> Float[Tensor, " n"]:
-    """Meters by which world points lie outside of what a camera sees, at least; negative inside.
+    """A lower bound of the distance from world points to what a camera sees, meters; negative inside.
 
-    What it sees ends at the sides of an image that is larger by ``margin`` of its size on each side, and at the camera.
-    A lens and a shutter are left out: a margin makes up for what they show beyond. Waits for no device.
+    The image is first enlarged by ``margin`` of its size on each side. Lens and shutter are ignored; the margin must
+    cover what they show beyond the pinhole's image. Never waits for a GPU.
+
+    >>> intrinsics = torch.tensor([[2.0, 0.0, 2.0], [0.0, 2.0, 2.0], [0.0, 0.0, 1.0]])
+    >>> camera = Camera(torch.eye(4), intrinsics, width=4, height=4)
+    >>> distance_to_view(camera, torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, -3.0]])).tolist()
+    [-3.5355..., 3.0]
     """
     right, down, ahead = camera.intrinsics
     limits = [(camera.width, right), (camera.height, down)]

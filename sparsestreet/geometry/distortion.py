@@ -6,10 +6,10 @@ With r2 = x^2 + y^2 and radial = 1 + k1 r2 + k2 r2^2 + k3 r2^3 (Brown, "Close-ra
     y_d = y radial + p1 (r2 + 2 y^2) + 2 p2 x y
 
 A polynomial that was fitted inside an image does not describe the lens far outside of it. The radius r radial(r2) of
-the distorted point grows only up to a certain r2, where it folds back; or it grows with r^7, beyond what float32 can
-carry. From where its slope leaves (0, 4), here called the fold in both cases, the map is continued along each ray from
-the center in proportion to the radius, D(x) = D(s x) / s with s x at the fold: it stays continuous, no point from far
-outside lands in the image, and none lands more than 4 times as far out as a pinhole would put it.
+the distorted point may fold back at some r2, or grow with r^7 beyond the range of float32. The fold is the smallest
+radius where the slope of r radial(r2) leaves (0, 4). Beyond the fold the map continues along each ray from the center
+in proportion to the radius: D(x) = D(s x) / s with s x at the fold. So the map is continuous, and no point from far
+outside lands in the image. No point lands more than 4 times as far out as a pinhole would put it.
 """
 
 import math
@@ -23,20 +23,29 @@ _STEEPEST = 4.0
 """Largest d(r radial)/dr: lenses stay far below it."""
 _NEWTON_STEPS = 30
 _GRID = 65
-"""Columns and rows of places where a shift is looked at, the border's among them."""
+"""Columns and rows of the grid on which shifts are computed, the image's border included."""
 
 
 def fold_radius_squared(distortion: Float[Tensor, "5"]) -> float:
-    """The smallest r2 > 0 where d(r radial)/dr = 1 + 3 k1 r2 + 5 k2 r2^2 + 7 k3 r2^3 is 0 or 4; inf if it never is."""
+    """The smallest r2 > 0 where d(r radial)/dr = 1 + 3 k1 r2 + 5 k2 r2^2 + 7 k3 r2^3 is 0 or 4; inf if it never is.
+
+    >>> fold_radius_squared(torch.tensor([-0.25, 0.0, 0.0, 0.0, 0.0]))  # 1 - 0.75 r2 = 0
+    1.3333...
+    """
     k1, k2, _, _, k3 = distortion.tolist()
-    # In v = 1 / r2 the leading coefficient is 1 - slope whatever the others are: no division by a small k3.
+    # In v = 1 / r2 the leading coefficient is always 1 - slope, so nothing is divided by a small k3.
     roots = np.concatenate([np.roots([1 - slope, 3 * k1, 5 * k2, 7 * k3]) for slope in (0.0, _STEEPEST)])
     positive = roots.real[(np.abs(roots.imag) <= 1e-7 * np.abs(roots)) & (roots.real > 0)]
     return float(1 / positive.max()) if len(positive) else math.inf
 
 
 def distort(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> Float[Tensor, "*b 2"]:
-    """Where the lens images normalized points; differentiable in the points, not in the coefficients."""
+    """Normalized image points as the lens shows them; differentiable in the points, not in the coefficients.
+
+    >>> barrel = torch.tensor([-0.25, 0.0, 0.0, 0.0, 0.0])
+    >>> distort(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), barrel).tolist()  # the second: 1 - 0.25
+    [[0.0, 0.0], [0.75, 0.0]]
+    """
     fold = fold_radius_squared(distortion)
     if math.isinf(fold):
         return _brown_conrady(points, distortion)
@@ -45,7 +54,11 @@ def distort(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> Fl
 
 
 def distortion_jacobian(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> Float[Tensor, "*b 2 2"]:
-    """d(x_d, y_d) / d(x, y), symmetric, for points before the fold."""
+    """Symmetric derivatives d(x_d, y_d) / d(x, y) of points inside the fold.
+
+    >>> distortion_jacobian(torch.tensor([1.0, 0.0]), torch.tensor([-0.25, 0.0, 0.0, 0.0, 0.0])).tolist()
+    [[0.25, 0.0], [0.0, 0.75]]
+    """
     k1, k2, p1, p2, k3 = distortion.tolist()
     x, y = points.unbind(-1)
     r2 = x * x + y * y
@@ -61,15 +74,18 @@ def distortion_jacobian(points: Float[Tensor, "*b 2"], distortion: Float[Tensor,
 def undistort(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> Float[Tensor, "*b 2"]:
     """The inverse of :func:`distort`, by Newton's method in float64.
 
-    Raises ValueError where no point is imaged there (tangential terms too strong for the model).
+    Raises ValueError if the lens maps no point there (tangential terms too strong for the model).
+
+    >>> undistort(torch.tensor([0.75, 0.0]), torch.tensor([-0.25, 0.0, 0.0, 0.0, 0.0])).tolist()
+    [1.0, 0.0]
     """
     target = points.double()
     guess = target.clone()
     for _ in range(_NEWTON_STEPS):
         error = distort(guess, distortion) - target
-        # Not solve(), whose error of a singular matrix is no ValueError.
+        # solve() would raise another error than ValueError for a singular matrix.
         guess = guess - torch.linalg.solve_ex(_continued_jacobian(guess, distortion), error[..., None]).result[..., 0]
-        if _found(error, target):  # before this step, which squares what was left
+        if _found(error, target):  # the error before this step, which squared it
             break
     error = distort(guess, distortion) - target
     if not _found(error, target):
@@ -81,10 +97,14 @@ def undistort(points: Float[Tensor, "*b 2"], distortion: Float[Tensor, "5"]) -> 
 
 
 def largest_shift(intrinsics: Float[Tensor, "3 3"], distortion: Float[Tensor, "5"], width: int, height: int) -> float:
-    """Pixels between a place in the image and where a pinhole would show what the lens shows there, at most.
+    """The largest distance, in pixels, between what the lens shows and where a pinhole would show it.
 
-    Found on a grid that reaches to the image's border: the shift of a polynomial need not be largest there. Raises
+    The search covers a grid over the whole image, because a polynomial may shift most away from the border. Raises
     ValueError for a lens without an inverse in the image.
+
+    >>> intrinsics = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 50.0], [0.0, 0.0, 1.0]])
+    >>> largest_shift(intrinsics, torch.tensor([-0.1, 0.0, 0.0, 0.0, 0.0]), width=100, height=100)
+    4.20...
     """
     (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
     x = (torch.linspace(0, width, _GRID, dtype=torch.float64) - cx) / fx

@@ -1,4 +1,4 @@
-"""Unit quaternions, wxyz, Hamilton product; the only place where rotations change their form."""
+"""Unit quaternions, wxyz, Hamilton product. All conversions between forms of rotations are here."""
 
 import torch
 from jaxtyping import Float
@@ -6,14 +6,17 @@ from torch import Tensor
 
 
 def normalized(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
-    """Unit quaternions; only an exact zero has no direction: it becomes the identity and gets no gradient.
+    """Unit quaternions; an exact zero becomes the identity and gets no gradient.
 
-    Gradients grow as 1 / length, down to the length tiny / eps of the dtype (1e-31 in float32); there they stay, so
+    Gradients grow as 1 / length. Below the length tiny / eps of the dtype (1e-31 in float32) they grow no further, so
     that they remain finite.
+
+    >>> normalized(torch.tensor([[0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])).tolist()
+    [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
     """
     shortest = torch.finfo(quaternions.dtype).tiny / torch.finfo(quaternions.dtype).eps
     values = quaternions.detach()
-    # By the largest component first: a squared length would leave the dtype's range long before the length does.
+    # Divided by the largest component first: the squared length leaves the dtype's range long before the length does.
     largest = values.abs().amax(-1, keepdim=True)
     usable = largest > 0
     scaled = values / torch.where(usable, largest, 1.0) + (quaternions - values) / largest.clamp(min=shortest)
@@ -24,7 +27,12 @@ def normalized(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
 
 
 def multiply(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 4"]:
-    """The rotation b followed by the rotation a: matrix(multiply(a, b)) = matrix(a) @ matrix(b)."""
+    """The rotation b followed by the rotation a: to_matrix(multiply(a, b)) = to_matrix(a) @ to_matrix(b).
+
+    >>> i, j = torch.tensor([0.0, 1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0, 0.0])
+    >>> multiply(i, j).tolist()  # k
+    [0.0, 0.0, 0.0, 1.0]
+    """
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -39,7 +47,11 @@ def multiply(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]) -> Float[Tensor
 
 
 def to_matrix(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrices; the input need not be unit (a zero quaternion gives the identity)."""
+    """Rotation matrices of quaternions of any length; a zero quaternion gives the identity.
+
+    >>> to_matrix(torch.tensor([0.0, 0.0, 0.0, 5.0])).tolist()  # half a turn about z
+    [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
     w, x, y, z = normalized(quaternions).unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -50,14 +62,18 @@ def to_matrix(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def from_matrix(rotations: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
-    """Unit quaternions with w >= 0, by the largest of the four squared components (Shepperd's method)."""
+    """Unit quaternions with w >= 0 of rotation matrices, by the largest squared component (Shepperd's method).
+
+    >>> from_matrix(torch.diag(torch.tensor([-1.0, -1.0, 1.0]))).tolist()  # half a turn about z
+    [0.0, 0.0, 0.0, 1.0]
+    """
     m = rotations
     diagonal = torch.diagonal(m, dim1=-2, dim2=-1)
     xx, yy, zz = diagonal.unbind(-1)
     squares = torch.stack((1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz), dim=-1)
     xw, yw, zw = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    # Row i holds 4 q_i q_j: any row divided by its norm is the quaternion; the one with the largest q_i is the safest.
+    # Row i holds 4 q_i q_j. Each row divided by its norm is the quaternion; that of the largest q_i is the most exact.
     outer = torch.stack(
         (
             torch.stack((squares[..., 0], xw, yw, zw), -1),
@@ -73,10 +89,15 @@ def from_matrix(rotations: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
 
 
 def from_rotation_vector(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """Exponential map: a rotation by |v| radians about v; smooth at zero."""
+    """Exponential map: a rotation by |v| radians about v; smooth at zero.
+
+    >>> from_rotation_vector(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, torch.pi / 3]]))
+    tensor([[1.0000, 0.0000, 0.0000, 0.0000],
+            [0.8660, 0.0000, 0.0000, 0.5000]])
+    """
     half = 0.5 * vectors
     squared = half.square().sum(-1, keepdim=True)
-    # sinc(|half|) with a Taylor branch: the gradient of norm is undefined at zero.
+    # Near zero sinc(|half|) is its Taylor series, because the gradient of the norm is undefined at zero.
     small = squared < 1e-6
     angle = torch.where(small, torch.ones_like(squared), squared).sqrt()
     sinc = torch.where(small, 1 - squared / 6, torch.sin(angle) / angle)
@@ -85,7 +106,12 @@ def from_rotation_vector(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"
 
 
 def slerp(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"], fraction: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4"]:
-    """The rotation at ``fraction`` of the shorter arc from a to b (q and -q are the same rotation)."""
+    """The rotation at ``fraction`` of the shorter arc from a to b (q and -q are the same rotation).
+
+    >>> a, b = torch.tensor([1.0, 0.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0, 1.0])
+    >>> slerp(a, b, torch.tensor(1 / 3))  # a third of half a turn about z
+    tensor([0.8660, 0.0000, 0.0000, 0.5000])
+    """
     a, b = normalized(a), normalized(b)
     dot = (a * b).sum(-1, keepdim=True)
     b = torch.where(dot < 0, -b, b)

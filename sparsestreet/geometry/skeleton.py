@@ -1,4 +1,4 @@
-"""The joints of a human body, how they move each other, and how they move what is attached to them.
+"""The joints of a human body, how each moves the next, and how they move attached points.
 
 Joints, their order and the frame are those of SMPL (Loper et al., SIGGRAPH Asia 2015): y up, x to the person's left,
 z forward, arms stretched out sideways at rest.
@@ -23,11 +23,15 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 NUM_JOINTS = len(JOINTS)
 
 HEIGHT = 1.75
-"""Of the body that ``rest_joints`` describes, meters."""
+"""Height of the body that ``rest_joints`` describes, meters."""
 
 
 def rest_joints() -> Float[Tensor, "24 3"]:
-    """A body of our own, ``HEIGHT`` tall, at rest: meters, on the ground at y = 0. The proportions are rounded."""
+    """The joints of our own body model at rest, meters: ``HEIGHT`` tall, the ground at y = 0, proportions rounded.
+
+    >>> rest_joints()[JOINTS.index("pelvis")].tolist()
+    [0.0, 0.93..., 0.0]
+    """
     middle = {
         "pelvis": (0.0, 0.93, 0.0), "spine1": (0.0, 1.03, 0.0), "spine2": (0.0, 1.15, 0.0),
         "spine3": (0.0, 1.22, 0.0), "neck": (0.0, 1.44, 0.0), "head": (0.0, 1.54, 0.015),
@@ -43,7 +47,7 @@ def rest_joints() -> Float[Tensor, "24 3"]:
 
 
 def _ancestors() -> tuple[tuple[int, ...], ...]:
-    """Round r: of each joint the one 2^r generations up; NUM_JOINTS stands for nothing, also for itself."""
+    """Round r holds, for each joint, its ancestor 2^r generations up; NUM_JOINTS stands for no joint."""
     step = (*(NUM_JOINTS if parent < 0 else parent for parent in PARENTS), NUM_JOINTS)
     rounds = []
     while any(joint != NUM_JOINTS for joint in step):
@@ -57,24 +61,27 @@ _ANCESTORS = _ancestors()
 
 @dataclass(frozen=True)
 class Bones:
-    """How joints have moved from rest what is attached to them: b bodies, or rows of several bodies in one."""
+    """How joints move attached points from rest. The batch is b bodies, or the joints of several bodies in one list."""
 
     transforms: Float[Tensor, "*b 3 4"]
-    """Rigid, of points at rest, meters."""
+    """Rigid transforms of points at rest, meters."""
     quaternions: Float[Tensor, "*b 4"]
-    """Rotations of the transforms, unit; neighbors in the tree never differ by the sign alone."""
+    """Unit rotations of the transforms; neighbors in the tree never differ by the sign alone."""
 
 
 def posed_bones(joints: Float[Tensor, "b 24 3"], rotations: Float[Tensor, "b 24 4"]) -> Bones:
-    """Where the joints take what is attached to them.
+    """The transforms by which the joints move attached points.
 
     Args:
-        joints: at rest, meters.
-        rotations: unit, of each joint relative to its parent, about the joint; the pelvis's, about itself, turns the
-            body.
+        joints: positions at rest, meters.
+        rotations: unit rotations of each joint about itself, relative to its parent. The pelvis turns the whole body.
 
-    Rotations along the tree are multiplied by doubling: after round r each joint holds those of 2^(r + 1)
-    generations, so the deepest of SMPL's takes four rounds instead of eight steps.
+    Rotations along the tree are multiplied by doubling: after round r each joint holds the product over 2^(r + 1)
+    generations. SMPL's deepest joint takes four rounds instead of eight steps.
+
+    >>> still = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(1, NUM_JOINTS, 4)
+    >>> posed_bones(rest_joints()[None], still).transforms[0, 0].tolist()
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
     """
     turns = torch.where(rotations[..., :1] < 0, -rotations, rotations)
     nothing = torch.zeros_like(turns[:, :1])
@@ -83,7 +90,7 @@ def posed_bones(joints: Float[Tensor, "b 24 3"], rotations: Float[Tensor, "b 24 
     for above in steps:
         turns = quat.multiply(turns[:, above], turns)
     matrices = quat.to_matrix(turns)
-    # A joint is moved by its parent's rotation; places add up along the tree as the rotations were multiplied.
+    # The parent's rotation moves a joint; positions add up along the tree in the same rounds.
     parents = steps[0, :-1]
     from_parent = joints - torch.nn.functional.pad(joints, (0, 0, 0, 1))[:, parents]
     moved = (matrices[:, parents] @ from_parent[..., None]).squeeze(-1)
@@ -102,17 +109,24 @@ def skin(
     attached: Int[Tensor, "n k"],
     weights: Float[Tensor, "n k"],
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
-    """Linear blend skinning: points by the blended transforms, rotations by the blended quaternions (not unit).
+    """Linear blend skinning: returns moved points and rotations (not unit).
 
-    A blended quaternion is the rotation of the blended matrix but for 3 degrees where two bones at a right angle meet,
-    and costs a tenth of it.
+    Blended transforms move the points, blended quaternions turn the rotations. A blended quaternion differs from the
+    rotation of the blended matrix by 3 degrees where two bones meet at a right angle, and takes a tenth of the time.
 
     Args:
-        points: at rest, meters.
-        quaternions: rotations of what is at the points.
-        bones: rows of ``transforms`` and ``quaternions``, of all bodies one after the other.
-        attached: the bones that move a point.
-        weights: their parts in it, which sum to 1; they get no gradient.
+        points: positions at rest, meters.
+        quaternions: rotations at the points.
+        bones: rows of ``transforms`` and ``quaternions`` of all bodies, one after the other.
+        attached: rows of the bones that move each point.
+        weights: their weights, which sum to 1; they get no gradient.
+
+    >>> rest = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    >>> up = torch.cat((torch.eye(3), torch.tensor([[0.0], [2.0], [0.0]])), 1)  # by 2 m
+    >>> bones = Bones(torch.stack((torch.eye(3, 4), up)), rest.expand(2, 4))
+    >>> points, _ = skin(torch.zeros(1, 3), rest[None], bones, torch.tensor([[0, 1]]), torch.tensor([[0.75, 0.25]]))
+    >>> points.tolist()
+    [[0.0, 0.5, 0.0]]
     """
     table = torch.cat((bones.transforms.flatten(1), bones.quaternions), 1)
     blended = torch.nn.functional.embedding_bag(attached, table, per_sample_weights=weights, mode="sum")

@@ -1,4 +1,4 @@
-"""Annotated poses of many objects, padded to one table, and the pose between them."""
+"""Annotated poses of many objects, padded to one table, and which keyframes surround a time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Track
 
 TIME_TOLERANCE = 1e-5
-"""A tenth of a frame of a 10,000-frame log: equal instants may differ by the rounding of frame / (frames - 1)."""
+"""A tenth of a frame of a 10,000-frame log. Equal instants may differ by the rounding of frame / (frames - 1)."""
 
 
 @dataclass(frozen=True)
 class Trajectories:
-    """World-from-box poses at annotated instants; row i is object i, its valid keyframes first, in order of time."""
+    """World-from-box poses at annotated instants. Row i is object i, its valid keyframes first, in order of time."""
 
     times: Float[Tensor, "i k"]
     """Normalized time; 0 where not valid."""
@@ -32,6 +32,11 @@ class Trajectories:
         """The tracks' annotations without those of held-out frames, float32.
 
         Raises ValueError if a track keeps no annotation.
+
+        >>> poses = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+        >>> car = Track("car", "vehicle", torch.tensor([0, 1, 2]), poses, torch.tensor([4.0, 2.0, 1.5]))
+        >>> Trajectories.from_tracks([car], held_out=frozenset({2}), num_frames=5).times
+        tensor([[0.0000, 0.2500]])
         """
         counts = [sum(int(frame) not in held_out for frame in track.frames) for track in tracks]
         for track, count in zip(tracks, counts, strict=True):
@@ -75,13 +80,18 @@ def keyframe_interval(
     time: float,
     max_gap: float,
 ) -> KeyframeInterval:
-    """The keyframes around ``time``. An object is active within its annotated span where a keyframe is near enough.
+    """The keyframes around ``time``. An object is active within its annotated span, if a keyframe is near enough.
 
     Args:
-        max_gap: farthest distance in time to the nearest keyframe at which an object counts as present.
+        max_gap: largest distance in time to the nearest keyframe at which an object is active.
 
-    A held-out end of a span lies beyond the last keyframe: there the first or last two keyframes are extrapolated at
-    constant velocity, up to the end of the span and no farther.
+    A held-out end of a span lies beyond the last keyframe. There the first or last two keyframes are extrapolated at
+    constant velocity, up to the end of the span.
+
+    >>> times, spans = torch.tensor([[0.0, 0.4, 0.8]]), torch.tensor([[0.0, 0.8]])
+    >>> at = keyframe_interval(times, torch.ones(1, 3, dtype=torch.bool), spans, time=0.5, max_gap=0.2)
+    >>> at.lower, at.upper, at.fraction, at.active
+    (tensor([1]), tensor([2]), tensor([0.2500]), tensor([True]))
     """
     count = valid.sum(1)
     num_before = (valid & (times <= time)).sum(1)

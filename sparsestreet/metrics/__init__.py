@@ -1,4 +1,4 @@
-"""What is reported of an image. ``definitions`` says in words what each number is (no torch); ``image`` computes them.
+"""The metrics of images: ``definitions`` says in words what each number means (no torch), other modules compute them.
 
-Nothing is imported here, so that a report reads the definitions without torch.
+Nothing is imported here, so that a report can read the definitions without torch.
 """

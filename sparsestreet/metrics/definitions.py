@@ -1,25 +1,26 @@
-"""The one place that says what each number in a record means (no torch: the report reads this too).
+"""The one place that says what each number in a record means (no torch, because the report reads it too).
 
-A metric's id is ``<quantity>_<region>``. All are computed of the stored prediction, the render clamped to [0, 1] and
-rounded to 16 bits, per image, and then averaged over images with equal weight. ``protocols`` names the choices of ids
-that tables show. The choice matters: on one set of masked frames the mean of per-image PSNRs, the PSNR of the mean MSE
-and the pixel-pooled PSNR lie more than 5 dB apart.
+A metric's id is ``<quantity>_<region>``. Each is computed per image, then averaged over images with equal weight. The
+image is the stored prediction: the render, clamped to [0, 1] and rounded to 16 bits. ``protocols`` names the choices
+of ids that tables show. The average matters: on one set of masked frames the mean of per-image PSNRs, the PSNR of the
+mean MSE and the pixel-pooled PSNR lie more than 5 dB apart.
 """
 
 REGIONS = ("full", "no_hood", "human", "vehicle", "static", "no_sky", "near_lidar", "beyond_lidar")
 QUANTITIES = ("mse", "psnr", "psnr8", "ssim_uniform7", "ssim_gauss11", "lpips_alex", "lpips_vgg")
 
 LPIPS_SIDES = {"lpips_alex": 31, "lpips_vgg": 16}
-"""LPIPS -> pixels of the shorter side below which its network has no last layer."""
+"""Least side of an image, pixels, for which each LPIPS network still has a last layer."""
 GAUSS_WINDOW = 11
 """Side of the window of ``ssim_gauss11``, pixels."""
 
 LIDAR_REACH = 0.04
-"""A pixel is near the lidar where a return of the same instant falls into the square window of this fraction of the
-longer image side to all four sides; the others are beyond it."""
+"""A pixel is near the lidar if a return of the same instant lies in the square window around it, else beyond.
+
+The window extends by this fraction of the longer image side in all four directions."""
 
 PSNR_CAP = 100.0
-"""dB; a perfectly reproduced image would otherwise make every mean infinite. Summaries count the capped images."""
+"""Largest PSNR, dB: without it one perfect image would make a mean infinite. Summaries count the capped images."""
 
 _MASKED = "the pixels of the {} mask; images without the mask, or where it is empty, are skipped in the mean"
 _LIDAR = (
@@ -71,11 +72,15 @@ _FULL = {
 _MASKED_MAP = dict.fromkeys(("ssim_uniform7", "ssim_gauss11"), _OF_MAP) | dict.fromkeys(LPIPS_SIDES, _LPIPS_OF_MAP)
 
 _LIDAR_QUANTITIES = ("mse", "psnr", "ssim_uniform7")
-"""Where lidar falls is a question about geometry; it gets no columns for perception."""
+"""Quantities of the lidar regions, which are about geometry; perceptual ones are left out."""
 
 
 def quantities_of(region: str) -> tuple[str, ...]:
-    """Which quantities are measured in a region, in their order."""
+    """The quantities measured in a region, in order.
+
+    >>> quantities_of("near_lidar")
+    ('mse', 'psnr', 'ssim_uniform7')
+    """
     return _LIDAR_QUANTITIES if region in ("near_lidar", "beyond_lidar") else QUANTITIES
 
 
@@ -88,7 +93,13 @@ def _definition(quantity: str, region: str) -> str:
 
 
 def metric_id(quantity: str, region: str) -> str:
-    """The column name of a quantity in a region, such as ``psnr_vehicle``."""
+    """The id of a quantity in a region.
+
+    >>> metric_id("psnr", "vehicle")
+    'psnr_vehicle'
+    >>> DEFINITIONS["mse_full"]
+    'mean squared error over pixels and RGB channels, values in [0, 1]; all pixels of the image, ...'
+    """
     return f"{quantity}_{region}"
 
 
@@ -97,4 +108,4 @@ DEFINITIONS: dict[str, str] = {
     for region in REGIONS
     for quantity in quantities_of(region)
 }
-"""Id of a metric -> its definition in words; every record carries the ones it uses."""
+"""The definition in words of each metric's id; every record carries those that it uses."""

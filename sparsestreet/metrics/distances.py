@@ -1,7 +1,8 @@
-"""How far two sets of images are apart, by their features: the Frechet distance and the kernel distance.
+"""Distances between two sets of images, computed on their features: the Frechet and the kernel distance.
 
-Both compare sets, not pairs: there need be no truth. With few images the Frechet distance is mostly bias (a street's
-60 to 600 images against 2,048 features): compare runs on the same views only, and read the kernel distance first.
+Both compare sets, not pairs, so they need no ground truth. With few images the Frechet distance is mostly bias: a
+street has 60 to 600 images against 2,048 features. Compare only runs on the same views, and read the kernel distance
+first.
 """
 
 import numpy as np
@@ -12,12 +13,20 @@ INCEPTION = "inception"
 
 
 def frechet_name(extractor: str) -> str:
-    """What a record calls the Frechet distance of an extractor's features: "fid" for Inception's alone."""
+    """The name in records of the Frechet distance of an extractor's features: "fid" only for Inception.
+
+    >>> frechet_name("inception"), frechet_name("lpips_alex")
+    ('fid', 'frechet_lpips_alex')
+    """
     return "fid" if extractor == INCEPTION else f"frechet_{extractor}"
 
 
 def kernel_name(extractor: str) -> str:
-    """What a record calls the kernel distance of an extractor's features: "kid" for Inception's alone."""
+    """The name in records of the kernel distance of an extractor's features: "kid" only for Inception.
+
+    >>> kernel_name("inception"), kernel_name("lpips_alex")
+    ('kid', 'kernel_lpips_alex')
+    """
     return "kid" if extractor == INCEPTION else f"kernel_{extractor}"
 
 
@@ -25,8 +34,12 @@ def frechet_distance(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, 
     """|mean1 - mean2|^2 + tr(S1 + S2 - 2 (S1 S2)^(1/2)) of two sets of features, in float64.
 
     The trace of the root is the sum of the singular values of A B^T, where A and B are the centered features over
-    sqrt(n - 1) and sqrt(m - 1): exact where covariances have no full rank, and of the size of the sets, not of the
-    features. Raises ValueError for fewer than two rows, which have no covariance, or values that are not finite.
+    sqrt(n - 1) and sqrt(m - 1). This is exact for covariances of any rank, and its matrix has the size of the sets, not
+    of the features. Raises ValueError for fewer than two rows, which have no covariance, or values that are not finite.
+
+    >>> first = np.array([[0.0, 0.0], [2.0, 0.0]])
+    >>> frechet_distance(first, first + 3.0)  # equal covariances, means 3 apart in both features
+    18.0...
     """
     a, b = _checked(first, "frechet"), _checked(second, "frechet")
     means = a.mean(axis=0), b.mean(axis=0)
@@ -38,9 +51,12 @@ def frechet_distance(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, 
 def kernel_distance(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m d"]) -> float:
     """Squared maximum mean discrepancy under k(x, y) = (x . y / d + 1)^3 of two sets of features, in float64.
 
-    The unbiased estimate (Binkowski et al. 2018): a row is not compared with itself, so that two samples of one law
-    are 0 apart on average, and may be slightly below. Raises ValueError for fewer than two rows, or values that are
-    not finite.
+    The unbiased estimate (Binkowski et al. 2018) never compares a row with itself. Two samples of one distribution are
+    0 apart on average, so a value may be slightly negative. Raises ValueError for fewer than two rows, or values that
+    are not finite.
+
+    >>> kernel_distance(np.zeros((2, 1)), np.ones((2, 1)))  # 1^3 + 2^3 - 2 * 1^3
+    7.0
     """
     a, b = _checked(first, "kernel"), _checked(second, "kernel")
 

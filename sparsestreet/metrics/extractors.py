@@ -1,4 +1,4 @@
-"""What turns an image into the features by which sets of images are compared."""
+"""Extractors: they turn an image into the features that distances between sets of images compare."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -12,19 +12,19 @@ from sparsestreet.metrics.lpips import Lpips
 
 @runtime_checkable
 class Extractor(Protocol):
-    """Features of an image; ``name`` says whose, and "inception" is for the network of FID alone."""
+    """Computes the features of an image. ``name`` is that of the network; "inception" is reserved for that of FID."""
 
     @property
     def name(self) -> str: ...
 
     def __call__(self, image: Float[Tensor, "h w 3"]) -> Float[np.ndarray, " d"]:
-        """Of an image in [0, 1]."""
+        """Returns the features of an image in [0, 1]."""
         ...
 
 
 @dataclass(frozen=True)
 class LastLayer:
-    """The last layer of a network of LPIPS, averaged over the image."""
+    """The last layer of an LPIPS network, averaged over the image."""
 
     name: str
     network: Lpips

@@ -1,7 +1,7 @@
-"""LPIPS: how far apart two images are for a network that was trained to tell objects, as defined in ``definitions``.
+"""LPIPS: the distance between two images in the features of a network trained to recognize objects (``definitions``).
 
-Zhang et al. 2018: features of several layers, each pixel's scaled to unit length; their squared differences, weighted
-by channel; the mean over each layer, and the sum over layers.
+Zhang et al. 2018: each pixel's features in several layers are scaled to unit length. Their squared differences are
+weighted by channel, averaged over each layer and summed over layers.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from sparsestreet.metrics.image import check_mask, check_pair
 
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-"""ImageNet's mean and deviation by channel, of values in [-1, 1]."""
+"""ImageNet's mean and standard deviation of each channel, for values in [-1, 1]."""
 _TINY = 1e-10
-"""Beside the length of a feature, so that one of zeros stays zero."""
+"""Added to the length of a feature, so that a zero feature stays zero."""
 
 
 @dataclass(frozen=True)
 class Convolution:
-    """A layer with a rectifier behind it."""
+    """A convolution followed by a rectifier."""
 
     channels: int
     kernel: int
@@ -32,16 +32,16 @@ class Convolution:
 
     @property
     def padding(self) -> int:
-        """Keeps the size; AlexNet's first layer, of stride 4, loses a little."""
+        """Padding that keeps the image's size; AlexNet's first layer, of stride 4, loses a few pixels."""
         return self.kernel // 2 if self.stride == 1 else 2
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What lies between two layers that are compared."""
+    """The layers between one compared layer and the next."""
 
     pool: int
-    """Side of the maximum that is taken first, in steps of 2 pixels; 0: none."""
+    """Side of the max pooling that comes first, with stride 2; 0: none."""
     convolutions: tuple[Convolution, ...]
 
 
@@ -63,14 +63,14 @@ VGG16 = (
 
 @dataclass(frozen=True)
 class LpipsWeights:
-    """Numbers of a network. Raises ValueError for shapes that are not its own."""
+    """Weights of a network. Raises ValueError for shapes that do not fit its stages."""
 
     stages: tuple[Stage, ...]
     kernels: tuple[Float[Tensor, "_ _ _ _"], ...]
-    """Of each convolution, [out, in, row, column]."""
+    """Kernel of each convolution, [out, in, row, column]."""
     biases: tuple[Float[Tensor, " _"], ...]
     channels: tuple[Float[Tensor, " _"], ...]
-    """Of each stage, what a channel's squared difference counts."""
+    """For each stage, the weight of each channel's squared difference."""
 
     def __post_init__(self) -> None:
         layers = [layer for stage in self.stages for layer in stage.convolutions]
@@ -88,19 +88,26 @@ class LpipsWeights:
             raise ValueError(f"LPIPS weights must have the shapes {expected}, got {found}: take another file")
 
     def to(self, device: torch.device) -> "LpipsWeights":
-        """The same on a device."""
+        """A copy on a device."""
         moved = (tuple(one.to(device) for one in part) for part in (self.kernels, self.biases, self.channels))
         return LpipsWeights(self.stages, *moved)
 
 
 class Lpips:
-    """The distance that a network gives; float32, on the device of its weights."""
+    """LPIPS of one network; float32, on the device of its weights.
+
+    >>> stage = Stage(0, (Convolution(channels=1, kernel=1),))
+    >>> weights = LpipsWeights((stage,), (torch.ones(1, 3, 1, 1),), (torch.zeros(1),), (torch.ones(1),))
+    >>> distance, white = Lpips(weights), torch.ones(2, 2, 3)
+    >>> distance(white, white), distance(white, torch.zeros(2, 2, 3))  # a rectifier: nothing answers to black
+    (0.0, 1.0)
+    """
 
     def __init__(self, weights: LpipsWeights) -> None:
         self.weights = weights
 
     def __call__(self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-        """LPIPS of two images in [0, 1]; 0 for identical ones."""
+        """Returns LPIPS of two images in [0, 1]; 0 for identical ones."""
         return lpips_of_layers(self.layer_maps(image, truth))
 
     @torch.no_grad()
@@ -114,7 +121,7 @@ class Lpips:
 
     @torch.no_grad()
     def features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "_ _ _"]]:
-        """What the network sees in an image in [0, 1]: [channels, rows, columns] of each stage."""
+        """The features of an image in [0, 1]: [channels, rows, columns] of each stage."""
         shift, scale = (torch.tensor(numbers, device=image.device) for numbers in (_SHIFT, _SCALE))
         values = ((2 * image.float() - 1 - shift) / scale).permute(2, 0, 1)[None]
         layers = zip(self.weights.kernels, self.weights.biases, strict=True)
@@ -130,12 +137,23 @@ class Lpips:
 
 
 def lpips_of_layers(layers: Sequence[Float[Tensor, "_ _"]]) -> float:
-    """The image's LPIPS: the sum of the layers' means."""
+    """LPIPS of the image: the sum of the layers' means.
+
+    >>> lpips_of_layers((torch.full((4, 4), 0.25), torch.full((2, 2), 0.5)))
+    0.75
+    """
     return float(sum(layer.double().mean() for layer in layers))
 
 
 def masked_lpips_of_layers(layers: Sequence[Float[Tensor, "_ _"]], mask: Bool[Tensor, "h w"]) -> float | None:
-    """The sum of the layers' maps, brought to the mask's size bilinearly, averaged over it; None where it is empty."""
+    """LPIPS of a mask: the layers' maps, resized bilinearly to the mask, summed and averaged over it.
+
+    None if the mask is empty.
+
+    >>> left = torch.tensor([[True, False], [True, False]])
+    >>> masked_lpips_of_layers((torch.tensor([[0.5, 0.0], [0.5, 0.0]]), torch.tensor([[0.25]])), left)
+    0.75
+    """
     if not bool(mask.any()):
         return None
     spatial = torch.zeros(mask.shape, dtype=torch.float64, device=mask.device)
@@ -151,5 +169,5 @@ def _unit(features: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
 
 
 def _full_precision(device: torch.device):
-    """cuDNN would round the factors of convolutions to 10 bits."""
+    """Turns off TF32, in which cuDNN rounds the factors of convolutions to 10 bits."""
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False) if device.type == "cuda" else nullcontext()

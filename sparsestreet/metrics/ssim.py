@@ -1,7 +1,7 @@
 """Structural similarity of one image, full and masked, as defined in ``definitions``.
 
-Images are [h, w, 3] in [0, 1]. Sums run in float64: in float32 the variance of a flat sky, E[x^2] - E[x]^2, loses
-the digits that SSIM's small constants compare it with.
+Images are [h, w, 3] in [0, 1]. Sums run in float64. In float32 the rounding errors of a flat sky's variance,
+E[x^2] - E[x]^2, matter next to SSIM's small constants.
 """
 
 import math
@@ -17,11 +17,11 @@ from sparsestreet.metrics.image import check_mask, check_pair
 
 @dataclass(frozen=True)
 class Window:
-    """Separable weights around each pixel, which sum to 1."""
+    """Separable weights around each pixel; they sum to 1."""
 
     weights: tuple[float, ...]
     bessel: float
-    """What a variance is multiplied with: n / (n - 1) of n equal weights makes it the sample's."""
+    """Factor of variances: n / (n - 1) for n equal weights gives the sample variance."""
 
     @property
     def side(self) -> int:
@@ -49,8 +49,12 @@ def ssim_map(
     """Structural similarity per pixel and channel (Wang et al. 2004).
 
     ((2 ux uy + C1)(2 vxy + C2)) / ((ux^2 + uy^2 + C1)(vx + vy + C2)) with C1 = 0.01^2, C2 = 0.03^2 and statistics
-    over the window; outside the image the pixels are mirrored, the edge pixel included.
+    over the window. Outside the image the pixels are mirrored, the edge pixel included.
     Raises ValueError for images with a side below the window's.
+
+    >>> black, white = torch.zeros(8, 8, 3), torch.ones(8, 8, 3)
+    >>> ssim_map(black, white)[0, 0]  # without variance C1 / (1 + C1) is left
+    tensor([9.9990e-05, 9.9990e-05, 9.9990e-05], dtype=torch.float64)
     """
     check_pair(image, truth)
     if min(image.shape[:2]) < window.side:
@@ -68,19 +72,36 @@ def ssim_map(
 
 
 def ssim_of_map(similarity: Float64[Tensor, "h w 3"], window: Window = UNIFORM7) -> float:
-    """The image's SSIM: the map's mean without the border whose windows leave the image."""
+    """SSIM of the image: the map's mean without the border, where windows leave the image.
+
+    >>> similarity = torch.zeros(8, 8, 3, dtype=torch.float64)
+    >>> similarity[3:-3, 3:-3] = 0.5  # a 7x7 window leaves the image in a border of 3 pixels
+    >>> ssim_of_map(similarity)
+    0.5
+    """
     border = window.border
     return float(similarity[border:-border, border:-border].mean())
 
 
 def masked_ssim_of_map(similarity: Float64[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]) -> float | None:
-    """The map of the full image averaged over the masked pixels, border included; None where the mask is empty."""
+    """The map of the full image averaged over the masked pixels, border included; None if the mask is empty.
+
+    >>> similarity = torch.zeros(2, 2, 3, dtype=torch.float64)
+    >>> similarity[0, 0] = 1.0
+    >>> masked_ssim_of_map(similarity, torch.tensor([[True, True], [False, False]]))
+    0.5
+    """
     check_mask(mask, similarity)
     return float(similarity[mask].mean()) if bool(mask.any()) else None
 
 
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], window: Window = UNIFORM7) -> float:
-    """Structural similarity of the image; 1 for identical ones. Raises ValueError for images below the window."""
+    """Structural similarity of the image; 1 for identical ones. Raises ValueError for images below the window.
+
+    >>> image = torch.linspace(0, 1, 8)[:, None, None].expand(8, 8, 3)
+    >>> ssim(image, image), ssim(image, 1 - image) < 0  # the negative: covariances change their sign
+    (1.0, True)
+    """
     return ssim_of_map(ssim_map(image, truth, window), window)
 
 
@@ -90,12 +111,17 @@ def masked_ssim(
     mask: Bool[Tensor, "h w"],
     window: Window = UNIFORM7,
 ) -> float | None:
-    """Structural similarity of the full image, averaged over the masked pixels; None where the mask is empty."""
+    """Structural similarity of the full image, averaged over the masked pixels; None if the mask is empty.
+
+    >>> image, mask = torch.zeros(8, 8, 3), torch.zeros(8, 8, dtype=torch.bool)
+    >>> print(masked_ssim(image, image, mask))
+    None
+    """
     return masked_ssim_of_map(ssim_map(image, truth, window), mask)
 
 
 def _window_means(stack: Float64[Tensor, "k c h w"], window: Window) -> Float64[Tensor, "k c h w"]:
-    """Weighted mean around each pixel, mirrored at the border with the edge pixel repeated."""
+    """Weighted mean around each pixel; the border is mirrored with the edge pixel repeated."""
     rows, columns = (_mirrored(length, window.border, stack.device) for length in stack.shape[-2:])
     padded = stack[:, :, rows][:, :, :, columns]
     means = _sevens if window is UNIFORM7 else _weighted
@@ -103,7 +129,7 @@ def _window_means(stack: Float64[Tensor, "k c h w"], window: Window) -> Float64[
 
 
 def _weighted(values: Float64[Tensor, "*b"], dim: int, window: Window) -> Float64[Tensor, "*c"]:
-    """Weighted sums of neighbors along a dimension; what lies at equal distance is added before its one product."""
+    """Weighted sums of neighbors along a dimension; two neighbors of equal weight are added first."""
     length = values.shape[dim] - window.side + 1
     parts = [values.narrow(dim, place, length) for place in range(window.side)]
     sums = window.weights[window.border] * parts[window.border]
