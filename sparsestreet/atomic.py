@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all: a reader never sees half of one, a crash leaves the old one."""
+"""Files and folders that appear whole or not at all. A reader never sees half of one; a crash leaves the old one."""
 
 import os
 import shutil
@@ -9,14 +9,21 @@ from pathlib import Path
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A file to write beside ``path``; it takes its place when the block ends, and goes when the block fails.
+    """Yields a temporary file next to ``path``. It replaces ``path`` when the block ends, and is deleted if it fails.
 
-    A block that writes nothing changes nothing: of several processes that save together, the first writes and the
-    others come here with nothing to say (``Trainer.save_checkpoint`` must be called by all).
+    A block that writes nothing changes nothing. When several processes save together, only the first writes; the others
+    enter the block too (``Trainer.save_checkpoint`` must be called by all), and change nothing.
 
-    Raises OSError before the block where nothing can be written.
+    Raises OSError before the block if nothing can be written.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     with atomic_file(Path(folder, "note.txt")) as file:
+    ...         _ = file.write_text("whole")
+    ...     [path.name for path in Path(folder).iterdir()]
+    ['note.txt']
     """
-    # The ending stays, because some writers choose the format by it.
+    # The suffix stays, because some writers choose the format by it.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         if path.is_dir():
@@ -39,9 +46,16 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """A folder to fill beside ``path``; it takes its place when the block ends, and goes when the block fails.
+    """Yields a temporary folder next to ``path``. It becomes ``path`` when the block ends, and is deleted if it fails.
 
-    Raises OSError before the block where nothing can be written, or where ``path`` holds something already.
+    Raises OSError before the block if nothing can be written, or if ``path`` is not an empty folder.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as parent:
+    ...     with atomic_folder(Path(parent, "run")) as folder:
+    ...         (folder / "log.txt").touch()
+    ...     [path.name for path in Path(parent, "run").iterdir()]
+    ['log.txt']
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:

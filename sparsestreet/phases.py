@@ -1,7 +1,7 @@
-"""Where time goes: phases of a step and stages of a command, timed only while somebody records.
+"""Times the phases of a step and the stages of a command, only while a recorder runs.
 
-Code says ``with phase("splat"):`` around what a step does often, and ``with stage("points"):`` around what a command
-does a few times; without a recorder a phase costs a third of a microsecond. Both may stand in one another: time belongs
+Code marks frequent parts of a step by ``with phase("splat"):``, and rare parts of a command by
+``with stage("points"):``. Without a recorder a phase costs a third of a microsecond. Both may be nested; time belongs
 to the innermost one.
 """
 
@@ -35,7 +35,7 @@ class WallClock:
 
 
 class CudaClock:
-    """Seconds of the device between events of its stream, launch gaps included; waits only when asked for seconds."""
+    """Seconds of the device between events of its stream, launch gaps included. Only ``seconds`` waits for it."""
 
     def mark(self) -> torch.cuda.Event:
         event = torch.cuda.Event(enable_timing=True)
@@ -48,15 +48,19 @@ class CudaClock:
 
 
 def clock_of(device: torch.device) -> Timer:
-    """The clock that sees the work of a device."""
+    """The clock that measures the work of a device.
+
+    >>> clock_of(torch.device("cpu")).seconds(1.0, 3.5)
+    2.5
+    """
     return CudaClock() if device.type == "cuda" else WallClock()
 
 
 class Timeline:
-    """Seconds by name of what is under way."""
+    """Adds up seconds by name; the name changes with ``enter`` and ``leave``."""
 
     def __init__(self, clock: Timer, outside: str) -> None:
-        """``outside`` is the name of the time that belongs to nothing else."""
+        """``outside`` names the time outside of all other names."""
         self._clock = clock
         self._names = [outside]
         self._marks: list[tuple[object, str]] = []
@@ -75,12 +79,12 @@ class Timeline:
         self._marks.append((self._clock.mark(), self._names[-1]))
 
     def begin(self) -> None:
-        """Forget what was."""
+        """Starts anew."""
         del self._names[1:]
         self._marks = [(self._clock.mark(), self._names[0])]
 
     def seconds(self) -> dict[str, float]:
-        """Those of every name since ``begin``; they add up to all of it."""
+        """Seconds of each name since ``begin``; they add up to the whole time."""
         marks = [*self._marks, (self._clock.mark(), "")]
         seconds: defaultdict[str, float] = defaultdict(float)
         for (begin, name), (end, _) in pairwise(marks):
@@ -89,13 +93,13 @@ class Timeline:
 
 
 class PhaseRecorder(Timeline):
-    """What happened between ``start`` and ``stop``, as seconds by name of the phase."""
+    """Records the seconds of each phase between ``start`` and ``stop``."""
 
     def __init__(self, clock: Timer, outside: str = "rest") -> None:
         super().__init__(clock, outside)
 
     def start(self) -> None:
-        """Forget what was, and record from now on; raises RuntimeError while another recorder does."""
+        """Records from now on; raises RuntimeError while another recorder does."""
         global _recorder
         if _recorder not in (None, self):
             raise RuntimeError("phases are recorded by one recorder at a time: stop the other one first")
@@ -103,17 +107,17 @@ class PhaseRecorder(Timeline):
         self.begin()
 
     def stop(self) -> dict[str, float]:
-        """Seconds of every phase since ``start``; they add up to all of it."""
+        """Returns the seconds of each phase since ``start``; they add up to the whole time."""
         global _recorder
         _recorder = None
         return self.seconds()
 
 
 class StageRecorder(Timeline):
-    """Wall clock of the stages of a command, while ``with`` holds it."""
+    """Records the wall clock of a command's stages inside its ``with`` block."""
 
     def __init__(self, since: float | None = None) -> None:
-        """``since``: ``time.perf_counter`` when the command began; what it did until now is the stage "start"."""
+        """``since``: ``time.perf_counter`` when the command began; the time until now is the stage "start"."""
         super().__init__(WallClock(), outside="other")
         self._earlier: Counter[str] = Counter()
         self.begin()
@@ -121,11 +125,11 @@ class StageRecorder(Timeline):
             self._marks.insert(0, (since, "start"))
 
     def go_on(self, earlier: Mapping[str, float]) -> None:
-        """Count what an earlier command spent on the same run as well."""
+        """Adds what an earlier command spent on the same run."""
         self._earlier = Counter(earlier)
 
     def seconds(self) -> dict[str, float]:
-        """Those of every stage of this command and of the earlier one."""
+        """Seconds of each stage of this command and of the earlier one."""
         return dict(self._earlier + Counter(super().seconds()))
 
     def __enter__(self) -> "StageRecorder":
@@ -143,7 +147,15 @@ _stages: StageRecorder | None = None
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """``with stage(name):`` marks a part of a command for whoever records; ``name/detail`` where there are several."""
+    """``with stage(name):`` marks a part of a command for the recorder; names of several like parts are
+    ``name/detail``.
+
+    >>> with StageRecorder() as stages:
+    ...     with stage("points"):
+    ...         pass
+    >>> list(stages.seconds())
+    ['other', 'points']
+    """
     recorder = _stages
     if recorder is None:
         yield
@@ -159,7 +171,15 @@ _recorder: PhaseRecorder | None = None
 
 
 class phase:  # noqa: N801 (reads as a statement)
-    """``with phase(name):`` marks a part of a step for whoever records."""
+    """``with phase(name):`` marks a part of a step for the recorder.
+
+    >>> recorder = PhaseRecorder(WallClock())
+    >>> recorder.start()
+    >>> with phase("splat"):
+    ...     pass
+    >>> list(recorder.stop())
+    ['rest', 'splat']
+    """
 
     __slots__ = ("_entered", "_name")
 
@@ -172,6 +192,6 @@ class phase:  # noqa: N801 (reads as a statement)
             self._entered.enter(self._name)
 
     def __exit__(self, *exception: object) -> None:
-        # A recorder that was stopped meanwhile has forgotten this phase.
+        # A recorder that was stopped inside this phase has already dropped it.
         if self._entered is not None and self._entered is _recorder:
             self._entered.leave()

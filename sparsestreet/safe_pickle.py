@@ -1,7 +1,8 @@
-"""Arrays out of pickles that others wrote, without running anything that is in them.
+"""Reads arrays from pickles of others without running anything in them.
 
-Unpickling normally calls what the file names. Here a name becomes a stand-in that calls nothing; when the file is read,
-those stand-ins that describe arrays of numbers are worked out, and any other name has been refused.
+Unpickling normally calls what the file names. Here a name that describes arrays of numbers becomes a stand-in that
+calls
+nothing; any other name is refused. After reading, the stand-ins are turned into arrays.
 """
 
 import io
@@ -18,15 +19,22 @@ import torch
 
 
 def read_pickled(path: Path) -> Any:
-    """Dicts, lists, numbers, text and arrays of numbers from a pickle, also one of joblib without compression.
+    """Reads dicts, lists, numbers, text and arrays of numbers from a pickle, or from joblib's without compression.
 
-    Tensors of torch, sparse matrices of scipy and arrays wrapped by chumpy come as plain NumPy arrays. Raises
-    FileNotFoundError where there is no file, ValueError, naming it, for a file that asks for anything else.
+    Tensors of torch, sparse matrices of scipy and arrays wrapped by chumpy become plain NumPy arrays. Raises
+    FileNotFoundError, or ValueError, naming the file, if it holds anything else.
+
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "array.pkl")
+    ...     _ = path.write_bytes(pickle.dumps({"means": np.arange(3)}))
+    ...     read_pickled(path)
+    {'means': array([0, 1, 2])}
     """
     with path.open("rb") as file:
         try:
             return _worked_out(_Reader(file, encoding="latin1").load())
-        except Exception as error:  # a broken pickle fails in as many ways as there are opcodes
+        except Exception as error:  # each opcode of a broken pickle fails in its own way
             reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             raise ValueError(
                 f"{path} must be a pickle of plain values and arrays of numbers, which it is not ({reason}): "
@@ -36,7 +44,7 @@ def read_pickled(path: Path) -> Any:
 
 @dataclass(eq=False)
 class _Named:
-    """What a pickle refers to by its name."""
+    """Stand-in for something that a pickle names."""
 
     name: str
 
@@ -46,7 +54,7 @@ class _Named:
 
 @dataclass(eq=False)
 class _Made:
-    """What calling the name would make, and what it was told about itself afterwards."""
+    """Stand-in for the object that a call of the name would make, with the state set afterwards."""
 
     name: str
     arguments: tuple[Any, ...]
@@ -54,7 +62,7 @@ class _Made:
 
 
 class _Reader(pickle._Unpickler):
-    """The unpickler written in Python: the only one in which every step can be replaced."""
+    """The unpickler written in Python, because only there every step can be replaced."""
 
     def __init__(self, file: BinaryIO, **options: Any) -> None:
         super().__init__(file, **options)
@@ -89,7 +97,7 @@ class _Reader(pickle._Unpickler):
         return value
 
     def _following(self, state: dict[str, Any]) -> bytes:
-        """The bytes of an array, which joblib writes behind its description, padded at the front."""
+        """The bytes of an array, which joblib writes after its description, padded at the front."""
         if state.get("numpy_array_alignment_bytes") is not None:
             self._stream.read(self._stream.read(1)[0])
         return self._stream.read(math.prod(state["shape"]) * _worked_out(state["dtype"]).itemsize)
@@ -132,13 +140,13 @@ def _scalar(made: _Made) -> np.generic:
 
 
 def _numbers(data: Any, dtype: Any) -> np.ndarray:
-    """A writable array of its own; Python 2 wrote bytes as text."""
+    """A writable copy as an array; Python 2 wrote bytes as text."""
     kind, data = _worked_out(dtype), _worked_out(data)
     return np.frombuffer(bytearray(data.encode("latin1") if isinstance(data, str) else data), kind)
 
 
 def _dtype(made: _Made) -> np.dtype:
-    """Numbers only: of objects the bytes would be taken for addresses."""
+    """Allows only dtypes of numbers, because the bytes of objects would be read as addresses."""
     name = str(made.arguments[0])
     if not re.fullmatch(r"[?]|b1|[iu][1248]|f[248]", name):
         raise ValueError(f"it holds an array of {name!r}, not of numbers")
@@ -171,13 +179,13 @@ def _sparse(made: _Made) -> np.ndarray:
     rows, columns = state["shape"]
     by_row = made.name == "scipy.sparse.csr.csr_matrix"
     dense = np.zeros((rows, columns) if by_row else (columns, rows), state["data"].dtype)
-    # NumPy checks the indices, where scipy would write to them unseen.
+    # NumPy checks the indices; scipy would write to them unchecked.
     np.add.at(dense, (np.repeat(np.arange(len(dense)), np.diff(state["indptr"])), state["indices"]), state["data"])
     return dense if by_row else dense.T
 
 
 def _chumpy(made: _Made) -> np.ndarray:
-    """A wrapped array, or some entries of another in a shape of their own."""
+    """A wrapped array, or a selection of another array's entries in its own shape."""
     if "x" in made.state:
         return np.asarray(_worked_out(made.state["x"]))
     whole, taken = (_worked_out(made.state[key]) for key in ("a", "idxs"))
@@ -185,12 +193,12 @@ def _chumpy(made: _Made) -> np.ndarray:
 
 
 def _no_bytes(made: _Made) -> bytes:
-    """How the oldest protocols write an empty string of bytes."""
+    """The empty bytes, as the oldest protocols write them."""
     return _refused(made) if made.arguments else b""
 
 
 def _reconstructed(made: _Made) -> Any:
-    """Objects of the oldest protocols: the class is an argument."""
+    """An object of the oldest protocols, whose class is an argument."""
     kind = made.arguments[0]
     return _worked_out(_Made(kind.name, (), made.state)) if isinstance(kind, _Named) else _refused(made)
 
@@ -219,4 +227,4 @@ _KNOWN: dict[str, Callable[[_Made], Any]] = {
     "builtins.object": _refused,
     "__builtin__.bytes": _no_bytes,
 }
-"""What a pickle may name, and how it is worked out."""
+"""What a pickle may name, and the function that turns it into a value."""

@@ -1,9 +1,12 @@
-"""The frozen values that the wings of the package hand to each other.
+"""The frozen values that the rooms of the package hand to each other.
 
-Conventions, everywhere: world frame metric and right-handed, re-centered at load; camera frame as in
-OpenCV (x right, y down, z forward); quaternions wxyz; ``a_from_b`` maps points of frame b to frame a;
-pixel centers at +0.5; time in [0, 1] beside the integer frame, and seconds and integer nanoseconds where
-the log has a clock; images float32 in [0, 1] at the splat op and uint8 in storage.
+Conventions, everywhere:
+
+- The world frame is metric and right-handed, and re-centered when a log is read.
+- The camera frame is OpenCV's: x right, y down, z forward. Pixel centers are at +0.5.
+- Quaternions are wxyz. ``a_from_b`` maps points of frame b to frame a.
+- Time is in [0, 1], next to the integer frame. If the log has a clock, also in seconds and integer nanoseconds.
+- Images are float32 in [0, 1] at the splat op, and uint8 in storage.
 """
 
 from dataclasses import dataclass, fields
@@ -15,7 +18,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Activated 3D Gaussians in the world frame (quaternions need not be unit)."""
+    """Activated 3D Gaussians in the world frame."""
 
     means: Float[Tensor, "n 3"]
     """Centers, meters."""
@@ -28,19 +31,20 @@ class Gaussians:
     sh: Float[Tensor, "n k 3"]
     """Spherical harmonics, k in {1, 4, 9, 16}; color = max(0, 0.5 + sum_i basis_i(direction) sh_i)."""
     displacements: Float[Tensor, "n 3"] | None = None
-    """How far each row moves while an image is read out, meters in the world; None: nothing moves. Used only with
-    ``Camera.shutter``; it gets no gradient."""
+    """How far each row moves while an image is read out, meters in the world; None: nothing moves.
+
+    Used only with ``Camera.shutter``. It gets no gradient."""
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
-        """Rows of all parts in order; parts of a lower SH degree are padded with zeros."""
+        """Joins the rows of all parts in order; parts of a lower SH degree are padded with zeros."""
         if len(parts) == 1:
             return parts[0]
         terms = max(part.sh.shape[1] for part in parts)
-        # pad copies even where there is nothing to add, and the harmonics are most of a scene's memory traffic.
+        # pad copies even when it adds nothing, and the harmonics are most of a scene's memory traffic.
         padded = [
             part.sh
             if part.sh.shape[1] == terms
@@ -66,7 +70,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Shutter:
-    """Motion of a camera while its rows are read from the first to the last; its pose is that of the middle row."""
+    """Motion of a camera while its rows are read from first to last. The camera's pose is that at the middle row."""
 
     translation: Float[Tensor, "3"]
     """Displacement of the camera over the whole readout, meters, in the camera frame."""
@@ -76,10 +80,7 @@ class Shutter:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; lens distortion and a rolling shutter only where they are given.
-
-    Its tensors are on the host, where the op reads them.
-    """
+    """A pinhole camera, with lens distortion and a rolling shutter if they are given. Its tensors are on the host."""
 
     camera_from_world: Float[Tensor, "4 4"]
     intrinsics: Float[Tensor, "3 3"]
@@ -87,9 +88,9 @@ class Camera:
     width: int
     height: int
     distortion: Float[Tensor, "5"] | None = None
-    """Brown-Conrady k1, k2, p1, p2, k3 as OpenCV orders them; None: a pinhole, at no cost."""
+    """Brown-Conrady k1, k2, p1, p2, k3, in OpenCV's order; None: a pinhole, which costs nothing."""
     shutter: Shutter | None = None
-    """None: all rows are exposed at once, at no cost."""
+    """None: all rows are exposed at once, which costs nothing."""
 
     @property
     def position(self) -> Float[Tensor, "3"]:
@@ -100,31 +101,31 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """From where and when a scene is seen."""
+    """A camera and a time at which a scene is seen."""
 
     camera: Camera
     time: float
     """Normalized time in [0, 1]."""
     frame_index: int | None = None
-    """Integer frame of the log; all cameras of one instant share it. None: between or beside the recorded frames."""
+    """Integer frame of the log; all cameras of one instant share it. None: not a recorded frame."""
     camera_index: int | None = None
-    """Which camera of the log's rig; None: none of them."""
+    """Number of the camera in the log's rig; None: not a camera of the rig."""
     seconds: float | None = None
-    """Since the first stamp of the log; None: the log has no clock."""
+    """Seconds since the first stamp of the log; None: the log has no clock."""
     stamp: int | None = None
-    """Nanoseconds on the log's own clock, whatever its zero; None: no clock, or between the recorded frames."""
+    """Nanoseconds on the log's own clock, whose zero is arbitrary; None: no clock, or between the recorded frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(View):
-    """A view with its image, and what is known about its pixels. Of a recorded one both numbers are given."""
+    """A view with its image and what is known about its pixels. A recorded frame has both indices."""
 
     image: UInt8[Tensor, "h w 3"]
     sky: Bool[Tensor, "h w"] | None = None
     human: Bool[Tensor, "h w"] | None = None
     vehicle: Bool[Tensor, "h w"] | None = None
     depth: Float[Tensor, "h w"] | None = None
-    """Lidar depth along the optical axis, meters; 0 where no return fell into the pixel."""
+    """Lidar depth along the optical axis, meters; 0 where the pixel has no return."""
     ego: Bool[Tensor, "h w"] | None = None
     """Pixels of the recording car itself, such as its hood."""
 
@@ -136,7 +137,7 @@ class Frame(View):
 
 @dataclass(frozen=True)
 class Sweep:
-    """Lidar points of one instant in the world frame, colored where a camera of that instant sees them."""
+    """Lidar points of one instant in the world frame, with colors where a camera of that instant sees them."""
 
     index: int
     points: Float[Tensor, "n 3"]
@@ -151,13 +152,13 @@ class Sweep:
 
 @dataclass(frozen=True)
 class BodyPoses:
-    """How a person's 24 joints (SMPL's, in its order) are turned; one entry per annotated frame of the track.
+    """Rotations of a person's 24 joints (SMPL's, in its order), one entry per annotated frame of the track.
 
     The body's own frame: y up, x to the person's left, z forward, at rest in T-pose.
     """
 
     rotations: Float[Tensor, "f 24 4"]
-    """Unit, wxyz; joint 0: world_from_root, the others relative to their parent."""
+    """Unit quaternions, wxyz. Joint 0 is world_from_root; the others are relative to their parent."""
     valid: Bool[Tensor, " f"]
     """Whether the frame has a pose."""
     shape: Float[Tensor, "10"]
@@ -166,17 +167,17 @@ class BodyPoses:
 
 @dataclass(frozen=True)
 class Track:
-    """One annotated object. Box frame: x along the length (heading), y left, z up, origin at the box center."""
+    """One annotated object. Its box frame has x along the length (heading), y left, z up, the origin at the center."""
 
     name: str
     class_name: str
     frames: Int[Tensor, " f"]
-    """Annotated integer frames, strictly increasing, not necessarily without gaps."""
+    """Annotated integer frames, strictly increasing; gaps are allowed."""
     world_from_object: Float64[Tensor, "f 4 4"]
     size: Float[Tensor, "3"]
     """Length, width, height, meters (mean over the annotated frames)."""
     body: BodyPoses | None = None
-    """How a person moves inside the box; None: unknown, or no person."""
+    """How a person moves inside the box; None: unknown, or not a person."""
 
     @property
     def path_length(self) -> float:
@@ -190,16 +191,17 @@ class Rendering:
     """What the splat op returns. Row-wise fields have one entry per input Gaussian, drawn or not."""
 
     rgb: Float[Tensor, "h w 3"]
-    """Blended color over the background given to the op (premultiplied by alpha where none was given)."""
+    """Blended color over the background of the call; premultiplied by alpha if it had none."""
     alpha: Float[Tensor, "h w"]
-    """1 - transmittance behind the last splat."""
+    """1 - transmittance after the last splat."""
     depth: Float[Tensor, "h w"]
     """Expected depth along the optical axis, meters: sum(w z) / max(alpha, 1e-6)."""
     radii: Float[Tensor, " n"]
-    """Half the longer side of the splat's pixel box, pixels; 0 where the row was culled."""
+    """Half the longer side of the splat's pixel box, pixels; 0 for a culled row."""
     screen_offsets: Float[Tensor, "n 2"]
-    """A leaf of zeros: after backward its .grad holds, per row, sum over pixels of |dLoss / d mean2d|, per pixel
-    unit (the absolute gradient of AbsGS, which density control thresholds)."""
+    """A leaf of zeros. After backward its .grad holds, per row, the sum over pixels of |dLoss / d mean2d|, 1/px.
+
+    This is the absolute gradient of AbsGS, which density control thresholds."""
 
     @property
     def visible(self) -> Bool[Tensor, " n"]:
@@ -220,9 +222,9 @@ class Contribution:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """How far one view moves when each row alone is taken away, the others staying as they are."""
+    """How much one view changes when each row alone is removed and the others stay."""
 
     max_abs_change: Float64[Tensor, " n"]
     """Largest absolute change of a channel of a pixel."""
     squared_change: Float64[Tensor, " n"]
-    """Sum over pixels and channels of the squared change, each pixel times its weight."""
+    """Sum over pixels and channels of the squared change times the pixel's weight."""

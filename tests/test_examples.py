@@ -15,8 +15,12 @@ import torch
 import sparsestreet
 
 ROOMS = (
+    "sparsestreet.atomic",
     "sparsestreet.geometry",
     "sparsestreet.metrics",
+    "sparsestreet.noise",
+    "sparsestreet.phases",
+    "sparsestreet.safe_pickle",
 )
 """Modules, and packages, in which everything public has an example: the names in ``__all__``, else each function."""
 

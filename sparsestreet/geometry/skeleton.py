@@ -1,7 +1,7 @@
 """The joints of a human body, how each moves the next, and how they move attached points.
 
-Joints, their order and the frame are those of SMPL (Loper et al., SIGGRAPH Asia 2015): y up, x to the person's left,
-z forward, arms stretched out sideways at rest.
+Joints, their order and the frame are those of SMPL (Loper et al., SIGGRAPH Asia 2015). y points up, x to the person's
+left, z forward. At rest the arms are stretched out sideways.
 """
 
 from dataclasses import dataclass
@@ -111,8 +111,8 @@ def skin(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
     """Linear blend skinning: returns moved points and rotations (not unit).
 
-    Blended transforms move the points, blended quaternions turn the rotations. A blended quaternion differs from the
-    rotation of the blended matrix by 3 degrees where two bones meet at a right angle, and takes a tenth of the time.
+    Blended transforms move the points, blended quaternions turn the rotations. A blended quaternion takes
+    a tenth of the time of a blended matrix. Its rotation differs by 3 degrees where two bones meet at a right angle.
 
     Args:
         points: positions at rest, meters.
