@@ -19,6 +19,7 @@ ROOMS = (
     "sparsestreet.geometry",
     "sparsestreet.metrics",
     "sparsestreet.noise",
+    "sparsestreet.ops",
     "sparsestreet.phases",
     "sparsestreet.safe_pickle",
 )

@@ -1,13 +1,14 @@
 """The splat op: one signature, a dense reference, a fast CPU backend and a Triton one. In reading order:
 
-1. the signature: Gaussians and a camera in, a differentiable Rendering out (``splat``), its knobs (``settings``), what
-   it demands of its inputs (``validate``), which rows it does not draw (``guards``), and that it is not compiled
-   (``disable_compile``);
-2. the backends: which one runs (``backend``), what each hands back (``raster``), the truth (``reference``), C++
-   (``cpu``), GPUs (``triton``); ``spherical_harmonics`` is the formula that all of them follow;
-3. steps around it, in torch and as one fused kernel (``fused`` chooses): from the rows of all nodes to Gaussians
-   (``activate``), where boxes are (``poses``), the sky behind the splats (``sky``; its geometry is in ``cube_map``),
-   D-SSIM (``ssim``, its window in ``ssim_window``) and Adam of the rows that were seen (``visible_adam``).
+1. The signature. ``splat`` takes Gaussians and a camera, and returns a differentiable Rendering. ``settings`` holds its
+   knobs, ``validate`` checks its inputs, ``guards`` counts the rows that it does not draw. ``compiling`` keeps
+   torch.compile out.
+2. The backends. ``backend`` chooses one, ``raster`` is what each returns. ``reference`` is the truth, ``cpu`` is in
+   C++,
+   ``triton`` for GPUs. All follow the formula in ``spherical_harmonics``.
+3. Steps around the op, in torch and as fused kernels (``fused`` chooses). ``activate`` turns the rows of all nodes into
+   Gaussians, and ``poses`` places boxes. ``sky`` adds the sky behind the splats; its geometry is in ``cube_map``.
+   ``ssim`` is D-SSIM (``ssim_window`` its window). ``visible_adam`` steps the rows that were seen.
 """
 
 from sparsestreet.ops.backend import resolve_backend

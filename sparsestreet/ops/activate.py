@@ -1,4 +1,4 @@
-"""From rows as nodes store them to rows as they are splatted: activated, masked, placed in the world, in one table."""
+"""Turns rows as nodes store them into Gaussians to splat: activated, masked, placed in the world, in one table."""
 
 from collections.abc import Sequence
 
@@ -15,12 +15,13 @@ from sparsestreet.types import Gaussians
 
 @disable_compile
 def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "auto") -> Gaussians:
-    """All parts one after the other: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
+    """Activates all parts into one table: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
 
-    With gradients to all that is learned; a part that uses fewer coefficients than another is padded with zeros. One
-    operation of the C++ library and one backward, whatever the number of parts and instances; of Triton a kernel for
-    each part; or a few dozen operations of torch for each. But for torch's, which adds up the gradients of poses by
-    atomics on a GPU, two runs agree to the last bit.
+    Gradients go to everything that is learned. A part with fewer coefficients than another is padded with zeros. The
+    C++
+    library needs one operation and one backward for all parts and instances. Triton runs one kernel per part, torch a
+    few dozen operations. Two runs agree to the last bit, except with torch on a GPU, which sums the gradients of poses
+    by atomics.
 
     ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
     """
@@ -54,7 +55,7 @@ def _placed(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"], Float[Tensor, " n"]]:
     """Means and quaternions in the world, and 1 where the row's instance is present, else 0."""
     poses = placement.poses
-    # One table, one gather: rotation matrix (9), quaternion (4), translation (3), presence (1) of each row's box.
+    # One gather from one table: rotation matrix (9), quaternion (4), translation (3), presence (1) of each row's box.
     columns = (
         quat.to_matrix(poses.quaternions).flatten(1),
         poses.quaternions,
@@ -63,6 +64,6 @@ def _placed(
     )
     row_poses = torch.cat(columns, dim=1).index_select(0, placement.instances)
     rotation, quaternion, translation, presence = row_poses.split((9, 4, 3, 1), dim=1)
-    # Written out instead of a matrix product, which autocast would round to bfloat16: meters become decimeters.
+    # Not a matrix product, which autocast would round to bfloat16: that loses decimeters.
     means = (rotation.unflatten(1, (3, 3)) * raw.means[:, None, :]).sum(-1) + translation
     return means, quat.multiply(quaternion, raw.quaternions), presence.squeeze(1)

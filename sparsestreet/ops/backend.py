@@ -1,4 +1,4 @@
-"""Which implementations of the op there are, and which one runs on a device."""
+"""The backends of the op, and which one runs on a device."""
 
 import importlib.util
 import warnings
@@ -12,11 +12,19 @@ TRITON_REMEDY = "pip install 'sparsestreet[gpu]' (Linux)"
 
 
 def resolve_backend(name: str, device: torch.device) -> str:
-    """``name`` if it can run on ``device``; for "auto" the fastest that can.
+    """Returns ``name`` if it can run on ``device``, or for "auto" the fastest backend that can.
 
-    Raises ValueError for an unknown name or a device the backend does not run on, RuntimeError with the remedy if the
-    library of "cpu" is not built or the package of "triton" is not installed. "auto" takes "triton" on CUDA devices and
-    "cpu" on the CPU; where those are missing it takes "reference" and warns once.
+    "auto" takes "triton" on CUDA devices and "cpu" on the CPU; if they are missing, it takes "reference" and warns
+    once.
+    Raises ValueError for an unknown name or a device the backend does not run on. Raises RuntimeError with the remedy
+    if
+    the library of "cpu" is not built, or the package triton is not installed.
+
+    >>> resolve_backend("reference", torch.device("cpu"))
+    'reference'
+    >>> resolve_backend("cpu", torch.device("meta"))
+    Traceback (most recent call last):
+    ValueError: backend 'cpu' needs tensors on the cpu, got meta: move them or use 'reference'
     """
     if name not in (*BACKENDS, "auto"):
         raise ValueError(f"no splat backend {name!r}: choose one of {sorted(BACKENDS)} or 'auto'")

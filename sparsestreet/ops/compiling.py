@@ -11,10 +11,10 @@ Result = TypeVar("Result")
 
 
 def disable_compile(op: Callable[P, Result]) -> Callable[P, Result]:
-    """``op`` as it is written, also inside a function that is compiled: the graph breaks there.
+    """Returns ``op``, which a compiled function then calls uncompiled: the graph breaks there.
 
-    Dynamo would trace into the backend's choice and the library's pointers, and warn. As ``torch.compiler.disable``,
-    but that one imports the compiler at once, which takes as long as torch itself.
+    Dynamo would otherwise trace into the choice of the backend and the library's pointers, and warn. The function
+    ``torch.compiler.disable`` does the same, but imports the compiler at once, which takes as long as torch itself.
     """
 
     @functools.wraps(op)

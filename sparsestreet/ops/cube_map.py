@@ -1,4 +1,4 @@
-"""A cube map: a color for every direction, by bilinear interpolation, also across the edges of the faces."""
+"""A cube map: a color for every direction, interpolated bilinearly, also across the edges of faces."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 # Rows of each face: outward axis, direction of increasing column, direction of increasing row.
-# Faces +x, -x, +y, -y, +z, -z. Which way a face lies on its square is our own choice; nobody else reads it.
+# Faces +x, -x, +y, -y, +z, -z. The orientation of a face on its square is our own choice; nobody else reads it.
 _FACES = torch.tensor(
     [
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -22,9 +22,9 @@ _FACES = torch.tensor(
 
 
 def colors_along(texels: Float[Tensor, "6 r r 3"], directions: Float[Tensor, "p 3"]) -> Float[Tensor, "p 3"]:
-    """Color seen along directions of any non-zero length; gradients go to the texels only."""
+    """Colors along directions of any non-zero length; gradients go to the texels only."""
     corners, weights = _corners(directions.detach().to(texels.dtype), texels.shape[1])
-    # gather has the fastest backward pass on the CPU among the ways to read rows.
+    # Of the ways to read rows, gather has the fastest backward pass on the CPU.
     index = corners.reshape(-1, 1).expand(-1, 3)
     values = texels.reshape(-1, 3).gather(0, index).reshape(-1, 4, 3)
     return (values * weights[..., None]).sum(1)
@@ -34,14 +34,15 @@ def colors_along(texels: Float[Tensor, "6 r r 3"], directions: Float[Tensor, "p 
 def bordered_texels(side: int, device: torch.device) -> Int[Tensor, " n"]:
     """Flat texel index for every entry of the faces with a border of one texel, flattened [6, side + 2, side + 2].
 
-    A border entry is the texel of the neighboring face that its direction hits: bilinear interpolation then mixes
-    the same two texels on either side of an edge, and the sky has no seams. Where three faces meet, all of them take
-    the x face's texel for their corner entry, which keeps it so up to the corners of the cube.
+    A border entry is the texel of the neighboring face in its direction. Bilinear interpolation then mixes the same two
+    texels on both sides of an edge, so the sky has no seams. Where three faces meet, all of them take the x face's
+    texel
+    for their corner entry. So there are no seams at the corners of the cube either.
     """
     centers = (torch.arange(-1, side + 1, dtype=torch.float64) + 0.5) * (2 / side) - 1
     row, column = torch.meshgrid(centers, centers, indexing="ij")
     on_face = torch.stack((torch.ones_like(row), column, row), dim=-1)
-    # The sign is the cube's corner, where all three axes are equal and the first is taken as the largest.
+    # The sign is a corner of the cube. There all three axes are equal, and the first is taken as the largest.
     at_corner = (row.abs() > 1) & (column.abs() > 1)
     on_face = torch.where(at_corner[..., None], on_face.sign(), on_face)
     directions = torch.einsum("rca,fab->frcb", on_face, _FACES)
@@ -51,11 +52,11 @@ def bordered_texels(side: int, device: torch.device) -> Int[Tensor, " n"]:
 
 
 def _corners(directions: Float[Tensor, "p 3"], side: int) -> tuple[Int[Tensor, "p 4"], Float[Tensor, "p 4"]]:
-    """The four texels around each direction (flat index) and their bilinear weights."""
+    """Flat indices of the four texels around each direction, and their bilinear weights."""
     face, column, row = _face_coordinates(directions, side)
     left, top = column.floor(), row.floor()
     right_share, bottom_share = column - left, row - top
-    # The border is one texel wide, so texel 0 of the face is at 1 of the bordered table.
+    # The border is one texel wide, so texel 0 of a face is entry 1 of the bordered table.
     stride = side + 2
     first = (face * stride + (top.long() + 1)) * stride + (left.long() + 1)
     around = torch.stack((first, first + 1, first + stride, first + stride + 1), dim=1)
@@ -67,7 +68,7 @@ def _corners(directions: Float[Tensor, "p 3"], side: int) -> tuple[Int[Tensor, "
 def _face_coordinates(
     directions: Float[Tensor, "p 3"], side: int
 ) -> tuple[Int[Tensor, " p"], Float[Tensor, " p"], Float[Tensor, " p"]]:
-    """Face, column and row of directions, in texels with centers at whole numbers: both in [-0.5, side - 0.5]."""
+    """Face, column and row of each direction, in texels with centers at whole numbers: [-0.5, side - 0.5]."""
     largest = directions.abs().argmax(1, keepdim=True)
     component = directions.gather(1, largest)
     on_cube = directions / component.abs()

@@ -1,4 +1,4 @@
-"""Steps of training with several implementations: plain torch for any device, the C++ library, fused Triton kernels."""
+"""Chooses between implementations of a training step: plain torch for any device, the C++ library, fused Triton."""
 
 from torch import Tensor, float32, float64
 
@@ -9,14 +9,14 @@ CHOICES = ("torch", "cpu", "triton")
 
 
 def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHOICES) -> str:
-    """Which of ``choices`` does a step on these tensors, all on one device; "auto": the fastest that takes them.
+    """Returns which of ``choices`` runs a step on these tensors, all on one device; for "auto" the fastest.
 
-    The C++ library ("cpu") takes tensors on the CPU that are all float32 or all float64, "triton" contiguous float32
-    tensors on a CUDA device, and asked for by name also on the CPU, by Triton's interpreter. The results are the same
-    but for rounding, so "auto" takes torch for all other tensors, and where the library is not built or triton missing.
+    The C++ library ("cpu") takes tensors on the CPU that are all float32 or all float64. "triton" takes contiguous
+    float32 tensors on a CUDA device; if it is named, also on the CPU, by Triton's interpreter. Results differ only by
+    rounding. So "auto" takes torch for all other tensors, and if the library is not built or triton is missing.
 
-    Raises ValueError for an unknown name, or for tensors that the named one does not take, RuntimeError with the remedy
-    if it is not installed.
+    Raises ValueError for an unknown name, or for tensors that the named backend does not take. Raises RuntimeError with
+    the remedy if the named backend is not installed.
     """
     if backend not in ("auto", *choices):
         raise ValueError(f"no backend {backend!r} of this step: choose one of {('auto', *choices)}")

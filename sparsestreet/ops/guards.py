@@ -1,4 +1,4 @@
-"""Which guards of the op act on a view, counted (docs/stability.md says what each of them is for)."""
+"""Counts which guards of the op act on a view; docs/stability.md says what each is for."""
 
 from dataclasses import astuple, dataclass, replace
 
@@ -19,52 +19,57 @@ _ALARMS = ("vanished", "overflowed", "identity_quaternion", "color_held")
 
 @dataclass(frozen=True)
 class Guards:
-    """Numbers of rows; views are added up with ``+``, from ``Guards()``.
+    """Numbers of rows by guard; ``+`` adds up views, starting from ``Guards()``.
 
-    Each row is in one of the first nine, by the first reason that holds in their order after ``drawn``. The others are
-    of rows that are drawn, and a row may be in several.
+    Each row is in exactly one of the first nine: that of the first reason that holds, or ``drawn``. The others count
+    rows that are drawn; a row may be in several.
+
+    >>> Guards(drawn=2, near=1) + Guards(drawn=3) == Guards(drawn=5, near=1)
+    True
+    >>> Guards(drawn=3, overflowed=1).alarms
+    {'overflowed': 1}
     """
 
     drawn: int = 0
-    """As ``Rendering.visible``. (A row whose alpha is the cut-off to the last bit is drawn with radius 0.)"""
+    """As in ``Rendering.visible``. (A row whose alpha equals the cut-off to the last bit is drawn with radius 0.)"""
     masked: int = 0
-    """Opacity 0; nothing else of such a row is looked at."""
+    """Opacity 0; nothing else of such a row is read."""
     near: int = 0
-    """At the near plane, before it, or behind the camera."""
+    """At the near plane, nearer, or behind the camera."""
     past_fold: int = 0
-    """Farther off the axis than the lens polynomial describes."""
+    """Past the fold: farther off the axis than the lens polynomial describes."""
     outruns_shutter: int = 0
-    """Falls nearly as fast as the image is read."""
+    """Moves down the image nearly as fast as its rows are read."""
     vanished: int = 0
-    """Determinant on the screen too small; only without blur. An alarm."""
+    """Screen determinant too small, which happens only without blur. An alarm."""
     overflowed: int = 0
-    """Determinant on the screen beyond the dtype. An alarm."""
+    """Screen determinant beyond the dtype's range. An alarm."""
     faint: int = 0
     """Peak alpha below ``alpha_min``, or below what float32 holds (2^-126)."""
     outside: int = 0
     """The box holds no pixel center of the image."""
 
     identity_quaternion: int = 0
-    """A quaternion without length, taken as the identity. An alarm."""
+    """A quaternion of length zero, replaced by the identity. An alarm."""
     slope_held: int = 0
-    """Without lens: the Jacobian is taken at the limit of its slope."""
+    """Without a lens: the Jacobian is taken at the limit of its slope."""
     sigma_point_held: int = 0
-    """With a lens: a sigma point is taken at the near plane, or past the fold where the lens is continued."""
+    """With a lens: a sigma point is moved to the near plane, or lies past the fold where the lens is continued."""
     compensation_held: int = 0
     """The antialias compensation is at its floor."""
     alpha_clamped: int = 0
     """Peak alpha above ``alpha_max``."""
     color_cut: int = 0
-    """A channel at 0 or below, which is black without gradient."""
+    """A color channel at 0 or below, which is black and has no gradient."""
     color_held: int = 0
-    """``half_colors``: a channel above the largest float16. An alarm."""
+    """With ``half_colors``: a channel above the largest float16. An alarm."""
 
     def __add__(self, other: "Guards") -> "Guards":
         return Guards(*(mine + theirs for mine, theirs in zip(astuple(self), astuple(other), strict=True)))
 
     @property
     def alarms(self) -> dict[str, int]:
-        """The guards that no clean scene needs, by name, as far as they acted; empty where all is well."""
+        """The guards that acted although no clean scene needs them, with their counts; empty if all is well."""
         return {name: count for name in _ALARMS if (count := getattr(self, name))}
 
 
@@ -75,12 +80,18 @@ def guards(
     *,
     settings: SplatSettings = SplatSettings(),  # noqa: B008 (frozen)
 ) -> Guards:
-    """Count what :func:`splat` of the same arguments culls and limits, on any device.
+    """Counts what :func:`splat` with the same arguments culls and limits, on any device.
 
-    It projects anew, in the dtype of the Gaussians, as the reference does: where rounding decides about a row, another
-    backend may decide otherwise. :func:`splat` itself counts nothing and pays for nothing.
+    It projects anew, as the reference does, in the dtype of the Gaussians. Where rounding decides about a row, another
+    backend may decide otherwise. :func:`splat` itself does not count, so it pays nothing.
 
-    Raises ValueError as :func:`splat`.
+    Raises ValueError as :func:`splat` does.
+
+    >>> means = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0]])  # the second is behind the camera
+    >>> pair = Gaussians(means, torch.ones(2, 4), torch.full((2, 3), 0.1), torch.full((2,), 0.5), torch.zeros(2, 1, 3))
+    >>> camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), width=16, height=16)
+    >>> guards(pair, camera) == Guards(drawn=1, near=1)
+    True
     """
     check_structure(gaussians, camera, None)
     check_dtype(gaussians, "guards")
@@ -98,7 +109,7 @@ def _acting(
     gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings
 ) -> dict[str, Bool[Tensor, " v"]]:
     """Which of the drawn rows each guard acts on."""
-    # Colors as they are before they are rounded.
+    # Colors before rounding.
     splats = on_screen(gaussians, rows, camera, replace(settings, half_colors=False))
     in_camera, none = to_camera(gaussians.means[rows], camera), torch.zeros_like(rows, dtype=torch.bool)
     if camera.distortion is None:

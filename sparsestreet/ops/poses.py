@@ -1,4 +1,4 @@
-"""Where moving objects are at a time: keyframes with learned corrections, interpolated."""
+"""Poses of moving objects at a time, interpolated between keyframes with learned corrections."""
 
 import torch
 from jaxtyping import Float, Int
@@ -19,14 +19,14 @@ def poses_at(
     *,
     backend: str = "auto",
 ) -> Poses:
-    """The poses at a time; gradients go to the corrections.
+    """Interpolates the pose of each instance at a time; gradients go to the corrections.
 
     A corrected keyframe has the rotation R exp([rotation_delta]) (a rotation vector in the box frame, radians) and the
-    translation t + translation_delta (world, meters). Between two of them the translation is interpolated linearly and
-    the rotation by slerp along the shorter arc; ``keyframe_interval`` says between which, and what is present.
+    translation t + translation_delta (world, meters). ``keyframe_interval`` chooses two keyframes per instance and says
+    which instances are present. The translation is interpolated linearly, the rotation by slerp along the shorter arc.
 
-    All instances are one operation of the C++ library or of Triton, forward and backward, or dozens of small ones of
-    torch. ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
+    The C++ library and Triton need one operation for all instances, forward and backward; torch needs dozens.
+    ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend` does.
     """
     table = keyframes
     numbers = (table.times, table.quaternions, table.translations, table.spans, rotation_deltas, translation_deltas)

@@ -1,4 +1,4 @@
-"""What a backend hands to the op before a background is put behind it, or raises."""
+"""What a backend returns to the op, before the background is added, or raises."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,16 @@ from torch import Tensor
 
 
 class PairLimitError(RuntimeError):
-    """The splats of one view cover more (splat, tile) pairs than may be held in memory."""
+    """The splats of one view cover more (splat, tile) pairs than memory may hold.
+
+    >>> raise PairLimitError.of(pairs=900, limit=800, worst=[(4, 600)])
+    Traceback (most recent call last):
+    sparsestreet.ops.raster.PairLimitError: the splats cover 900 tiles, more than the 800 that may be held; most: ...
+    """
 
     @staticmethod
     def of(pairs: int, limit: int, worst: list[tuple[int, int]]) -> "PairLimitError":
-        """The error for ``pairs`` of at most ``limit``; ``worst``: rows with most tiles, and how many."""
+        """Returns the error for ``pairs`` above ``limit``; ``worst``: the rows with most tiles, and their numbers."""
         named = ", ".join(f"row {row} ({tiles})" for row, tiles in worst)
         return PairLimitError(
             f"the splats cover {pairs} tiles, more than the {limit} that may be held; most: {named}. "
@@ -26,8 +31,8 @@ class Raster:
     rgb: Float[Tensor, "h w 3"]
     """Sum over splats of weight times color (premultiplied: no background)."""
     transmittance: Float[Tensor, "h w"]
-    """Light that gets past all splats, kept itself: 1 - alpha would lose its digits in opaque pixels."""
+    """Light that passes all splats. It is stored because 1 - alpha would lose its digits in opaque pixels."""
     depth_sum: Float[Tensor, "h w"]
     """Sum over splats of weight times depth, meters."""
     radii: Float[Tensor, " n"]
-    """Half the longer side of the opacity-aware box, pixels; 0 where the row was culled."""
+    """Half the longer side of the opacity-aware box, pixels; 0 for a culled row."""

@@ -1,4 +1,4 @@
-"""Gaussians as nodes store them: raw parameters, mask multipliers and the boxes they stand in."""
+"""Gaussians as nodes store them: raw parameters, mask multipliers and the boxes of their instances."""
 
 from dataclasses import dataclass
 
@@ -6,11 +6,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 OPACITY_LOGIT_LIMIT = 15.0
-"""sigmoid(15) = 1 - 3e-7: beyond it float32 knows no gradient any more, and exp would only gather overflow."""
+"""sigmoid(15) = 1 - 3e-7. Beyond it float32 has no gradient left, and exp could overflow."""
 
 
 INPUTS, LEARNED = 11, 9
-"""Tensors of a part, and how many of them, the first ones, are of real numbers and have gradients."""
+"""Number of a part's tensors, and how many of them, the first ones, are floating point with gradients."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Placement:
-    """In which instance's box each row lies, and where the boxes are."""
+    """The instance of each row, and the poses of the instances' boxes."""
 
     poses: Poses
     instances: Int[Tensor, " n"]
@@ -43,9 +43,9 @@ class RawGaussians:
     opacity_logits: Float[Tensor, " n"]
     sh_dc: Float[Tensor, "n 1 3"]
     sh_rest: Float[Tensor, "n k 3"]
-    """The coefficients behind the first, k in {0, 3, 8, 15}."""
+    """The coefficients after the first, k in {0, 3, 8, 15}."""
     multipliers: Float[Tensor, " n"] | None = None
-    """Of opacities and scales (a mask's); None: 1."""
+    """Factors of opacities and scales, from a mask; None: 1."""
     placement: Placement | None = None
     """Moves means and quaternions from their boxes to the world; rows of an absent instance get opacity 0."""
 
@@ -53,7 +53,7 @@ class RawGaussians:
         return self.means.shape[0]
 
     def tensors(self) -> list[Tensor | None]:
-        """Six fields, multipliers, the poses' quaternions and translations, and then instances and presence."""
+        """The six fields, multipliers, the poses' quaternions and translations, instances and presence, in order."""
         fields = [self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest]
         if self.placement is None:
             return [*fields, self.multipliers, None, None, None, None]
@@ -61,5 +61,5 @@ class RawGaussians:
         return [*fields, self.multipliers, poses.quaternions, poses.translations, instances, poses.present]
 
     def terms(self, sh_degree: int) -> int:
-        """Coefficients in use up to a degree; rows that store fewer use what they have."""
+        """Number of coefficients in use up to a degree; rows that store fewer use all of theirs."""
         return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])

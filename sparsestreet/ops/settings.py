@@ -1,4 +1,4 @@
-"""The knobs of the splat op: what is cut off, when a pixel stops, and how a splat is blurred."""
+"""The knobs of the splat op: cut-offs, when a pixel stops, and how a splat is blurred."""
 
 from dataclasses import dataclass
 from math import inf
@@ -12,14 +12,20 @@ class SplatSettings:
     """Cut-offs and filters of one rendering; the defaults are those of 3DGS with an inclusive stop.
 
     Raises ValueError for values outside the ranges given with each field.
+
+    >>> SplatSettings(eps2d=0.1).eps2d, SplatSettings.preset("gsplat15").alpha_max
+    (0.1, 0.999)
+    >>> SplatSettings(alpha_max=1.0)
+    Traceback (most recent call last):
+    ValueError: alpha_max must lie in (0, 1), got 1.0
     """
 
     alpha_min: float = 1 / 255
-    """A splat does not touch a pixel where its alpha would be smaller; in [0, alpha_max). 0: no cut-off."""
+    """A splat leaves out pixels where its alpha would be smaller; in [0, alpha_max). 0: no cut-off."""
     alpha_max: float = 0.99
-    """Alpha is clamped here (gradient 0 above), in (0, 1): 1 / (1 - alpha) must stay finite."""
+    """Alpha is clamped to this (gradient 0 above), in (0, 1), because 1 / (1 - alpha) must stay finite."""
     transmittance_min: float = 1e-4
-    """A pixel is finished when less light than this gets through, in [0, 1). 0: never."""
+    """A pixel is finished when less light than this passes, in [0, 1). 0: never."""
     stop: StopRule = "inclusive"
     """``inclusive``: the splat that crosses transmittance_min is still blended (error <= transmittance_min);
     ``exclusive``: it is dropped, as in 3DGS and gsplat."""
@@ -28,10 +34,11 @@ class SplatSettings:
     near_plane: float = 0.2
     """Rows at this depth or nearer are culled, meters, > 0."""
     max_sigma: float = inf
-    """A splat ends this many standard deviations from its mean, > 0, besides at ``alpha_min`` (gsplat: 3.33)."""
+    """A splat ends this many standard deviations from its mean, or at ``alpha_min`` if nearer, > 0 (gsplat: 3.33)."""
     depth_bits: int = 32
-    """Upper bits of the float32 depth that are sorted, 9 to 32 (9: powers of two of the depth). With fewer bits, rows
-    of nearly equal depth are sorted by index."""
+    """Number of upper bits of the float32 depth that are sorted, 9 to 32 (9: powers of two of the depth).
+
+    With fewer bits, rows of nearly equal depth are drawn in the order of their index."""
     half_colors: bool = False
     """Round colors to float16 before blending (gradient as if not rounded)."""
     antialias: bool = False
@@ -49,9 +56,9 @@ class SplatSettings:
 
     @staticmethod
     def preset(name: str) -> "SplatSettings":
-        """Settings by name; raises ValueError naming the presets there are.
+        """Returns settings by name; raises ValueError with the names of all presets.
 
-        ``gsplat15``, ``gsplat16`` and ``inria`` match those renderers as far as these fields can say.
+        ``gsplat15``, ``gsplat16`` and ``inria`` match those renderers as far as these fields allow.
         """
         if name not in _PRESETS:
             raise ValueError(f"no settings preset {name!r}: choose one of {sorted(_PRESETS)}")
@@ -65,14 +72,14 @@ def _require(holds: bool, invariant: str, value: float | int | str) -> None:
 
 _PRESETS = {
     "default": SplatSettings(),
-    # The clamp of alpha is part of the model, not a cut-off: it stays.
+    # The clamp of alpha stays, because it is part of the model, not a cut-off.
     "exact": SplatSettings(alpha_min=0.0, transmittance_min=0.0),
     "gsplat15": SplatSettings(alpha_max=0.999, stop="exclusive", near_plane=0.01),
     "gsplat16": SplatSettings(stop="exclusive", near_plane=0.01),
     "inria": SplatSettings(stop="exclusive"),
-    # Splats end at 4 standard deviations instead of at an alpha: 20 dB and more nearer to "exact" than the default,
-    # for little more time where stacks are shallow (docs/scaling.md).
+    # Splats end at 4 standard deviations instead of at an alpha. This is at least 20 dB nearer to "exact" than the
+    # default, and takes little more time where stacks are shallow (docs/scaling.md).
     "fine": SplatSettings(alpha_min=0.0, max_sigma=4.0),
-    # About 50 dB against "exact"; fewer pixels per splat and earlier stops.
+    # About 50 dB against "exact", with fewer pixels per splat and earlier stops.
     "fast": SplatSettings(alpha_min=1 / 128, transmittance_min=1e-3),
 }

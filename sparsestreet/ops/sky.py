@@ -1,7 +1,6 @@
-"""The sky behind an image: a cube map, looked up only where it is seen.
+"""The sky behind an image: a cube map, read only where the sky shows (in a street, a fifth of the pixels).
 
-In a street that is a fifth of the pixels. Fused because a training step would else dispatch a hundred small operations
-for it.
+It is fused, because a training step would otherwise dispatch a hundred small operations for it.
 """
 
 import torch
@@ -29,24 +28,29 @@ def over_sky(
     transmittance_min: float,
     backend: str = "auto",
 ) -> Float[Tensor, "h w 3"]:
-    """``rgb`` plus the light 1 - alpha times the sky's color, where that light is more than ``transmittance_min``.
+    """Adds the sky's color times the light 1 - alpha to ``rgb``, where that light is above ``transmittance_min``.
 
-    Differentiable in ``rgb``, ``alpha`` and ``texels``, not in the camera. The sky is at infinity: a pixel sees it
-    along its ray through the lens (``ray_directions``), as if there were no rolling shutter.
+    Differentiable in ``rgb``, ``alpha`` and ``texels``, not in the camera. The sky is at infinity. A pixel sees it
+    along its ray through the lens (``ray_directions``); the rolling shutter is ignored.
 
     Args:
         rgb: color premultiplied by alpha.
-        alpha: coverage by what stands before the sky.
+        alpha: coverage by everything in front of the sky.
         texels: a cube map (``cube_map``), r >= 1.
-        camera: of the image's size.
-        transmittance_min: that of the splats' settings, below which their pixels are finished.
-        backend: "torch", "cpu", "triton", or "auto" for the one that suits the tensors. The gradient of the texels is
-            the same to the last bit in every run with "cpu", for any number of threads; with "triton" it is not.
+        camera: a camera of the image's size.
+        transmittance_min: that of the splats' settings; below it a pixel is finished.
+        backend: "torch", "cpu", "triton", or "auto" for the one that suits the tensors. With "cpu" the gradient of the
+            texels is the same to the last bit in every run, for any number of threads; with "triton" it is not.
 
     Raises:
-        ValueError: tensors of other shapes, of several dtypes or devices; a camera that the splats would refuse; an
-            unknown backend, or tensors that it does not take.
-        RuntimeError: the backend asked for is not built.
+        ValueError: wrong shapes; several dtypes or devices; a camera that ``splat`` would refuse; an unknown backend,
+            or tensors that it does not take.
+        RuntimeError: the named backend is not built.
+
+    >>> camera = Camera(torch.eye(4), torch.tensor([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]), width=2, height=2)
+    >>> blue = torch.tensor([0.0, 0.0, 1.0]).expand(6, 1, 1, 3)
+    >>> over_sky(torch.zeros(2, 2, 3), torch.full((2, 2), 0.75), blue, camera, transmittance_min=1e-4)[0, 0]
+    tensor([0.0000, 0.0000, 0.2500])
     """
     if backend not in BACKENDS:
         raise ValueError(f"no backend {backend!r} of the sky: choose one of {BACKENDS}")

@@ -43,9 +43,9 @@ def basis(directions: Float[Tensor, "n 3"], terms: int) -> Float[Tensor, "n k"]:
 
 
 def view_colors(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """max(0, 0.5 + sum_i basis_i(direction) sh_i); directions of any non-zero length, camera to Gaussian.
+    """Colors max(0, 0.5 + sum_i basis_i(direction) sh_i) along directions of any non-zero length, camera to Gaussian.
 
-    The gradient is zero where the clamp acts; it flows into the directions as well.
+    Gradients go to coefficients and directions; they are zero where the clamp acts.
     """
     unit = directions / directions.norm(dim=-1, keepdim=True)
     colors = 0.5 + (basis(unit, sh.shape[1])[..., None] * sh).sum(1)

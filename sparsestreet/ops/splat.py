@@ -1,4 +1,4 @@
-"""The one public signature of the op: Gaussians and a camera in, a differentiable Rendering out."""
+"""The public signatures of the op: it takes Gaussians and a camera, and returns a differentiable Rendering."""
 
 from types import ModuleType
 
@@ -31,29 +31,38 @@ def splat(
 ) -> Rendering:
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
-    Differentiable in every field of ``gaussians`` but ``displacements`` (in means also through the view direction of
-    the colors) and in ``background``; not in the camera. Only once, but for "reference": torch refuses to
-    differentiate a gradient of the other backends, or takes it, without a word, for a constant where the loss is linear
-    in the image. Autocast has no effect here: everything runs in the dtype of the Gaussians, whatever the camera's. A
-    graph of ``torch.compile`` breaks here, and the op runs as it is.
+    Differentiable in ``background`` and in every field of ``gaussians`` except ``displacements``; not in the camera.
+    The gradient of means includes that through the view direction of the colors.
+
+    Only "reference" can be differentiated twice. With the other backends torch refuses, or silently treats the gradient
+    as a constant if the loss is linear in the image. Autocast has no effect: everything runs in the dtype of the
+    Gaussians, whatever the camera's. A graph of ``torch.compile`` breaks here, and the op runs uncompiled.
 
     Args:
         gaussians: n rows in the world, meters; n = 0 gives the background.
-        camera: pinhole without skew, with its lens and rolling shutter where given (docs/effects.md).
-        background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha. On a GPU its
-            values are not looked at, which would be one more wait for the device: what is not finite shows in rgb.
+        camera: pinhole without skew, with lens and rolling shutter if given (docs/effects.md).
+        background: RGB behind everything, [3] or per pixel; None leaves rgb premultiplied by alpha. On a GPU its values
+            are not checked, which would wait for the device once more; values that are not finite show in rgb.
         settings: cut-offs and filters.
         backend: "reference", "cpu", "triton" or "auto".
-        screen_gradients: whether ``Rendering.screen_offsets`` gathers gradients; without, the pixel loop of Triton's
+        screen_gradients: whether ``Rendering.screen_offsets`` gets gradients. Without them the pixel loop of Triton's
             backward pass takes 8 % fewer instructions.
 
     Raises:
-        ValueError: wrong shapes, dtypes or devices; a camera whose pose is no rigid motion, whose size or lens is
-            out of range; a value that is not finite, an opacity outside [0, 1] or a negative scale (named with field
-            and row). Nothing but the opacity is looked at in a row whose opacity is 0, and the harmonics only of rows
-            that are drawn (``Rendering.visible``): those of others may hold anything.
-        RuntimeError: the backend asked for is not built.
-        PairLimitError: the splats cover more tiles than can be held.
+        ValueError: wrong shapes, dtypes or devices; a camera whose pose is not a rigid motion, or whose size or lens is
+            out of range. Also for a value that is not finite, an opacity outside [0, 1] or a negative scale; the
+            message names field and row. Rows of opacity 0 are not checked further. Harmonics are checked only in rows
+            that are drawn (``Rendering.visible``).
+        RuntimeError: the named backend is not built.
+        PairLimitError: the splats cover more tiles than memory may hold.
+
+    >>> one = torch.ones(1)
+    >>> white = torch.full((1, 1, 3), 0.5 / 0.28209479)  # 0.5 + basis_0 sh_0 = 1
+    >>> ball = Gaussians(torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 4), torch.full((1, 3), 0.2), 0.5 * one, white)
+    >>> camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 4.5], [0, 20, 4.5], [0, 0, 1]]), width=9, height=9)
+    >>> view = splat(ball, camera)
+    >>> view.rgb[4, 4], view.depth[4, 4]  # at the mean, where alpha is the opacity
+    (tensor([0.5000, 0.5000, 0.5000]), tensor(2.))
     """
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
@@ -71,9 +80,17 @@ def contribution(
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
 ) -> Contribution:
-    """What each row adds to one view: sum of blend weights, pixels touched, pixels dominated. No gradients.
+    """Computes what each row adds to one view: sum of blend weights, pixels touched, pixels dominated. No gradients.
 
-    Raises as :func:`splat`.
+    Raises as :func:`splat` does.
+
+    >>> means = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0]])
+    >>> scales = torch.tensor([0.05, 0.4])[:, None].expand(2, 3)  # a small Gaussian in front of a large one
+    >>> pair = Gaussians(means, torch.ones(2, 4), scales, torch.full((2,), 0.9), torch.zeros(2, 1, 3))
+    >>> camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 4.5], [0, 20, 4.5], [0, 0, 1]]), width=9, height=9)
+    >>> counts = contribution(pair, camera)
+    >>> counts.pixels, counts.dominant
+    (tensor([21, 81]), tensor([ 1, 80]))
     """
     check_structure(gaussians, camera, None)
     chosen = resolve_backend(backend, gaussians.means.device)
@@ -91,15 +108,21 @@ def leave_one_out(
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
 ) -> LeaveOneOut:
-    """How far the view moves when each row alone is taken away, over a background (None: black). No gradients.
+    """Computes how much the view changes when each row alone is removed, over a background (None: black). No gradients.
 
-    ``pixel_weights``, finite and >= 0: how much the squared change of each pixel counts; None: 1.
+    ``pixel_weights``, finite and >= 0, multiply the squared change of each pixel; None: 1.
 
-    Exact for pixels that are not stopped: a pixel is linear in the alpha of each of its splats, so that the change is
-    -alpha dC/dalpha. Where the stop rule hid splats behind, up to ``transmittance_min / (1 - alpha_max)`` of their
-    light is missed.
+    Exact for pixels that are not stopped: a pixel is linear in the alpha of each of its splats, so the change is
+    -alpha dC/dalpha. Where the stop rule hides splats, up to ``transmittance_min / (1 - alpha_max)`` of their light is
+    missed.
 
-    Raises as :func:`splat`, and ValueError for pixel weights out of range.
+    Raises as :func:`splat` does, and ValueError for pixel weights out of range.
+
+    >>> one, black = torch.ones(1), torch.full((1, 1, 3), -0.5 / 0.28209479)
+    >>> ball = Gaussians(torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 4), torch.full((1, 3), 0.2), 0.5 * one, black)
+    >>> camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 4.5], [0, 20, 4.5], [0, 0, 1]]), width=9, height=9)
+    >>> leave_one_out(ball, camera, background=torch.ones(3)).max_abs_change  # black of opacity 0.5 before white
+    tensor([0.5000], dtype=torch.float64)
     """
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
@@ -111,7 +134,7 @@ def leave_one_out(
 
 
 def _module(backend: str) -> ModuleType:
-    """Each checks values itself. Triton is imported only here, when it is first used."""
+    """The module of a backend, which checks values itself. Triton is imported only here, when it is first used."""
     if backend != "triton":
         return reference if backend == "reference" else cpu
     from sparsestreet.ops.triton import rasterizer
@@ -120,7 +143,7 @@ def _module(backend: str) -> ModuleType:
 
 
 def _screen_offsets(gaussians: Gaussians, wanted: bool) -> Float[Tensor, "n 2"]:
-    """A leaf of zeros; it takes part in the graph only where some field of the Gaussians does, and it is wanted."""
+    """A leaf of zeros. It is in the graph only if it is wanted and a field of the Gaussians is in the graph."""
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.sh)
     wanted = wanted and torch.is_grad_enabled() and any(field.requires_grad for field in fields)
     offsets = gaussians.means.new_zeros(len(gaussians), 2)
@@ -128,7 +151,7 @@ def _screen_offsets(gaussians: Gaussians, wanted: bool) -> Float[Tensor, "n 2"]:
 
 
 def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rendering:
-    """Put the background behind the layers and turn the sum of depths into an expectation."""
+    """Adds the background and turns the sum of depths into an expectation."""
     alpha = 1 - raster.transmittance
     rgb = raster.rgb
     if background is not None:

@@ -1,8 +1,8 @@
 """Structural similarity with an 11x11 Gaussian window, as a training loss (Wang et al. 2004; 3DGS's D-SSIM).
 
-Written here because the loss runs at every step: in plain torch it takes a quarter of the time of
-``kornia.losses.ssim_loss`` at 320x192 on two cores, and in C++ (``cpu/ssim.py``) a seventh of that. Tested
-against kornia. Reported SSIM is another definition (``metrics/``).
+It is our own because the loss runs at every step. In plain torch it takes a quarter of the time of
+``kornia.losses.ssim_loss`` at 320x192 on two cores, and in C++ (``cpu/ssim.py``) a seventh of that. It is tested
+against kornia. Reported SSIM is defined differently (``metrics/``).
 """
 
 import torch
@@ -20,8 +20,8 @@ BACKENDS = ("auto", "torch", "cpu", "triton")
 def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backend: str = "auto") -> Float[Tensor, ""]:
     """Mean SSIM over the pixels whose window lies inside the image. Gradients go to the image only.
 
-    ``backend``: "torch", "cpu" (C++), "triton", or "auto" for the one that suits the tensors; raises as
-    :func:`sparsestreet.ops.fused.fused_backend`, and ValueError below 11x11 pixels or for different shapes.
+    ``backend``: "torch", "cpu" (C++), "triton", or "auto" for the one that suits the tensors. Raises as
+    :func:`sparsestreet.ops.fused.fused_backend` does, and ValueError below 11x11 pixels or for different shapes.
     """
     if backend not in BACKENDS:
         raise ValueError(f"no backend {backend!r} of SSIM: choose one of {BACKENDS}")

@@ -1,4 +1,4 @@
-"""The window and the constants of SSIM (Wang et al. 2004), which every implementation of it takes from here."""
+"""The window and the constants of SSIM (Wang et al. 2004), shared by all implementations of the loss."""
 
 import math
 

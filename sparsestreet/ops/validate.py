@@ -1,4 +1,4 @@
-"""What the op demands of its inputs, in one place; every message names the invariant, the value and the remedy."""
+"""Checks of the op's inputs, in one place; every message names the invariant, the value and the remedy."""
 
 import math
 from collections.abc import Sequence
@@ -10,21 +10,22 @@ from torch import Tensor
 from sparsestreet.types import Camera, Gaussians
 
 LONGEST_SIDE = 1 << 22
-"""Pixels: up to here the centers of all pixels are exact in float32."""
+"""Longest side of an image, pixels: up to here all pixel centers are exact in float32."""
 MOST_PIXELS = 1 << 29
-"""Places in an image of three channels then fit 32 bits, in which the GPU's kernels count."""
+"""Most pixels of an image: the indices of its three channels then fit the 32-bit integers of the GPU's kernels."""
 RIGID_TOLERANCE = 1e-3
-"""Largest entry of R R^T - I: poses in text files keep four digits or more; a scale, a shear or a half converted pose
-is further off, and 1e-3 moves a point at the edge of an image by a pixel."""
+"""Largest entry of R R^T - I. Poses in text files keep four digits or more; a pose with scale or shear is further off.
+
+An error of 1e-3 moves a point at the edge of an image by a pixel."""
 LARGEST_DISTORTION = 1e12
-"""Of each coefficient: no lens comes near, and its powers stay finite in float32."""
+"""Largest coefficient of a lens: no real one comes near, and its powers stay finite in float32."""
 _SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
 
 
 def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | None) -> None:
-    """Shapes, dtypes, devices, the camera and a background on the host; raises ValueError.
+    """Checks shapes, dtypes, devices, the camera and a background on the host; raises ValueError.
 
-    Looks at no Gaussian's value and at nothing on a GPU, so it costs next to nothing and never waits.
+    It reads neither values of Gaussians nor anything on a GPU, so it is cheap and never waits.
     """
     means, rows = gaussians.means, gaussians.means.shape[0]
     for name, tail in _SHAPES.items():
@@ -57,7 +58,8 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
 
 
 def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
-    """One weight >= 0 per pixel, like the means; raises ValueError. Waits for a GPU."""
+    """Checks for one finite weight >= 0 per pixel, of the means' dtype and device; raises ValueError. Waits for a
+    GPU."""
     shape = (camera.height, camera.width)
     if tuple(weights.shape) != shape or weights.dtype != means.dtype or weights.device != means.device:
         raise ValueError(
@@ -69,10 +71,10 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
 
 
 def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) -> None:
-    """Every value finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value.
+    """Checks that values are finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value.
 
     Rows of opacity 0 are not checked, because they are culled before anything else of them is read. ``drawn``: the rows
-    whose harmonics are read; None where one of them is known to be bad, and then any bad one is named.
+    whose harmonics are checked; None: those of all rows, for when a bad one is known to exist.
     """
     opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
     masked = opacities == 0
@@ -121,7 +123,7 @@ def _check_size(camera: Camera) -> None:
 
 
 def check_camera(camera: Camera) -> None:
-    """A size, a pose, intrinsics and effects that a camera can have; raises ValueError."""
+    """Checks a camera's size, pose, intrinsics and effects; raises ValueError."""
     _check_size(camera)
     for name, shape in (("camera_from_world", (4, 4)), ("intrinsics", (3, 3))):
         matrix = getattr(camera, name)
@@ -183,7 +185,8 @@ def _check_background(background: Tensor, camera: Camera, means: Tensor) -> None
             f"background must be {means.dtype} on {means.device} like the means, got {background.dtype} on "
             f"{background.device}: convert it with .to(means)"
         )
-    # A sum is infinite or NaN where a value is, and takes a fortieth of the time. On a GPU it would be one more wait.
+    # If a value is infinite or NaN, so is the sum, which takes a fortieth of the time. On a GPU it would wait once
+    # more.
     values = background.detach()
     if values.device.type == "cpu" and not math.isfinite(values.sum()):
         _raise_in_image("background", values, torch.isfinite(values), "must be finite")

@@ -1,8 +1,8 @@
 """One step of Adam for the rows that were seen, in place; all other rows keep their values and moments.
 
-A view draws a part of a scene's rows, and Adam would read and write the moments of all. That only seen rows step is
-the idea of Taming 3DGS (Mallick et al. 2024) and of gsplat's SelectiveAdam; torch.optim.SparseAdam does it for sparse
-gradients. Written from Adam's formula (Kingma & Ba 2015, algorithm 1).
+A view draws a part of a scene's rows, but Adam would read and write the moments of all. Taming 3DGS (Mallick et al.
+2024) and gsplat's SelectiveAdam step only seen rows; torch.optim.SparseAdam does it for sparse gradients. This is
+written from Adam's formula (Kingma & Ba 2015, algorithm 1).
 """
 
 import math
@@ -20,16 +20,16 @@ class AdamStep:
     """The numbers of one step."""
 
     count: int
-    """Steps taken with this one, from 1, counted for the whole parameter: the bias corrections are those of a row that
-    was seen at every step. A row seen for the first time late so moves by (1 - beta1) / sqrt(1 - beta2) learning rates
-    (3.2 with torch's betas) where Adam's first step moves by one, as it does in dense Adam."""
+    """Number of this step, from 1, for the whole parameter. So all rows have the bias corrections of a row that was
+    seen at every step, as in dense Adam. A row that is first seen late moves by (1 - beta1) / sqrt(1 - beta2) learning
+    rates (3.2 with torch's betas), while Adam's first step moves by one."""
     lr: float
     betas: tuple[float, float] = (0.9, 0.999)
     eps: float = 1e-15
 
     @property
     def size(self) -> float:
-        """The learning rate over the first moment's bias correction."""
+        """The learning rate divided by the first moment's bias correction."""
         return self.lr / (1 - self.betas[0] ** self.count)
 
     @property
@@ -49,11 +49,11 @@ def adam_step_(
     *,
     backend: str = "auto",
 ) -> None:
-    """Adam's update of ``parameter`` and both moments where ``visible``; other rows keep every bit.
+    """Updates ``parameter`` and both moments of ``visible`` rows by Adam; other rows keep every bit.
 
     With all rows visible it is torch.optim.Adam without weight decay. ``backend``: "torch", "triton", or "auto" for
-    the one that suits the tensors; raises as :func:`sparsestreet.ops.fused.fused_backend`, and ValueError for tensors
-    of different shapes.
+    the one that suits the tensors. Raises as :func:`sparsestreet.ops.fused.fused_backend` does, and ValueError for
+    tensors of different shapes.
     """
     shapes = [tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)]
     if len(set(shapes)) != 1:
