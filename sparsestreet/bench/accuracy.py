@@ -1,4 +1,4 @@
-"""How far an image and its gradients are from a truth in float64."""
+"""Errors of an image and its gradients against a truth in float64."""
 
 import math
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class ImageError:
-    """Differences of colors in [0, 1]; premultiplied, black behind."""
+    """Differences of colors in [0, 1], over black."""
 
     maximum: float
     mean: float
@@ -80,7 +80,7 @@ def image_error(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) ->
 
 
 def gradient_error(gradient: Tensor, truth: Tensor) -> GradientError:
-    """Over a whole group, and what its worst thousandth of rows exceeds."""
+    """Errors over a whole group, and what its worst thousandth of rows exceeds."""
     difference = (gradient - truth).flatten(1) if truth.dim() > 1 else (gradient - truth)[:, None]
     whole, scale = float(difference.norm()), float(truth.norm())
     if scale == 0:

@@ -1,4 +1,4 @@
-"""``sparsestreet bench blend``: the stages of the C++ backend beside vectorized torch and the arithmetic floor."""
+"""``sparsestreet bench blend``: the stages of the C++ backend, next to vectorized torch and the arithmetic floor."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -17,18 +17,18 @@ from sparsestreet.ops.splat import splat
 from sparsestreet.types import Camera, Gaussians
 
 FORWARD_FLOPS, BACKWARD_FLOPS = 30, 57
-"""Per (splat, pixel) sample: the arithmetic of one color blend and of its gradient."""
+"""Operations per (splat, pixel) sample of one color blend, and of its gradient."""
 SETTINGS = SplatSettings()
 MAIN = Size(640, 384, 100_000)
 TRAINING = (Size(320, 192, 20_000), Size(320, 192, 60_000))
 """Sizes of training, where the cost of a call counts as well as that of the loops."""
 _TIE = 1e-5
-"""Differences above it come from a splat within rounding of the cut-off, which one blends and the other does not."""
+"""Larger differences come from a splat within rounding of the cut-off, which only one of the two blends."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """C++ against vectorized torch, largest over the pixels."""
+    """C++ against vectorized torch: the largest differences over the pixels."""
 
     pixels: int
     ties: int
@@ -46,7 +46,7 @@ class BlendRecord:
     height: int
     times: OpTimes
     peer: dict[str, TimeSpread] | None
-    """Vectorized torch on splats that are already on the screen: ``forward``, and ``both`` with the backward."""
+    """Vectorized torch on splats that are already on the screen: ``forward``, and ``both`` with backward."""
     peak_gflops: float | None
     """float32 operations of a matrix product in the same run."""
     floor_ms: dict[str, float] | None
@@ -62,7 +62,7 @@ def run_blend(
     file: RecordFile,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Time one size beside the peer, then the sizes of training alone."""
+    """Times one size together with the peer, then the sizes of training without it."""
     for record in (_with_peer(size, budget, peer_budget), *(_alone(other, budget) for other in training)):
         file.write("blend", record)
         for line in lines(record):
@@ -95,7 +95,7 @@ def _scene(size: Size) -> tuple[Gaussians, Camera]:
 
 
 def time_torch(gaussians: Gaussians, camera: Camera, budget: TimingBudget) -> dict[str, TimeSpread]:
-    """Forward alone, and forward + backward, each with the listing of tiles, of splats already on the screen."""
+    """Times forward, and forward + backward, of splats already on the screen; both include the listing of tiles."""
     splats, size = _projected(gaussians, camera), (camera.width, camera.height)
     cotangent = Cotangent.of(camera, gaussians.means).rgb
 
@@ -110,7 +110,7 @@ def time_torch(gaussians: Gaussians, camera: Camera, budget: TimingBudget) -> di
 
 
 def image_difference(gaussians: Gaussians, camera: Camera) -> Difference:
-    """Pixels whose difference a tie at the cut-off explains are counted apart."""
+    """The largest differences; pixels whose difference a tie at the cut-off explains are counted separately."""
     with torch.no_grad():
         image = splat(gaussians, camera, backend="cpu").rgb
         other = torch_tiles.blend(_projected(gaussians, camera), camera.width, camera.height, SETTINGS)[0]

@@ -1,8 +1,9 @@
-"""That leaving out the tiles a splat does not reach changes nothing: a test of identity, not a point on a curve.
+"""Checks that leaving out the tiles a splat does not reach changes nothing: an identity, not a point on a curve.
 
-The C++ backend can be told to list every splat in front of the camera in every tile, and to look at all rows of the
-tile; where a splat ends in a pixel stays. A term that is exactly zero changes no bit of a sum, so that image and
-gradients must equal those over the tiles' own lists bit for bit.
+The C++ backend can list every splat in front of the camera in every tile, and look at all lines of the tile. The
+cut-off of a splat in a pixel stays. A term that is exactly zero changes no bit of a sum. So image and
+gradients
+must equal those over the tiles' own lists bit for bit.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from sparsestreet.types import Camera, Gaussians
 
 @dataclass(frozen=True)
 class Culling:
-    """What culling left out of one view, and whether anything was missed."""
+    """What culling left out of one view, and whether that changed anything."""
 
     pairs: int
     """(splat, tile) pairs without culling: splats in front of the camera times tiles."""
@@ -28,7 +29,7 @@ class Culling:
     pixels_changed: int
     """Pixels whose color, transmittance or depth differs in any bit between the two (float32)."""
     rows_changed: int
-    """Rows of which a gradient differs in any bit between the two."""
+    """Rows with a gradient that differs in any bit between the two."""
     rows_touching_other_pixels: int | None = None
     """Rows whose number of touched pixels differs between C++ and the dense reference (float64); None: not compared."""
 
@@ -41,7 +42,7 @@ class Culling:
 
 
 def compare_culling(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Culling:
-    """Draw and differentiate with the tiles' own lists, and with every splat in every tile.
+    """Draws and differentiates with the tiles' own lists, and with every splat in every tile.
 
     Raises PairLimitError if splats times tiles are more than the op holds.
     """
@@ -56,7 +57,7 @@ def compare_culling(gaussians: Gaussians, camera: Camera, settings: SplatSetting
 
 @torch.no_grad()
 def compare_touched(culling: Culling, gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Culling:
-    """Beside it, which rows touch other pixels than in the dense reference; for small views."""
+    """Adds which rows touch other pixels than in the dense reference; for small views."""
     doubled = leaves(gaussians, torch.float64)
     fast, dense = (contribution(doubled, camera, settings=settings, backend=name) for name in ("cpu", "reference"))
     return replace(culling, rows_touching_other_pixels=int((fast.pixels != dense.pixels).sum()))
@@ -79,7 +80,7 @@ def _draw(gaussians: Gaussians, camera: Camera, settings: SplatSettings, every_t
     layers = [raster.rgb, raster.transmittance, raster.depth_sum]
     torch.autograd.backward(layers, [cotangent.rgb, cotangent.alpha, cotangent.alpha])
     pixels = torch.cat([layer.detach().reshape(camera.height * camera.width, -1) for layer in layers], 1)
-    del raster, layers  # with the graph goes the loan of the workspace that counts pairs
+    del raster, layers  # without the graph, the workspace that counts pairs is free again
     gradients = [*(getattr(rows, name).grad for name in GROUPS), offsets.grad]
     flat = torch.cat([gradient.flatten(1) if gradient.dim() > 1 else gradient[:, None] for gradient in gradients], 1)
     return _Drawn(pixels, flat, last_workspace(torch.float32).pair_count())

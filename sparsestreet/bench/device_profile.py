@@ -1,4 +1,4 @@
-"""Time and memory of a CUDA device: what each stage's kernels take, and the peak of a training step."""
+"""Time and memory on a CUDA device: of each stage's kernels, and the peak of a training step."""
 
 import re
 from collections.abc import Callable
@@ -16,7 +16,7 @@ STAGES = {
     "sort": r"(?<!search)sort|radix",
     "bin": r"list_|tile|pairs|isect|intersect|scan|search",
 }
-"""Stage -> pattern of its kernels' names, ours and gsplat 1.5.3's; the first that fits gets the time, the rest is
+"""Stage -> pattern of its kernels' names, ours and gsplat 1.5.3's. The first match gets the time, the rest is
 ``other``."""
 
 
@@ -26,8 +26,9 @@ def stage_of(kernel: str) -> str:
 
 
 def kernel_milliseconds(run: Callable[[], None], repeats: int = 7) -> dict[str, TimeSpread]:
-    """Device time of each stage in one ``run``, over repeats that are profiled one by one; copies and fills of memory
-    under ``other``. A stage that a repeat does not have takes no time in it."""
+    """Device time of each stage in one ``run``, over repeats that are profiled one by one.
+
+    Copies and fills of memory are ``other``. A stage that is missing from a repeat counts as zero."""
     _stages_of(run)  # does not count: the profiler starts, kernels are compiled
     taken = [_stages_of(run) for _ in range(repeats)]
     names = dict.fromkeys(name for stages in taken for name in stages)
@@ -49,7 +50,7 @@ def _stages_of(run: Callable[[], None]) -> dict[str, float]:
 
 
 def peak_megabytes(run: Callable[[], None]) -> tuple[float, float]:
-    """Device memory before ``run`` and the most during it, MB (10^6 bytes); what lay there counts in both."""
+    """Device memory before ``run`` and its peak during it, MB (10^6 bytes); what was there before counts in both."""
     torch.cuda.synchronize()
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()

@@ -17,7 +17,7 @@ from sparsestreet.bench.fit import Line
 Record = dict[str, Any]
 """A line of a file of records, as JSON has it."""
 PlottedPoint = tuple[float, float, Record]
-"""Cost, error, and what they belong to."""
+"""Cost, error and their record."""
 # Okabe and Ito's palette: distinguishable with any color vision. One color and marker a knob.
 _STYLES = {
     "default": ("#000000", "o"),
@@ -38,14 +38,14 @@ _STYLES = {
     "backend": ("#7F3C8D", "X"),
 }
 LEAST_ERROR = 1e-8
-"""Errors are drawn no lower: an image equal to the truth has its place at the bottom, not at minus infinity."""
+"""Least error that is drawn, so that an image equal to the truth is at the bottom, not at minus infinity."""
 
 
 def draw_pareto(records: Sequence[Record], folder: Path) -> list[Path]:
-    """Two figures of a panel a scene: image error against forward time, gradient error against the whole time.
+    """Draws two figures with one panel per scene: image error against forward time, gradient error against whole time.
 
-    Filled points are the default's model and make up the front; hollow ones are another model (blur, clamp,
-    effects), whose error is against their own exact version. Presets carry their names.
+    Filled points are the default's model and form the front. Hollow points are another model (blur, clamp, effects),
+    with errors against their own exact version. Presets carry their names.
     """
     measured = [record for record in records if record["kind"] == "knob" and record["exact"] is not None]
     drawn = (
@@ -71,7 +71,7 @@ def draw_pareto(records: Sequence[Record], folder: Path) -> list[Path]:
 
 
 def forward_time(record: Record) -> float:
-    """Least milliseconds of the forward pass: what else runs on a machine can only add to it."""
+    """Least milliseconds of the forward pass, because other load on a machine can only add time."""
     return record["times"]["stages"]["forward"]["minimum"]
 
 
@@ -87,7 +87,7 @@ def image_rmse(record: Record) -> float:
 
 
 def gradient_l2(record: Record) -> float:
-    """Relative L2 of the worst parameter group; infinite where one has a zero truth and no zero answer."""
+    """Relative L2 of the worst parameter group; infinite if a group's truth is zero and its gradient is not."""
     values = [group["relative_l2"] for group in record["exact"]["gradients"].values()]
     return math.inf if None in values else max(LEAST_ERROR, *values)
 
@@ -95,7 +95,7 @@ def gradient_l2(record: Record) -> float:
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Indices of the points (cost, error) that are not dominated, by rising cost.
 
-    A point is dominated if another is no worse in both and better in one; of equal points the first is kept.
+    A point is dominated if another is no worse in both and better in one. Of equal points the first is kept.
     """
     front, least = [], float("inf")
     for index in sorted(range(len(points)), key=lambda i: points[i]):
@@ -129,7 +129,7 @@ def _pareto_figure(
 
 
 def _blank_figure(width: float, height: float, x_label: str, y_label: str) -> Figure:
-    """Inches. Margins are fixed: a layout engine would draw everything several times over."""
+    """A figure of this size in inches. Margins are fixed, because a layout engine would draw everything repeatedly."""
     figure = Figure(figsize=(width, height), dpi=110)
     FigureCanvasAgg(figure)
     left, right, bottom, top = 0.9 / width, 1 - 0.2 / width, 0.8 / height, 1 - 0.4 / height
@@ -140,7 +140,7 @@ def _blank_figure(width: float, height: float, x_label: str, y_label: str) -> Fi
 
 
 def _legend(place: Axes, panels: Sequence[Axes]) -> None:
-    """One legend of all panels, alone in its place."""
+    """Draws one legend for all panels in a place of its own."""
     handles: dict[str, Artist] = {}
     for axes in panels:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
@@ -149,7 +149,7 @@ def _legend(place: Axes, panels: Sequence[Axes]) -> None:
 
 
 def _pareto_panel(axes: Axes, points: Sequence[PlottedPoint]) -> list[PlottedPoint]:
-    """Draw a scene; returns the points that deserve a name: presets and the front."""
+    """Draws a scene; returns the points to be named: presets and the front."""
     own = [point for point in points if not point[2]["other_model"]]
     front = [own[index] for index in pareto_front([point[:2] for point in own])]
     x, y = [point[0] for point in front], [point[1] for point in front]
@@ -179,7 +179,7 @@ def _pareto_panel(axes: Axes, points: Sequence[PlottedPoint]) -> list[PlottedPoi
 
 
 def _steps(front: Sequence[PlottedPoint]) -> list[PlottedPoint]:
-    """Points of the front without a preset's name that lower the error by a third: smaller steps would hide them."""
+    """Points of the front without a preset's name that lower the error by a third; labels of smaller steps would hide them."""
     steps: list[PlottedPoint] = []
     least = math.inf
     for point in front:
@@ -190,7 +190,7 @@ def _steps(front: Sequence[PlottedPoint]) -> list[PlottedPoint]:
 
 
 def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
-    """Names beside points; of names that would overlap, the later one moves up or down to the next free place."""
+    """Writes names next to points. If names would overlap, the later one moves up or down to the next free place."""
     axes.get_xlim(), axes.get_ylim()  # fixes the limits, and with them the transform to pixels
     bottom, top, end_of_panel = (float(side) for side in (axes.bbox.y0, axes.bbox.y1, axes.bbox.x1))
     pixel = 72 / axes.figure.dpi
@@ -250,7 +250,7 @@ def draw_scaling(
 def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     vector, pixels = folder / f"{name}.svg", folder / f"{name}.png"
-    # Text stays text, and nothing depends on the day: an eighth of the size, and a figure redrawn is the same file.
+    # Text stays text, which takes an eighth of the size. Without a date, a redrawn figure is the same file.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "sparsestreet"}):
         figure.savefig(vector, metadata={"Date": None})
     figure.savefig(pixels)
@@ -258,6 +258,6 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 
 def _sparse(value: float, _: int) -> str:
-    """Only 1, 2 and 5 of each decade: all nine would run into each other."""
+    """Labels only 1, 2 and 5 of each decade, because nine labels would overlap."""
     digit = round(value / 10 ** math.floor(math.log10(value)))
     return f"{value:g}" if digit in (1, 2, 5) else ""

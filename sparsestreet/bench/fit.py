@@ -18,7 +18,7 @@ class Line:
 
 
 def fit_line(x: Sequence[float], y: Sequence[float]) -> Line:
-    """Least squares of relative residuals, weights 1/y^2: times over decades, of which the least ones count as well.
+    """Least squares of relative residuals (weights 1/y^2), so that small times count as much as large ones.
 
     Raises ValueError for fewer than two different x, or a y that is not positive.
     """

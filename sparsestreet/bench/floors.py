@@ -1,7 +1,7 @@
-"""The least that each phase of a training step has to move and to compute.
+"""Floors: the least memory traffic and arithmetic of each phase of a training step.
 
-Bytes count what must be read and what must be written once, float32, caches aside; operations are those of the
-arithmetic that the formula asks for. A phase at its floor waits for memory or arithmetic units all the time.
+Bytes count everything that must be read or written once, in float32, without caches. Operations are those of the
+formula. A phase at its floor keeps memory or arithmetic units busy all the time.
 """
 
 import time
@@ -18,7 +18,7 @@ from sparsestreet.training.system import StreetSystem
 NUMBER = 4.0
 """Bytes of a float32."""
 _SHAPE_NUMBERS = 11
-"""Means, quaternion, scales, opacity of a row."""
+"""Numbers of a row's mean, quaternion, scales and opacity."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Floor:
     flops: float = 0.0
 
     def seconds(self, bandwidth: float, peak: float) -> float:
-        """At so many bytes and operations a second; the larger of the two, as if they overlapped."""
+        """Seconds at these bytes and operations per second: the larger of the two, as if they overlapped."""
         return max(self.bytes / bandwidth, self.flops / peak)
 
 
 @dataclass(frozen=True)
 class StepWork:
-    """What one step had to do."""
+    """The work of one step."""
 
     rows: int
     visible: int
@@ -52,7 +52,7 @@ class StepWork:
 
     @staticmethod
     def of(system: StreetSystem, samples: int | None) -> "StepWork":
-        """Of the step that the system has just made."""
+        """The work of the last step of the system."""
         rendering = system.rendering
         stepped = (value.numel() for value in system.scene.parameters() if value.grad is not None)
         degree = system.state().sh_degree
@@ -69,7 +69,7 @@ class StepWork:
 
 
 def floors(work: Sequence[StepWork]) -> dict[str, Floor]:
-    """Phase -> its floor, the mean over some steps; phases whose least is next to nothing are left out."""
+    """The floor of each phase, averaged over some steps; phases with a negligible floor are left out."""
     steps = [_floors(step) for step in work]
     return {
         name: Floor(mean(step[name].bytes for step in steps), mean(step[name].flops for step in steps))
@@ -79,7 +79,7 @@ def floors(work: Sequence[StepWork]) -> dict[str, Floor]:
 
 def _floors(work: StepWork) -> dict[str, Floor]:
     pixels, color = work.size[0] * work.size[1], 3 * work.terms
-    # Scales, opacity and coefficients are read as they are stored and written as they are splatted.
+    # Scales, opacity and coefficients are read raw and written activated.
     assembly = Floor(NUMBER * 2 * work.rows * (4 + color))
     read = work.rows * _SHAPE_NUMBERS + work.visible * color
     window_flops = 2 * 2 * WINDOW  # an 11-tap filter along two axes
@@ -88,7 +88,7 @@ def _floors(work: StepWork) -> dict[str, Floor]:
         "scene backward": assembly,
         "sky": Floor(NUMBER * (pixels + work.sky_pixels * (3 + 3))),
         "sky backward": Floor(NUMBER * work.sky_pixels * (3 + 1 + 3)),
-        # Four means forward, of sums and differences; three derivatives backward.
+        # Forward takes four means, of sums and differences; backward three derivatives.
         "loss photometric": Floor(NUMBER * 2 * 3 * pixels, 4.0 * window_flops * 3 * pixels),
         "ssim backward": Floor(NUMBER * 3 * 3 * pixels, 3.0 * window_flops * 3 * pixels),
         # Parameter, gradient and two moments are read, all but the gradient written.
@@ -106,7 +106,7 @@ def _floors(work: StepWork) -> dict[str, Floor]:
 def measured_bandwidth(device: torch.device, megabytes: int = 256) -> float:
     """Bytes per second that an addition in place reads and writes, the best of several.
 
-    In place, because a copy also reads what it overwrites, which no count of bytes shows.
+    It is in place because a copy also reads what it overwrites, which the count of bytes would miss.
     """
     values = torch.zeros(megabytes << 18, device=device)
     seconds = []

@@ -1,4 +1,4 @@
-"""Splats that fill a camera's frustum at random: the scene of the op's timings."""
+"""Random splats that fill a camera's frustum: the scene of the op's timings."""
 
 import torch
 from torch import Tensor
@@ -7,13 +7,13 @@ from sparsestreet.types import Camera, Gaussians
 
 
 def frustum_camera(width: int, height: int) -> Camera:
-    """At the origin along +z, 53 degrees wide."""
+    """A camera at the origin that looks along +z, 53 degrees wide."""
     intrinsics = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=torch.float32)
     return Camera(torch.eye(4), intrinsics, width, height)
 
 
 def frustum_gaussians(rows: int, camera: Camera, sigma_pixels: float, terms: int, seed: int = 0) -> Gaussians:
-    """Depths 2 to 50 m, log-normal sizes with this median on the screen, opacities 0.05 to 0.95; float32."""
+    """Gaussians of depth 2 to 50 m, log-normal sizes of this median on the screen, opacity 0.05 to 0.95; float32."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:

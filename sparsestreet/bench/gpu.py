@@ -1,4 +1,4 @@
-"""``sparsestreet bench gpu``: stage times and peak memory at sizes of real scenes, gsplat beside it in the same run."""
+"""``sparsestreet bench gpu``: stage times and peak memory at sizes of real scenes, with gsplat in the same run."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -35,12 +35,13 @@ from sparsestreet.phases import clock_of
 from sparsestreet.types import Camera, Gaussians
 
 ROWS = (1_500_000, 500_000, 5_000_000, 100_000, 1_000)
-"""The last is next to nothing for a device: what it takes is the host's time."""
+"""Numbers of rows. The last is almost no work for a device, so it measures the host."""
 IMAGES = ((1920, 1280), (960, 640))
-"""The first of both is the headline: what a time limit cuts off is something else."""
+"""Sizes of images. The first rows and image are the headline, so a time limit cuts off others."""
 TRUTH_ROWS = 1_500_000
-"""Splats up to which images and gradients are compared, with gsplat's and with those in float64 on the host: seconds,
-where the device takes milliseconds."""
+"""Most splats for which images and gradients are compared, with gsplat's and with float64 on the host.
+
+The host takes seconds where the device takes milliseconds."""
 BUDGET = TimingBudget(repeats=30, seconds=8.0, least=20)
 
 
@@ -58,7 +59,7 @@ class GpuRecord:
     """(splat, tile) pairs, and (splat, pixel) samples of the forward pass; None for gsplat."""
     samples: int | None = None
     failed: str | None = None
-    """Why a measurement is missing; what was measured before it stands."""
+    """Why a measurement is missing; earlier measurements stay."""
     inference: TimeSpread | None = None
     """Forward without gradients."""
     forward: TimeSpread | None = None
@@ -66,12 +67,12 @@ class GpuRecord:
     step: TimeSpread | None = None
     """A whole step of training (gpu_step.py)."""
     stages: dict[str, TimeSpread] | None = None
-    """Device time of the kernels of one forward and backward by stage; None without a CUDA device."""
+    """Device time by stage of the kernels of one forward and backward; None without a CUDA device."""
     memory_before: float | None = None
     memory_peak: float | None = None
-    """Most during one forward and backward; includes what lay there before: the Gaussians."""
+    """Peak during one forward and backward, including what was there before: the Gaussians."""
     parity: Errors | None = None
-    """gsplat against us; us against the C++ backend in float64, where it is built. None above TRUTH_ROWS."""
+    """For gsplat: against us. For us: against the C++ backend in float64, if it is built. None above TRUTH_ROWS."""
     agrees: bool | None = None
 
     @property
@@ -111,11 +112,11 @@ def run_gpu(
     say: Callable[[str], None] = print,
     street: BenchScene | None = None,
 ) -> bool:
-    """Measure every size, and a trained street after the first; False if a renderer failed or gsplat disagrees, which
-    ends none of the others.
+    """Measures every size, and a trained street after the first; returns False if a renderer failed or gsplat
+    disagrees.
 
-    gsplat runs in both of its modes at the first size, then in the one that was faster there. Each record is on disk as
-    soon as it is measured.
+    A failure does not stop the other measurements. gsplat runs in both of its modes at the first size, then in the
+    faster one. Each record is on disk as soon as it is measured.
     """
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
     backend, peer = resolve_backend("auto", device), gsplat_peer.find_gsplat(device)
@@ -200,7 +201,7 @@ def _theirs(workload: Workload, peer: ModuleType, mode: str) -> Draw:
 
 
 def measure(record: GpuRecord, draw: Draw, workload: Workload, budget: TimingBudget) -> GpuRecord:
-    """Times, then memory, then stages. An error is put on record: it is a result about this renderer at this size."""
+    """Measures times, then memory, then stages. An error is recorded: it is a result of this renderer at this size."""
     cotangent = Cotangent.of(workload.camera, workload.rows.means)
 
     def step() -> None:
@@ -238,7 +239,7 @@ def compared(record: GpuRecord, compare: Callable[[], Errors]) -> GpuRecord:
 
 
 def _against_truth(workload: Workload, backend: str) -> Errors:
-    """Us on the device against the C++ backend in float64."""
+    """Errors of our op on the device against the C++ backend in float64."""
     settings, kind = gsplat_peer.SETTINGS, workload.device.type
     ours = answer(workload.rows, workload.camera, settings, backend, torch.float32, kind)
     return errors(ours, answer(workload.rows, workload.camera, settings, "cpu", torch.float64))
@@ -272,7 +273,7 @@ def _reason(error: Exception) -> str:
 
 
 def line(record: GpuRecord) -> str:
-    """One row of the table: medians, and how far apart the quartiles are."""
+    """One row of the table: medians and inter-quartile ranges."""
     start = f"{record.renderer:<24}{record.scene:<16}{record.rows:>9} {record.width}x{record.height:<6}"
     if record.forward is None or record.backward is None:
         return f"{start} FAILED: {record.failed}"

@@ -1,5 +1,7 @@
-"""A whole step of training on one view, as 3DGS takes it, with either renderer: activation, rendering, L1 and SSIM,
-backward, Adam over all numbers, the statistics of density control. All but the renderer is ours and the same."""
+"""A whole training step of 3DGS on one view with either renderer; everything but the renderer is our code.
+
+The step is activation, rendering, L1 and SSIM, backward, Adam over all numbers, and the statistics of density control.
+"""
 
 from collections.abc import Callable
 from types import ModuleType
@@ -20,11 +22,11 @@ Seen = Callable[[], tuple[Tensor | None, Tensor]]
 Render = Callable[[Gaussians], tuple[Tensor, Seen]]
 
 SHARE = 0.2
-"""Of SSIM in the loss (3DGS, eq. 7)."""
+"""Weight of D-SSIM in the loss (3DGS, eq. 7)."""
 
 
 def our_render(camera: Camera, backend: str) -> Render:
-    """With the op of this project."""
+    """Renders with the op of this project."""
 
     def render(gaussians: Gaussians) -> tuple[Tensor, Seen]:
         rendering = splat(gaussians, camera, settings=gsplat_peer.SETTINGS, backend=backend)
@@ -34,7 +36,7 @@ def our_render(camera: Camera, backend: str) -> Render:
 
 
 def their_render(module: ModuleType, camera: Camera, device: torch.device, mode: str) -> Render:
-    """With gsplat in one of its modes."""
+    """Renders with gsplat in one of its modes."""
     moved = on_device(camera, device)
 
     def render(gaussians: Gaussians) -> tuple[Tensor, Seen]:
@@ -74,7 +76,7 @@ class TrainingStep:
 
 
 def step_time(start: Gaussians, camera: Camera, render: Render, budget: TimingBudget) -> TimeSpread:
-    """Milliseconds of a step, each waited for."""
+    """Milliseconds of a step; each step waits for the device."""
     step, clock, seconds = TrainingStep(start, camera, render), clock_of(start.means.device), []
 
     def run() -> None:

@@ -1,7 +1,7 @@
-"""gsplat on the same splats: its rasterization with our semantics matched to it, timed and checked for parity.
+"""gsplat on the same splats, timed and checked for parity; our settings match its semantics.
 
-Written for gsplat 1.5.3, the newest release on PyPI. It lacks what its repository has since then: exact ellipse-tile
-intersection, the clamp at 0.99 and the kernel work of 2026. A comparison with 1.5.3 says nothing about those.
+Written for gsplat 1.5.3, the newest release on PyPI. Its repository has since added exact ellipse-tile intersection,
+the clamp at 0.99 and the kernel work of 2026. A comparison with 1.5.3 says nothing about those.
 """
 
 import importlib
@@ -18,18 +18,19 @@ from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.types import Camera, Gaussians
 
 SETTINGS = SplatSettings.preset("gsplat15")
-"""What we render with beside it: its clamp, stop rule and near plane."""
+"""Settings of our op in the comparison: gsplat's clamp, stop rule and near plane."""
 MODES = ("packed", "unpacked")
-"""The first keeps rows in view only, which takes less memory; which is faster depends on the view."""
+"""The first keeps only rows in view, which takes less memory. Which one is faster depends on the view."""
 LEAST_PSNR = 60.0
-"""dB. Fast-math exponentials move a sample over the cut-off 1/255 in some pixels; if every thousandth pixel changed by
-1/255 that would be 78 dB."""
+"""Least PSNR of agreement, dB. Fast-math exponentials move a sample over the cut-off 1/255 in some pixels.
+
+If every thousandth pixel changed by 1/255, PSNR would be 78 dB."""
 LARGEST_GRADIENT_ERROR = 5e-3
-"""Relative L2 of a group. gsplat recovers transmittance from 1 - alpha, by division: up to 2e-3 in saturated pixels."""
+"""Largest relative L2 of a group. gsplat recovers transmittance by dividing: errors to 2e-3 in saturated pixels."""
 
 
 def find_gsplat(device: torch.device) -> ModuleType | str:
-    """The module, or why it cannot be timed here."""
+    """Returns the module, or the reason why it cannot be timed here."""
     if device.type != "cuda":
         return "gsplat needs a CUDA device"
     try:
@@ -54,13 +55,13 @@ def draw(
 def draw_for_training(
     module: ModuleType, gaussians: Gaussians, camera: Camera, mode: str
 ) -> tuple[Float[Tensor, "h w 3"], dict[str, Any]]:
-    """Color, and what ``seen`` reads after the backward pass."""
+    """Returns color, and what ``seen`` reads after the backward pass."""
     colors, _, meta = _rasterization(module, gaussians, camera, mode == "packed")
     return colors[0], meta
 
 
 def seen(meta: dict[str, Any], rows: int) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
-    """Absolute screen gradients and radii of all rows; packed, of those in view, the others are 0."""
+    """Absolute screen gradients and radii of all rows; in packed mode 0 for rows out of view."""
     gradients, radii = meta["means2d"].absgrad, meta["radii"].amax(-1).float()
     if gradients.dim() == 3:
         return gradients[0], radii[0]
@@ -72,7 +73,7 @@ def seen(meta: dict[str, Any], rows: int) -> tuple[Float[Tensor, "n 2"], Float[T
 def _rasterization(
     module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """``absgrad`` is on, as our op sums absolute screen gradients by default."""
+    """Calls gsplat with ``absgrad``, because our op sums absolute screen gradients by default."""
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.sh.shape[1]]
     return module.rasterization(
         means=gaussians.means,
@@ -104,7 +105,7 @@ def parity(module: ModuleType, rows: Gaussians, camera: Camera, backend: str) ->
 
 
 def agrees(error: Errors) -> bool:
-    """Whether both draw the same image and have the same gradients, to the limits above."""
+    """Whether images and gradients agree within the limits above."""
     if error.image.psnr is not None and error.image.psnr < LEAST_PSNR:
         return False
     groups = [group.relative_l2 for group in error.gradients.values()]

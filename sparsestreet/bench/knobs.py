@@ -22,12 +22,14 @@ KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
 }
 """Fields of SplatSettings and their values."""
 BOXES_ALONE = (3.0, 3.33, 4.0)
-"""Boxes without alpha_min, two knobs at once: either of them bounds a splat, so each hides what the other costs."""
+"""Values of max_sigma without alpha_min. Either bounds a splat, so each would hide what the other costs."""
 STOPS_EARLIER = (1e-3, 1e-2)
-"""transmittance_min of the exclusive stop, two knobs at once: it may lose transmittance_min / (1 - alpha_max) of a
-pixel's light where the inclusive one, which KNOBS has at these values, loses at most transmittance_min."""
+"""Values of transmittance_min for the exclusive stop; KNOBS has them for the inclusive stop.
+
+The exclusive stop may lose transmittance_min / (1 - alpha_max) of a pixel's light, the inclusive one transmittance_min.
+"""
 BACKENDS = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
-"""Besides the C++ backend in float32, which times all other points."""
+"""The backends besides C++ in float32, which times all other points."""
 FIXED = {
     ("tile size", "reference"): "dense: it has no tiles",
     ("tile size", "triton"): "compiled for tiles of 16x16",
@@ -38,15 +40,15 @@ FIXED = {
     ("dot precision", "reference"): "a truth: matrix products in the dtype of the Gaussians",
     ("dot precision", "triton"): "no backend has a matrix product in its blend",
 }
-"""What would be a knob but is a property of a backend: (knob, backend) -> what holds instead."""
+"""Choices that a backend fixes: (knob, backend) -> what holds instead."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One thing to time."""
+    """One configuration to time."""
 
     knob: str
-    """Which knob is off its default; ``default``, ``preset`` and ``backend`` for the rest."""
+    """The knob that is not at its default; ``default``, ``preset`` and ``backend`` for the rest."""
     value: str
     settings: SplatSettings
     preset: str | None = None
@@ -56,30 +58,30 @@ class Point:
     tile: int | None = None
     """Side of the tiles, pixels, for which the C++ library is compiled; None: the library in use."""
     effects: EffectsName | None = None
-    """Lens and shutter through which the scene is seen; None: its own camera."""
+    """Lens and shutter that replace those of the scene's camera; None: its own."""
 
     @property
     def other_model(self) -> bool:
-        """Whether what is drawn differs by intention: blur, clamp, compensation, lens and shutter are model, not
-        precision."""
+        """Whether the image differs on purpose: blur, clamp, compensation, lens and shutter change the model."""
         return _model(self.settings) != _model(DEFAULT) or self.effects not in (None, "off")
 
     @property
     def exact(self) -> SplatSettings:
-        """This point's own model without cut-offs: R0."""
+        """Settings of this point's own model without cut-offs: R0."""
         blur, alpha_max, antialias = _model(self.settings)
         exact = SplatSettings.preset("exact")
         return replace(exact, eps2d=blur, alpha_max=alpha_max, antialias=antialias, near_plane=self.settings.near_plane)
 
     @property
     def same_cutoffs(self) -> SplatSettings:
-        """This point's cut-offs without its rounding of colors and depths: R1."""
+        """Settings with this point's cut-offs, without its rounding of colors and depths: R1."""
         return replace(self.settings, half_colors=False, depth_bits=32)
 
 
 def points() -> list[Point]:
-    """The default first, then every knob, the presets that no knob reaches, the effects, the tile sizes (that of the
-    library in use as well, since a process of its own may cost something), and the other backends."""
+    """All points: the default, every knob, presets that no knob reaches, effects, tile sizes and the other backends.
+
+    The tile sizes include that of the library in use, because a separate process may cost something."""
     effects = [Point("effects", name, DEFAULT, effects=name) for name in EFFECTS]
     tiles = [Point("tile size", str(size), DEFAULT, tile=size) for size in TILE_SIZES]
     return [*_points_of_settings(), *effects, *tiles, *backend_points()]

@@ -1,4 +1,4 @@
-"""``sparsestreet bench masks``: what the network of a mask over time costs a frame, and what its bits save."""
+"""``sparsestreet bench masks``: what a temporal mask's network costs per frame, and what its bits save."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,14 +14,14 @@ from sparsestreet.scene.initialize.gaussians import init_gaussians
 from sparsestreet.scene.masks import Mask, MaskScope, TemporalMaskSettings
 
 ROWS = (5_000, 50_000)
-"""A few people of a small street; K_min of the paper's people."""
+"""Numbers of rows: a few people of a small street, and K_min of the paper's people."""
 FRAMES = 150
-"""A log of the Waymo Open Dataset has about 200, of which a tenth and more are held out."""
+"""Number of training frames. A log of the Waymo Open Dataset has about 200 frames, at least a tenth held out."""
 
 
 @dataclass(frozen=True)
 class MaskTimes:
-    """M of all rows at one time, by the network and by the bits that it leaves."""
+    """Times of computing M of all rows at one time, by the network and by its baked bits."""
 
     rows: int
     frames: int
@@ -33,7 +33,7 @@ class MaskTimes:
 def run_masks(
     sizes: Sequence[int], frames: int, budget: TimingBudget, file: RecordFile, say: Callable[[str], None] = print
 ) -> None:
-    """Time the same mask before and after it is finished."""
+    """Times the same mask before and after it is baked."""
     for count in sizes:
         mask, rows = _masked_rows(count, frames)
         network = _time(mask, rows, budget)
@@ -64,7 +64,7 @@ def _time(mask: Mask, rows: Rows, budget: TimingBudget) -> TimeSpread:
 
 
 def _masked_rows(count: int, frames: int) -> tuple[Mask, Rows]:
-    """Rows in a box of 2 m, and a mask over time whose network has seen nothing yet."""
+    """Rows in a box of 2 m, and a temporal mask with an untrained network."""
     generator = torch.Generator().manual_seed(0)
     scope = MaskScope.whole([frame / (frames - 1) for frame in range(frames)], torch.zeros(3), 1.0)
     mask = TemporalMaskSettings(sparsity_weight=1.0e-5).build(0, scope)

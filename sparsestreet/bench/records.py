@@ -1,4 +1,4 @@
-"""Records of measurements: one strict JSON object a line, on disk as soon as it is measured."""
+"""Records of measurements: one strict JSON object per line, on disk as soon as it is measured."""
 
 import dataclasses
 import math
@@ -14,7 +14,7 @@ from sparsestreet.records.strict_json import Json, json_line, parsed
 
 @dataclass(frozen=True)
 class Provenance:
-    """By which command, on what and from which code something was measured."""
+    """The command, the machine and the code of a measurement."""
 
     command: str
     threads: int
@@ -23,7 +23,7 @@ class Provenance:
 
 
 class RecordFile:
-    """Writes records line by line; a sweep that is interrupted leaves the points it has measured."""
+    """Writes records line by line; an interrupted sweep leaves what it has measured."""
 
     def __init__(self, path: Path, provenance: Provenance) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -32,9 +32,9 @@ class RecordFile:
         self._provenance = provenance
 
     def write(self, kind: str, record: object) -> None:
-        """Append a frozen dataclass as one line with its kind, the machine's load and provenance.
+        """Appends a frozen dataclass as one line with its kind, the machine's load and provenance.
 
-        Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
+        Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON lacks.
         """
         line = {"kind": kind, **vars(record), "load": os.getloadavg()[0], "provenance": self._provenance}
         text = json_line(line, kind)
@@ -43,12 +43,12 @@ class RecordFile:
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """All lines of a file. Raises RecordError, naming file and line, for anything that is not strict JSON."""
+    """Reads all lines of a file. Raises RecordError, naming file and line, for anything but strict JSON."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return [cast("dict[str, Any]", parsed(line, f"{path}:{number}")) for number, line in enumerate(lines, start=1)]
 
 
 def settings_entries(settings: SplatSettings) -> dict[str, Json]:
-    """All fields; a max_sigma of infinity, which JSON cannot say, is None."""
+    """All fields as JSON; an infinite max_sigma, which JSON lacks, is None."""
     finite = settings.max_sigma if math.isfinite(settings.max_sigma) else None
     return dataclasses.asdict(settings) | {"max_sigma": finite}

@@ -1,4 +1,4 @@
-"""``sparsestreet bench scaling``: time against work, from a thousand to millions of splats, and the line through it."""
+"""``sparsestreet bench scaling``: time against work, from a thousand to millions of splats, and a line fit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from sparsestreet.ops.settings import SplatSettings
 
 ROWS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)
 DENSITY = 0.4
-"""Splats a pixel, the same at every number of splats: with more of them pixels would stop earlier, and time would grow
-more slowly than the number of pairs for a reason that has nothing to do with the pairs."""
+"""Splats per pixel, equal for all numbers of splats. At a higher density pixels stop earlier, so that time would grow
+more slowly than the number of pairs."""
 LARGE = Size(1920, 1280, 1_000_000)
 
 
@@ -29,7 +29,7 @@ class ScalingRecord:
     width: int
     height: int
     fitted: bool
-    """Whether the line goes through this point; the large view stands beside it."""
+    """Whether this point is part of the fit; the large view is not."""
     times: OpTimes
 
 
@@ -40,7 +40,7 @@ class FitRecord:
     part: str
     line: Line
     largest_relative_residual: float
-    """Over all points; the smallest views, where the cost of a call is most of the time, decide it."""
+    """The largest over all points. It comes from the smallest views, where the cost of a call is most of the time."""
 
 
 def run_scaling(
@@ -51,7 +51,7 @@ def run_scaling(
     folder: Path,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Time the C++ backend at every number of splats, fit forward and backward, draw."""
+    """Times the C++ backend at every number of splats, fits forward and backward, and draws."""
     records = [_measure(sized(count), True, budget, file, say) for count in rows]
     if large is not None:
         _measure(large, False, budget, file, say)
@@ -71,7 +71,7 @@ def run_scaling(
 
 
 def sized(rows: int) -> Size:
-    """A 3:2 image that holds DENSITY splats a pixel, sides a multiple of 16."""
+    """A 3:2 image with DENSITY splats per pixel; its sides are multiples of 16."""
     side = (rows / DENSITY / 1.5) ** 0.5
     return Size(*(max(16, round(factor * side / 16) * 16) for factor in (1.5, 1.0)), rows)
 

@@ -28,13 +28,13 @@ class BenchScene:
 
     name: str
     source: str
-    """What it is made of, and whether it was trained."""
+    """What the scene is made of, and whether it was trained."""
     gaussians: Gaussians
     camera: Camera
 
 
 def bench_scenes(size: Size, street: BenchScene | None = None, seed: int = 0) -> list[BenchScene]:
-    """All five; ``street`` is a trained one, which otherwise a proxy scene replaces. The same for the same seed."""
+    """All five scenes, equal for the same seed; without a trained ``street`` a proxy scene takes its place."""
     camera = frustum_camera(size.width, size.height)
     if street is None:
         street = BenchScene("street", "proxy scene made of numbers, not trained", proxy_street(size.rows), camera)
@@ -49,7 +49,7 @@ def bench_scenes(size: Size, street: BenchScene | None = None, seed: int = 0) ->
 
 
 def deep_stack(size: Size, seed: int = 0) -> BenchScene:
-    """Faint splats, STACK of them over a pixel in the middle of the image (fewer at its edges).
+    """Faint splats, STACK of them on a pixel in the middle of the image (fewer at its edges).
 
     A splat of opacity o reaches alpha_min = 1/255 on an area of 2 pi sigma^2 ln(255 o); rows x area = STACK x image.
     """
@@ -58,14 +58,14 @@ def deep_stack(size: Size, seed: int = 0) -> BenchScene:
     opacities = 0.01 + 0.04 * torch.rand(size.rows, generator=torch.Generator().manual_seed(seed))
     reach = float((255 * opacities).log().mean())
     sigma = math.sqrt(STACK * size.width * size.height / (size.rows * 2 * math.pi * reach))
-    # Not round: the gradient of a round splat's rotation is zero, and nothing to measure errors by.
+    # Not round, because the rotation of a round splat has no gradient to compare.
     scales = sigma * rows.means[:, 2:] / size.width * torch.tensor([0.7, 1.0, 1 / 0.7])
     stacked = replace(rows, scales=scales, opacities=opacities)
     return BenchScene("deep stack", f"{STACK} faint splats over a pixel, sigma {sigma:.1f} px", stacked, camera)
 
 
 def needles_and_giants(size: Size, seed: int = 0) -> BenchScene:
-    """Half needles (0.1 to 1 px by 20 to 200 px), a twentieth giants (a tenth to half the image), the rest ordinary."""
+    """Half needles (0.1 to 1 px by 20 to 200 px), 1/20 giants (a tenth to half the image), the rest ordinary."""
     camera = frustum_camera(size.width, size.height)
     rows = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16, seed=seed)
     generator = torch.Generator().manual_seed(seed)
@@ -85,7 +85,7 @@ def needles_and_giants(size: Size, seed: int = 0) -> BenchScene:
 
 
 def half_masked(street: BenchScene, seed: int = 0) -> BenchScene:
-    """The street with the opacity of a random half of its rows at 0, as mask training leaves them until they go."""
+    """The street with a random half of its rows at opacity 0, as mask training leaves them before they are removed."""
     kept = torch.rand(len(street.gaussians), generator=torch.Generator().manual_seed(seed)) < 0.5
     opacities = torch.where(kept, street.gaussians.opacities, 0.0)
     masked = replace(street.gaussians, opacities=opacities)

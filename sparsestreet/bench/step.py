@@ -1,4 +1,4 @@
-"""``sparsestreet bench step``: the phases of a training step, what each costs, and how far each is from its floor."""
+"""``sparsestreet bench step``: the time of each phase of a training step, compared with its floor."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -24,7 +24,7 @@ OP = ("splat", "splat backward")
 
 @dataclass(frozen=True)
 class StepWindow:
-    """Which steps of a run are looked at: ``timed`` from ``first`` on, then ``counted``."""
+    """The steps of a run to measure: ``timed`` steps from ``first`` on, then ``counted`` steps."""
 
     first: int
     timed: int
@@ -41,7 +41,7 @@ FULL, QUICK = StepWindow(740, 100, 10), StepWindow(10, 8, 4)
 class StepWatch(Callback):
     """Times the phases of the steps in a window, then counts their operations, then ends training.
 
-    Configure it last: what the other callbacks do at the end of a step is a part of the step.
+    Configure it last, because the work of other callbacks at the end of a step is part of the step.
     """
 
     def __init__(self, window: StepWindow) -> None:
@@ -73,7 +73,7 @@ class StepWatch(Callback):
 
 
 class CountedOperations(TorchDispatchMode):
-    """Counts what is dispatched, by phase; views cost nothing and are left out."""
+    """Counts dispatched operations by phase; views cost nothing and are left out."""
 
     def __init__(self, recorder: PhaseRecorder, counts: Counter[str]) -> None:
         super().__init__()
@@ -93,15 +93,15 @@ def run_step(
     folder: Path,
     say: Callable[[str], None] = print,
 ) -> StepRecord:
-    """Train through a window, write what was seen, draw it.
+    """Trains through a window, writes the record and draws it.
 
     Args:
-        what: is trained, in words.
-        train: trains with one more callback, and answers what it trained.
-        window: which steps.
-        file: takes the record.
-        folder: takes the picture.
-        say: hears the table.
+        what: name of what is trained, in words.
+        train: trains with one more callback, and returns what it trained.
+        window: the steps to measure.
+        file: file for the record.
+        folder: folder for the picture.
+        say: called with the lines of the table.
     """
     watch = StepWatch(window)
     system = train(watch)

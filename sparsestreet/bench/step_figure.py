@@ -1,4 +1,4 @@
-"""The picture of a training step: a bar a phase, its floor inside."""
+"""The picture of a training step: one bar per phase, with its floor inside."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ _OP, _REST, _FLOOR = "#0072B2", "#E69F00", "#333333"
 
 
 def draw_step(record: StepRecord, folder: Path) -> list[Path]:
-    """Median milliseconds of every phase that takes at least a hundredth of the step, the longest on top."""
+    """Draws median milliseconds of each phase that takes at least a hundredth of the step, the longest on top."""
     shown = [phase for phase in record.phases if phase.time.median >= 0.01 * record.step.median]
     figure = Figure(figsize=(8.0, 1.3 + 0.34 * len(shown)), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)

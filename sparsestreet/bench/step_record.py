@@ -8,19 +8,19 @@ from sparsestreet.bench.timing import TimeSpread
 
 @dataclass(frozen=True)
 class PhaseRecord:
-    """One phase; a floor of None is not known, or next to nothing."""
+    """One phase; a floor of None is unknown or negligible."""
 
     name: str
     time: TimeSpread
     operations: float
-    """Dispatched tensor operations a step; views are not counted."""
+    """Dispatched tensor operations per step, without views."""
     floor: Floor | None
     floor_ms: float | None
 
 
 @dataclass(frozen=True)
 class StepRecord:
-    """A step of training, from one batch's end to the next one's; times are milliseconds."""
+    """A training step, from the end of one batch to the end of the next; times are milliseconds."""
 
     what: str
     gaussians: dict[str, int]
@@ -36,5 +36,5 @@ class StepRecord:
 
     @property
     def ratio(self) -> float:
-        """The step over its op."""
+        """Time of the step divided by that of its op."""
         return self.step.median / self.op.median

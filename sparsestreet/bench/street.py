@@ -1,8 +1,8 @@
-"""A proxy scene for a trained street, made of numbers: splats of the same kinds at the same places, nothing trained.
+"""A synthetic proxy for a trained street: splats of the same kinds in the same places, without training.
 
-Camera frame at the origin (x right, y down, z forward, meters), the road 1.6 m below. Splats lie on surfaces as a
-trained street has them: flat on the road and on facades, thin and upright on poles and trunks, small on cars, a few
-large faint ones adrift. Sizes grow with distance, as what one camera saw has about one size on its screen.
+The camera is at the origin (x right, y down, z forward, meters), 1.6 m above the road. Splats lie on surfaces as in a
+trained street: flat on the road and facades, thin and upright on poles and trunks, small on cars. A few large faint
+ones float. Sizes grow with distance, because what one camera saw has about one size on its screen.
 """
 
 import math
@@ -15,12 +15,12 @@ from sparsestreet.types import Gaussians
 _ROAD = 1.6
 _NEAR, _FAR = 3.0, 70.0
 _CARS = ((-3.6, 9.0), (3.4, 14.0), (-3.4, 22.0), (3.6, 30.0), (-0.4, 38.0), (3.4, 48.0))
-"""Centers (x, z) of cars of 1.8 x 1.5 x 4.2 m."""
+"""Centers (x, z) of cars, each 1.8 x 1.5 x 4.2 m."""
 _SHARES = {"road": 0.3, "facades": 0.4, "cars": 0.15, "poles": 0.1, "adrift": 0.05}
 
 
 def proxy_street(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
-    """``rows`` splats with spherical harmonics of ``terms`` terms; float32, the same for the same seed."""
+    """``rows`` splats with ``terms`` spherical harmonics; float32, equal for the same seed."""
     draw = _Draw(seed, unit=0.9 / math.sqrt(max(1, rows)))
     counts = {name: int(share * rows) for name, share in _SHARES.items()}
     counts["facades"] += rows - sum(counts.values())
@@ -34,13 +34,13 @@ def proxy_street(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
     means, scales, opacities, colors = (torch.cat(columns) for columns in zip(*parts, strict=True))
     sh = 0.05 * draw.normal(rows, terms, 3)
     sh[:, 0] = (colors - 0.5) * math.sqrt(4 * math.pi)
-    # Turned a little about a random axis: surfaces are rough.
+    # A small rotation about a random axis, because surfaces are rough.
     quaternions = torch.cat((torch.ones(rows, 1), 0.03 * draw.normal(rows, 3)), -1)
     return Gaussians(means, quaternions, scales, opacities, sh)
 
 
 class _Draw:
-    """Random numbers of one seed, and sizes in a ``unit``, radians, that closes surfaces with the rows there are."""
+    """Random numbers of one seed, and a ``unit`` of size, radians, with which the rows just close the surfaces."""
 
     def __init__(self, seed: int, unit: float) -> None:
         self._unit = unit
@@ -56,16 +56,16 @@ class _Draw:
         return torch.randint(choices, (count,), generator=self._generator)
 
     def depth(self, count: int) -> Tensor:
-        """Log-uniform: as many splats per octave of distance, so that the image is filled evenly."""
+        """Log-uniform depths: an equal number of splats per octave of distance fills the image evenly."""
         return torch.exp(self.between(math.log(_NEAR), math.log(_FAR), count))
 
     def sizes(self, depth: Tensor, x: float | int, y: float | int, z: float | int) -> Tensor:
-        """Standard deviations: these factors of unit times the distance, log-normal by half an octave."""
+        """Standard deviations: factor times unit times distance, log-normal by half an octave."""
         spread = torch.exp(0.35 * self.normal(len(depth), 3))
         return self._unit * depth[:, None] * spread * torch.tensor([x, y, z])
 
     def opacities(self, count: int) -> Tensor:
-        """Two thirds nearly opaque surface, one third faint filling."""
+        """Opacities: two thirds are nearly opaque surface, one third faint filling."""
         solid = torch.rand(count, generator=self._generator) < 0.67
         return torch.where(solid, self.between(0.6, 0.99, count), self.between(0.02, 0.4, count))
 
@@ -88,7 +88,7 @@ def _facades(draw: _Draw, count: int) -> _Part:
 
 
 def _cars(draw: _Draw, count: int) -> _Part:
-    """On the sides of boxes: one coordinate of each is pushed to the surface."""
+    """Splats on the sides of boxes: one coordinate of each is moved to the surface."""
     place, half = torch.tensor(_CARS), torch.tensor([0.9, 0.75, 2.1])
     chosen = draw.pick(len(_CARS), count)
     inside = draw.between(-1, 1, count, 3)
@@ -101,7 +101,7 @@ def _cars(draw: _Draw, count: int) -> _Part:
 
 
 def _poles(draw: _Draw, count: int) -> _Part:
-    """Every eight meters at both curbs; needles, tens of pixels long and about one wide."""
+    """Poles every eight meters at both curbs, of needles tens of pixels long and about one wide."""
     z = 5 + 8.0 * draw.pick(8, count)
     side = 2.0 * draw.pick(2, count) - 1
     means = torch.stack((6.5 * side, draw.between(-5, _ROAD, count), z), -1)

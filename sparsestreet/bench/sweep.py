@@ -1,4 +1,4 @@
-"""``sparsestreet bench knobs``: time, work and error of every knob on every scene, one record a point."""
+"""``sparsestreet bench knobs``: time, work and error of every knob on every scene, one record per point."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -20,14 +20,15 @@ from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.records.strict_json import Json
 
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(64, 48, 400)
-"""Sizes of a sweep, of a trial, and of the copies that the dense reference bears: there it is timed, and is the oracle
-of truths and culling."""
+"""Sizes of a sweep, of a trial, and of small copies for the dense reference.
+
+On the copies it is timed, and it is the oracle of truths and culling."""
 BUDGET = TimingBudget(repeats=20, seconds=2.0, least=3)
 QUICK_BUDGET = TimingBudget(repeats=2, seconds=0.1, least=1)
 DENSE_SAMPLES = 1 << 28
-"""(row, pixel) samples beyond which the dense reference is not timed: it takes about a second for each 10^8."""
+"""Most (row, pixel) samples for which the dense reference is timed; it takes about a second per 10^8."""
 UNBOUNDED_PAIRS = 1 << 26
-"""(splat, tile) pairs of a view without any bound that are still computed: about 7 GB in float64."""
+"""Most (splat, tile) pairs of a view without any bound that are computed: about 7 GB in float64."""
 _EXACT_BACKEND = "cpu"
 
 
@@ -48,26 +49,26 @@ class KnobRecord:
     settings: dict[str, Json]
     """Fields of SplatSettings, as ``settings_entries`` writes them."""
     distortion: list[float] | None
-    """Of the camera that was timed; the shutter's: translation, then rotation."""
+    """Distortion of the timed camera; its shutter is translation, then rotation."""
     shutter: list[float] | None
     skipped: str | None
     """Why there is no measurement; times and errors are then None."""
     other_model: bool
-    """What is drawn differs by intention; ``model_psnr`` is then no error."""
+    """Whether the image differs on purpose; ``model_psnr`` is then not an error."""
     model_psnr: float | None = None
-    """dB between this model without cut-offs and the default one without; None where they draw the same."""
+    """dB between this model and the default one, both without cut-offs; None if they draw the same."""
     times: OpTimes | None = None
     exact: Errors | None = None
-    """Against this model in float64 without cut-offs (R0); None where that covers too many tiles to be held."""
+    """Errors against this model in float64 without cut-offs (R0); None if that covers too many tiles to be held."""
     same_cutoffs: Errors | None = None
-    """Against this model in float64 with the same cut-offs (R1): what rounding alone does."""
+    """Errors against this model in float64 with the same cut-offs (R1), which are due to rounding alone."""
     tiles_in_use: Errors | None = None
-    """A tile size against the library in use: the same image up to rounding, not a trade."""
+    """Errors of a tile size against the library in use: only rounding, not a trade."""
 
 
 @dataclass(frozen=True)
 class CullingRecord:
-    """That culling by tiles is exact on this scene: identical images, not a trade."""
+    """Evidence that culling by tiles is exact on this scene: identical images, not a trade."""
 
     scene: str
     rows: int
@@ -89,7 +90,7 @@ class OracleRecord:
 
 @dataclass(frozen=True)
 class FixedRecord:
-    """What would be a knob but is a property of a backend."""
+    """A choice that a backend fixes."""
 
     knob: str
     backend: str
@@ -105,7 +106,7 @@ class Truths:
 
     def of(self, settings: SplatSettings, effects: EffectsName | None = None) -> Answer:
         if not self._depths_between(settings.near_plane, DEFAULT.near_plane):
-            settings = replace(settings, near_plane=DEFAULT.near_plane)  # the same rows, the same answer
+            settings = replace(settings, near_plane=DEFAULT.near_plane)  # the same rows give the same answer
         if (settings, effects) not in self._answers:
             seen = seen_through(self._scene, effects)
             truth = answer(seen.gaussians, seen.camera, settings, _EXACT_BACKEND, torch.float64)
@@ -126,10 +127,11 @@ def run_sweep(
     file: RecordFile,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Measure all points of all scenes into ``file``; ``small`` are copies on which the truth itself is checked and
-    the dense reference is timed, with the C++ backend beside it (``small`` records).
+    """Measures all points of all scenes into ``file``.
 
-    Raises RuntimeError with the remedy if the C++ backend, which computes the truths, is not built.
+    On the ``small`` copies the truth itself is checked, and the dense reference is timed next to the C++ backend
+    (``small`` records). Raises RuntimeError with the remedy if the C++ backend, which computes the truths, is not
+    built.
     """
     resolve_backend(_EXACT_BACKEND, torch.device("cpu"))
     for (knob, backend), holds in FIXED.items():
@@ -157,7 +159,7 @@ def _write_culling(scene: BenchScene, culling: Culling, file: RecordFile, say: C
 
 
 def title(scene: BenchScene) -> str:
-    """What a scene is, for the terminal."""
+    """A scene's title for the terminal."""
     return f"{scene.name}: {scene.source}; {len(scene.gaussians)} splats, {scene.camera.width}x{scene.camera.height}"
 
 
@@ -177,7 +179,7 @@ def _measure_points(
 
 
 def measure_point(scene: BenchScene, point: Point, truths: Truths, budget: TimingBudget) -> KnobRecord:
-    """Time and error of one point, or why it cannot be had here."""
+    """Measures time and error of one point, or says why that is impossible here."""
     record = _unmeasured(scene, point)
     if record.skipped is not None:
         return record
@@ -199,7 +201,7 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, budget: Timin
 
 
 def time_and_answer(scene: BenchScene, point: Point, budget: TimingBudget) -> tuple[OpTimes, Answer]:
-    """What is timed, and what it draws."""
+    """Times of a point, and what it draws."""
     device = "cuda" if point.backend == "triton" else "cpu"
     rows = leaves(scene.gaussians, point.dtype, device)
     times = time_op(rows, scene.camera, point.settings, point.backend, budget)
@@ -228,7 +230,7 @@ def _unmeasured(scene: BenchScene, point: Point) -> KnobRecord:
 
 
 def affordable(scene: BenchScene, settings: SplatSettings) -> bool:
-    """Whether the pairs can be held where nothing bounds a splat, so that each covers every tile."""
+    """Whether the pairs can be held if nothing bounds a splat, so that each covers every tile."""
     side = tile_size()
     tiles = -(-scene.camera.width // side) * -(-scene.camera.height // side)
     bounded = settings.alpha_min > 0 or settings.max_sigma < float("inf")
@@ -255,7 +257,7 @@ def unavailable(scene: BenchScene, point: Point) -> str | None:
 
 
 def check_oracle(scene: BenchScene) -> OracleRecord:
-    """Truth against truth: two implementations of the exact model in float64."""
+    """Compares two truths: two implementations of the exact model in float64."""
     exact = SplatSettings.preset("exact")
     fast, dense = (
         answer(scene.gaussians, scene.camera, exact, backend, torch.float64)
@@ -283,6 +285,6 @@ def describe(record: KnobRecord) -> str:
 
 
 def worst_gradient(error: Errors) -> float:
-    """Relative L2 of the parameter group that is furthest off; infinite where a group's truth is zero."""
+    """Relative L2 of the parameter group with the largest error; infinite if a group's truth is zero."""
     values = [group.relative_l2 for group in error.gradients.values()]
     return float("inf") if None in values else max(values)

@@ -1,7 +1,6 @@
-"""Other sizes of the C++ backend's tiles: the library compiled for them, in a process of its own.
+"""Other sizes of the C++ backend's tiles: the library is compiled for them and runs in a separate process.
 
-The size is a constant of the compiled loops, so that the product pays nothing for the choice; a process loads one
-library.
+The size is a constant of the compiled loops, so that users pay nothing for the choice. A process loads one library.
 """
 
 import fcntl
@@ -38,8 +37,9 @@ class Build:
 
 @cache
 def build(size: int) -> Build:
-    """The library in use if its tiles have this size, else one compiled into ``.cache`` of the checkout: half a minute
-    the first time, as good as nothing later."""
+    """Returns the library in use if its tiles have this size, else one compiled into ``.cache`` of the checkout.
+
+    Compiling takes half a minute the first time, and almost nothing later."""
     if size == tile_size():
         return Build(find_library())
     if not (ROOT / "CMakeLists.txt").is_file():
@@ -60,11 +60,11 @@ def build(size: int) -> Build:
 
 
 def with_tiles(size: int, function: Callable[..., Result], *arguments: object) -> Result:
-    """``function(*arguments)`` in a process whose C++ backend has tiles of this size, with as many threads as here.
+    """Calls ``function(*arguments)`` in a process whose C++ backend has tiles of this size, with our number of threads.
 
     Function, arguments and result must pickle. Raises RuntimeError with the reason if there is no such library.
     """
-    # Pickled here: torch would put the tensors it finds into shared memory, of which a machine may have little.
+    # Pickled here, because torch would put tensors into shared memory, of which a machine may have little.
     request = pickle.dumps((function, arguments))
     return pickle.loads(_process(size, torch.get_num_threads()).submit(_call, request).result())
 
@@ -76,7 +76,7 @@ def _call(request: bytes) -> bytes:
 
 @cache
 def _process(size: int, threads: int) -> ProcessPoolExecutor:
-    """One process, spawned: a forked one would inherit the library that is loaded here. It ends with this one."""
+    """One spawned process, because a forked one would inherit the library that is loaded here. It ends with ours."""
     made = build(size)
     if made.library is None:
         raise RuntimeError(f"no library with tiles of {size} pixels: {made.missing}")

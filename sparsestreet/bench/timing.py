@@ -25,7 +25,7 @@ class TimeSpread:
     median: float
     minimum: float
     iqr: float | None
-    """Third less first quartile; None for a single run."""
+    """Third quartile less the first; None for a single run."""
     repeats: int
 
     def __str__(self) -> str:
@@ -52,14 +52,14 @@ class TimingBudget:
     least: int = 3
 
     def warm_up(self, run: Callable[[], None]) -> None:
-        """Runs that do not count: buffers grow, code is compiled. Two, or one where that takes long."""
+        """Runs twice, or once if that takes long, without counting: buffers grow, code is compiled."""
         start = time.perf_counter()
         run()
         if time.perf_counter() - start < self.seconds / self.least:
             run()
 
     def runs(self, run: Callable[[], None]) -> None:
-        """Call ``run`` as often as the budget allows."""
+        """Calls ``run`` as often as the budget allows."""
         start = time.perf_counter()
         for done in range(self.repeats):
             if done >= self.least and time.perf_counter() - start > self.seconds:
@@ -69,29 +69,29 @@ class TimingBudget:
 
 @dataclass(frozen=True)
 class Cotangent:
-    """A fixed random upstream gradient of color and alpha; alpha's part shows what is lost in the transmittance."""
+    """A fixed random upstream gradient of color and alpha; alpha's part reveals errors of the transmittance."""
 
     rgb: Tensor
     alpha: Tensor
 
     @staticmethod
     def of(camera: Camera, like: Tensor, seed: int = 1) -> "Cotangent":
-        """Standard normal; drawn in float64, so that every dtype and device gets the same numbers."""
+        """Draws standard normal numbers, in float64 so that every dtype and device gets the same."""
         generator = torch.Generator().manual_seed(seed)
         values = torch.randn(camera.height, camera.width, 4, generator=generator, dtype=torch.float64).to(like)
         return Cotangent(values[..., :3].contiguous(), values[..., 3].contiguous())
 
     def backward(self, rgb: Tensor, alpha: Tensor) -> None:
-        """Sum of products, differentiated."""
+        """Differentiates the sum of the products with color and alpha."""
         torch.autograd.backward([rgb, alpha], [self.rgb, self.alpha])
 
 
 @dataclass(frozen=True)
 class OpTimes:
-    """TimeSpread of each stage and of the whole op, and the work of its forward pass (None: the dense reference)."""
+    """Times of each stage and of the whole op, and the work of its forward pass (None for the dense reference)."""
 
     stages: dict[str, TimeSpread]
-    """``forward`` and ``backward`` are the whole op; what the backend reports of its stages comes beside them."""
+    """``forward`` and ``backward`` of the whole op, and the stages that the backend reports."""
     pairs: int | None
     samples: int | None
 
@@ -104,7 +104,7 @@ def leaves(gaussians: Gaussians, dtype: torch.dtype, device: str | torch.device 
 
 
 def on_device(camera: Camera, device: str | torch.device) -> Camera:
-    """The camera with its matrices on the device, for peers that want them there (ours reads them on the host)."""
+    """The camera with its matrices on the device, for peers that need them there (ours reads them on the host)."""
     return replace(
         camera, camera_from_world=camera.camera_from_world.to(device), intrinsics=camera.intrinsics.to(device)
     )
@@ -113,7 +113,7 @@ def on_device(camera: Camera, device: str | torch.device) -> Camera:
 def time_op(
     gaussians: Gaussians, camera: Camera, settings: SplatSettings, backend: str, budget: TimingBudget
 ) -> OpTimes:
-    """Forward and backward of the op on rows that are ``leaves``, again and again."""
+    """Times repeated forward and backward passes of the op on rows that are ``leaves``."""
     cotangent = Cotangent.of(camera, gaussians.means)
     seconds: dict[str, list[float]] = {}
 
@@ -150,13 +150,13 @@ def time_once(draw: Draw, cotangent: Cotangent, gaussians: Gaussians) -> dict[st
 
 
 def drop_gradients(gaussians: Gaussians) -> None:
-    """Forget the gradients that leaves have collected."""
+    """Drops the gradients that leaves have collected."""
     for name in GROUPS:
         getattr(gaussians, name).grad = None
 
 
 def stage_seconds(gaussians: Gaussians, backend: str) -> dict[str, float]:
-    """Seconds of the stages of the last forward and backward pass; empty where the backend keeps no clock."""
+    """Seconds of the stages of the last forward and backward pass; empty if the backend does not time them."""
     if backend != "cpu":
         return {}
     stages = last_workspace(gaussians.means.dtype).stage_seconds()
@@ -180,5 +180,5 @@ def work_of(
 
 
 def last_workspace(dtype: torch.dtype) -> Workspace:
-    """That of the C++ rendering whose graph was dropped last."""
+    """The workspace of the C++ rendering whose graph was dropped last."""
     return [workspace for workspace in idle_workspaces() if workspace.key == (dtype, FASTEST_VARIANT)][-1]

@@ -1,6 +1,7 @@
 """The blend in vectorized torch, tile by tile: the peer on the CPU, and a second oracle for large scenes.
 
-Splats are listed by 16x16 tile, nearest first; tiles of similar length are padded to one [tiles, splats, pixels] block.
+Splats are listed per 16x16 tile, nearest first. Tiles of similar length are padded to one [tiles, splats, pixels]
+block.
 """
 
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ class Block:
 def blend(
     splats: Splats, width: int, height: int, settings: SplatSettings
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Color (premultiplied) and transmittance; splats must come nearest first."""
+    """Returns color (premultiplied) and transmittance; splats must come nearest first."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     image = splats.means.new_zeros(tiles_x * tiles_y, TILE * TILE, 4)
     image[..., 3] = 1
@@ -45,7 +46,7 @@ def blend_gradients(
 ) -> dict[str, Tensor]:
     """Gradients of sum(cotangent * color) with respect to means, cholesky, opacities and colors.
 
-    Each block is differentiated as soon as it is blended, so that the graph of only one block is held.
+    Each block is differentiated as soon as it is blended, so that only one block's graph is in memory.
     """
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     padded = torch.nn.functional.pad(cotangent, (0, 0, 0, tiles_x * TILE - width, 0, tiles_y * TILE - height))
@@ -96,7 +97,7 @@ def blend_block(splats: Splats, block: Block, tiles_x: int, settings: SplatSetti
 def block_weights(
     splats: Splats, block: Block, tiles_x: int, settings: SplatSettings
 ) -> tuple[Float[Tensor, "t k 256"], Float[Tensor, "t 256"]]:
-    """Blend weight of each splat in each pixel, and what gets past all of them."""
+    """Blend weight of each splat in each pixel, and the light that passes all of them."""
     inside = torch.arange(TILE * TILE)
     x = (block.tiles % tiles_x * TILE)[:, None] + inside % TILE + 0.5
     y = (block.tiles // tiles_x * TILE)[:, None] + inside // TILE + 0.5
