@@ -179,7 +179,7 @@ def _pareto_panel(axes: Axes, points: Sequence[PlottedPoint]) -> list[PlottedPoi
 
 
 def _steps(front: Sequence[PlottedPoint]) -> list[PlottedPoint]:
-    """Points of the front without a preset's name that lower the error by a third; labels of smaller steps would hide them."""
+    """Points of the front without a preset's name that lower the error by a third; more labels would hide them."""
     steps: list[PlottedPoint] = []
     least = math.inf
     for point in front:

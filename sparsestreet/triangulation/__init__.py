@@ -1,8 +1,8 @@
-"""Points that images give: features, matched along the epipolar lines of known poses, and triangulated.
+"""Points from images: features are matched along the epipolar lines of known poses, and triangulated.
 
-``features`` finds them in one image; ``pairs`` says which images to compare; ``matches`` compares two; ``rays`` is
-about where the rays of a point meet; ``points`` is the way from views to points; ``street`` keeps what stands still
-apart from what is in the boxes; ``cache`` remembers the points on disk.
+``features`` finds features in one image, ``pairs`` chooses images to compare, ``matches`` compares two. ``rays``
+computes where the rays of a point meet, ``points`` turns views into points. ``street`` separates what stands still from
+what is in boxes, and ``cache`` keeps the points on disk.
 """
 
 from sparsestreet.triangulation.cache import cached_street_points

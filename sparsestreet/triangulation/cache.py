@@ -1,4 +1,4 @@
-"""Points on disk, named after everything that made them."""
+"""Points on disk, named by everything that determines them."""
 
 import hashlib
 import json
@@ -26,9 +26,9 @@ _COLUMNS = ("positions", "colors", "pixel_sizes", "observed", "views", "pixels")
 
 
 def cached_street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
-    """``street_points``, read from the cache where the same images, poses, boxes and settings made them before.
+    """Returns ``street_points``, from the cache if the same images, poses, boxes and settings made them before.
 
-    Raises OSError where the cache cannot be written, before any work.
+    Raises OSError before any work if the cache cannot be written.
     """
     if settings.cache is None:
         return street_points(frames, moving, settings)

@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 SIFT_WIDTH = 640
-"""Narrower images are doubled before SIFT, which doubles them once more: small images have little else to offer."""
+"""Width, pixels, below which images are doubled before SIFT, which doubles them again: small ones have few features."""
 
 CONTRAST = 0.01
-"""SIFT's contrast threshold; OpenCV's 0.04 leaves evenly painted walls and asphalt empty."""
+"""SIFT's contrast threshold; OpenCV's 0.04 finds nothing on evenly painted walls and asphalt."""
 
 EDGE = 20.0
-"""SIFT's limit of the ratio of curvatures; OpenCV's 10 drops what is drawn out: window frames, seen from the side."""
+"""SIFT's limit of the ratio of curvatures; OpenCV's 10 drops elongated things such as window frames from the side."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Features:
 
 
 def find_features(image: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
-    """At most ``limit`` features, those of the strongest contrast."""
+    """Returns at most ``limit`` features, those of the strongest contrast."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     zoom = 2 if gray.shape[1] < SIFT_WIDTH else 1
     if zoom > 1:
@@ -46,6 +46,6 @@ def find_features(image: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
 
 
 def _hellinger(descriptors: Float32[np.ndarray, "n 128"]) -> Float32[np.ndarray, "n 128"]:
-    """Square roots of the normalized histograms (Arandjelovic and Zisserman 2012): then of unit length."""
+    """Square roots of the normalized histograms (Arandjelovic and Zisserman 2012), which have unit length."""
     total = descriptors.sum(1, keepdims=True)
     return np.sqrt(descriptors / np.maximum(total, np.float32(1e-12)))

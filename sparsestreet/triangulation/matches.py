@@ -1,4 +1,4 @@
-"""Features of two images that may be one point of the world: alike, and on each other's epipolar lines."""
+"""Matches features of two images that may be one point of the world: alike, and on each other's epipolar lines."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int
@@ -6,13 +6,13 @@ from jaxtyping import Bool, Float32, Float64, Int
 from sparsestreet.triangulation.features import Features
 
 SAME_PLACE = 3.0
-"""Pixels; SIFT finds one corner at several scales, which are no rivals of each other."""
+"""Pixels within which features are the same place: SIFT finds one corner at several scales, which do not compete."""
 
 NEAREST = 0.5
-"""Meters; the least depth of a point in either camera."""
+"""Least depth of a point in either camera, meters."""
 
 ROWS_AT_ONCE = 256
-"""Features of the first image compared at a time: a table with all of the second then fits into the cache."""
+"""Features of the first image that are compared at once, so that a table with all of the second fits the cache."""
 
 
 def guided_matches(
@@ -25,14 +25,14 @@ def guided_matches(
     tolerance: float,
     ratio: float,
 ) -> Int[np.ndarray, "k 2"]:
-    """Rows of the features that match each other best along the epipolar line and in front of both cameras.
+    """Returns the rows of features that match each other best along the epipolar line and in front of both cameras.
 
     Args:
         first, second: features of either image.
         first_rays, second_rays: their normalized image points x/z, y/z.
         second_from_first: relative pose of the cameras, meters.
         tolerance: largest distance from the epipolar line in the second image, in normalized units.
-        ratio: of a match's distance to that of the next like one elsewhere on the line, at most (Lowe's test).
+        ratio: largest ratio of a match's distance to that of the second-best match elsewhere on the line (Lowe's test).
     """
     rows, columns = _on_epipolar_lines(first_rays, second_rays, second_from_first, tolerance)
     in_front = _in_front(first_rays[rows], second_rays[columns], second_from_first)
@@ -75,8 +75,8 @@ def _in_front(
 ) -> Bool[np.ndarray, " k"]:
     """Whether the two rays come closest to each other in front of both cameras.
 
-    With a and b the rays in the second camera's frame and t the first center there, a s + t = b u in the least
-    squares sense.
+    It solves a s + t = b u by least squares, with a and b the rays and t the first center, all in the second camera's
+    frame.
     """
     a = _homogeneous(first) @ second_from_first[:3, :3].T
     b = _homogeneous(second)
@@ -94,7 +94,7 @@ def _distances(first: Float32[np.ndarray, "k 128"], second: Float32[np.ndarray, 
 
 
 def _least(values: Float32[np.ndarray, " k"], groups: Int[np.ndarray, " k"], count: int) -> Float32[np.ndarray, " n"]:
-    """The least value of each group; infinity where there is none."""
+    """The least value of each group; infinity for an empty group."""
     least = np.full(count, np.inf, np.float32)
     np.minimum.at(least, groups, values)
     return least

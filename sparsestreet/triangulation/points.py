@@ -1,4 +1,4 @@
-"""From views with known poses to points: every feature gathers its matches, and the rays of all of them must meet."""
+"""Triangulates points from views with known poses: each feature gathers its matches, whose rays must meet."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,19 +15,19 @@ from sparsestreet.triangulation.settings import ImagePointSettings
 from sparsestreet.types import View
 
 FEATURE_NOISE = 0.5
-"""Pixels; standard deviation of a feature's position, for the uncertainty of a point."""
+"""Standard deviation of a feature's position, pixels, for the uncertainty of a point."""
 
 ROUNDS = 4
-"""Times that the worst observation of a point is dropped before the point is given up."""
+"""How often the worst observation of a point is dropped before the point itself is dropped."""
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one view shows of something that does not change its shape."""
+    """The features of one view that lie on one rigid thing."""
 
     view: View
     camera_from_frame: Float64[np.ndarray, "4 4"]
-    """From the frame in which the thing stands still."""
+    """Pose of the camera in the frame in which the thing stands still."""
     features: Features
     rays: Float64[np.ndarray, "n 2"]
     """The features' normalized image points x/z, y/z, without lens distortion."""
@@ -45,20 +45,20 @@ class Sighting:
 
 @dataclass(frozen=True)
 class TriangulatedPoints:
-    """Points, and the pixels that show them."""
+    """Points, and the pixels that show them; an observation is one view of one point."""
 
     positions: Float32[np.ndarray, "n 3"]
     """Meters."""
     colors: Float32[np.ndarray, "n 3"]
-    """RGB in [0, 1], the mean over the views."""
+    """Mean RGB over the views, in [0, 1]."""
     pixel_sizes: Float32[np.ndarray, " n"]
-    """Meters that a pixel spans at the point, in the nearest view."""
+    """Size of a pixel at the point in the nearest view, meters."""
     observed: Int[np.ndarray, " o"]
-    """One row for each view of each point: the point,"""
+    """Point of each observation."""
     views: Int[np.ndarray, " o"]
-    """the view's place among those that were given,"""
+    """View of each observation: its place in the list that was triangulated."""
     pixels: Float32[np.ndarray, "o 2"]
-    """and where it shows the point."""
+    """Pixel of each observation."""
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -69,9 +69,9 @@ def triangulate(
     settings: ImagePointSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> TriangulatedPoints:
-    """The points on which the views agree; none where the cameras stand still.
+    """Returns the points on which the views agree; none if the cameras stand still.
 
-    ``progress`` is called with the number of pairs of images compared and of all pairs.
+    ``progress`` is called with the number of compared pairs of images, and of all pairs.
     """
     pairs = image_pairs([sighting.view for sighting in sightings], _poses(sightings))
     counts = np.array([len(sighting.features) for sighting in sightings], np.int64)
@@ -101,7 +101,7 @@ def _all_matches(
     settings: ImagePointSettings,
     progress: Callable[[int, int], None] | None,
 ) -> Int[np.ndarray, "k 2"]:
-    """Matches of all pairs, features numbered over all views; by threads, as NumPy lets go of the interpreter."""
+    """Matches of all pairs, features numbered over all views. Threads work here, because NumPy releases the lock."""
 
     def compare(pair: tuple[int, int]) -> Int[np.ndarray, "k 2"]:
         first, second = (sightings[index] for index in pair)
@@ -128,9 +128,9 @@ def _all_matches(
 def _stars(
     matches: Int[np.ndarray, "k 2"], count: int, min_views: int
 ) -> tuple[Int[np.ndarray, " s"], Int[np.ndarray, " o"], Int[np.ndarray, " o"]]:
-    """(center, feature, point): each feature with its own matches, itself first, is one candidate of a point.
+    """(center, feature, point): each feature with its own matches, itself first, is one candidate point.
 
-    Nothing is joined over more than one match: one wrong link would tie two points together.
+    Matches of matches are not joined, because one wrong match would join two points.
     """
     both = np.concatenate((matches, matches[:, ::-1]))
     centers = np.flatnonzero(np.bincount(both[:, 0], minlength=count) >= min_views - 1)
@@ -156,10 +156,9 @@ def _observations(
 def _agreed(
     observations: Observations, count: int, settings: ImagePointSettings
 ) -> tuple[Bool[np.ndarray, " o"], Float64[np.ndarray, "s 3"]]:
-    """(observations that are left, positions) when each point drops its worst one again and again while one is too far
-    off.
+    """Drops the worst observation of each point while it is too far off; returns (observations left, positions).
 
-    Points that still have one after all rounds, or too few views, keep nothing.
+    Points with a bad observation after all rounds, or with too few views, keep none.
     """
     left, positions = np.zeros(len(observations), bool), np.zeros((count, 3))
     open_rows = np.arange(len(observations))
@@ -186,7 +185,7 @@ def _lookers(
     pairs: Sequence[tuple[int, int]],
     sightings: Sequence[Sighting],
 ) -> Int[np.ndarray, " s"]:
-    """For each point, in how many of the views that its center was compared with it lies inside the image."""
+    """For each point, the number of views compared with its center's view that have the point inside their image."""
     count = np.zeros(len(positions), np.int64)
     by_view = [np.flatnonzero(center_views == view) for view in range(len(sightings))]
     for first, second in pairs:
@@ -203,7 +202,7 @@ def _twins(
     seen: Int[np.ndarray, " s"],
     good: Bool[np.ndarray, " s"],
 ) -> Bool[np.ndarray, " s"]:
-    """Points whose center belongs to a good point of more views (or as many, and an earlier one) as well."""
+    """Points whose center also belongs to a good point of more views, or to an earlier one of equally many."""
     rank = np.empty(len(centers), np.int64)
     rank[np.lexsort((np.arange(len(centers)), -np.where(good, seen, 0)))] = np.arange(len(centers))
     of_good = good[points]

@@ -1,4 +1,4 @@
-"""Where the rays of each point meet: linear least squares, then Gauss-Newton on the reprojection errors."""
+"""Computes where the rays of each point meet: linear least squares, then Gauss-Newton on the reprojection errors."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float64, Int, Shaped
 
 GAUSS_NEWTON_STEPS = 4
 DAMPING = 1e-9
-"""Added to the normal matrix relative to its trace: rays that are almost parallel leave it singular."""
+"""Added to the diagonal of the normal matrix, times its trace, because almost parallel rays leave it singular."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Observations:
         return len(self.rays)
 
     def where(self, rows: Bool[np.ndarray, " o"] | Int[np.ndarray, " k"]) -> "Observations":
-        """Those of a mask, or of some row numbers."""
+        """The observations of a mask or of row numbers."""
         return Observations(self.point[rows], self.camera_from_frame[rows], self.rays[rows], self.focal[rows])
 
     def directions(self) -> tuple[Float64[np.ndarray, "o 3"], Float64[np.ndarray, "o 3"]]:
@@ -39,7 +39,7 @@ class Observations:
 
 
 def meet(observations: Observations, count: int) -> Float64[np.ndarray, "n 3"]:
-    """The position of least squared reprojection error of each point; the origin for one without observation."""
+    """The position of least squared reprojection error of each point; the origin for a point without observations."""
     positions = _nearest_to_rays(observations, count)
     for _ in range(GAUSS_NEWTON_STEPS):
         residual, jacobian, _ = _reprojection(observations, positions)
@@ -62,8 +62,8 @@ def relative_depth_error(
 ) -> Float64[np.ndarray, " n"]:
     """Standard deviation of a point along its least certain direction over its distance from the nearest camera.
 
-    By the covariance noise^2 (J^T J)^-1 of the reprojection, with ``noise`` the standard deviation of a feature in
-    pixels. It says what an angle between two rays cannot: how much many views of a small parallax are worth.
+    The covariance is noise^2 (J^T J)^-1 with the Jacobian J of the reprojection; ``noise`` is the standard deviation of
+    a feature in pixels. Unlike the angle between two rays, it counts many views of small parallax.
     """
     count = len(positions)
     _, jacobian, _ = _reprojection(observations, positions)
@@ -76,7 +76,7 @@ def relative_depth_error(
 
 
 def _nearest_to_rays(observations: Observations, count: int) -> Float64[np.ndarray, "n 3"]:
-    """sum (I - d d^T) x = sum (I - d d^T) c over the rays c + s d."""
+    """Solves sum (I - d d^T) x = sum (I - d d^T) c over the rays c + s d."""
     centers, rays = observations.directions()
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     normal = summed(across, observations.point, count)

@@ -6,26 +6,27 @@ from pathlib import Path
 
 @dataclass(frozen=True, kw_only=True)
 class ImagePointSettings:
-    """How points are found in images; pixels are those of the images as they are trained on."""
+    """How points are found in images. Pixels are those of the training images."""
 
     features: int = 2000
-    """Of one image, at most."""
+    """Most features of one image."""
     epipolar_tolerance: float = 0.8
-    """Pixels between a match and the epipolar line."""
+    """Largest distance of a match from the epipolar line, pixels."""
     ratio: float = 0.8
-    """Lowe's ratio of distances to the best match and the next one elsewhere on the line."""
+    """Largest ratio of the distances to the best match and to the second-best elsewhere on the line (Lowe)."""
     max_error: float = 0.6
-    """Pixels; a view in which a point is farther from its feature does not count."""
+    """Largest reprojection error, pixels; a view with a larger one does not count."""
     min_views: int = 3
-    """Views that a point must be seen in."""
+    """Least number of views of a point."""
     min_support: float = 0.6
-    """Share of the compared views in whose image a point lies that must show it: windows repeat, and only the right
-    one is there from everywhere."""
+    """Of the compared views whose image contains a point, the least share that must show it.
+
+    Windows of a house repeat, but only the right match is seen from all views."""
     max_depth_error: float = 0.03
-    """Standard deviation of a point's position over its distance, by its parallax and the noise of features."""
+    """Largest standard deviation of a point's position divided by its distance, from parallax and feature noise."""
     threads: int = 2
     cache: Path | str | None = None
-    """Folder in which points are kept; None: they are made anew by every run."""
+    """Folder for computed points; None: every run computes them anew."""
 
     def __post_init__(self) -> None:
         for name in ("features", "threads"):

@@ -1,4 +1,4 @@
-"""The points of a drive: of what stands still, and of each box in its own frame."""
+"""The points of a drive: static ones in the world, and those of each box in its own frame."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from sparsestreet.types import Camera, Frame, Track, View
 log = logging.getLogger(__name__)
 
 ENLARGEMENT = 1.1
-"""Of a box, for what lies just outside an imprecise one."""
+"""Factor of a box's size, for points just outside an imprecise box."""
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class StreetPoints:
     """Points triangulated from the training images; ``views`` count the training views."""
 
     static: TriangulatedPoints
-    """In the world."""
+    """Static points, in the world."""
     in_boxes: Mapping[str, TriangulatedPoints]
-    """Name of a track -> points in the frame of its box, within it."""
+    """Name of a track -> points inside its box, in the box's frame."""
 
 
 def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
-    """Find points in images; each is decoded once.
+    """Finds points in images; each image is decoded once.
 
     Args:
         frames: training views.
-        moving: objects that move on their own: what is seen through their boxes counts for them alone.
+        moving: objects that move on their own; features seen through their boxes count only for them.
         settings: limits of the search.
     """
     sightings = _sightings(frames, settings)
@@ -62,7 +62,7 @@ def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointS
 
 
 def _report(done: int, total: int) -> None:
-    """A line when a quarter more is compared."""
+    """Logs a line whenever another quarter of the pairs is compared."""
     if done * 4 // total > (done - 1) * 4 // total:
         log.info("points from images: %d of %d pairs compared", done, total)
 
@@ -72,8 +72,8 @@ def _total(parts: Mapping[str, TriangulatedPoints]) -> int:
 
 
 def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
-    """In the order of the frames; OpenCV lets go of the interpreter, so threads find features beside each other."""
-    reading = Lock()  # what a log remembers of its frames is not made for threads
+    """Sightings in the order of the frames. OpenCV releases the interpreter's lock, so threads run in parallel."""
+    reading = Lock()  # a log's memory of its frames is not safe for threads
 
     def sighting(index: int) -> Sighting:
         with reading:
@@ -85,7 +85,7 @@ def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
 
 
 def _sighting(view: View, frame: Frame, limit: int) -> Sighting:
-    """The features of a frame that are not in the sky; its pixels are not kept."""
+    """The features of a frame outside the sky, without the frame's pixels."""
     image = frame.image.numpy()
     features = find_features(image, limit)
     if frame.sky is not None:
@@ -106,7 +106,7 @@ def _pixel(features: Features, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rays(pixels: Float64[np.ndarray, "n 2"], camera: Camera) -> Float64[np.ndarray, "n 2"]:
-    """Normalized image points, the lens taken away."""
+    """Normalized image points without lens distortion."""
     intrinsics = camera.intrinsics.double().numpy()
     imaged = np.linalg.solve(intrinsics[:2, :2], (pixels - intrinsics[:2, 2]).T).T
     if camera.distortion is None:
@@ -115,7 +115,7 @@ def _rays(pixels: Float64[np.ndarray, "n 2"], camera: Camera) -> Float64[np.ndar
 
 
 def _from_box(sighting: Sighting, track: Track) -> Sighting | None:
-    """The same with its pose in the box's frame; None where the box is not annotated."""
+    """The sighting with its pose in the box's frame; None if the box is not annotated then."""
     at = torch.nonzero(track.frames == sighting.view.frame_index).flatten()
     if not len(at):
         return None
@@ -124,7 +124,7 @@ def _from_box(sighting: Sighting, track: Track) -> Sighting | None:
 
 
 def _through_box(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:
-    """Which features' rays meet the box, whose frame the sighting is in, ahead of the camera (slab test)."""
+    """Whether each feature's ray meets the box ahead of the camera (slab test); the sighting is in the box's frame."""
     rotation, translation = sighting.camera_from_frame[:3, :3], sighting.camera_from_frame[:3, 3]
     center = -rotation.T @ translation
     rays = np.concatenate((sighting.rays, np.ones((len(sighting.rays), 1))), 1) @ rotation
@@ -136,7 +136,7 @@ def _through_box(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:
 
 
 def _inside(points: TriangulatedPoints, views: list[int], track: Track) -> TriangulatedPoints:
-    """Those of a box's points that lie in the box; ``views`` are the places of the views that were given."""
+    """The points that lie in the box; ``views`` are the places of its views among all."""
     kept = (np.abs(points.positions) <= ENLARGEMENT / 2 * track.size.numpy()).all(1)
     number, of_kept = np.cumsum(kept) - 1, kept[points.observed]
     return TriangulatedPoints(
