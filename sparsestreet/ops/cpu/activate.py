@@ -15,13 +15,13 @@ from sparsestreet.phases import phase
 from sparsestreet.types import Gaussians
 
 FIELDS = 6
-"""Means, log-scales, quaternions, opacity logits, first coefficient, the others."""
+"""Number of fields: means, log-scales, quaternions, opacity logits, first coefficient, the others."""
 
 
 def activate(
     parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float, variant: int = FASTEST_VARIANT
 ) -> Gaussians:
-    """As ``sparsestreet.ops.activate``; the same bits for any number of threads."""
+    """``sparsestreet.ops.activate`` in C++, bitwise the same for any number of threads."""
     terms = [part.terms(sh_degree) for part in parts]
     tensors = [tensor for part in parts for tensor in part.tensors()]
     return Gaussians(*_Activate.apply(_Call(terms, logit_limit, variant), *tensors))
@@ -29,7 +29,7 @@ def activate(
 
 @dataclass(frozen=True)
 class _Call:
-    """What all parts have in common, and the number of coefficients of each."""
+    """What all parts share, and the number of coefficients of each."""
 
     terms: list[int]
     logit_limit: float
@@ -37,7 +37,7 @@ class _Call:
 
 
 class _Activate(torch.autograd.Function):
-    """Stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities and coefficients."""
+    """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities, coefficients."""
 
     @staticmethod
     def forward(ctx, call, *given):
@@ -68,12 +68,12 @@ class _Activate(torch.autograd.Function):
 
 
 def _part_backward(part: list[Tensor | None], terms: int, call: _Call, cotangents: list[Tensor]) -> list[Tensor | None]:
-    """Gradients of the inputs of one part, from those of its rows."""
+    """Gradients of a part's inputs from those of its rows."""
     gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
     if part[LEARNED] is None:
-        # Means and quaternions went through as they are.
+        # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
-    # As in torch: an optimizer leaves alone what has no part in the image yet.
+    # As in torch, so that an optimizer skips coefficients that are not in use yet.
     if terms == 1:
         gradients[FIELDS - 1] = None
     status = native.load_library().splat_activate_backward(
@@ -91,7 +91,7 @@ def _parts(tensors: list[Tensor | None]) -> list[list[Tensor | None]]:
 
 
 def _walk(tensors: list[Tensor | None], call: _Call) -> list[tuple[slice, list[Tensor | None], int]]:
-    """Every part: its rows in the whole, its inputs, its number of coefficients."""
+    """For each part its rows in the table, its inputs, and its number of coefficients."""
     found, start = [], 0
     for part, terms in zip(_parts(tensors), call.terms, strict=True):
         found.append((slice(start, start + len(part[0])), part, terms))

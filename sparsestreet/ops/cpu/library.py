@@ -12,7 +12,7 @@ import torch
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
-"""Environment variable that names another build of the library, for measurements and tests of it."""
+"""Environment variable that names another build of the library, to measure and test it."""
 _INTERFACE_VERSION = 10
 _LOADED_IN = os.getpid()
 
@@ -68,13 +68,13 @@ class CCounters(ctypes.Structure):
 
 
 class CBackdrop(ctypes.Structure):
-    """Pointers to what stands behind the splats and to how much each pixel counts; null: black, and 1."""
+    """Pointers to the background and to the weights of pixels; null: black, and 1."""
 
     _fields_ = tuple((name, c_void_p) for name in ("rgb", "pixel_weights"))
 
 
 class CChanges(ctypes.Structure):
-    """Pointers to what the removal of each row changes."""
+    """Pointers to the changes when each row is removed."""
 
     _fields_ = tuple((name, c_void_p) for name in ("largest", "squared"))
 
@@ -91,7 +91,7 @@ class CSky(ctypes.Structure):
 
 
 class CRawRows(ctypes.Structure):
-    """Pointers to rows as a node stores them; null: multipliers, instances."""
+    """Pointers to rows as a node stores them; multipliers and instances may be null."""
 
     _fields_ = (
         *((name, c_int64) for name in ("count", "stored_rest", "terms", "stride")),
@@ -120,7 +120,7 @@ class CRawGradients(ctypes.Structure):
 
 
 class CKeyframes(ctypes.Structure):
-    """Pointers to the tables of trajectories and of their corrections, and the time that is asked for."""
+    """Pointers to the tables of trajectories and of their corrections, and the time."""
 
     _fields_ = (
         *((name, c_int64) for name in ("instances", "length")),
@@ -131,7 +131,7 @@ class CKeyframes(ctypes.Structure):
 
 
 class CInstancePoses(ctypes.Structure):
-    """Pointers to poses and to what their gradient needs."""
+    """Pointers to poses and to what their gradients need."""
 
     _fields_ = (
         *((name, c_void_p) for name in ("quaternions", "translations", "present")),
@@ -167,8 +167,10 @@ def remedy() -> str:
 
 @cache
 def find_library() -> Path | None:
-    """Path of the library: the one that LIBRARY_VARIABLE names, else beside this module, else where an editable install
-    put it; None if it was not built. Raises RuntimeError if the variable names no file."""
+    """Returns the path of the library, or None if it was not built.
+
+    It is the path in LIBRARY_VARIABLE, else next to this module, else where an editable install put it. Raises
+    RuntimeError if the variable names no file."""
     named = os.environ.get(LIBRARY_VARIABLE)
     if named is not None:
         if not Path(named).is_file():
@@ -189,7 +191,7 @@ def find_library() -> Path | None:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """The loaded library; raises RuntimeError with the remedy if it is absent or was built from other sources."""
+    """Loads the library; raises RuntimeError with the remedy if it is absent or was built from other sources."""
     path = find_library()
     if path is None:
         raise RuntimeError(f"the splat library is not built: {remedy()}")
@@ -208,8 +210,9 @@ def tile_size() -> int:
 
 
 def thread_count() -> int:
-    """Threads a call may use: torch's number, but one in a forked child, where the OpenMP runtime would wait for
-    threads that only its parent has."""
+    """Number of threads a call may use: torch's, but one in a forked child.
+
+    There the OpenMP runtime would wait for threads that only its parent has."""
     return torch.get_num_threads() if os.getpid() == _LOADED_IN else 1
 
 

@@ -12,7 +12,7 @@ from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
 
 _INPUTS = 6
-"""Numbers of an instance that its rotation depends on: two rotation vectors."""
+"""Count of numbers that an instance's rotation depends on: two rotation vectors."""
 
 
 def poses_at(
@@ -30,7 +30,7 @@ def poses_at(
 
 
 class _Poses(torch.autograd.Function):
-    """Corrections of all keyframes to one pose per instance."""
+    """Maps the corrections of all keyframes to one pose per instance."""
 
     @staticmethod
     def forward(ctx, rotation_deltas, translation_deltas, table, time, max_gap, variant):

@@ -19,8 +19,9 @@ from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
-"""(splat, tile) pairs of one rendering; each takes 24 bytes forward and 48 more backward in float32, 32 and 96 in
-float64, and all of that a quarter more where buffers have just grown: up to 24 GB in float32 at the limit."""
+"""Most (splat, tile) pairs of one rendering. A pair takes 24 bytes forward and 48 more backward in float32.
+
+In float64 it takes 32 and 96. Buffers that have just grown are a quarter larger: up to 24 GB in float32."""
 
 
 def rasterize(
@@ -34,8 +35,8 @@ def rasterize(
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
     ``variant`` picks an instruction set: 0 baseline, 1 x86-64-v3, 2 x86-64-v4, -1 the fastest that runs here.
-    ``every_tile`` lists each splat in every tile and looks at all its rows, to check the lists against: slow, the same
-    layers, and radii without end.
+    ``every_tile`` lists each splat in every tile and visits all lines of the tile, as a check of the lists. It is slow,
+    and gives the same layers and infinite radii.
     """
     _check_dtype(gaussians)
     g = gaussians
@@ -74,7 +75,7 @@ def leave_one_out(
     settings: SplatSettings,
     variant: int = FASTEST_VARIANT,
 ) -> LeaveOneOut:
-    """How far the view moves when each row alone is taken away."""
+    """How much the view changes when each row alone is removed."""
     _check_dtype(gaussians)
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
@@ -95,7 +96,7 @@ def leave_one_out(
 
 
 class _Blend(torch.autograd.Function):
-    """Five fields and the screen offsets to the layers of a Raster."""
+    """Maps five fields and the screen offsets to the layers of a Raster."""
 
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, variant):

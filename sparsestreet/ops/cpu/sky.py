@@ -24,13 +24,14 @@ def over_sky(
     transmittance_min: float,
     variant: int = FASTEST_VARIANT,
 ) -> Float[Tensor, "h w 3"]:
-    """``sparsestreet.ops.over_sky`` of contiguous tensors of one dtype, float32 or float64. Bitwise the same, gradients
-    too, for any number of threads. ``variant`` as for the splats."""
+    """``sparsestreet.ops.over_sky`` of contiguous tensors of one dtype, float32 or float64.
+
+    Values and gradients are bitwise the same for any number of threads. ``variant`` is as for the splats."""
     return _OverSky.apply(rgb, alpha, texels, camera, transmittance_min, variant)
 
 
 class _OverSky(torch.autograd.Function):
-    """Backward looks everything up once more: an image of colors would cost more to keep."""
+    """Adds the sky. Backward reads the texels again, because keeping an image of colors would cost more."""
 
     @staticmethod
     def forward(ctx, rgb, alpha, texels, camera, transmittance_min, variant):

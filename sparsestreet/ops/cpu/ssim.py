@@ -18,10 +18,10 @@ TAPS = (c_double * WINDOW)(*window())
 def mean_ssim(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], variant: int = FASTEST_VARIANT
 ) -> Float[Tensor, ""]:
-    """``sparsestreet.ops.ssim.ssim`` of contiguous images, both float32 or both float64. Bitwise the same for any
-    number of threads; ``variant`` picks an instruction set, as in :func:`sparsestreet.ops.cpu.rasterizer.rasterize`.
+    """``sparsestreet.ops.ssim.ssim`` of contiguous images, both float32 or both float64.
 
-    Raises MemoryError without room for the sums.
+    Bitwise the same for any number of threads. ``variant`` picks an instruction set, as in
+    :func:`sparsestreet.ops.cpu.rasterizer.rasterize`. Raises MemoryError without room for the sums.
     """
     return _MeanSSIM.apply(image, truth, variant)
 

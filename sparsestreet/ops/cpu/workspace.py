@@ -52,7 +52,7 @@ class Workspace:
 
 
 class Lease:
-    """A workspace on loan: back to the idle ones when the last reference to the lease goes."""
+    """A workspace on loan. It becomes idle again when the last reference to the lease is gone."""
 
     def __init__(self, dtype: torch.dtype, variant: int) -> None:
         idle = _idle.setdefault((dtype, variant), [])
@@ -63,7 +63,7 @@ class Lease:
 
     def __del__(self) -> None:
         workspace = getattr(self, "workspace", None)
-        # Where both are garbage of one cycle (an error's traceback), the workspace may have gone first.
+        # If both are garbage of one cycle (an error's traceback), the workspace may be collected first.
         if workspace is None or not workspace.handle:
             return
         workspace.last_use = next(_uses)
@@ -73,6 +73,6 @@ class Lease:
 
 
 def idle_workspaces() -> list[Workspace]:
-    """Workspaces that wait for the next rendering, the last used one last."""
+    """Workspaces that wait for the next rendering, the most recently used one last."""
     waiting = [workspace for same_key in _idle.values() for workspace in same_key]
     return sorted(waiting, key=lambda workspace: workspace.last_use)

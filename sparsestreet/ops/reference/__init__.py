@@ -1,4 +1,4 @@
-"""The truth the fast backends are held to: dense plain torch with autograd, float32 or float64."""
+"""The reference for the fast backends: dense plain torch with autograd, float32 or float64."""
 
 from sparsestreet.ops.reference.blend import check_dtype, contribution, leave_one_out, rasterize
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows

@@ -1,4 +1,4 @@
-"""Splats blended front to back into every pixel, and what each of them adds."""
+"""Blends splats front to back into every pixel, and measures what each of them adds."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def rasterize(
         weights, transmittance = _weights(_alphas(pixels, splats, offsets, settings), settings)
         return weights.T @ splats.colors, transmittance, weights.T @ splats.depths
 
-    # Recomputed in backward chunk by chunk: memory does not grow with the image.
+    # Backward recomputes chunk by chunk, so that memory does not grow with the image.
     parts = [
         checkpoint(blend, chunk, use_reentrant=False, preserve_rng_state=False)
         for chunk in _pixel_chunks(camera, splats)
@@ -73,7 +73,7 @@ def leave_one_out(
     camera: Camera,
     settings: SplatSettings,
 ) -> LeaveOneOut:
-    """Change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
+    """The change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
     check_dtype(gaussians)
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
@@ -103,7 +103,7 @@ def leave_one_out(
 
 
 def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
-    """Raises ValueError, saying ``who`` computes, for anything but float32 and float64."""
+    """Raises ValueError, naming ``who`` computes, for dtypes other than float32 and float64."""
     if gaussians.means.dtype not in DTYPES:
         raise ValueError(
             f"{who} computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
@@ -112,7 +112,7 @@ def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:
-    """Pixel centers in row order, as many at a time as keep a splats x pixels table small."""
+    """Pixel centers in row order, in chunks that keep a splats x pixels table small."""
     like = {"dtype": splats.means.dtype, "device": splats.means.device}
     y, x = torch.meshgrid(torch.arange(camera.height, **like), torch.arange(camera.width, **like), indexing="ij")
     centers = torch.stack((x, y), dim=-1).reshape(-1, 2) + 0.5
@@ -122,7 +122,7 @@ def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"],
 def _alphas(
     pixels: Float[Tensor, "p 2"], splats: Splats, offsets: Float[Tensor, "v 2"], settings: SplatSettings
 ) -> Float[Tensor, "v p"]:
-    """Clamped alpha of each splat in each pixel, 0 past the splat's reach."""
+    """Clamped alpha of each splat in each pixel, 0 outside the splat's reach."""
     shifts = _AbsoluteOffset.apply(offsets, len(pixels))
     dx, dy = (pixels[None] - splats.means[:, None] - shifts).unbind(-1)
     l11, l21, l22 = (column[:, None] for column in splats.cholesky.unbind(-1))
@@ -132,7 +132,7 @@ def _alphas(
 
 
 def _weights(alphas: Float[Tensor, "v p"], settings: SplatSettings) -> tuple[Float[Tensor, "v p"], Float[Tensor, " p"]]:
-    """Blend weight of each splat in each pixel, and the light that gets past all of them.
+    """Blend weight of each splat in each pixel, and the light that passes all of them.
 
     Transmittance never rises along a ray, so the stop rule is one test per splat and pixel.
     """

@@ -1,7 +1,8 @@
-"""Where a Gaussian lands on the screen: its mean, and a factor V of its covariance V V^T (px^2).
+"""A Gaussian's footprint on the screen: its mean, and a factor V of its covariance V V^T (px^2).
 
-Pinhole: V = J R S, the derivative of the projection at the mean (EWA splatting, Zwicker et al. 2001), 2x3. With lens
-distortion: the unscented transform (Julier and Uhlmann 1997; for splats 3DGUT, Wu et al. 2025), 2x7.
+For a pinhole V = J R S, 2x3, with the derivative J of the projection at the mean (EWA splatting, Zwicker et al. 2001).
+With lens distortion V comes from the unscented transform, 2x7 (Julier and Uhlmann 1997; for splats 3DGUT, Wu et al.
+2025).
 """
 
 import math
@@ -17,7 +18,7 @@ Footprint = tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"]]
 
 
 def pinhole(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera) -> Footprint:
-    """Means, and V = J axes with J taken at the row's mean, its slopes held at ``slope_limits``.
+    """Means, and V = J axes, with J at the row's mean and its slopes clamped to ``slope_limits``.
 
     Past the limit x/z has no derivative.
     """
@@ -50,14 +51,15 @@ def slopes_held(in_camera: Float[Tensor, "v 3"], camera: Camera) -> Bool[Tensor,
 def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera, near: float) -> Footprint:
     """Mean and covariance of seven sigma points sent through projection and lens.
 
-    With alpha = 1, beta = 2, kappa = 0 the points are mu and mu +- sqrt(3) a_k; mu weighs 0 in the mean and 2 in the
-    covariance, the others 1/6 in both: no weight is negative, so V V^T is a covariance. A point at less than ``near``
-    meters is taken there, with its x and y; its depth has no derivative then.
+    With alpha = 1, beta = 2, kappa = 0 the points are mu and mu +- sqrt(3) a_k. mu has weight 0 in the mean and 2 in
+    the
+    covariance, the others 1/6 in both. No weight is negative, so V V^T is a covariance. The depth of a point nearer
+    than ``near`` meters is set to ``near`` and has no derivative.
     """
     K = camera.intrinsics.to(in_camera)
     points = _sigma_points(in_camera, axes)
     normalized = points[..., :2] / points[..., 2:].clamp(min=near)
-    # From the principal point, whose digits the differences would lose.
+    # Relative to the principal point, because adding it would cost the differences digits.
     pixels = distort(normalized, camera.distortion) * K.diagonal()[:2]
     centers = pixels[:, 1:].mean(1)
     weights = pixels.new_tensor([2.0] + [1 / 6] * 6)
@@ -67,7 +69,7 @@ def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], cam
 def sigma_points_held(
     in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera, near: float
 ) -> Bool[Tensor, " v"]:
-    """Rows of which :func:`unscented` takes a point at ``near``, or past the fold where the lens is continued."""
+    """Rows with a point that :func:`unscented` moves to ``near``, or that lies past the fold of the lens."""
     points = _sigma_points(in_camera, axes)
     slopes = points[..., :2] / points[..., 2:].clamp(min=near)
     past_fold = slopes.square().sum(-1) > fold_radius_squared(camera.distortion)

@@ -1,7 +1,7 @@
-"""From rows of Gaussians to splats on the screen.
+"""Projects rows of Gaussians to splats on the screen.
 
 Notation: u = mean on the screen, d = pixel center - u, Sigma = V V^T + blur I with the screen factor V (footprint.py),
-Sigma^-1 = L^T L with L = [[l11, l21], [0, l22]]; a splat's alpha is o exp(-q/2) with q = |L d|^2.
+Sigma^-1 = L^T L with L = [[l11, l21], [0, l22]]. A splat's alpha is o exp(-q/2) with q = |L d|^2.
 """
 
 from dataclasses import dataclass
@@ -24,16 +24,16 @@ from sparsestreet.types import Camera, Gaussians
 BOX_MARGIN = 0.01
 """Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""
 COMPENSATION_FLOOR = 0.005
-"""Least antialias compensation (gsplat 1.6): below it the ratio of determinants has no correct digits."""
+"""Least antialias compensation (gsplat 1.6); below it the ratio of determinants has no correct digits."""
 LEAST_OPACITY = 2.0**-126
-"""Smallest normal float32: the fast backends keep log2 of the opacity, of which less is left below."""
+"""Smallest normal float32. The fast backends keep log2 of the opacity, which loses digits below it."""
 DETERMINANT_MIN = 1e-12
-"""px^4. Reached only without blur, by splats so thin that they touch no pixel center; their conic would overflow."""
+"""Least determinant, px^4. Only without blur are splats thinner; they touch no pixel center, their conic overflows."""
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Rows on the screen."""
+    """Rows projected to the screen."""
 
     means: Float[Tensor, "v 2"]
     cholesky: Float[Tensor, "v 3"]
@@ -44,16 +44,16 @@ class Splats:
     reaches: Float[Tensor, " v"]
     """Largest q that is drawn: where alpha falls to alpha_min or the settings' box ends, whichever is nearer."""
     half_boxes: Float[Tensor, "v 2"]
-    """Half sides of the box around the ellipse q = reach, pixels; infinite where nothing ends it."""
+    """Half sides of the box around the ellipse q = reach, pixels; infinite if nothing bounds it."""
     ratios: Float[Tensor, " v"] | None
     """Determinant without blur over that with blur; None without antialias."""
     refusals: dict[Reason, Bool[Tensor, " v"]]
-    """Rows that have no shape on this screen, by what takes it from them."""
+    """Rows without a valid shape on this screen, by reason."""
 
 
 @torch.no_grad()
 def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Int[Tensor, " n"]:
-    """For each row the first ``Reason`` why it is not drawn, or DRAWN. Comparisons are written so that NaN culls."""
+    """The first ``Reason`` why each row is not drawn, or DRAWN. Comparisons are written so that NaN culls."""
     depths = to_camera(gaussians.means, camera)[:, 2]
     reasons = first_reason({Reason.MASKED: ~(gaussians.opacities > 0), Reason.NEAR: ~(depths > settings.near_plane)})
     rows = (reasons == Reason.DRAWN).nonzero().squeeze(-1)
@@ -70,8 +70,8 @@ def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -
 def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Int[Tensor, " v"]:
     """Rows whose box holds a pixel center, nearest first, ties in row order.
 
-    Found before anything is differentiated: a culled row takes no part in the graph, so no infinity of its
-    intermediates can meet a zero cotangent. Raises ValueError for bad values.
+    Culled rows are removed before the graph begins, so that none of their infinities can meet a zero cotangent. Raises
+    ValueError for bad values.
     """
     drawn = row_reasons(gaussians, camera, settings) == Reason.DRAWN
     check_values(gaussians, drawn)
@@ -81,7 +81,7 @@ def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
 
 
 def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings) -> Splats:
-    """Project the given rows, which must lie in front of the camera."""
+    """Projects the given rows, which must lie in front of the camera."""
     in_camera = to_camera(gaussians.means[rows], camera)
     means, factors, refusals = _footprints(gaussians, rows, in_camera, camera, settings)
     determinant, bare = _determinants(factors, settings.eps2d)
@@ -108,9 +108,9 @@ def _rotation(camera: Camera, like: Tensor) -> Float[Tensor, "3 3"]:
 
 
 def to_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3"]:
-    """R ((m - c) - rest), where c + rest is the camera's position with twice the digits of the dtype.
+    """Means in the camera: R ((m - c) - rest), where c + rest is the camera's position with twice the dtype's digits.
 
-    A difference of neighbors far from the origin is exact; R m + t would round two numbers of the world's size.
+    The difference of two near points far from the origin is exact; R m + t would round two large numbers.
     """
     position = exact_position(camera).to(means.device)
     center = position.to(means.dtype)
@@ -119,7 +119,7 @@ def to_camera(means: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 3
 
 
 def axes_in_camera(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera) -> Float[Tensor, "v 3 3"]:
-    """Columns: the rows' own axes times their standard deviations, meters in the camera frame."""
+    """The rows' own axes times their standard deviations, as columns, meters in the camera frame."""
     axes = to_matrix(gaussians.quaternions[rows]) * gaussians.scales[rows][:, None]
     return _rotation(camera, axes) @ axes
 
@@ -131,7 +131,7 @@ def _footprints(
     camera: Camera,
     settings: SplatSettings,
 ) -> tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"], dict[Reason, Bool[Tensor, " v"]]]:
-    """Means and screen factors, and the rows that the lens or the shutter cannot show."""
+    """Means and screen factors, and the rows that lens or shutter cannot show."""
     axes, refusals = axes_in_camera(gaussians, rows, camera), {}
     if camera.distortion is None:
         means, factors = pinhole(in_camera, axes, camera)
@@ -147,14 +147,14 @@ def _footprints(
 
 
 def _determinants(factors: Float[Tensor, "v 2 k"], blur: float) -> tuple[Float[Tensor, " v"], Float[Tensor, " v"]]:
-    """det(V V^T + blur I) and det(V V^T) by Cauchy-Binet: sums of squares, no cancellation for needles."""
+    """det(V V^T + blur I) and det(V V^T) by Cauchy-Binet: sums of squares, without cancellation for needles."""
     products = factors[:, 0, :, None] * factors[:, 1, None]
     bare = (products - products.mT).square().sum((-1, -2)) / 2  # each pair of columns comes twice
     return bare + blur * factors.square().sum((-1, -2)) + blur * blur, bare
 
 
 def _reaches(opacities: Float[Tensor, " v"], settings: SplatSettings) -> Float[Tensor, " v"]:
-    """o exp(-q/2) >= alpha_min needs q <= 2 ln(o / alpha_min); ``box`` standard deviations need q <= box^2."""
+    """Largest q: o exp(-q/2) >= alpha_min needs q <= 2 ln(o / alpha_min), ``max_sigma`` needs q <= max_sigma^2."""
     end = settings.max_sigma * settings.max_sigma
     if settings.alpha_min == 0:
         return torch.full_like(opacities, end)
@@ -162,10 +162,10 @@ def _reaches(opacities: Float[Tensor, " v"], settings: SplatSettings) -> Float[T
 
 
 def _sort_keys(depths: Float[Tensor, " v"], bits: int) -> Float[Tensor, " v"]:
-    """Depths with only the upper ``bits`` of their float32 form; all digits of the dtype for 32."""
+    """Depths with only the upper ``bits`` of their float32 form; for 32 all digits of the dtype."""
     if bits == 32:
         return depths
-    # Positive floats are ordered as their bits are.
+    # Positive floats have the order of their bits.
     return (depths.float().view(torch.int32) & -(1 << (32 - bits))).view(torch.float32)
 
 

@@ -1,4 +1,4 @@
-"""Why a row is not drawn: named, and put in an order."""
+"""The reasons why a row is not drawn, in order."""
 
 from enum import IntEnum
 
@@ -8,19 +8,19 @@ from torch import Tensor
 
 
 class Reason(IntEnum):
-    """In the order in which the projection asks; of several reasons the first counts."""
+    """Reasons in the order in which the projection checks them; the first that holds counts."""
 
     DRAWN = 0
     MASKED = 1
     """Opacity 0."""
     NEAR = 2
-    """At the near plane, before it, or behind the camera."""
+    """At the near plane, nearer, or behind the camera."""
     PAST_FOLD = 3
     """Farther off the axis than the lens polynomial describes."""
     OUTRUNS_SHUTTER = 4
-    """Falls nearly as fast as the image is read."""
+    """Moves down the image nearly as fast as its rows are read."""
     VANISHED = 5
-    """Thinner than the dtype can invert; only without blur."""
+    """Thinner than the dtype can invert, which happens only without blur."""
     OVERFLOWED = 6
     """Larger on the screen than the dtype can hold."""
     FAINT = 7
@@ -30,7 +30,7 @@ class Reason(IntEnum):
 
 
 def first_reason(holds: dict[Reason, Bool[Tensor, " v"]]) -> Int[Tensor, " v"]:
-    """Per row the first reason that holds, DRAWN where none does; at least one reason must be given."""
+    """The first reason that holds for each row, DRAWN if none does; at least one reason must be given."""
     reasons = torch.zeros_like(next(iter(holds.values())), dtype=torch.int64)
     for reason in sorted(holds, reverse=True):
         reasons[holds[reason]] = reason

@@ -1,9 +1,10 @@
-"""A rolling shutter without a second look at any pixel: the moving splat is again one 2D Gaussian.
+"""A rolling shutter that costs nothing per pixel, because the moving splat is again a 2D Gaussian.
 
-Image row y (pixel center at +0.5) is read at tau = y / H - 1/2 of the readout, and the splat's mean is then at
-m + tau u, with u its motion on the screen over the whole readout. As tau is linear in y, the exponent stays a quadratic
-form in the pixel: with A = [[1, -u_x / H], [0, 1 - u_y / H]] the splat's mean m' solves A m' = m - u / 2 and its
-covariance is A^-1 Sigma A^-T.
+Image row y (pixel center at +0.5) is read at tau = y / H - 1/2 of the readout. The splat's mean is then at m + tau u,
+with u its motion on the screen over the whole readout. tau is linear in y, so the exponent stays quadratic in the
+pixel.
+With A = [[1, -u_x / H], [0, 1 - u_y / H]] the splat's mean m' solves A m' = m - u / 2. Its covariance is
+A^-1 Sigma A^-T.
 """
 
 import torch
@@ -15,7 +16,7 @@ from sparsestreet.ops.reference.footprint import Footprint
 from sparsestreet.types import Camera, Gaussians
 
 SLOWEST_READOUT = 0.1
-"""Least a = 1 - u_y / H: a splat that falls nearly as fast as the readout (a = 0) would be stretched without bound."""
+"""Least a = 1 - u_y / H. A splat that moves down as fast as the readout (a = 0) would be stretched without bound."""
 
 
 def screen_motion(
@@ -38,7 +39,7 @@ def screen_motion(
 def read_out(
     means: Float[Tensor, "v 2"], factors: Float[Tensor, "v 2 k"], motion: Float[Tensor, "v 2"], height: int
 ) -> tuple[Footprint, Bool[Tensor, " v"]]:
-    """The splats as the readout records them, and which of them do not outrun it."""
+    """The splats as the readout records them, and whether each of them does not outrun it."""
     slowness = 1 - motion[:, 1] / height
     y = (means[:, 1] - motion[:, 1] / 2) / slowness
     x = means[:, 0] + motion[:, 0] * (y / height - 0.5)

@@ -8,12 +8,12 @@
 4. backward: pixels to a slot per pair (``blend_backward``), slots to rows (``slots``), rows to parameters
    (``rows_backward``, and the backward halves beside each formula).
 
-``screen`` starts the first two stages, ``pixels`` the third and the pixels' half of the fourth, ``rasterizer`` makes an
-autograd function of them. ``quaternions`` and ``vectors`` are what formulas are made of.
+``screen`` runs the first two stages, ``pixels`` the third and the first half of the fourth. ``rasterizer`` makes an
+autograd function of them. ``quaternions`` and ``vectors`` serve all formulas.
 
-The other steps of a training step, a file each: ``poses`` and ``activate`` before the op, ``sky`` and ``ssim`` behind
+Other parts of a training step have a file each: ``poses`` and ``activate`` before the op, ``sky`` and ``ssim`` after
 it, and ``adam``.
 
-No atomics: two runs agree to the last bit, but for the texels of the sky (``sky``). Nothing here is imported before a
-backend "triton" is asked for.
+There are no atomics, so two runs agree to the last bit, except for the texels of the sky (``sky``). Nothing here is
+imported before backend "triton" is used.
 """

@@ -1,8 +1,9 @@
-"""Activation and placement of stored rows and their gradients, one kernel each a part: ``sparsestreet.ops.activate``.
+"""Activation and placement of stored rows, and their gradients, one kernel each per part:
+``sparsestreet.ops.activate``.
 
-A lane is a row; coefficients are copied in tiles of rows and columns, so that neighbors read and write neighbors.
-Gradients of poses are sums over rows: each program adds up its own, instance by instance, and torch adds the programs'.
-No atomics: two runs agree to the last bit.
+A lane is a row. Coefficients are copied in tiles of rows and columns, so that neighboring lanes access neighbors.
+Gradients of poses are sums over rows. Each program adds up its rows by instance, and torch adds the programs. Without
+atomics two runs agree to the last bit.
 """
 
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ from sparsestreet.types import Gaussians
 
 LANES = 128
 COLUMNS = constant(16)
-"""Numbers of a row that are copied at once."""
+"""How many numbers of a row are copied at once."""
 
 
 def activate(parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float) -> Gaussians:
@@ -43,7 +44,7 @@ def activate(parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float) 
 
 
 class _Activate(torch.autograd.Function):
-    """Stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities and coefficients."""
+    """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities, coefficients."""
 
     @staticmethod
     def forward(ctx, terms, logit_limit, *tensors):
@@ -82,16 +83,16 @@ def _parts(tensors: Sequence[Tensor | None]) -> list[_Part]:
 
 
 def _part_backward(ctx, part: _Part, cotangents: list[Tensor]) -> list[Tensor | None]:
-    """Gradients of the inputs of one part, from those of all rows."""
+    """Gradients of a part's inputs from those of all rows."""
     means, turns = part.tensors[0], part.tensors[7]
     gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part.tensors[:7]]
     if turns is None:
-        # Means and quaternions went through as they are.
+        # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
-    # As in torch: an optimizer leaves alone what has no part in the image yet.
+    # As in torch, so that an optimizer skips coefficients that are not in use yet.
     if min(ctx.terms, 1 + part.tensors[5].shape[1]) == 1:
         gradients[5] = None
-    # A line for each program: four numbers of each instance's quaternion, then three of each translation.
+    # One line per program: four numbers of each instance's quaternion, then three of each translation.
     count = 0 if turns is None else len(turns)
     sums = means if turns is None else means.new_zeros(-(-len(means) // LANES), 7 * count)
     written = [means if value is None else value for value in gradients]
@@ -106,7 +107,7 @@ def _part_backward(ctx, part: _Part, cotangents: list[Tensor]) -> list[Tensor | 
 def _launch(kernel: KernelInterface, ctx, part: _Part, *others: Tensor | int) -> None:
     *floats, instances, present = part.tensors
     means, placed = floats[0], present is not None
-    # Means stand for what is not read: multipliers without a mask, all that is about poses without a placement.
+    # Means replace arguments that are not read: multipliers without a mask, and poses without a placement.
     floats = [means if tensor is None else tensor for tensor in floats]
     indices = (instances.contiguous(), present.contiguous().view(torch.uint8)) if placed else (means, means)
     launch(
@@ -117,14 +118,14 @@ def _launch(kernel: KernelInterface, ctx, part: _Part, *others: Tensor | int) ->
 
 @jit
 def opacity_of(logit, limit):
-    """NaN passes the limits, so that it shows."""
+    """Opacity of a limited logit; NaN passes the limits, so that it shows."""
     below = tl.where(logit > limit, limit, logit)
     return 1 / (1 + tl.exp(-tl.where(below < -limit, -limit, below)))
 
 
 @jit
 def tile(row, given, COLUMN: tl.constexpr):
-    """Rows and columns from COLUMN, and which of them are given, of the first coefficient and of the others."""
+    """Rows and columns from COLUMN, and which of them exist, for the first coefficient and for the others."""
     column = COLUMN + tl.arange(0, COLUMNS)[None, :]
     return row[:, None], column, given[:, None] & (column < 3), given[:, None] & (column >= 3)
 
@@ -137,7 +138,7 @@ def activate_rows(
 ):  # fmt: skip
     """``turns``, ``shifts``: quaternions and translations of the instances; ``start``: the first row to write.
 
-    TERMS, STORED: coefficients of a row that are written and that are stored; what is not stored is 0.
+    TERMS, STORED: how many coefficients of a row are written, and stored; those not stored are 0.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given, to = row < rows, start + row
@@ -176,7 +177,7 @@ def activate_rows_backward(
     v_means, v_log_scales, v_quaternions, v_logits, v_dc, v_rest, v_multipliers, sums, count, start, rows, limit,
     TERMS: tl.constexpr, STORED: tl.constexpr, MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Means and quaternions only with a placement, and then ``sums`` [programs, 7 count], which are 0 before."""
+    """Writes gradients; of means, quaternions and poses (``sums`` [programs, 7 count], 0 before) only if PLACED."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given, at = row < rows, start + row
     multiplier = tl.load(multipliers + row, given, 0.0) if MASKED else 1.0

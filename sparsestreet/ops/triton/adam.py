@@ -1,4 +1,4 @@
-"""Adam for the rows that were seen: one lane per number, of rows not seen only the mask is read."""
+"""Adam for the rows that were seen, one lane per number; for other rows only the mask is read."""
 
 from functools import partial
 
@@ -36,7 +36,7 @@ def step_rows_(
         1 - betas[0], betas[1], 1 - betas[1], root, eps, size,
         ROW=numbers // len(parameter), options=OPTIONS,
     )  # fmt: skip
-    # What a kernel writes autograd does not see: a graph that holds old values must refuse its backward pass.
+    # Autograd does not see what a kernel writes, but a graph that holds old values must refuse its backward pass.
     increment_version((parameter, exp_avg, exp_avg_sq))
 
 
@@ -58,7 +58,7 @@ def step_numbers(
     m, v = tl.load(exp_avg + at, seen, 0.0), tl.load(exp_avg_sq + at, seen, 0.0)
     m += share * (g - m)
     v = beta * v + square_share * g * g
-    # Rounded as torch rounds: the pass waits for memory, and the approximate ones would differ by two units.
+    # Rounded as torch rounds. The kernel waits for memory anyway; approximate operations would differ by two units.
     change = size * tl.div_rn(m, tl.div_rn(tl.sqrt_rn(v), root + tl.zeros_like(v)) + eps)
     tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
     tl.store(exp_avg + at, m, seen)

@@ -1,8 +1,8 @@
-"""Forward: each tile's splats, nearest first, into its 256 pixels.
+"""Forward: blends each tile's splats, nearest first, into its 256 pixels.
 
 One warp per tile (or per part of a long one, parts.py) holds 8 pixels per lane in registers, two of each quadrant of
-the tile (quadrants.py), and walks the splats one by one; every number of a splat is one load for all lanes. Of the next
-pair the row is fetched ahead. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
+the tile (quadrants.py). It walks the splats one by one; every number of a splat is one load for all lanes. The row of
+the next pair is fetched ahead. Registers and instructions are bounded in tests/ops/triton/test_machine_code.py.
 """
 
 from functools import partial
@@ -25,20 +25,22 @@ from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
-# Pairs between two looks at whether the whole tile is finished.
+# Number of pairs between two checks whether the whole tile is finished.
 LOOK_LENGTH = 32
 LOOK = constant(LOOK_LENGTH)
 
 
 def registers(exclusive: bool) -> int:
-    """Of a lane: the fewest without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
+    """Fewest registers of a lane without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
     return 88 if exclusive else 80
 
 
 @jit
 def pixels_of(tile, width, height, tiles_x):
-    """Columns and lines of a tile's pixels, and which of them lie in the image; all [256]. For kernels that take all of
-    a tile's pixels at once: they are one axis, so that each version of the compiler gives a lane pixels of one line."""
+    """Columns and lines of a tile's pixels, and which of them lie in the image; all [256].
+
+    For kernels that take all pixels of a tile at once. With one axis, each version of the compiler gives a lane pixels
+    of one line."""
     p = tl.arange(0, PIXELS)
     x = (tile % tiles_x) * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
     y = (tile // tiles_x) * TILE + p % TILE
@@ -47,18 +49,18 @@ def pixels_of(tile, width, height, tiles_x):
 
 @jit
 def part_pixels(part):
-    """Places of a part's pixels in the layers of all parts [256]: line by line, as in the image."""
+    """Indices of a part's pixels in the layers of all parts [256], line by line as in the image."""
     p = tl.arange(0, PIXELS)
     return part * PIXELS + p % TILE * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
 
 
 @jit
 def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr):
-    """Where a quadrant's pixels are written, in the image or in the layers of parts, and which of them; [64]."""
+    """Indices at which a quadrant's pixels are written, in the image or in the layers of parts, and a mask; [64]."""
     x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
     at, inside = y * width + x, (x < width) & (y < height)
     if PARTS:
-        # Pixels outside have a place too, and are written, for they are read.
+        # Pixels outside the image are written too, because they are read.
         at, inside = tl.program_id(0) * PIXELS + y % TILE * TILE + x % TILE, inside | True
     return at, inside
 
@@ -82,10 +84,10 @@ def whitened(s, px, py):
 
 @jit
 def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
-    """Blend weight of a splat, the light that gets past it, and which pixels were open to it.
+    """Blend weight of a splat, the light that passes it, and which pixels were open to it.
 
-    A pixel is finished for good where ``passed`` is at most ``transmittance_min``. The exclusive stop drops the splat
-    that would cross that limit and marks the pixel by the sign: the light itself stays above.
+    A pixel is finished for good when ``passed`` is at most ``transmittance_min``. The exclusive stop drops the splat
+    that would cross that limit, and marks the pixel by the sign, because the light itself stays above.
     """
     alpha = tl.minimum(tl.exp2(exponent), alpha_max)
     drawn = exponent >= cutoff
@@ -106,8 +108,9 @@ def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE:
 def open_quadrant(
     tile, products, firsts, first_pair, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr
 ):
-    """A quadrant before its first splat: the light that reaches its pixels (none of those outside the image), no color,
-    no depth, and the index after the last pair that each pixel was open to."""
+    """A quadrant before its first splat: light, color, depth, and the index after the last pair each pixel was open to.
+
+    Light is 0 for pixels outside the image; color and depth are 0."""
     x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
     passed = tl.where((x < width) & (y < height), 1.0, 0.0)
     if PARTS:
@@ -123,7 +126,7 @@ def blend_quadrant(
     touched, quadrant, x, line, RIGHT: tl.constexpr, splat, k, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
 ):  # fmt: skip
-    """A quadrant behind a splat, which it may touch."""
+    """A quadrant after a splat, which may touch it."""
     passed, red, green, blue, depth, last = quadrant
     if touched:
         geometry, ends, light = splat
@@ -163,17 +166,16 @@ def store_quadrant(
         tl.store(lasts + at, last, inside)
 
 
-# Specialized, sizes of some images would take a register more than there are.
+# Specialized to the sizes of some images, the kernel would need one register too many.
 @partial(jit, do_not_specialize=["width", "height", "tiles_x"])
 def blend_tiles(
     records, pair_rows, begins, ends, order, firsts, products, rgb, transmittance, depth_sum, lasts,
     width, height, tiles_x, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes every pixel of one tile; with PARTS of one part of a tile, into the layers of parts (parts.py), and
-    nothing of a part that is not needed.
+    """Writes every pixel of one tile. With PARTS it writes those of one part, if needed, into the layers (parts.py).
 
-    ``lasts`` (if LASTS): an index after the last pair that a pixel took light from, where backward begins.
+    ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins.
     """
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
@@ -202,7 +204,7 @@ def blend_tiles(
         k = stop
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     if written:
-        # Volatile: the compiler must compute places anew instead of holding registers for them through the loop.
+        # Volatile, so that the compiler computes indices anew instead of keeping them in registers through the loop.
         tile = tl.load(order + tl.program_id(0), volatile=True)
         to, size = (rgb, transmittance, depth_sum, lasts), (width, height, tiles_x)
         store_quadrant(q0, tile, *to, *size, 0, DEPTH, LASTS, PARTS)

@@ -1,8 +1,9 @@
-"""Backward, from the last splat of a pixel to the first: dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light
-from behind k), where f = color and depth against the cotangents. The light from behind is summed from the back, its
-small terms first, and the transmittance before a splat is that after it / (1 - alpha): both keep their relative digits
-however deep the stack. (Total minus prefix, from the front, would carry the rounding of the total to the faintest
-splat.) Each pair writes its own slot: no atomics.
+"""Backward, from the last splat of a pixel to the first.
+
+dLoss/d(ln alpha_k) = w_k f_k - alpha_k / (1 - alpha_k) (light from behind k), where f is the product of color and depth
+with the cotangents. The light from behind is summed from the back, small terms first. The transmittance before a splat
+is that after it / (1 - alpha). Both keep their relative digits for any depth of the stack. (From the front, total minus
+prefix would carry the rounding of the total to the faintest splat.) Each pair writes its own slot, without atomics.
 
 A slot holds, with s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d and w the blend weight, the sums over pixels of
 s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + l22 b)|; w times the cotangents.
@@ -33,21 +34,25 @@ ZEROED = constant(16)
 
 
 def registers(depth: bool) -> int:
-    """Of a lane: the fewest without spills. A multiprocessor runs 20 warps with up to 96 registers, 16 with to 128."""
+    """Fewest registers of a lane without spills. A multiprocessor runs 20 warps with up to 96 registers, 16 with
+    128."""
     return 104 if depth else 96
 
 
 @jit
 def halved(low, high, lane, BIT: tl.constexpr):
-    """Lanes without BIT keep ``low`` and those with it ``high``, each with the same of its partner added."""
+    """Lanes without BIT return ``low``, those with it ``high``, each plus the same value of its partner lane."""
     upper = (lane & BIT) != 0
     return tl.where(upper, high, low) + tl.gather(tl.where(upper, low, high), lane ^ BIT, 0)
 
 
 @jit
 def store_sums(to, s):
-    """Sums over the warp of each lane's twelve numbers, in a fixed order. Every exchange between lanes halves how many
-    numbers a lane still holds: 13 exchanges, where a sum of each number alone would take 60."""
+    """Stores the sums over the warp of each lane's twelve numbers, added in a fixed order.
+
+    Every exchange between lanes halves how many numbers a lane still holds. This takes 13 exchanges; summing each
+    number
+    alone would take 60."""
     lane = tl.arange(0, WARP)
     s0, s1, s2 = halved(s[0], s[6], lane, 16), halved(s[1], s[7], lane, 16), halved(s[2], s[8], lane, 16)
     s3, s4, s5 = halved(s[3], s[9], lane, 16), halved(s[4], s[10], lane, 16), halved(s[5], s[11], lane, 16)
@@ -63,7 +68,8 @@ def store_sums(to, s):
 
 @jit
 def zero_slots(slots, pair_slots, begin, end, COUNT: tl.constexpr):
-    """Pairs behind the last one that was looked at: in a closed tile most of them. Lanes side by side write a slot."""
+    """Zeroes the slots of pairs after the last visited one (most pairs in a closed tile); adjacent lanes share a
+    slot."""
     field = tl.arange(0, 16)[None, :]
     for k in range(begin, end, ZEROED):
         pair = k + tl.arange(0, ZEROED)
@@ -77,7 +83,7 @@ def alpha_behind(exponent, cutoff, k, last, alpha_max):
     raw = tl.exp2(exponent)
     drawn = (exponent >= cutoff) & (k < last)
     alpha = tl.where(drawn, tl.minimum(raw, alpha_max), 0.0)
-    # The device's reciprocal root is good to 2^-22.9; one Newton step, so that no drift builds up over a stack.
+    # The device's reciprocal root is exact to 2^-22.9. One Newton step keeps errors from adding up over a stack.
     rest = 1.0 - alpha
     root = tl.rsqrt(rest)
     inverse = root * root
@@ -86,7 +92,7 @@ def alpha_behind(exponent, cutoff, k, last, alpha_max):
 
 @jit
 def light_behind(part_rgb, part_depth, nexts, v, at, DEPTH: tl.constexpr):
-    """Light of the parts of the tile behind this one, against the cotangents; ``at``: places in this part's layer."""
+    """Light of the tile's parts behind this one times the cotangents; ``at``: indices in this part's layer."""
     part = tl.program_id(0)
     light = tl.zeros_like(v[0])
     for after in range(part + 1, tl.load(nexts + part)):
@@ -104,8 +110,9 @@ def last_quadrant(
     nexts, part_rgb, part_depth, part_transmittance, part_lasts, width, height, tiles_x,
     QUADRANT: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
-    """A quadrant behind its last splat: the light that is left and the light behind against the cotangents; then what
-    stays the same, the cotangents of color and depth and the index after the last pair of each pixel."""
+    """A quadrant after its last splat: the light left, and the light behind times the cotangents.
+
+    Then what stays the same: the cotangents of color and depth, and the index after the last pair of each pixel."""
     at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, False)
     red = tl.load(v_rgb + 3 * at, inside, 0.0)
     green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
@@ -127,8 +134,9 @@ def differentiate_quadrant(
     touched, quadrant, v, last, sums, x, line, RIGHT: tl.constexpr, splat, k, alpha_max,
     DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr,
 ):  # fmt: skip
-    """The quadrant before a splat, and the splat's sums with those over this quadrant: within a lane, whose pixels
-    share y, all that x changes."""
+    """The quadrant before a splat, and the splat's sums with this quadrant's added.
+
+    Within a lane, whose pixels share y, the sums cover everything that depends on x."""
     passed, behind = quadrant
     s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = sums
     if touched:
@@ -183,8 +191,8 @@ def blend_tiles_backward(
     q3, v3, last3 = last_quadrant(*given, *part, *size, 3, DEPTH, PARTS)
     x, y = centers(tile, tiles_x)
     latest = tl.max(tl.maximum(tl.maximum(last0, last1), tl.maximum(last2, last3)))
-    # Of a split tile no pair is this program's: its ``lasts`` are those of the parts put together. Of a part that is
-    # not needed nothing was written.
+    # A split tile leaves no pair to this program: its ``lasts`` are those of all parts together. A part that is not
+    # needed has written nothing.
     latest = tl.maximum(tl.minimum(latest, end), begin)
     zero_slots(slots, pair_slots, latest, end, SLOT)
     pair = tl.load(pair_rows + latest - 1, latest > begin, 0)

@@ -1,8 +1,9 @@
-"""Rows of many numbers: read and written by lanes side by side, then one row per lane.
+"""Rows of many numbers: adjacent lanes read and write them together, then each lane holds one row.
 
-Where each lane walks a row of 192 bytes by itself, every load touches 32 sectors of 32 bytes and takes 4 of each. Here
-neighboring lanes take neighboring numbers of a tile [rows, columns], and the compiler hands the columns to the rows'
-lanes through shared memory: one exchange per tile, the splits are registers.
+If each lane walks a row of 192 bytes by itself, every load touches 32 sectors of 32 bytes and uses 4 bytes of each.
+Here
+neighboring lanes take neighboring numbers of a tile [rows, columns]. The compiler passes the columns to the rows' lanes
+through shared memory, one exchange per tile; the splits stay in registers.
 """
 
 import triton
@@ -19,7 +20,7 @@ def load_columns(table, row, mask, COUNT: tl.constexpr):
     """COUNT numbers of each lane's row; 0 where the mask is off."""
     width: tl.constexpr = 16 if COUNT % 16 == 0 else triton.next_power_of_2(COUNT)
     tiles = ()
-    # All are asked for before any is waited for.
+    # All loads start before the first is waited for.
     for first in tl.static_range(0, COUNT, width):
         column = (first + tl.arange(0, width))[None, :]
         tiles += (tl.load(table + row[:, None] * COUNT + column, mask[:, None] & (column < COUNT), 0.0),)
@@ -45,7 +46,7 @@ def store_columns(table, row, values, mask, COUNT: tl.constexpr):
 def unzipped(tile, WIDTH: tl.constexpr):
     """The columns of a tile [rows, WIDTH]."""
     parts = (tile,)
-    # Halves of halves: each level has twice as many parts of half the width.
+    # Each level has twice the parts of half the width.
     for level in tl.static_range(LEVELS):
         if WIDTH >> level > 1:
             halves = ()

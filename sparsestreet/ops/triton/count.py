@@ -1,5 +1,7 @@
-"""What each row adds to a view: sum of weights, touched pixels, dominated pixels. A pass of its own, so that training
-does not pay for it; slots instead of atomics, as in backward."""
+"""What each row adds to a view: sum of weights, touched pixels, dominated pixels.
+
+It is a separate pass, so that training does not pay for it. Like backward it writes slots instead of using atomics.
+"""
 
 import triton.language as tl
 
@@ -35,7 +37,7 @@ def count_tiles_pixels(
             _, _, _, _, exponent = whitened(s, px, py)
             cutoff = tl.load(s + record.CUTOFF)
             weight, passed, _ = blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE)
-            # Strictly more: of equal weights the nearer splat keeps the pixel.
+            # Strictly more, so that of equal weights the nearer splat keeps the pixel.
             more = weight > best
             best, best_pair = tl.where(more, weight, best), tl.where(more, i, best_pair)
             o = slots + tl.load(pair_slots + i) * COUNTERS

@@ -1,4 +1,4 @@
-"""What kernels are written with: functions for the GPU, and numbers that are known when they are compiled."""
+"""The language of kernels: functions for the GPU, and constants known at compile time."""
 
 import inspect
 from collections.abc import Callable
@@ -12,10 +12,10 @@ _INTERPRETED = triton.knobs.runtime.interpret
 
 
 def jit(function: Callable, **options: Any) -> KernelInterface:
-    """triton.jit of the function as it is written: a type checker wrapped around it would hide its globals.
+    """Applies triton.jit to the bare function, because a type checker wrapped around it would hide its globals.
 
-    Counts that change from one rendering to the next belong in ``do_not_specialize``: the compiler would make a kernel
-    for multiples of 16, one for 1 and one for the rest.
+    Counts that change between renderings belong in ``do_not_specialize``. Otherwise the compiler makes one kernel for
+    multiples of 16, one for 1 and one for the rest.
     """
     return triton.jit(inspect.unwrap(function), **options)
 
@@ -23,7 +23,7 @@ def jit(function: Callable, **options: Any) -> KernelInterface:
 def constant(value: int | float | tuple[float, ...]) -> int | float | tuple[float, ...] | tl.constexpr:
     """A global number (or tuple of numbers) for kernels, wrapped as the compiler wants it.
 
-    Triton's interpreter gets it as it is: there a wrapped number times a tensor would be wrapped again, and no function
-    takes that.
+    Triton's interpreter gets the bare number. There a wrapped number times a tensor would be wrapped again, which no
+    function takes.
     """
     return value if _INTERPRETED else tl.constexpr(value)

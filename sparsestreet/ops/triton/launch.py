@@ -1,8 +1,8 @@
-"""How kernels are started: one place, so that tests can see what is compiled for what.
+"""Launches kernels in one place, so that tests can see what is compiled for which arguments.
 
-Triton binds the arguments of each launch to names, specializes them and looks the kernel up by a text of all that,
-which takes the host longer than many a kernel takes the device. A launch like an earlier one goes to the compiled
-kernel at once.
+For each launch Triton binds the arguments to names, specializes them, and looks up the kernel by a string of the
+result.
+This takes the host longer than many kernels take the device. Here a repeated launch calls the compiled kernel directly.
 """
 
 import warnings
@@ -20,8 +20,10 @@ from triton.runtime.interpreter import InterpretedFunction
 from triton.runtime.jit import KernelInterface
 
 _KNOWN = ("3.6.", "3.7.")
-"""Versions of Triton whose specialization ``_kinds`` is no coarser than, and whose compiled kernels take the grid,
-what hooks get, and then all arguments: tensors by address, and constants too."""
+"""Versions of Triton for which a direct call is known to work.
+
+``_kinds`` is no coarser than their specialization. Their compiled kernels take the grid, what hooks get, and then all
+arguments: tensors by address, and constants too."""
 _INT32 = 1 << 31
 _COMPILED: dict[tuple, CompiledKernel] = {}
 
@@ -34,20 +36,20 @@ def launch(
     options: dict[str, Any] | None = None,
     **constants: Any,
 ) -> None:
-    """Run ``kernel`` over ``items`` in programs of ``block``, given to it as BLOCK; nothing runs for no items.
+    """Runs ``kernel`` over ``items`` in programs of ``block``, passed as BLOCK; without items nothing runs.
 
-    The first of ``arguments`` must be a tensor. ``constants`` are all others that the kernel takes, ``options`` the
-    compiler's (num_warps, maxnreg, enable_fp_fusion). Raises TypeError for arguments that are no tensors, ints or
-    floats.
+    The first of ``arguments`` must be a tensor. ``constants`` are the kernel's other constants, ``options`` those of
+    the
+    compiler (num_warps, maxnreg, enable_fp_fusion). Raises TypeError for arguments other than tensors, ints and floats.
     """
     if not items:
         return
     grid, options, constants = (-(-items // block), 1, 1), options or {}, constants | {"BLOCK": block}
-    # Addresses are what a kernel gets of tensors; of a tensor, its launcher would ask the driver where it lies.
+    # Tensors are passed by address; for a tensor the launcher would ask the driver where it lies.
     given = [value.data_ptr() if isinstance(value, Tensor) else value for value in arguments]
     key = (kernel.fn, *_kinds(arguments, given), *constants.items(), *options.items())
     if is_interpreted(kernel):
-        # NumPy, which the interpreter computes in, would warn of infinities in lanes that are masked off.
+        # The interpreter computes in NumPy, which would warn of infinities in masked lanes.
         with np.errstate(all="ignore"):
             kernel[grid](*arguments, **constants, **options)
         return
@@ -56,11 +58,11 @@ def launch(
     elsewhere = device >= 0 and device != torch.cuda.current_device()
     with torch.cuda.device(device) if elsewhere else nullcontext():
         if compiled is not None:
-            # Constants fill their places in the signature; the machine code has them already.
+            # Constants only fill their places in the signature; the machine code has them already.
             _start(compiled, device, grid, (*given, *constants.values()))
             return
         compiled = kernel[grid](*arguments, **constants, **options)
-    # A hook of Triton's may have kept it from compiling.
+    # A hook of Triton may have prevented the compilation.
     if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
         _COMPILED[key] = compiled
 
@@ -70,14 +72,15 @@ def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], ar
     if hooks.launch_enter_hook.calls or hooks.launch_exit_hook.calls:
         compiled[grid](*arguments)
     else:
-        # What that comes to where nobody watches launches.
+        # The same call without hooks.
         stream = driver.active.get_current_stream(device)
         compiled.run(*grid, stream, compiled.function, compiled.packed_metadata, None, None, None, *arguments)
 
 
 def _kinds(arguments: tuple, given: list) -> list[tuple[object, ...] | type]:
-    """What a kernel is compiled for of its arguments, ``given`` as they are or by address: never less than what Triton
-    specializes, and the device."""
+    """The properties of arguments (``given`` by value or address) that select a compiled kernel.
+
+    They are at least as fine as Triton's specialization, and include the device."""
     return [
         (value.dtype, value.get_device(), number % 16 == 0)
         if value is not number

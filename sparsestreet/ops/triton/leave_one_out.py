@@ -1,5 +1,7 @@
-"""How far a view moves when one row alone is taken away. A pixel is linear in the alpha of each of its splats, so the
-change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha); from the back to the front, as backward.
+"""How much a view changes when one row alone is removed.
+
+A pixel is linear in the alpha of each of its splats, so the change is exactly
+-alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha). Like backward it runs from the back to the front.
 """
 
 import triton.language as tl
@@ -16,7 +18,7 @@ CHANGES = constant(CHANGE_COUNT)
 
 @jit
 def light_of(background, passed, at, inside, CHANNEL: tl.constexpr, BEHIND: tl.constexpr):
-    """One channel of what is behind everything, as it is seen."""
+    """One channel of the background's light that passes all splats."""
     light = tl.zeros_like(passed)
     if BEHIND:
         light = passed * tl.load(background + 3 * at + CHANNEL, inside, 0.0)

@@ -1,8 +1,8 @@
 """Visible rows by depth, and the tiles' lists of splats in that order.
 
-Rows are sorted by depth first and pairs then stably by their tile's short key: a fraction of the traffic of sorting
-long keys. A pair keeps its number from before the second sort, so the pairs of a row have neighboring numbers: these
-are the slots its gradient is summed from.
+Rows are sorted by depth first, then pairs stably by their tile's short key. This takes a fraction of the traffic of
+sorting long keys. A pair keeps its number from before the second sort, so the pairs of a row have neighboring numbers.
+These are the slots from which the row's gradient is summed.
 """
 
 from dataclasses import dataclass
@@ -24,34 +24,34 @@ from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
 from sparsestreet.ops.triton.view import KernelView
 
 PAIR_LIMIT = 1 << 28
-"""(splat, tile) pairs of one rendering. Each takes 34 bytes while they are sorted (torch 2.11, H100; 40 above 32,768
-tiles), 12 of them kept for the backward pass, which takes 48 more: 9 and 16 GB at the limit."""
+"""Most (splat, tile) pairs of one rendering. A pair takes 34 bytes while sorting (torch 2.11, H100; 40 above 32,768
+tiles). 12 of them are kept for the backward pass, which takes 48 more: 9 and 16 GB at the limit."""
 _SHORT_KEYS = 1 << 15
 _BLOCK = 256
 _LANES = 2
-"""Lanes of a splat where pairs are listed: most reach one or two rows of tiles."""
+"""Lanes per splat in the listing of pairs, because most splats reach one or two rows of tiles."""
 GIANT = constant(32)
 """Splats that cover at least this many tiles get a warp each."""
 
 
 @dataclass(frozen=True)
 class Lists:
-    """Who is drawn where: v visible rows, p (splat, tile) pairs, t tiles."""
+    """The tiles' lists of splats: v visible rows, p (splat, tile) pairs, t tiles."""
 
     rows: Int[Tensor, " v"]
     """Visible rows, nearest first."""
     first_pairs: Int[Tensor, " v"]
     tile_counts: Int[Tensor, " v"]
     pair_rows: Int[Tensor, " p"]
-    """Rows of the pairs tile by tile, nearest first, and the quadrants of the tile that each touches (quadrants.py)."""
+    """Row of each pair, tile by tile, nearest first, with the quadrants of the tile that it touches (quadrants.py)."""
     slots: Int[Tensor, " p"]
-    """Number of each of those pairs before it was sorted by tile."""
+    """Number of each of those pairs before the sort by tile."""
     begins: Int[Tensor, " t"]
     ends: Int[Tensor, " t"]
     order: Int[Tensor, " t"]
-    """Tiles by the power of two of their number of pairs, the longest first: they must not start last."""
+    """Tiles by the power of two of their number of pairs, longest first, because long ones must not start last."""
     parts: Parts | None
-    """Room for the parts of long tiles, empty where there are none; None where no tile can be long."""
+    """Room for the parts of long tiles, empty if there are none; None if no tile can be long."""
 
     @property
     def rows_of_pairs(self) -> Int[Tensor, " p"]:
@@ -71,7 +71,7 @@ def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: 
     given = row < row_count
     seen = given & (tl.load(tile_counts + row, given, 0) > 0)
     place = tl.load(places + row, seen, 1) - 1
-    # Bits of a positive float order as the float does.
+    # The bits of positive floats have the order of the floats.
     depth = tl.load(record.record_of(records, row) + record.DEPTH, seen, 1.0)
     tl.store(keys + place, depth.to(tl.int32, bitcast=True) & KEY_MASK, seen)
     tl.store(rows + place, row, seen)
@@ -79,7 +79,7 @@ def list_visible(records, tile_counts, places, keys, rows, row_count, KEY_MASK: 
 
 @partial(jit, do_not_specialize=["visible"])
 def list_counts(tile_counts, unsorted_rows, order, rows, counts, first_pairs, visible, BLOCK: tl.constexpr):
-    """Rows in the ``order`` of their depths, and how many pairs each has; 0 as the first of ``first_pairs``."""
+    """Rows in the ``order`` of their depths, and the number of pairs of each; sets ``first_pairs[0]`` to 0."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = rank < visible
     row = tl.load(unsorted_rows + tl.load(order + rank, given, 0), given, 0)
@@ -120,8 +120,10 @@ def list_pairs(
     records, rows, counts, first_pairs, keys, pair_rows, visible, width, height, tiles_x,
     BOUNDED: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tile of each pair, and its row with the quadrants it touches (quadrants.py): pair i of a row lies in the i-th
-    tile of its splat, counted row of tiles by row. Giants get a warp each: nobody else is to wait for them."""
+    """Writes the tile of each pair, and its row with the quadrants it touches (quadrants.py).
+
+    Pair i of a row lies in the i-th tile of its splat, counted along rows of tiles. Giants get a warp each, so that no
+    other splat waits for them."""
     lane = tl.arange(0, LANES)[None, :]
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None] + 0 * lane
     count = tl.load(counts + rank, rank < visible, 0)
@@ -152,14 +154,15 @@ def bound_tiles(
     keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, classes, pairs, tiles, steps, whole,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Rows of the sorted pairs, where each tile's pairs begin and end, and the class of its length: a program does its
-    share of both."""
+    """Rows of the sorted pairs; where each tile's pairs begin and end, and the class of its length.
+
+    Each program does its share of pairs and of tiles."""
     start = tl.program_id(0) * BLOCK
     pair = start + tl.arange(0, BLOCK)
     row = tl.load(unsorted_rows + tl.load(slots + pair, pair < pairs, 0), pair < pairs, 0)
     tl.store(pair_rows + pair, row, pair < pairs)
     if start < tiles:
-        # Both searches at once: each step of one waits for its load.
+        # Both searches run together, because each step of one waits for its load.
         end = tl.arange(0, 2)[:, None]
         tile = start + tl.arange(0, BLOCK)[None, :] + 0 * end
         bound = first_at_least(keys, tile + end, pairs, steps)
@@ -175,9 +178,9 @@ def bound_tiles(
 def list_tiles(
     records: Tensor, tile_counts: Tensor, places: Tensor, visible: int, pairs: int, view: KernelView
 ) -> Lists:
-    """Sort rows and pairs; ``visible`` and ``pairs`` are the numbers of both, already checked.
+    """Sorts rows and pairs; ``visible`` and ``pairs`` are the numbers of both, already checked.
 
-    The device has nothing else to do meanwhile: every call between two kernels of ours is a gap.
+    The device has nothing else to do, so every host call between two of our kernels is a gap.
     """
     rows, counts, first_pairs = _rows_by_depth(records, tile_counts, places, visible, view)
     columns, lines = view.tiles
@@ -197,7 +200,7 @@ def list_tiles(
         keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, classes, pairs, len(lengths), pairs.bit_length(),
         2 * part_length(pairs),
     )  # fmt: skip
-    # Of one class neighbors follow each other: they share splats, which the caches then still hold.
+    # Within a class neighboring tiles follow each other. They share splats, which are then still in the caches.
     order = torch.sort(classes, descending=True, stable=True).indices.int()
     parts = split_tiles(begins, ends, order, lengths, pairs)
     return Lists(rows, first_pairs, counts, pair_rows, slots, begins, ends, order, parts)

@@ -1,12 +1,14 @@
 """Long tiles in parts, so that a few deep tiles do not keep the device waiting for one warp each.
 
-A part's start is what the parts before it let through. The light that a part alone lets through is computed for all
-parts at once (``thin_parts``); every part is then blended from its true start, with the stop rule of the whole tile,
-and the sums are put together (``merge_parts``). The image is that of the tile in one piece, but for the rounding of
-products and sums. Backward, the light behind a part is the sum of the parts behind it.
+A part starts with the light that the parts before it let through. ``thin_parts`` computes the light that each part
+alone
+lets through, for all parts at once. Then every part is blended from its true start, with the stop rule of the whole
+tile, and ``merge_parts`` adds up the parts. The image differs from that of an unsplit tile only by rounding. In
+backward
+the light behind a part is the sum of the parts behind it.
 
-A tile is not split before it is much longer than the device's share of all pairs: the parts' transmittance is computed
-twice, which pays only where others would wait.
+A tile is split only if it is much longer than the device's share of all pairs. The parts' transmittance is computed
+twice, which pays only if other warps would wait.
 """
 
 from dataclasses import dataclass
@@ -25,16 +27,18 @@ from sparsestreet.ops.triton.quadrants import row_of
 from sparsestreet.ops.triton.search import first_at_least
 
 PART_LENGTH = 256
-"""Least pairs of a part; none has more than one and a half times as many."""
+"""Least number of pairs of a part; no part has more than one and a half times this."""
 PART_LIMIT = 4096
-"""Most parts of a view: somewhat more than the warps that a large GPU runs at once (20 to 24 on each of its 108 to 132
-multiprocessors), so that no part takes longer than the device's share of the whole view. 7 kB each."""
+"""Most parts of a view, 7 kB each.
+
+It is a little more than the warps that a large GPU runs at once (20 to 24 on each of 108 to 132 multiprocessors). So no
+part takes longer than the device's share of the whole view."""
 _BLOCK = 128
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Which pairs of which tile each part holds. Those beyond the last needed one are empty and nobody reads them."""
+    """The tile and the pairs of each part. Parts after the last needed one are empty and never read."""
 
     tiles: Int[Tensor, " s"]
     begins: Int[Tensor, " s"]
@@ -52,7 +56,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class PartLayers:
-    """What each part adds to its tile's pixels (as in ``Raster``), and what is left behind it."""
+    """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
 
     products: Float[Tensor, "s 256"]
     """Light that the part alone lets through."""
@@ -72,10 +76,11 @@ class PartLayers:
 
 
 def part_length(pairs: int) -> int:
-    """Least pairs of a part of a view with so many; a tile of twice as many is split.
+    """Least number of pairs of a part, for a view with ``pairs``; a tile with twice that many is split.
 
-    So none is split of 2,400 tiles (960x640) and more that are much alike: a part does not know which of its pixels the
-    parts before it have closed, and what an opaque tile hides is computed once for nothing.
+    Views of 2,400 tiles (960x640) or more of similar length have no split tile. A part does not know which of its
+    pixels
+    earlier parts have closed, so in an opaque tile it computes hidden splats once in vain.
     """
     return max(PART_LENGTH, -(-pairs // PART_LIMIT))
 
@@ -83,16 +88,16 @@ def part_length(pairs: int) -> int:
 def split_tiles(
     begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], order: Int[Tensor, " t"], lengths: Int[Tensor, " t"], pairs: int
 ) -> Parts | None:
-    """Parts of all tiles that are long enough for two; None if the pairs are too few for one.
+    """Parts of all tiles that are long enough for two; None if there are too few pairs for that.
 
-    ``order`` holds the tiles, those that are split first, and ``lengths`` the number of pairs of each tile. Does not
-    wait for the device: there is room for the most parts that so many pairs could need.
+    ``order`` holds the tiles, split ones first, and ``lengths`` the number of pairs of each tile. It does not wait for
+    the device, but makes room for the most parts that this number of pairs could need.
     """
     length = part_length(pairs)
     most = pairs // length
     if most < 2:
         return None
-    # No more tiles can have two parts. Those too short for two come last, so they move no part of the others.
+    # No more tiles can have two parts. Tiles too short for two come last, so they do not shift the parts of others.
     nexts = (lengths.index_select(0, order[: most // 2]) // length).cumsum(0, dtype=torch.int32)
     parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends))
     launch(
@@ -109,14 +114,14 @@ def list_parts(
     begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends,
     tile_count, split_count, steps, part_count, length, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One lane a part and a tile. ``split_nexts``: the part after the last one of each of the first tiles in order."""
+    """One lane per part and per tile. ``split_nexts``: the part after the last of each of the first tiles in order."""
     number = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = number < tile_count
     tile = tl.load(order + number, given, 0)
     begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
     tl.store(whole_ends + tile, tl.where(end - begin < 2 * length, end, begin), given)
 
-    # The first tile whose parts end behind this one.
+    # The first tile whose parts end after this one.
     rank = first_at_least(split_nexts, number + 1, split_count, steps)
     tile = tl.load(order + rank, rank < split_count, 0)
     pairs = tl.load(lengths + tile, rank < split_count, 0)
@@ -124,7 +129,7 @@ def list_parts(
     tile, count = tl.where(used, tile, 0), tl.where(used, pairs // length, 1)
     first = tl.where(used, tl.load(split_nexts + rank, used, 0) - count, number)
     share = tl.cdiv(pairs, count)
-    # Rounded up, the shares may leave nothing for the last parts: these are not needed, and nobody reads them.
+    # Shares are rounded up, so the last parts may get nothing; these are not needed and never read.
     next_part = tl.where(used, first + tl.cdiv(pairs, tl.maximum(share, 1)), number)
     end = tl.load(ends + tile, used, 0)
     begin = tl.minimum(tl.load(begins + tile, used, 0) + (number - first) * share, end)
@@ -141,7 +146,7 @@ def thin_parts(
     records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each needed part, or something below the limit where it falls there."""
+    """Writes the product of 1 - alpha over each needed part, or some value below the limit once it is below."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
     x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
@@ -168,7 +173,7 @@ def merge_parts(
     rgb, transmittance, depth_sum, lasts, width, height, tiles_x, transmittance_min,
     LASTS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the pixels of each split tile: one program a part, of which only a tile's first one does anything."""
+    """Writes the pixels of each split tile. There is one program per part; only that of a tile's first part works."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
     x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
@@ -182,7 +187,7 @@ def merge_parts(
         green += tl.load(part_rgb + 3 * at + 1)
         blue += tl.load(part_rgb + 3 * at + 2)
         depth += tl.load(part_depth + at)
-        # Parts that begin behind a pixel's end say nothing of it.
+        # Parts that begin after a pixel's end do not contribute to it.
         reached = passed > transmittance_min
         rest = tl.where(reached, tl.load(part_transmittance + at), rest)
         if LASTS:

@@ -1,4 +1,4 @@
-"""Which pixel kernels run for a view: one over whole tiles, and where there may be long ones, some over parts."""
+"""Runs the pixel kernels of a view: one over whole tiles and, if there may be long ones, some over parts."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class Ends:
 
     transmittance: Float[Tensor, "h w"]
     lasts: Int[Tensor, "h w"] | None
-    """Index after the last pair that each pixel was open to; None if no backward pass was to follow."""
+    """Index after the last pair that each pixel was open to; None if no backward pass was expected."""
     parts: PartLayers | None
 
 
@@ -35,7 +35,7 @@ class Layers:
 
 @dataclass(frozen=True)
 class Cotangents:
-    """dLoss/d of the layers; a missing one is 0."""
+    """Derivatives of the loss by the layers; a missing one is 0."""
 
     rgb: Float[Tensor, "h w 3"]
     transmittance: Float[Tensor, "h w"]
@@ -43,7 +43,7 @@ class Cotangents:
 
 
 def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
-    """Blend all tiles; ``lasts``: whether a backward pass will follow."""
+    """Blends all tiles; ``lasts``: whether a backward pass will follow."""
     lists, shape, limit = screen.lists, (view.camera.height, view.camera.width), view.transmittance_min
     rgb = screen.records.new_empty(*shape, 3)
     transmittance, depth_sum = screen.records.new_empty(shape), screen.records.new_empty(shape)
@@ -82,7 +82,7 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
 def differentiate_view(
     screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
 ) -> Float[Tensor, "p 12"]:
-    """A slot of gradients for each pair; ``absolute``: those of the screen means' magnitudes as well."""
+    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
     slots = passed.new_empty(len(lists.slots), blend_backward.SLOT_LENGTH)
 

@@ -1,6 +1,6 @@
 """Poses of moving objects at a time and their gradients, one kernel each: ``sparsestreet.ops.poses``.
 
-A lane is an instance. Backward computes the pose once more, and writes the gradients of all of its keyframes.
+A lane is an instance. Backward computes the pose again, and writes the gradients of all its keyframes.
 """
 
 from functools import partial
@@ -52,7 +52,7 @@ def poses_at(
 
 
 class _Poses(torch.autograd.Function):
-    """Corrections of all keyframes to one pose per instance."""
+    """Maps the corrections of all keyframes to one pose per instance."""
 
     @staticmethod
     def forward(ctx, rotation_deltas, translation_deltas, table, centers, time, max_gap):
@@ -89,7 +89,8 @@ class _Poses(torch.autograd.Function):
 
 @jit
 def bracket(times, valid, spans, instance, given, length, time):
-    """The keyframes around a time, where it is between them, its distance to the nearest keyframe and to the span."""
+    """The keyframes around a time, the fraction between them, and the distances to the nearest keyframe and the
+    span."""
     count, before = tl.zeros_like(instance), tl.zeros_like(instance)
     nearest = tl.zeros_like(instance).to(tl.float32) + float("inf")
     for k in range(length):
@@ -111,7 +112,7 @@ def bracket(times, valid, spans, instance, given, length, time):
 
 @jit
 def half_turn(vector):
-    """Half a rotation vector; of its length h sin(h) / h, cos(h), and the derivative of the first by h over h."""
+    """Half a rotation vector; with its length h also sin(h) / h, cos(h), and the first one's derivative by h over h."""
     half = scaled(0.5, vector)
     squared = dot(half, half)
     small = squared < SMALL
@@ -124,7 +125,7 @@ def half_turn(vector):
 
 @jit
 def corrected(quaternions, rotation_deltas, keyframe, given):
-    """A keyframe's corrected rotation as a unit quaternion, and 1 over the length it had."""
+    """A keyframe's corrected rotation as a unit quaternion, and the inverse of its former length."""
     half, sinc, cosine, _ = half_turn(load_row(rotation_deltas, keyframe, given, 3))
     correction = (cosine, sinc * half[0], sinc * half[1], sinc * half[2])
     return unit_quaternion(multiply(load_row(quaternions, keyframe, given, 4), correction))
@@ -167,7 +168,7 @@ def interpolate(
     times, valid, spans, quaternions, centers, rotation_deltas, translation_deltas,
     out_quaternions, out_translations, present, instances, length, time, reach, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``reach``: farthest distance in time to the nearest keyframe at which an instance is present."""
+    """``reach``: largest distance in time to the nearest keyframe at which an instance is present."""
     instance = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = instance < instances
     lower, upper, fraction, nearest, outside = bracket(times, valid, spans, instance, given, length, time)
@@ -186,7 +187,7 @@ def interpolate(
 
 @jit
 def shared(is_a, a, is_b, b):
-    """The sum of those of two vectors that a keyframe gets."""
+    """The sum of vectors ``a`` (if ``is_a``) and ``b`` (if ``is_b``)."""
     return (
         tl.where(is_a, a[0], 0.0) + tl.where(is_b, b[0], 0.0),
         tl.where(is_a, a[1], 0.0) + tl.where(is_b, b[1], 0.0),
@@ -199,7 +200,7 @@ def interpolate_backward(
     times, valid, spans, quaternions, rotation_deltas, v_quaternions, v_translations,
     v_rotation_deltas, v_translation_deltas, instances, length, time, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of all corrections: 0 but at the two keyframes around the time, which may be one."""
+    """Gradients of all corrections: 0 except at the two keyframes around the time, which may be the same."""
     instance = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = instance < instances
     lower, upper, fraction, _, _ = bracket(times, valid, spans, instance, given, length, time)

@@ -1,8 +1,9 @@
 """A tile's four quadrants of 8x8 pixels: top left, top right, bottom left, bottom right.
 
-Splats are smaller than tiles more often than not, so each pair says which quadrants of its tile the splat can touch,
-and pixel kernels pass over the others. A warp holds two pixels of each quadrant in a lane, both in one line, so that
-what only y changes is computed once.
+Most splats are smaller than a tile. So each pair says which quadrants of its tile the splat can touch, and pixel
+kernels
+skip the others. Each lane of a warp holds two pixels of each quadrant in one line, so that what depends only on y is
+computed once.
 """
 
 import triton.language as tl
@@ -18,7 +19,7 @@ PIXELS = constant(QUADRANT_PIXELS)
 WARP = constant(32)
 QUADRANT_SHIFT = 28
 MOST_ROWS = 1 << QUADRANT_SHIFT
-"""Rows that a pair has room for beside its quadrants, in 32 bits."""
+"""Most rows: a pair stores its row and its quadrants in 32 bits."""
 ROW = constant(MOST_ROWS - 1)
 SHIFT = constant(QUADRANT_SHIFT)
 ALL = constant(15)
@@ -38,8 +39,9 @@ def touches(pair, QUADRANT: tl.constexpr):
 
 @jit
 def half_spans(splat, reach, tile_y, BOUNDED: tl.constexpr):
-    """The least and the largest x of the ellipse (tiles.py) in the upper and in the lower half of a row of tiles, and
-    whether it comes there at all; nothing where nothing ends it."""
+    """Least and largest x of the ellipse (tiles.py) in the upper and lower half of a row of tiles.
+
+    Also whether it reaches each half. Empty if nothing bounds the splat."""
     spans = ()
     if BOUNDED:
         x, y, l11, l21, l22 = splat
@@ -65,7 +67,7 @@ def touched_quadrants(spans, tile_x, BOUNDED: tl.constexpr):
 
 @jit
 def quadrant_pixels(tile, tiles_x, QUADRANT: tl.constexpr):
-    """Columns and lines of a quadrant's pixels [64]. Of 32 neighbors each lane gets one: its two are four apart."""
+    """Columns and lines of a quadrant's pixels [64]. Each lane gets one of 32 neighbors, so its two are four apart."""
     p = tl.arange(0, PIXELS)
     x = (tile % tiles_x) * TILE + QUADRANT % 2 * SIDE + p // WARP * 4 + p % WARP // SIDE
     y = (tile // tiles_x) * TILE + QUADRANT // 2 * SIDE + p % SIDE
@@ -74,7 +76,7 @@ def quadrant_pixels(tile, tiles_x, QUADRANT: tl.constexpr):
 
 @jit
 def centers(tile, tiles_x):
-    """Centers of the pixels of the upper left quadrant. Others lie SIDE farther: kernels move the splat."""
+    """Centers of the upper left quadrant's pixels. For other quadrants kernels move the splat by SIDE."""
     x, y = quadrant_pixels(tile, tiles_x, 0)
     return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
 
@@ -87,7 +89,7 @@ def lane_sum(values):
 
 @jit
 def of_lane(values):
-    """What the two pixels of each lane share [32]."""
+    """Values that the two pixels of each lane share [32]."""
     return tl.max(tl.reshape(values, (PIXELS // WARP, WARP)), 0)
 
 
@@ -108,9 +110,9 @@ def load_splat(records, row):
 
 @jit
 def of_lines(y, geometry, log2_opacity, LOWER: tl.constexpr):
-    """What a line of pixels shares: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1.
+    """What the pixels of a line share: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1.
 
-    LOWER: of the lower quadrants.
+    LOWER: for the lower quadrants.
     """
     dy = y - (geometry[1] - LOWER * SIDE)
     b = geometry[4] * dy
@@ -119,6 +121,6 @@ def of_lines(y, geometry, log2_opacity, LOWER: tl.constexpr):
 
 @jit
 def across(x, geometry, line, RIGHT: tl.constexpr):
-    """dx and (L d)_1 of a quadrant's pixels; RIGHT: of a right one."""
+    """dx and (L d)_1 of a quadrant's pixels; RIGHT: for a right quadrant."""
     dx = x - (geometry[0] - RIGHT * SIDE)
     return dx, geometry[2] * dx + line[1]

@@ -23,8 +23,8 @@ def weighted(k, a, m, b):
 def unit_quaternion(q):
     """Unit quaternion and 1 / length; an exact zero is the identity with 1 / length 0.
 
-    By the largest component first: squares would leave float32's range long before the length does. 1 / length stays
-    below 1 / SHORTEST, where it would leave it.
+    It is divided by the largest component first, because squares leave float32's range long before the length does.
+    1 / length is at most 1 / SHORTEST, because it would leave that range too.
     """
     largest = tl.maximum(tl.maximum(tl.abs(q[0]), tl.abs(q[1])), tl.maximum(tl.abs(q[2]), tl.abs(q[3])))
     scale = 1.0 / tl.maximum(largest, SHORTEST)

@@ -1,7 +1,7 @@
 """The Triton backend as an autograd function over torch tensors.
 
-One forward waits for the device once, for the numbers of visible rows and of pairs (and for whether a value was bad);
-backward never waits.
+A forward pass waits for the device once, for the numbers of visible rows, pairs and bad values. A backward pass never
+waits.
 """
 
 import torch
@@ -33,7 +33,7 @@ from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 def rasterize(
     gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
 ) -> Raster:
-    """Project, sort by tile and blend, in float32. Bitwise the same in every run on one device."""
+    """Projects, sorts by tile and blends, in float32. Bitwise the same in every run on one device."""
     g = gaussians
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
@@ -68,7 +68,7 @@ def leave_one_out(
     camera: Camera,
     settings: SplatSettings,
 ) -> LeaveOneOut:
-    """How far the view moves when each row alone is taken away, over a background (None: black)."""
+    """How much the view changes when each row alone is removed, over a background (None: black)."""
     _check(gaussians)
     view = KernelView(camera, settings)
     screen = project(gaussians, view)
@@ -91,7 +91,7 @@ def leave_one_out(
 
 
 class _Blend(torch.autograd.Function):
-    """Five fields and the screen offsets to the layers of a Raster."""
+    """Maps five fields and the screen offsets to the layers of a Raster."""
 
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, differentiated):

@@ -1,4 +1,4 @@
-"""What a visible splat is to the kernels behind the projection: 12 numbers (48 bytes)."""
+"""The record of a visible splat, which kernels after the projection read: 12 numbers (48 bytes)."""
 
 import triton.language as tl
 

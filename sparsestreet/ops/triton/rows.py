@@ -1,4 +1,4 @@
-"""From the rows of a scene to splats on the screen: one lane per row, every input read once."""
+"""Projects the rows of a scene to splats on the screen: one lane per row, every input read once."""
 
 from functools import partial
 
@@ -40,7 +40,7 @@ HALF_LARGEST = constant(65504.0)
 
 
 def block_of(view: KernelView) -> int:
-    """Rows of a program: fewer where a lane holds the eight points of a distorted row."""
+    """Rows of a program: fewer if a lane holds the eight points of a distorted row."""
     return 32 if view.distorted else 128
 
 
@@ -86,7 +86,7 @@ def checked_row(means, quaternions, scales, opacities, displacements, row, given
 
 @jit
 def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
-    """Half sides of the box around the ellipse where a splat ends; infinite where nothing ends it."""
+    """Half sides of the box around the ellipse where a splat ends; infinite if nothing bounds it."""
     half_x, half_y = 0 * effective + float("inf"), 0 * effective + float("inf")
     if BOUNDED:
         reach = reach_of(view, effective)
@@ -96,7 +96,7 @@ def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
 
 @jit
 def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, HALF_COLORS: tl.constexpr):
-    """Colors of the rows that are seen, and which of them have finite coefficients; no others are read."""
+    """Colors of the rows that are seen, and which of these have finite coefficients; other rows are not read."""
     coefficients, color = load_columns(sh, row, seen, 3 * TERMS), ()
     raw = raw_color(basis(direction, TERMS), coefficients, TERMS)
     for i in tl.static_range(3):
@@ -116,7 +116,7 @@ def project_rows(
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    ``numbers``: of each program its pairs, its rows with tiles, and its bad rows. Comparisons are written so that NaN
+    ``numbers``: each program's count of pairs, of rows with tiles, and of bad rows. Comparisons are written so that NaN
     culls.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -127,7 +127,7 @@ def project_rows(
     rotation = load_matrix(view + ROTATION)
     mean = in_camera(view, rotation, mean)
     seen = alive & (mean[2] > tl.load(view + NEAR))
-    # Lanes that are not drawn compute with a harmless row.
+    # Lanes of rows that are not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
     unit, _ = unit_quaternion(q)
     shape, sees = on_screen(view, mean, camera_axes(rotation, unit, size), moved, DISTORTED, ROLLING)

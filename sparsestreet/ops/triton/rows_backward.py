@@ -1,4 +1,4 @@
-"""From the sums over pixels back to the parameters: one lane per row, every gradient written once."""
+"""Turns the sums over pixels into gradients of the parameters: one lane per row, every gradient written once."""
 
 from functools import partial
 
@@ -26,7 +26,8 @@ from sparsestreet.ops.triton.view import ROTATION, KernelView, in_camera, load_m
 
 
 def block_of(view: KernelView) -> int:
-    """Rows of a program: as many lanes hold the eight points of a distorted row, so that none spills registers."""
+    """Rows of a program. 16 distorted rows of eight points take as many lanes as 128 others, so none spills
+    registers."""
     return 16 if view.distorted else 128
 
 
@@ -44,7 +45,7 @@ def lens_backward(view, mean, axes, v, DISTORTED: tl.constexpr):
 def screen_gradient(s, to, mask):
     """A row's sums over pixels (blend_backward.py) in natural units (exponent -|L d|^2 / 2).
 
-    Answers the gradients of the mean, of its absolute value, of (l11, l21, l22) and of the effective opacity.
+    Returns the gradients of the mean, their absolute values, and those of (l11, l21, l22) and the effective opacity.
     """
     l11, l21 = tl.load(to + record.L11, mask, 1.0), tl.load(to + record.L21, mask, 0.0)
     l22, log2_opacity = tl.load(to + record.L22, mask, 1.0), tl.load(to + record.LOG2_OPACITY, mask, 0.0)
@@ -61,17 +62,17 @@ def project_rows_backward(
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr,
     DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of all rows; exactly 0 for those that were not drawn, of which nothing but the tile count is read."""
+    """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = row < rows
     seen = given & (tl.load(tile_counts + row, given, 0) > 0)
     rotation = load_matrix(view + ROTATION)
     mean = in_camera(view, rotation, load_row(means, row, seen, 3))
-    # Lanes that were not drawn compute with a harmless row.
+    # Lanes of rows that were not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
     s = load_columns(sums, row, seen, record.RECORD)
     coefficients = load_columns(sh, row, seen, 3 * TERMS)
-    # Before all else, so that nothing else takes registers meanwhile.
+    # This comes first, so that nothing else holds registers meanwhile.
     v_coefficients, v_mean = color_backward(rotation, mean, (s[8], s[9], s[10]), coefficients, TERMS)
     store_columns(v_sh, row, v_coefficients, given, 3 * TERMS)
 

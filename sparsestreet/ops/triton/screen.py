@@ -1,4 +1,4 @@
-"""From a scene to what the pixel kernels take: records of the visible rows, and the tiles' lists."""
+"""Prepares a scene for the pixel kernels: records of the visible rows, and the tiles' lists."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ from sparsestreet.types import Gaussians
 
 @dataclass(frozen=True)
 class Screen:
-    """A scene on the screen of one view."""
+    """A scene projected to the screen of one view."""
 
     table: Float[Tensor, " numbers"]
     records: Float[Tensor, "n 12"]
@@ -27,7 +27,7 @@ class Screen:
 
 
 def project(gaussians: Gaussians, view: KernelView) -> Screen:
-    """Project all rows; waits for the device once, for the numbers of rows and of pairs.
+    """Projects all rows; waits for the device once, for the numbers of rows and of pairs.
 
     Raises ValueError for bad values, PairLimitError.
     """
@@ -52,12 +52,12 @@ def project(gaussians: Gaussians, view: KernelView) -> Screen:
 
 
 def wait_for(numbers: Int[Tensor, " numbers"]) -> list[int]:
-    """The numbers on the host: the only place where the op waits for the device."""
+    """Copies the numbers to the host. Only here does the op wait for the device."""
     return numbers.tolist()
 
 
 def fields_of(gaussians: Gaussians) -> tuple[Tensor, ...]:
-    """Means, quaternions, scales, opacities and harmonics as kernels walk them."""
+    """Means, quaternions, scales, opacities and harmonics as kernels read them."""
     g = gaussians
     return tuple(field.contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
 
@@ -67,7 +67,7 @@ def contiguous(tensor: Tensor | None) -> Tensor | None:
 
 
 def given_or(tensor: Tensor | None, other: Tensor) -> Tensor:
-    """A tensor for a kernel that does not read it where it is missing."""
+    """``tensor``, or ``other`` in its place if it is missing; the kernel does not read it then."""
     return other if tensor is None else tensor
 
 

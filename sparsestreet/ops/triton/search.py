@@ -7,7 +7,7 @@ from sparsestreet.ops.triton.language import jit
 
 @jit
 def first_at_least(values, least, count, steps):
-    """Place of the first of ``count`` sorted numbers that is not below ``least``; count < 2^steps."""
+    """Index of the first of ``count`` sorted numbers that is not below ``least``; count < 2^steps."""
     low = tl.zeros_like(least)
     high = low + count
     for _ in range(steps):

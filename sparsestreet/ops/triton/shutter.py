@@ -1,7 +1,7 @@
 """Rolling shutter: a splat that moves while rows are read one after the other is again a 2D Gaussian.
 
-A point at p + u tau, read at image row y where tau = y / H - 1/2, is seen where y = p_y + u_y (y / H - 1/2): the map
-from p to what is seen is linear, with a = 1 - u_y / H.
+A point at p + u tau, read at image row y with tau = y / H - 1/2, is seen where y = p_y + u_y (y / H - 1/2). So the map
+from p to the seen point is linear, with a = 1 - u_y / H.
 """
 
 import triton.language as tl

@@ -1,7 +1,7 @@
 """The sky behind an image and its gradients, one kernel each: ``sparsestreet.ops.over_sky``.
 
-A lane is a pixel; where no sky is seen it loads nothing of it. Backward adds to the texels' gradient by atomics: pixels
-that share a texel do so in any order, and two runs agree but for rounding.
+A lane is a pixel; pixels that see no sky load nothing of it. Backward adds to the texels' gradient by atomics. Pixels
+that share a texel do so in any order, so two runs agree only up to rounding.
 """
 
 import itertools
@@ -35,7 +35,7 @@ def over_sky(
 
 
 class _OverSky(torch.autograd.Function):
-    """Backward looks everything up once more."""
+    """Adds the sky. Backward reads the texels again."""
 
     @staticmethod
     def forward(ctx, rgb, alpha, texels, camera, transmittance_min):
@@ -68,7 +68,7 @@ def _launch(kernel, ctx, alpha: Tensor, texels: Tensor, directions: Tensor, *ima
 
 @jit
 def direction(directions, rays, pixel, seen, width, LENS: tl.constexpr):
-    """In the world, of any length."""
+    """Direction in the world, of any length."""
     if LENS:
         at = directions + pixel * CHANNELS
         return tl.load(at, seen, 1.0), tl.load(at + 1, seen, 1.0), tl.load(at + 2, seen, 1.0)
@@ -77,8 +77,9 @@ def direction(directions, rays, pixel, seen, width, LENS: tl.constexpr):
 
 @jit
 def bordered_place(from_middle, side):
-    """In the bordered face, whose texel centers are whole numbers. What is no number is put inside too, so that nothing
-    is read outside the table."""
+    """Coordinate in the bordered face, whose texel centers are whole numbers.
+
+    NaN becomes a coordinate inside too, so that nothing is read outside the table."""
     place, most = from_middle + (0.5 * side + 0.5), side + 0.5
     place = tl.where(place > 0.5, place, 0.5)
     return tl.where(place < most, place, most)

@@ -1,4 +1,4 @@
-"""Sums over the slots of each row, which are neighbors, in a fixed order."""
+"""Sums the slots of each row, which are neighbors, in a fixed order."""
 
 from functools import partial
 
@@ -10,7 +10,7 @@ ROWS = 16
 """Rows of a program. Four neighboring lanes take a row's numbers, four at a time."""
 OPTIONS = {"num_warps": 2}
 STEP = constant(4)
-"""Slots of a row that are fetched together."""
+"""Number of slots of a row that are loaded together."""
 
 
 @partial(jit, do_not_specialize=["visible"])

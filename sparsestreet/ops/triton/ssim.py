@@ -1,12 +1,12 @@
 """SSIM and its gradient, one kernel each: ``sparsestreet.ops.ssim`` in the sum and the difference of the two images.
 
-With s = x + y, d = x - y, their window means m_s, m_d and variances V_s, V_d, the product 2 xy is (s^2 - d^2) / 2 and
-x^2 + y^2 is (s^2 + d^2) / 2: four window means do the work of five, and where two images are alike their small
-difference keeps its digits. SSIM = l c, luminance l = (m_s^2 - m_d^2 + 2 C1) / (m_s^2 + m_d^2 + 2 C1) and
+Let s = x + y and d = x - y, with window means m_s, m_d and variances V_s, V_d. Then 2 xy = (s^2 - d^2) / 2 and
+x^2 + y^2 = (s^2 + d^2) / 2. So four window means replace five, and the small difference of similar images keeps its
+digits. SSIM = l c, with luminance l = (m_s^2 - m_d^2 + 2 C1) / (m_s^2 + m_d^2 + 2 C1) and
 c = (V_s - V_d + 2 C2) / (V_s + V_d + 2 C2).
 
-A program owns a strip of columns and walks down its lines: across, taps are read from the image; down, the last eleven
-lines stay in registers. Channels are interleaved, so that a tap is three numbers away and no kernel knows channels.
+A program owns a strip of columns and walks down its lines. Across, taps are read from the image; down, the last eleven
+lines stay in registers. Channels are interleaved: the next tap is three numbers away, and kernels ignore channels.
 """
 
 import torch
@@ -27,7 +27,7 @@ COUNT = constant(WINDOW)
 PAD = constant(WINDOW - 1)
 CHANNELS = constant(3)
 MOST_NUMBERS = 1 << 31
-"""Of the three maps of derivatives: kernels count in int32."""
+"""Most numbers in the three maps of derivatives, because kernels count in int32."""
 TWICE_C1, TWICE_C2 = constant(2 * C1), constant(2 * C2)
 
 
@@ -73,7 +73,7 @@ class _MeanSSIM(torch.autograd.Function):
 
 
 def _programs(height: int, width: int) -> tuple[int, int]:
-    """Strips of lines, and lanes of one strip: whole programs."""
+    """Number of strips of lines, and of lanes in a strip, rounded up to whole programs."""
     return -(-height // LINES), -(-width // LANES) * LANES
 
 
@@ -121,8 +121,8 @@ def across_images(image, truth, at, level, mask):
 def derivatives(s, d, var_s, var_d):
     """SSIM of window means and variances, and its derivatives by the mean of x, by V_s and by V_d (as E s^2, E d^2).
 
-    1 - l is 2 m_d^2 over l's denominator and 1 - c is 2 V_d over c's: put in, they leave no derivative that is a
-    difference of nearly equal numbers.
+    1 - l is 2 m_d^2 over l's denominator, and 1 - c is 2 V_d over c's. With these no derivative is a difference of
+    nearly equal numbers.
     """
     by_luminance = 1 / (s * s + d * d + TWICE_C1)
     by_contrast = 1 / (var_s + var_d + TWICE_C2)
@@ -144,7 +144,8 @@ def similarity(
     """
     first, column = place(width, LINES, BLOCK)
     inside = column < width
-    # A lane's variances are taken about a number of its own column: about zero, bright flat skies leave them no digits.
+    # A lane's variances are taken about a number of its own column. About zero, a bright flat sky would leave no
+    # digits.
     corner = first * (width + PAD * CHANNELS) + column
     level = tl.load(image + corner, inside, 0.0) + tl.load(truth + corner, inside, 0.0)
     lines = empty_lines(column, 4)

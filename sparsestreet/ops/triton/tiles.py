@@ -1,7 +1,7 @@
-"""Which 16x16 tiles a splat can touch: per row of tiles, the columns its ellipse |L d|^2 <= reach passes through.
+"""Finds the 16x16 tiles a splat can touch: per row of tiles, the columns that its ellipse |L d|^2 <= reach touches.
 
-The counting and the listing kernel both compute this from the record alone, and both are compiled without fused
-multiply-adds: they cannot disagree.
+The counting and the listing kernel both compute this from the record alone. Both are compiled without fused
+multiply-adds, so they cannot disagree.
 """
 
 import triton.language as tl
@@ -23,7 +23,7 @@ def limited(value, least, most):
 @jit
 def tile_span(low, high, size):
     """First and last tile with a pixel center in [low, high]; last < first if there is none. ``size`` in pixels."""
-    # As float first: the box of a giant does not fit an integer.
+    # Limited as floats, because the box of a giant does not fit an integer.
     first = limited(tl.ceil(low - 0.5), 0.0, size).to(tl.int32)
     last = limited(tl.floor(high - 0.5), -1.0, size - 1.0).to(tl.int32)
     return first // TILE, tl.where(first <= last, last // TILE, first // TILE - 1)
@@ -50,8 +50,9 @@ def half_chord(dy, half_width, half_y):
 
 @jit
 def lines_span(x, y, l11, l21, l22, reach, line, LINES: tl.constexpr):
-    """The least and the largest x of the ellipse x(dy) = slope dy -+ half_chord(dy) within LINES lines of pixels from
-    ``line`` on, and whether it comes near them at all; margins included."""
+    """Least and largest x of the ellipse x(dy) = slope dy -+ half_chord(dy) within LINES lines of pixels from ``line``.
+
+    Also whether the ellipse reaches them. Margins are included."""
     root = tl.sqrt(reach)
     slope, half_width, half_y = -l21 / l11, root / l11, root / l22
     half_x = root * tl.sqrt(l21 * l21 + l22 * l22) / (l11 * l22)

@@ -1,7 +1,7 @@
-"""Lens distortion: the polynomial of Brown and Conrady, and a Gaussian's shape behind it by the unscented transform.
+"""Lens distortion: the polynomial of Brown and Conrady, and a Gaussian's shape through it by the unscented transform.
 
 Unscented transform: Julier and Uhlmann 1997; for splats 3DGUT, Wu et al. 2025. With alpha = 1, beta = 2, kappa = 0 in
-3 dimensions lambda is 0: the six points mu +- sqrt(3) a_k weigh 1/6, and mu itself 0 in the mean and 2 in the
+3 dimensions lambda is 0. The six points mu +- sqrt(3) a_k have weight 1/6; mu has 0 in the mean and 2 in the
 covariance. All weights are >= 0, so the covariance is V V^T with columns sqrt(w_i) (p_i - m), as for the pinhole.
 Points lie along the second axis of a block: mu, +a_1..3, -a_1..3, and one of weight 0.
 """
@@ -65,7 +65,7 @@ def within_fold(view, mean):
 
 @jit
 def shrink(view, x, y):
-    """s = min(1, sqrt(r2_max / r2)): beyond the fold the map goes on as D(s x) / s."""
+    """s = min(1, sqrt(r2_max / r2)); beyond the fold the map continues as D(s x) / s."""
     r2, fold = x * x + y * y, tl.load(view + FOLD)
     beyond = r2 > fold
     return tl.where(beyond, tl.sqrt(fold / tl.where(beyond, r2, 1.0)), 1.0)
@@ -73,7 +73,7 @@ def shrink(view, x, y):
 
 @jit
 def shown(view, x, y):
-    """Pixels from the principal point, whose digits differences would lose, beyond the fold as well."""
+    """Pixels relative to the principal point (so that differences keep their digits), beyond the fold as well."""
     s = shrink(view, x, y)
     at_x, at_y = distort(view, s * x, s * y)
     return tl.load(view + FOCAL) * at_x / s, tl.load(view + FOCAL + 1) * at_y / s
@@ -143,7 +143,7 @@ def sigma_backward(v):
 
 @jit
 def normalized_points(view, mean, axes):
-    """x/z and y/z of the points, 1/z, and whether z was left as it is: it is limited to >= near."""
+    """x/z and y/z of the points, 1/z, and whether z stayed unchanged by its limit z >= near."""
     depth, near = sigma(mean[2], axes[2]), tl.load(view + NEAR)
     inverse = 1.0 / tl.maximum(depth, near)
     return sigma(mean[0], axes[0]) * inverse, sigma(mean[1], axes[1]) * inverse, inverse, depth >= near
@@ -151,7 +151,7 @@ def normalized_points(view, mean, axes):
 
 @jit
 def screen_factor(view, x, y):
-    """Mean on the screen, from the principal point, and the rows of V, 8 columns."""
+    """Mean on the screen relative to the principal point, and the rows of V, 8 columns."""
     at_x, at_y = shown(view, x, y)
     m_x, m_y = tl.sum(at_x * mean_weights(), 1), tl.sum(at_y * mean_weights(), 1)
     return m_x, m_y, covariance_roots() * (at_x - m_x[:, None]), covariance_roots() * (at_y - m_y[:, None])
@@ -165,7 +165,7 @@ def minors(vx, vy):
 
 @jit
 def unscented(view, mean, axes):
-    """Shape on the screen (lens.py) of a Gaussian behind the distorted lens."""
+    """Shape on the screen (lens.py) of a Gaussian seen through the lens."""
     x, y, _, _ = normalized_points(view, mean, axes)
     m_x, m_y, vx, vy = screen_factor(view, x, y)
     c = minors(vx, vy)

@@ -19,7 +19,7 @@ from sparsestreet.types import Camera
 TILE_SIZE = 16
 TILE = constant(TILE_SIZE)
 LEAST_LIGHT = 1e-30
-"""Of ops/cpu: a pixel stops there at the latest."""
+"""As in ops/cpu: a pixel stops at this light at the latest."""
 
 # Places in the table.
 ROTATION, POSITION = constant(0), constant(9)
@@ -44,7 +44,7 @@ def load_matrix(table):
 
 @jit
 def in_camera(view, rotation, mean):
-    """A mean in the camera. Of neighbors far from the origin the difference is exact, R m + t would round both."""
+    """A mean in the camera. The difference of near points far from the origin is exact; R m + t would round both."""
     c, rest = load_vector(view + POSITION), load_vector(view + POSITION_REST)
     return times(rotation, ((mean[0] - c[0]) - rest[0], (mean[1] - c[1]) - rest[1], (mean[2] - c[2]) - rest[2]))
 
@@ -71,7 +71,7 @@ class KernelView:
 
     @property
     def bounded(self) -> bool:
-        """Whether splats end anywhere."""
+        """Whether splats have an end."""
         return self.settings.alpha_min > 0 or math.isfinite(self.settings.max_sigma)
 
     @property
@@ -80,7 +80,7 @@ class KernelView:
 
     @property
     def transmittance_min(self) -> float:
-        """Never 0: backward divides its way back from the light that is left, which must not vanish."""
+        """Never 0, because backward divides the light that is left, which must not vanish."""
         return max(self.settings.transmittance_min, LEAST_LIGHT)
 
     def table(self, device: torch.device) -> Float[Tensor, " numbers"]:
@@ -110,13 +110,13 @@ class KernelView:
             *distortion,
             math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
             *motion,
-            # What float32 cannot hold of the position.
+            # The rest of the position, which float32 cannot hold.
             *(position - position.float().double()).tolist(),
         )
         return list(map(float, numbers))
 
 
 def _slope_limits(focal: float, center: float, size: int) -> tuple[float, float]:
-    """Where x/z is limited in the Jacobian: 1.3 tan(fov/2) of 3DGS, moved with the principal point."""
+    """Limits of x/z in the Jacobian: 1.3 tan(fov/2) of 3DGS, moved with the principal point."""
     margin = 0.3 * size / (2 * focal)
     return -center / focal - margin, (size - center) / focal + margin

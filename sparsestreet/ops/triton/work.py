@@ -1,4 +1,4 @@
-"""How much a view gives the pixel kernels to do: what a benchmark divides times by. Waits for the device."""
+"""Counts the work of the pixel kernels for a view, by which benchmarks divide times. Waits for the device."""
 
 import torch
 from torch import Tensor
@@ -17,9 +17,8 @@ from sparsestreet.types import Camera, Gaussians
 def count_work(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> tuple[int, int]:
     """(splat, tile) pairs of one view and (splat, pixel) samples that its forward pass computes.
 
-    The walk over a tile is counted up to the 32 pairs in which its last pixel is open to a splat, and of each pair the
-    quadrants that it touches. Long tiles are counted as if they were in one piece: that the light through their parts
-    is computed twice is not in the number.
+    A tile is counted up to the block of 32 pairs in which its last pixel is still open, and for each pair the quadrants
+    that it touches. Long tiles count as unsplit, without the second computation of the light through their parts.
     """
     view = KernelView(camera, settings)
     screen = project(gaussians, view)
