@@ -9,7 +9,7 @@ from pathlib import Path
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary file next to ``path``. It replaces ``path`` when the block ends, and is deleted if it fails.
+    """Yields a temporary path next to ``path``. Its file replaces ``path`` at the end, or goes if the block fails.
 
     A block that writes nothing changes nothing. When several processes save together, only the first writes; the others
     enter the block too (``Trainer.save_checkpoint`` must be called by all), and change nothing.
