@@ -1,7 +1,7 @@
 """What is measured of a finished scene where somebody asks: beside the recorded path, and rendered in other ways."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from sparsestreet.data.datamodule import StreetData
@@ -9,6 +9,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Truth
 from sparsestreet.evaluation.novel import evaluate_novel
 from sparsestreet.evaluation.presets import evaluate_presets
+from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.extractors import LastLayer
 from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import SplatSettings
@@ -29,6 +30,8 @@ class ExtraMetrics:
     """Whether the shift grows over the drive, as in a change of lane."""
     presets: Sequence[str] = ()
     """Ways to render, names of ``render.preset``."""
+    timing: Timing = field(default_factory=Timing)
+    """How often the frames of the record are timed."""
 
     def __post_init__(self) -> None:
         for preset in self.presets:

@@ -13,7 +13,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
 from sparsestreet.evaluation.node_costs import measure_scene_costs
 from sparsestreet.evaluation.predictions import Predictions
-from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.evaluation.speed import Timing, measure_latency
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import Guards, guards
@@ -46,8 +46,7 @@ def evaluate_scene(
     command: str,
     device: torch.device | str,
     pictures: int = 4,
-    warmup: int = 20,
-    repeats: int = 50,
+    timing: Timing | None = None,
 ) -> RunSummary:
     """Measure quality, speed and size of a scene; write ``out/records``, ``out/predictions`` and ``out/pictures``.
 
@@ -67,7 +66,7 @@ def evaluate_scene(
         command: that this evaluation was asked for with.
         device: where it is rendered and timed.
         pictures: how many views become pictures.
-        warmup, repeats: of the latency protocol.
+        timing: how often frames are timed; None: ``Timing()``.
 
     Raises ValueError without any view, or for renders that are not finite.
     """
@@ -93,10 +92,11 @@ def evaluate_scene(
         )
         for split, frames in splits.items()
     }
+    timing = timing or Timing()
     with stage("latency"):
-        latency = measure_latency(scene, frames.views, options, warmup=warmup, repeats=repeats)
+        latency = measure_latency(scene, frames.views, options, warmup=timing.warmup, repeats=timing.repeats)
     with stage("costs"):
-        costs = measure_scene_costs(scene, frames.views, options, repeats=(repeats + 1) // 2)
+        costs = measure_scene_costs(scene, frames.views, options, repeats=timing.rounds)
     summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent)
     with stage("pictures"):
         chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]

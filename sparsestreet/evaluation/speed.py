@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TypeVar
 
@@ -23,6 +24,22 @@ T = TypeVar("T")
 
 SceneAt = Callable[[View], SceneGraph]
 """The scene that is rendered for a view."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How often frames are timed. Raises ValueError for a number below 1."""
+
+    warmup: int = 20
+    """Renders that do not count, before those of ``measure_latency``."""
+    repeats: int = 50
+    """Renders of each of its clocks."""
+    rounds: int = 25
+    """Rounds of ``node_costs.measure_scene_costs``."""
+
+    def __post_init__(self) -> None:
+        if min(self.warmup, self.repeats, self.rounds) < 1:
+            raise ValueError(f"timing needs at least one warm-up render, repeat and round, got {self}")
 
 
 @torch.no_grad()

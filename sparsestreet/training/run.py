@@ -205,6 +205,7 @@ def evaluate(
             out=out,
             command=command,
             device=device,
+            timing=extra.timing,
         )
     extra.measure(scene, data, options, out=out, command=command, say=say)
     with stage("pictures"):

@@ -34,7 +34,12 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "schedule.refine_in.every=10",
         "schedule.mask_in.every=10",
         "trainer.val_check_interval=60",
+        *TIMED_ONCE,
     ]
+
+
+TIMED_ONCE = [f"evaluation.timing.{name}={count}" for name, count in (("warmup", 1), ("repeats", 2), ("rounds", 1))]
+TIMED_BY_DEFAULT = [f"~{word.partition('=')[0]}" for word in TIMED_ONCE]
 
 
 TINY_BACKGROUND = [

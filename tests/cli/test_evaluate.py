@@ -6,6 +6,7 @@ import pytest
 
 from sparsestreet.cli.evaluate import Options, evaluate, extra_words
 from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.evaluation.speed import Timing
 
 
 @pytest.mark.parametrize("words", [["novel=-1"], ["novel=1,0"], ["ramp=true"]])
@@ -24,5 +25,6 @@ def test_an_evaluation_measures_what_the_runs_configuration_asks_for_unless_it_i
     assert Options(Path("run")).extra(of_run) == of_run
     told = Options(Path("run"), novel=(2.0,), ramp=True, presets=()).extra(of_run)
     assert told == ExtraMetrics(novel=(2.0,), ramp=True, presets=())
+    assert of_run.timing == Timing(20, 50, 25)
     assert extra_words(of_run) == ["novel=1.5", "presets=fast"]
     assert extra_words(told) == ["novel=2", "ramp=true"]

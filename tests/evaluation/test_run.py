@@ -14,6 +14,7 @@ from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.evaluate import evaluate_predictions
 from sparsestreet.evaluation.predictions import PredictionError, Predictions
 from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
+from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
@@ -48,7 +49,7 @@ def evaluate(out, held_out, training=(), pictures=2, device="cpu", **replaced):
         out=out,
         device=device,
         pictures=pictures,
-        **{"run": MADE, "options": OPTIONS, "command": "sparsestreet evaluate run=x", "warmup": 1, "repeats": 4}
+        **{"run": MADE, "options": OPTIONS, "command": "sparsestreet evaluate run=x", "timing": Timing(1, 2, 1)}
         | replaced,
     )
 
@@ -79,7 +80,7 @@ def test_a_run_leaves_its_records(tmp_path):
     assert on_disk.gaussians_total == 4
     assert on_disk.bytes_by_part == {"road": 2 * 14 * 4, "cars": 2 * 14 * 4, "poses": 0, "sky": 6 * 2 * 2 * 3 * 4}
     assert (on_disk.images, on_disk.resolutions) == ({HELD_OUT: 5, TRAINING: 3}, ("12x9",))
-    assert (on_disk.latency.warmup, on_disk.latency.clocks["frame"].repeats, on_disk.latency.views) == (1, 4, 5)
+    assert (on_disk.latency.warmup, on_disk.latency.clocks["frame"].repeats, on_disk.latency.views) == (1, 2, 5)
     assert (on_disk.evaluated.command, on_disk.evaluated.threads) == (
         "sparsestreet evaluate run=x",
         torch.get_num_threads(),
@@ -143,7 +144,7 @@ def test_images_are_loaded_for_their_comparison_and_pictures_alone(tmp_path):
     views = [View(frame.camera, frame.time, frame.frame_index, frame.camera_index) for frame in frames.values()]
     loaded = []
     lazy = Frames(views, lambda view: loaded.append(view.frame_index) or frames[view.frame_index])
-    evaluate(tmp_path, lazy, pictures=2, repeats=9)
+    evaluate(tmp_path, lazy, pictures=2, timing=Timing(1, 9, 5))
     assert loaded[-7:] == [0, 10, 20, 30, 40, 20, 40]  # before them, what the type checks of a test look at
 
 
@@ -245,10 +246,32 @@ def test_images_are_let_go_one_by_one(tmp_path):
     evaluate_scene(
         *(small_scene(), lazy(0), lazy(1)),
         **{"run": MADE, "options": OPTIONS, "out": tmp_path, "command": "c", "device": "cpu", "pictures": 0},
-        **{"warmup": 1, "repeats": 1},
+        timing=Timing(1, 1, 1),
     )
     assert len(counts) >= 12
     assert max(counts) <= 1  # the one before, until its name is taken
+
+
+def test_frames_are_timed_as_often_as_it_is_told(tmp_path, monkeypatch):
+    asked = {}
+    for name in ("measure_latency", "measure_scene_costs"):
+        measure = getattr(run_module, name)
+        monkeypatch.setattr(
+            run_module,
+            name,
+            lambda *args, name=name, measure=measure, **how: (
+                asked.update({name: how}) or measure(*args, **dict.fromkeys(how, 1))
+            ),
+        )
+    for timing in (None, Timing(1, 2, 3)):
+        evaluate(tmp_path, make_frames(1), timing=timing)
+        wanted = timing or Timing(20, 50, 25)
+        assert asked == {
+            "measure_latency": {"warmup": wanted.warmup, "repeats": wanted.repeats},
+            "measure_scene_costs": {"repeats": wanted.rounds},
+        }
+    with pytest.raises(ValueError, match="at least one warm-up render, repeat and round"):
+        Timing(rounds=0)
 
 
 def test_no_view_is_an_error(tmp_path):
