@@ -1,7 +1,6 @@
-"""Triton's interpreter in reasonable time: one needless patch left out, and costly cases left to ``make test-all``."""
+"""Triton's interpreter in reasonable time: what it needs not do left out, costly cases left to ``make test-all``."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -10,20 +9,14 @@ from sparsestreet.ops.backend import has_triton
 
 INTERPRETED = has_triton() and not torch.cuda.is_available()
 if INTERPRETED:
-    from triton.runtime.interpreter import InterpretedFunction
+    from tests.ops.interpreter import check_overflow, speed_up
 
-    patch_and_call = InterpretedFunction.__call__
-    called: set[InterpretedFunction] = set()
+    speed_up()
 
-    def call_from_a_kernel(function: InterpretedFunction, *arguments: Any, **options: Any) -> Any:
-        if function in called:
-            return function.rewrite()(*arguments, **options)
-        called.add(function)
-        return patch_and_call(function, *arguments, **options)
-
-    # For each call of a function from a kernel the interpreter patches all that the function sees of triton.language,
-    # which the kernel's launch and the function's first call have patched for good: more than half of its time.
-    InterpretedFunction.__call__ = call_from_a_kernel
+    @pytest.fixture(autouse=True)
+    def _overflow(request: pytest.FixtureRequest) -> None:
+        """Integers are watched in the tests that only ``make test-all`` runs."""
+        check_overflow(request.node.get_closest_marker("slow") is not None)
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
