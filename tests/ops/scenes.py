@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 import torch
@@ -55,6 +55,11 @@ every_precision = _each(BACKENDS, in_every_precision=True)
 every_double = _each(_DOUBLE_BACKENDS, in_every_precision=False)
 every_fast_backend = _each(_FAST_BACKENDS, in_every_precision=False)
 every_fast_precision = _each(_FAST_BACKENDS, in_every_precision=True)
+
+
+def first_interpreted(first: Any, *others: Any) -> list[Any]:
+    """Values of a parameter of which Triton's interpreter takes the first; the others wait for ``make test-all``."""
+    return [first, *(pytest.param(value, marks=pytest.mark.slow_if_interpreted) for value in others)]
 
 
 def camera(width: int, height: int, dtype: torch.dtype = torch.float64, focal: float | None = None) -> Camera:

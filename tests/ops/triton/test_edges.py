@@ -13,6 +13,7 @@ from tests.ops.scenes import (
     camera,
     cast,
     device_of,
+    first_interpreted,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -34,6 +35,7 @@ def assert_same_bits(result, other) -> None:
             assert torch.equal(value, getattr(other, part)[name]), name
 
 
+@pytest.mark.slow_if_interpreted
 def test_two_runs_are_bitwise_equal():
     view = camera(19, 17)
     gaussians = random_gaussians(12, view)
@@ -70,7 +72,7 @@ def test_masked_rows_leave_no_trace():
         assert not dropped.gradients[name][~keep].any()
 
 
-@pytest.mark.parametrize("effects", [False, pytest.param(True, marks=pytest.mark.slow_if_interpreted)])
+@pytest.mark.parametrize("effects", first_interpreted(False, True))
 def test_nothing_is_read_before_it_is_written(effects, monkeypatch):
     # The third tile is empty; the stack closes the first one, so that its pairs behind the 32nd are never looked at.
     view = front_camera(33, 5, 20.0)
@@ -219,7 +221,7 @@ def test_no_rows():
     assert counted.weight.shape == counted.pixels.shape == counted.dominant.shape == (0,)
 
 
-@pytest.mark.parametrize("laid_out", ["transposed", "expanded"])
+@pytest.mark.parametrize("laid_out", first_interpreted("transposed", "expanded"))
 def test_displacements_in_any_layout(laid_out):
     view = dataclasses.replace(VIEW, shutter=Shutter(torch.full((3,), 0.1), torch.zeros(3)))
     scene = random_gaussians(6, view)
@@ -246,7 +248,7 @@ def test_many_tiles_take_wide_keys(monkeypatch):
     assert_same_bits(wide, render(gaussians, view, "triton", torch.float32))
 
 
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("dtype", first_interpreted(torch.bfloat16, torch.float16))
 def test_autocast_changes_nothing(dtype):
     gaussians = single(random_gaussians(4, VIEW))
     plain = splat(gaussians, VIEW, backend="triton")

@@ -10,7 +10,7 @@ from sparsestreet.ops.triton import parts
 from sparsestreet.ops.triton.screen import Screen, project
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Gaussians
-from tests.ops.scenes import camera, cast, device_of, front_camera, one_gaussian, random_gaussians
+from tests.ops.scenes import camera, cast, device_of, first_interpreted, front_camera, one_gaussian, random_gaussians
 
 DEVICE = device_of("triton")
 WIDTH, HEIGHT, TILE = 587, 171, 16
@@ -157,7 +157,9 @@ def test_a_splat_that_ends_on_a_pixel_center_is_listed(edge, distance):
     assert (0, {"left": 3, "right": 5, "top": 1, "bottom": 7}[edge]) in listed(screen)
 
 
-@pytest.mark.parametrize("settings", [SplatSettings(), SplatSettings(max_sigma=2.0)], ids=["cut-off", "max_sigma"])
+@pytest.mark.parametrize(
+    "settings", first_interpreted(SplatSettings(), SplatSettings(max_sigma=2.0)), ids=["cut-off", "max_sigma"]
+)
 def test_culling_by_tiles_changes_no_bit(settings, monkeypatch):
     view = camera(35, 19)
     scene = cast(random_gaussians(12, view), torch.float32, device=DEVICE)

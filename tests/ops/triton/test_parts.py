@@ -14,6 +14,7 @@ from tests.ops.scenes import (
     camera,
     cast,
     device_of,
+    first_interpreted,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -52,7 +53,7 @@ def short_parts(monkeypatch):
     monkeypatch.setattr(parts, "PART_LENGTH", 3)
 
 
-@pytest.mark.parametrize("name", STOPS)
+@pytest.mark.parametrize("name", first_interpreted(*STOPS))
 def test_against_the_reference(name, short_parts):
     scene, seen = stack(13), []
     truth = render(scene, VIEW, "reference", torch.float64, STOPS[name])
@@ -99,7 +100,7 @@ def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatc
     assert torch.equal(written[False], ~written[True])
 
 
-@pytest.mark.parametrize("length", [pytest.param(1, marks=pytest.mark.slow_if_interpreted), 4])
+@pytest.mark.parametrize("length", first_interpreted(4, 1))
 def test_any_length_draws_the_same(length, monkeypatch):
     view = camera(19, 17)
     scene = random_gaussians(12, view)
