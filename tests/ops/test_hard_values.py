@@ -95,11 +95,7 @@ def test_01_extreme_scenes_are_right(backend, dtype):
 @every_backend
 # On Triton's kernels 1e25 is a smaller test (triton/test_edges.py).
 @pytest.mark.parametrize(
-    ("size", "antialias"),
-    [
-        (1e12, False),
-        *(pytest.param(*case, marks=pytest.mark.slow_if_interpreted) for case in ((1e12, True), (1e25, False))),
-    ],
+    "case", first_interpreted((1e12, False), (1e12, True), (1e25, False)), ids=lambda case: f"{case[0]:g}-{case[1]}"
 )
 def test_02_an_overflowing_row_is_culled(backend, case):
     # 1e12 m and 1e25 m are finite, but not the determinant of the one nor the variance of the other on the screen, in

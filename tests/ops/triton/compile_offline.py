@@ -50,12 +50,11 @@ def _compile(kernel: KernelInterface, launch: dict, arch: int) -> dict:
         ASTSource(kernel, signature, constants, attributes), GPUTarget("cuda", arch, 32), options=launch["options"]
     )
     cubin = compiled.asm["cubin"]
-    resources, instructions = resources_of(cubin), _instructions_of(cubin)
+    instructions = _instructions_of(cubin)
     return {
-        **resources,
-        "tensor_core": sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
-        + compiled.asm["ptx"].count("tf32"),
-        "atomics": sum(text.split()[0].startswith(("ATOM", "RED.", "REDG.")) for _, text in instructions),
+        **resources_of(cubin),
+        "tensor_core": _tensor_core(instructions) + compiled.asm["ptx"].count("tf32"),
+        "atomics": _atomics(instructions),
         "sample": _per_sample(instructions),
         "loads": sum(text.startswith("LDG") for _, text in instructions),
         "stores": sum(text.startswith("STG") for _, text in instructions),
@@ -72,6 +71,20 @@ def resources_of(cubin: bytes) -> dict[str, int]:
     """Registers, and bytes of stack, where spilled registers go."""
     used = re.search(r"REG:(\d+) STACK:(\d+)", _listed(cubin, "-res-usage"))
     return {"registers": int(used[1]), "spilled": int(used[2])}
+
+
+def forbidden_in(cubin: bytes) -> dict[str, int]:
+    """Instructions of the tensor cores, and atomics."""
+    instructions = _instructions_of(cubin)
+    return {"tensor_core": _tensor_core(instructions), "atomics": _atomics(instructions)}
+
+
+def _tensor_core(instructions: list[tuple[int, str]]) -> int:
+    return sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
+
+
+def _atomics(instructions: list[tuple[int, str]]) -> int:
+    return sum(text.split()[0].startswith(("ATOM", "RED.", "REDG.")) for _, text in instructions)
 
 
 def _instructions_of(cubin: bytes) -> list[tuple[int, str]]:

@@ -18,7 +18,7 @@ from sparsestreet.ops import splat
 from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
 from sparsestreet.ops.triton.launch import launch
 from tests.ops.scenes import camera, cast, random_gaussians
-from tests.ops.triton.compile_offline import resources_of
+from tests.ops.triton.compile_offline import forbidden_in, resources_of
 from tests.ops.triton.fake_driver import Binary, FakeDevice, install
 
 MODULES: tuple[ModuleType, ...] = (screen, lists, parts, pixels, rasterizer)
@@ -68,7 +68,7 @@ class Case:
 
 
 def found_in(binary: Binary) -> dict:
-    resources = resources_of(binary.cubin)
+    resources = resources_of(binary.cubin) | forbidden_in(binary.cubin)
     types = dict(binary.source.signature)
     return {"name": binary.name, "types": types, "known": binary.specialized(), "shared": binary.shared, **resources}
 

@@ -1,4 +1,7 @@
-"""The fused steps of training compile for sm_80 and sm_90 without a GPU, and keep everything in registers."""
+"""The fused steps of training compile for sm_80 and sm_90 without a GPU, and keep everything in registers.
+
+``make test`` compiles the largest of each kernel for sm_90, ``make test-all`` the smallest too, and for both.
+"""
 
 from dataclasses import replace
 
@@ -34,43 +37,56 @@ REGISTERS = {
 STACK = {"interpolate": 32, "interpolate_backward": 32}
 
 
-@pytest.fixture(scope="module", params=[90, pytest.param(80, marks=pytest.mark.slow)], ids=["sm_90", "sm_80"])
-def compiled(request) -> list[tuple[Launch, dict]]:
+SCOPES = [
+    pytest.param((90, False), id="largest, sm_90"),
+    pytest.param((90, True), id="all, sm_90", marks=pytest.mark.slow),
+    pytest.param((80, True), id="all, sm_80", marks=pytest.mark.slow),
+]
+
+
+@pytest.fixture(scope="module", params=SCOPES)
+def scope(request) -> tuple[int, bool]:
+    """Architecture, and whether the smallest kernels are compiled too."""
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def compiled(scope) -> list[tuple[Launch, dict]]:
+    arch, smallest_too = scope
     with pytest.MonkeyPatch.context() as monkeypatch:
         launches = record_launches(monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim))
-        launch_nodes()
-        launch_images()
-        for shape in ((2, 3), (2, 15, 3)):
+        launch_nodes(smallest_too)
+        launch_images(smallest_too)
+        for shape in ((2, 15, 3), (2, 3))[: 1 + smallest_too]:
             fields = [torch.zeros(shape, device=DEVICE) for _ in range(4)]
             adam_step_(*fields, torch.ones(2, dtype=torch.bool, device=DEVICE), AdamStep(1, 0.1), backend="triton")
-    return compile_launches(launches, request.param)
+    return compile_launches(launches, arch)
 
 
-def launch_nodes() -> None:
-    """The largest and the smallest kernels."""
-    for rest, degree, masked, placed in ((15, 3, True, True), (0, 0, False, False)):
+def launch_nodes(smallest_too: bool) -> None:
+    for rest, degree, masked, placed in ((15, 3, True, True), (0, 0, False, False))[: 1 + smallest_too]:
         inputs, run = case(rest, degree, masked, placed, torch.float32, count=2, device=DEVICE)
         activated(inputs, lambda run=run: run("triton"))
     table, deltas = on_device(0.3)
     poses_at(table, *deltas, 0.3, MAX_GAP, backend="triton").translations.sum().backward()
 
 
-def launch_images() -> None:
+def launch_images(smallest_too: bool) -> None:
     image = torch.zeros(11, 11, 3, device=DEVICE)
     ssim(image, image, backend="triton")
     ssim(image.requires_grad_(), image, backend="triton").backward()
     texels = torch.zeros(6, 2, 2, 3, device=DEVICE)
-    for view in (camera(11, 11), replace(camera(11, 11), distortion=torch.zeros(5))):
+    for view in (replace(camera(11, 11), distortion=torch.zeros(5)), camera(11, 11))[: 1 + smallest_too]:
         over_sky(image, image[..., 0], texels, view, transmittance_min=0.1, backend="triton").sum().backward()
 
 
-def test_every_kernel_is_compiled(compiled):
-    assert sorted(launch.name for launch, _ in compiled) == [
-        "activate_rows", "activate_rows", "activate_rows_backward", "activate_rows_backward",
-        "interpolate", "interpolate_backward",
-        "lay_over_sky", "lay_over_sky", "lay_over_sky_backward", "lay_over_sky_backward",
-        "similarity", "similarity", "similarity_backward", "step_numbers", "step_numbers"
+def test_every_kernel_is_compiled(compiled, scope):
+    of_two_sizes = [
+        "activate_rows", "activate_rows_backward", "lay_over_sky", "lay_over_sky_backward", "step_numbers"
     ]  # fmt: skip
+    of_one = ["interpolate", "interpolate_backward", "similarity", "similarity", "similarity_backward"]
+    expected = [*of_one, *of_two_sizes * (1 + scope[1])]
+    assert sorted(launch.name for launch, _ in compiled) == sorted(expected)
 
 
 def test_nothing_spills_and_registers_are_few(compiled):

@@ -42,7 +42,7 @@ def check(case: dict, found: dict) -> None:
     assert {kernel["name"] for kernel in found["compiled"]} <= set(names)
     for kernel in found["compiled"]:
         sizes = expected(kernel["name"], case["width"], case["height"])
-        assert kernel["spilled"] == 0, kernel
+        assert kernel["spilled"] == kernel["tensor_core"] == kernel["atomics"] == 0, kernel
         assert kernel["shared"] <= 48 << 10, kernel
         for name, known in kernel["known"].items():
             kind = kernel["types"][name]
