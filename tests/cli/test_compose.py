@@ -86,17 +86,14 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
     ],
 )
 def test_a_value_that_cannot_be_is_found_before_any_data_is_read(override, said):
-    with configuration():
-        cfg = compose("train", ["folder=.", override])
-    assert said in config_problem(cfg)
+    assert said in config_problem(composed([override]))
 
 
 @pytest.mark.parametrize(
     "override", ["node.background.max_gaussians=null", "loss.sky.weight=1", "schedule.max_steps=5"]
 )
 def test_values_that_can_be_pass(override):
-    with configuration():
-        assert config_problem(compose("train", ["folder=.", override])) is None
+    assert config_problem(composed([override])) is None
 
 
 def test_the_whole_configuration_can_be_shown_resolved(capsys):
@@ -113,9 +110,7 @@ def test_a_gpu_that_is_not_there(monkeypatch):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with configuration():
-        cfg = compose("train", ["folder=.", "trainer=gpu"])
-    assert "trainer=gpu needs a CUDA device" in config_problem(cfg)
+    assert "trainer=gpu needs a CUDA device" in config_problem(composed(["trainer=gpu"]))
 
 
 def folder_of_the_log(run: Path, started: Path, *overrides: str) -> Path:

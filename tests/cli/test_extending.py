@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose
 from hydra.errors import InstantiationException
 from PIL import Image
 
 from sparsestreet.cli.assemble import data_of, recipe_of
-from sparsestreet.cli.compose import configuration, override_problem
+from sparsestreet.cli.compose import override_problem
 from sparsestreet.cli.data import data
 from sparsestreet.cli.train import train
 from sparsestreet.data.drivestudio import DriveStudioReader
@@ -25,6 +24,7 @@ from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.masks import StaticMask
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.views import read_views
+from tests.cli import configurations
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.toy.density import GrowthDensity
 from tests.cli.toy.loss import MeanColor
@@ -44,8 +44,7 @@ PROBIT = "node.background.mask._target_=tests.cli.toy.mask.ProbitMaskSettings"
 
 def composed(*overrides: str):
     assert override_problem([OUTSIDE, *overrides]) is None
-    with configuration():
-        return compose("train", ["folder=.", OUTSIDE, *overrides])
+    return configurations.composed(OUTSIDE, *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -6,16 +6,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hydra import compose
 
 from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.compose import configuration
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.types import BodyPoses, Track
+from tests.cli.configurations import composed
 from tests.scene.street import NUM_FRAMES, pose, street_log, track
 
 METHODS = ("3dgs", "deformgs", "pvg", "streetgs", "omnire")
@@ -36,9 +35,7 @@ SIZES = {"streetgs": OBJECTS, "omnire": (*OBJECTS, *PEOPLE)}
 
 def system_on(log: DrivingLog, method: str = "omnire", stride: int = 4, offset: int = 2) -> StreetSystem:
     """With masks, as a run would start it."""
-    overrides = ["folder=.", f"method={method}", "sparsify=masks", *SMALL, *SIZES.get(method, ())]
-    with configuration():
-        cfg = compose("train", overrides)
+    cfg = composed(f"method={method}", "sparsify=masks", *SMALL, *SIZES.get(method, ()))
     data = StreetData(log, stride=stride, offset=offset)
     return recipe_of(cfg).build(data)
 
@@ -130,9 +127,7 @@ def test_one_frame_of_one_camera(method: str):
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_to_start_from_is_an_error_of_one_sentence(method: str):
     log = replace(with_tracks(), sweeps=())
-    overrides = ["folder=.", f"method={method}", *SMALL, "node.background.num_points=0"]
-    with configuration():
-        recipe = recipe_of(compose("train", overrides))
+    recipe = recipe_of(composed(f"method={method}", *SMALL, "node.background.num_points=0"))
     with pytest.raises(ValueError, match="has nothing to start from: none of num_points=0"):
         recipe.build(StreetData(log, stride=4, offset=2))
 

@@ -3,22 +3,23 @@
 import csv
 import itertools
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
-from hydra import compose
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import CONF, configuration, override_problem
+from sparsestreet.cli.compose import CONF, override_problem
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.density import GradientDensity, VibratingDensity
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.triangulation import ImagePointSettings
+from tests.cli.configurations import composed
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
@@ -28,24 +29,24 @@ DAILY = [("streetgs", "paper"), ("3dgs", "removal"), ("omnire", "removal"), ("pv
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 
-def composed(*overrides: str):
-    with configuration():
-        return compose("train", ["folder=.", *overrides])
-
-
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
     assert {"none", "masks", "importance", "paper", "removal", "random", "opacity", "capped"} <= set(SPARSIFY)
+
+
+@cache
+def plain_losses(method: str) -> list[str]:
+    return list(recipe_of(composed(f"method={method}")).losses)
 
 
 @pytest.mark.parametrize(("method", "sparsify"), PAIRS)
 def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     """Masks, their loss and their callback come together; what a method has stays with every sparsification."""
     cfg = composed(f"method={method}", f"sparsify={sparsify}")
-    recipe, plain = recipe_of(cfg), recipe_of(composed(f"method={method}"))
+    recipe = recipe_of(cfg)
     masked = cfg.sparsify.masks
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
-    assert list(recipe.losses) == [*plain.losses, *(["mask_sparsity"] if masked else [])]
+    assert list(recipe.losses) == [*plain_losses(method), *(["mask_sparsity"] if masked else [])]
     # Which rule and which masks a sparsification has is the paper's matter, and that of its name.
     rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
     rules |= {"random": RandomRule, "opacity": OpacityRule}
