@@ -1,32 +1,49 @@
-"""A street small enough that a training takes seconds."""
+"""A street small enough that a training takes seconds, and the runs on it that many tests look at."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
+import jaxtyping
 import pytest
+from lightning import Callback, Trainer
 
 from sparsestreet.cli.data import data
 from sparsestreet.cli.train import train
 from tests.conftest import unchecked
+from tests.shared import made_once
+
+
+class OneStepChecked(Callback):
+    """Shapes are checked in the first step of a training: they cost half of each, and the next ones are alike."""
+
+    def on_train_batch_end(self, *arguments: Any) -> None:
+        jaxtyping.config.update("jaxtyping_disable", True)
+
+
+@pytest.fixture(autouse=True, scope="package")
+def one_step_checked() -> Iterator[None]:
+    fit = Trainer.fit
+
+    def checked_once(trainer: Trainer, *arguments: Any, **options: Any) -> None:
+        before = jaxtyping.config.jaxtyping_disable
+        trainer.callbacks.append(OneStepChecked())
+        try:
+            fit(trainer, *arguments, **options)
+        finally:
+            jaxtyping.config.update("jaxtyping_disable", before)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "fit", checked_once)
+        yield
 
 
 @pytest.fixture(scope="session")
 def tiny_street(tmp_path_factory) -> list[str]:
     """Overrides that select it; it is traced once per session."""
-    root = tmp_path_factory.mktemp("street") / "tiny"
-    street = [
-        f"data.log.root={root}",
-        "data.log.settings.num_frames=12",
-        "data.log.settings.width=64",
-        "data.log.settings.height=40",
-        "data.log.settings.num_cameras=2",
-        "data.lidar.beams=24",
-        "data.lidar.azimuth_steps=300",
-    ]
-    with unchecked():
-        assert data(["make", *street]) == 0
+    root = made_once(tmp_path_factory, "streets", trace) / "tiny"
     return [
-        *street,
+        *street_at(root),
         "effects.sky.resolution=8",
         *TINY_BACKGROUND,
         f"image_points.cache={root.parent / 'points'}",
@@ -36,6 +53,33 @@ def tiny_street(tmp_path_factory) -> list[str]:
         "trainer.val_check_interval=60",
         *TIMED_ONCE,
     ]
+
+
+def trace(folder: Path) -> None:
+    with unchecked():
+        assert data(["make", *street_at(folder / "tiny")]) == 0
+
+
+def street_at(root: Path) -> list[str]:
+    return [
+        f"data.log.root={root}",
+        "data.log.settings.num_frames=12",
+        "data.log.settings.width=64",
+        "data.log.settings.height=40",
+        "data.log.settings.num_cameras=2",
+        "data.lidar.beams=24",
+        "data.lidar.azimuth_steps=300",
+    ]
+
+
+@pytest.fixture(scope="session")
+def finished(tiny_street, tmp_path_factory) -> Path:
+    """A run with all stages, for those who look: not to be changed."""
+
+    def make(out: Path) -> None:
+        assert train([*tiny_street, *ALL_STAGES, f"out={out}"]) == 0
+
+    return made_once(tmp_path_factory, "finished", make)
 
 
 TIMED_ONCE = [f"evaluation.timing.{name}={count}" for name, count in (("warmup", 1), ("repeats", 2), ("rounds", 1))]
@@ -54,6 +98,12 @@ TINY_RIGID = [
 ]
 
 
+ALL_STAGES = [
+    *TINY_RIGID,
+    "sparsify=removal",
+    # A budget relative to the error would take most of a scene that is hardly trained.
+    "schedule.removal_db=0.0",
+]
 TINY_PEOPLE = [
     "node.smpl.body.num_vertices=500",
     "node.smpl.min_gaussians=50",
@@ -70,7 +120,7 @@ def method_of(overrides: Sequence[str]) -> str:
     return named[0] if named else "streetgs"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def run_train(tiny_street):
     """Train on the tiny street into a folder; what has no options is named: ``method=3dgs``, ``image_points=none``."""
 

@@ -15,10 +15,9 @@ from tests.conftest import unchecked
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
-def test_the_lines_of_python_render_a_run(run_train, tmp_path):
+def test_the_lines_of_python_render_a_run(finished, tmp_path):
     code, _ = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    run = run_train(tmp_path / "run", "schedule.max_steps=3")
-    code = code.replace('"RUN"', repr(str(run)))
+    code = code.replace('"RUN"', repr(str(finished)))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "[192, 320, 3]" in done.stdout

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +14,13 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.resume import check_resumed
 from sparsestreet.cli.train import train
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.training.callbacks import RowLedger
+from tests.cli.conftest import TINY_RIGID
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -31,6 +34,16 @@ def assert_equal(run: Path, other: Path) -> None:
         assert torch.equal(value, got[name]), name
 
 
+ALL_STAGES = [
+    *TINY_RIGID,
+    "sparsify=removal",
+    "schedule.reset_in.start=0.3",
+    "schedule.reset_in.stop=0.35",
+    "schedule.reset_in.every=10",
+    "schedule.pause_after_reset=12",
+]
+
+
 @pytest.fixture(scope="module")
 def whole(tiny_street, tmp_path_factory) -> Path:
     """The uninterrupted run, with resets, so that a pause after one can be interrupted too."""
@@ -39,27 +52,40 @@ def whole(tiny_street, tmp_path_factory) -> Path:
     return out
 
 
-ALL_STAGES = (
-    "sparsify=removal",
-    "node.rigid.points_per_instance=150",
-    "node.rigid.min_gaussians=60",
-    "node.rigid.max_gaussians=3000",
-    "schedule.reset_in.start=0.3",
-    "schedule.reset_in.stop=0.35",
-    "schedule.reset_in.every=10",
-    "schedule.pause_after_reset=12",
-)
-
-
-@pytest.mark.parametrize("stop_at", [23, pytest.param(50, marks=pytest.mark.slow)])
-def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, tiny_street, tmp_path, stop_at):
-    """Stopped inside the mask stage (23: after a reset, in its pause) and after it (50: the masks are gone)."""
-    part = tmp_path / "part"
+def stopped_at(step: int, tiny_street: list[str], out: Path) -> Path:
+    """A run with all stages that failed in a step."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RowLedger, "on_train_batch_start", _raises_at(stop_at), raising=False)
+        patch.setattr(RowLedger, "on_train_batch_start", _raises_at(step), raising=False)
         patch.setenv("HYDRA_FULL_ERROR", "1")
         with pytest.raises(RuntimeError, match="stopped by the test"):
-            train([*tiny_street, *ALL_STAGES, f"out={part}"])
+            train([*tiny_street, *ALL_STAGES, f"out={out}"])
+    return out
+
+
+@pytest.fixture(scope="module")
+def stopped_early(tiny_street, tmp_path_factory) -> Path:
+    """Inside the mask stage: after a reset, in its pause."""
+    return stopped_at(23, tiny_street, tmp_path_factory.mktemp("stopped") / "run")
+
+
+def test_an_interrupted_run_can_be_evaluated(stopped_early, tmp_path):
+    shutil.copytree(stopped_early, tmp_path / "run")
+    assert evaluate([f"run={tmp_path / 'run'}"]) == 0
+    run = SUMMARY.read(tmp_path / "run").run
+    assert (run.steps, run.max_steps) == (23, 60)
+
+
+def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, stopped_early):
+    goes_on_to_the_same_end(stopped_early, whole)
+
+
+@pytest.mark.slow
+def test_resume_after_the_mask_stage(whole, tiny_street, tmp_path):
+    """The masks are gone."""
+    goes_on_to_the_same_end(stopped_at(50, tiny_street, tmp_path / "part"), whole)
+
+
+def goes_on_to_the_same_end(part: Path, whole: Path) -> None:
     before = curve(part)
     started = time.perf_counter()
     assert train([f"resume={part}"]) == 0
@@ -102,9 +128,31 @@ def _raises_at(step: int):
     return hook
 
 
-@pytest.mark.parametrize(
-    ("number", "status"), [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)]
-)
+def test_a_signal_between_two_steps(whole, tiny_street, tmp_path, monkeypatch):
+    """In this process, which is told how it would have ended; then it goes on to the same end."""
+
+    def signaled(self, trainer, *arguments):
+        if trainer.global_step == 6:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RowLedger, "on_train_batch_start", signaled, raising=False)
+        with pytest.raises(SystemExit) as ended:
+            train([*tiny_street, *ALL_STAGES, f"out={tmp_path}"])
+    assert ended.value.code == 143
+    ended_well_and_goes_on(tmp_path, whole)
+
+
+def ended_well_and_goes_on(out: Path, whole: Path) -> None:
+    assert (out / "checkpoints" / "interrupted.ckpt").is_file()
+    assert (out / "scene.safetensors").is_file()
+    assert train([f"resume={out}"]) == 0
+    assert not (out / "checkpoints" / "interrupted.ckpt").exists()
+    assert_equal(whole, out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_after_the_step_with_its_own_status(whole, tiny_street, tmp_path, number, status):
     """In a process of its own, at whatever moment of a step the signal comes; then it goes on to the same end."""
     out = tmp_path / "run"
@@ -118,11 +166,7 @@ def test_a_signal_ends_after_the_step_with_its_own_status(whole, tiny_street, tm
     process.send_signal(number)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == status, errors
-    assert (out / "checkpoints" / "interrupted.ckpt").is_file()
-    assert (out / "scene.safetensors").is_file()
-    assert train([f"resume={out}"]) == 0
-    assert not (out / "checkpoints" / "interrupted.ckpt").exists()
-    assert_equal(whole, out)
+    ended_well_and_goes_on(out, whole)
 
 
 @pytest.mark.parametrize(
@@ -152,15 +196,3 @@ def test_what_may_change_when_a_run_goes_on(tmp_path, change, refused):
     OmegaConf.save(config, tmp_path / ".hydra" / "config.yaml")
     with nullcontext() if refused is None else pytest.raises(ValueError, match=refused):
         check_resumed(config | change, tmp_path)
-
-
-def test_an_interrupted_run_can_be_evaluated(tiny_street, tmp_path, monkeypatch):
-    from sparsestreet.cli.evaluate import evaluate
-
-    monkeypatch.setattr(RowLedger, "on_train_batch_start", _raises_at(7), raising=False)
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(RuntimeError, match="stopped by the test"):
-        train([*tiny_street, *ALL_STAGES, f"out={tmp_path}"])
-    assert evaluate([f"run={tmp_path}"]) == 0
-    run = SUMMARY.read(tmp_path).run
-    assert (run.steps, run.max_steps) == (7, 60)

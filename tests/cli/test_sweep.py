@@ -14,6 +14,7 @@ from sparsestreet.cli.train import train
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY
 from tests.cli import configurations
+from tests.cli.conftest import TIMED_ONCE
 from tests.evaluation.frames import make_summary
 
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
@@ -37,13 +38,23 @@ def jobs(name: str) -> list[list[str]]:
     return [[f"{first[0]}={value}", *rest, f"+sweep={name}"] for value in first[1]]
 
 
+@pytest.fixture(scope="module")
+def counted(tmp_path_factory) -> str:
+    """The run that controls have their count from; a drive as well as any."""
+    folder = tmp_path_factory.mktemp("counted")
+    SUMMARY.write(folder, make_summary(gaussians={"background": 20_000, "rigid": 2000}))
+    return str(folder)
+
+
+def composed_jobs(name: str, counted: str) -> list[DictConfig]:
+    drive = [f"data.root={counted}"] if name in NEED_DRIVES else []
+    return [composed(*job, *drive, f"count_of={counted}") for job in jobs(name)]
+
+
 @pytest.mark.parametrize("name", SWEEPS)
-def test_every_job_of_a_sweep_can_be(name, tmp_path):
-    # The run that controls have their count from.
-    SUMMARY.write(tmp_path, make_summary(gaussians={"background": 20_000, "rigid": 2000}))
-    drive = [f"data.root={tmp_path}"] if name in NEED_DRIVES else []
-    for job in jobs(name):
-        assert problem_of(composed(*job, *drive, f"count_of={tmp_path}")) is None, job
+def test_every_job_of_a_sweep_can_be(name, counted):
+    for cfg in composed_jobs(name, counted):
+        assert problem_of(cfg) is None, cfg.name
 
 
 def test_the_rows_of_table_1_are_the_papers():
@@ -81,14 +92,13 @@ def test_drives_are_read_where_the_authors_read_them():
     assert windows == {"172": (30, 180), "023": (0, 150), "500": (0, -1)}
 
 
-def test_a_control_keeps_what_the_other_run_ended_with(tmp_path):
-    SUMMARY.write(tmp_path, make_summary(gaussians={"background": 20_000, "rigid": 2000}))
-    capped = composed("sparsify=capped", f"count_of={tmp_path}").node.background
+def test_a_control_keeps_what_the_other_run_ended_with(counted):
+    capped = composed("sparsify=capped", f"count_of={counted}").node.background
     assert (capped.num_points, capped.max_gaussians) == (20_000, 20_000)
-    rule = composed("sparsify=random", f"count_of={tmp_path}").callback.pruning.rule
+    rule = composed("sparsify=random", f"count_of={counted}").callback.pruning.rule
     assert rule.keep == {"background": 20_000, "rigid": 2000}
     assert composed("sparsify=random").callback.pruning.rule.keep == 0.5
-    assert "that run has no record" in problem_of(composed("sparsify=opacity", f"count_of={tmp_path / 'nothing'}"))
+    assert "that run has no record" in problem_of(composed("sparsify=opacity", f"count_of={counted}/nothing"))
 
 
 def test_drives_must_be_named_and_there(tmp_path):
@@ -165,6 +175,7 @@ def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, caps
         "seed=0",
         "sparsify=random,removal",
         "schedule.max_steps=20",
+        *TIMED_ONCE,
     ]
     assert train(command) == 1
     assert "1 failed; the same command runs them again" in capsys.readouterr().err

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
 from sparsestreet.cli.train import train
+from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.metrics.protocols import PROTOCOLS
@@ -27,6 +28,7 @@ from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.views import read_views
+from tests.cli.conftest import TIMED_BY_DEFAULT
 from tests.cli.recompute import recompute
 from tests.conftest import unchecked
 from tests.metrics.networks import random_weights, write_weights
@@ -39,20 +41,32 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 @pytest.fixture(scope="module")
-def finished(tiny_street, tmp_path_factory):
-    """A run with all stages; a budget relative to the error would take most of a scene that is hardly trained."""
-    from tests.cli.conftest import TINY_RIGID
+def brief(run_train, tmp_path_factory) -> tuple[Path, float]:
+    """A run of two steps that measures more than usual, as often as by default; the seconds of its command."""
+    measured = ["evaluation.novel=[1.5]", "evaluation.presets=[fast]", *TIMED_BY_DEFAULT]
+    with unchecked():
+        started = time.perf_counter()
+        out = run_train(tmp_path_factory.mktemp("brief") / "run", "schedule.max_steps=2", *measured)
+        return out, time.perf_counter() - started
 
-    out = tmp_path_factory.mktemp("finished") / "run"
-    assert train([*tiny_street, *TINY_RIGID, f"out={out}", "sparsify=removal", "schedule.removal_db=0.0"]) == 0
+
+@pytest.fixture(scope="module")
+def evaluated_again(finished, tmp_path_factory) -> Path:
+    """A copy, evaluated by a process of another number of threads than trained it."""
+    out = tmp_path_factory.mktemp("again") / "run"
+    shutil.copytree(finished, out)
+    before = torch.get_num_threads()
+    torch.set_num_threads(before + 1)  # evaluate goes back to the number that trained
+    assert evaluate([f"run={out}"]) == 0
+    torch.set_num_threads(before)
     return out
 
 
-def test_training_improves_and_leaves_records(finished, run_train, tmp_path):
+def test_training_improves_and_leaves_records(finished, brief):
     summary = json.loads((finished / "records" / "summary.json").read_text())
     with (finished / "curves" / "metrics.csv").open() as file:
         psnr = [float(row["psnr"]) for row in csv.DictReader(file) if row["psnr"]]
-    start = SUMMARY.read(run_train(tmp_path / "start", "schedule.max_steps=1"))
+    start = SUMMARY.read(brief[0])
     # 60 steps from gray random rotations: several dB; noise between runs is zero on the CPU.
     first = start.quality["held_out"]["psnr_full"].mean
     assert summary["quality"]["held_out"]["psnr_full"]["mean"] > first + 3
@@ -65,11 +79,9 @@ def test_training_improves_and_leaves_records(finished, run_train, tmp_path):
         assert (finished / picture).is_file()
 
 
-def test_phases_are_the_wall_clock_of_the_command(run_train, tmp_path):
+def test_phases_are_the_wall_clock_of_the_command(brief):
     """By a clock outside: each second belongs to one phase."""
-    started = time.perf_counter()
-    out = run_train(tmp_path / "run", "schedule.max_steps=2")
-    wall = time.perf_counter() - started
+    out, wall = brief
     costs = COSTS.read(out)
     assert costs.wall_seconds == pytest.approx(wall, rel=0.02)
     assert sum(costs.phases.values()) == pytest.approx(wall, rel=0.02)
@@ -176,13 +188,9 @@ def test_instances_keep_the_names_of_their_tracks(finished, tiny_street):
     assert set(names) <= set(tracks)
 
 
-def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, tmp_path):
-    out = tmp_path / "copy"
-    shutil.copytree(finished, out)
-    first, costs = SUMMARY.read(out), COSTS.read(out)
-    torch.set_num_threads(first.run.threads + 1)  # evaluate goes back to the number that trained
-    assert evaluate([f"run={out}"]) == 0
-    second, again = SUMMARY.read(out), COSTS.read(out)
+def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, evaluated_again):
+    first, costs = SUMMARY.read(finished), COSTS.read(finished)
+    second, again = SUMMARY.read(evaluated_again), COSTS.read(evaluated_again)
     made_anew = ("frame_ms", "nodes", "effects", "noise")
     assert replace(again, **{name: getattr(costs, name) for name in made_anew}) == costs
     assert again.nodes != costs.nodes  # other milliseconds
@@ -191,25 +199,22 @@ def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished,
     assert list(second.by_camera["held_out"]) == ["0", "1"]
     assert second.gaussians == first.gaussians
     assert second.run == first.run
-    assert second.evaluated.command == f"sparsestreet evaluate run={out}"
+    assert second.evaluated.command == f"sparsestreet evaluate run={evaluated_again}"
     assert first.evaluated.command == first.run.command
 
 
-def test_the_tables_numbers_follow_from_predictions_and_images(finished, tiny_street, tmp_path):
+def test_the_tables_numbers_follow_from_predictions_and_images(finished, evaluated_again, tiny_street):
     """Six numbers in each of two protocols, by a program that shares no code with the metrics; so after evaluate."""
     (root,) = (Path(word.partition("=")[2]) for word in tiny_street if word.startswith("data.log.root="))
-    again = tmp_path / "again"
-    shutil.copytree(finished, again)
-    assert evaluate([f"run={again}"]) == 0
-    for run in (finished, again):
+    for run in (finished, evaluated_again):
         summary, expected = SUMMARY.read(run), recompute(run, root)
         names = [name for protocol in PROTOCOLS.values() for name in protocol.metrics if not name.startswith("lpips")]
         assert len(names) == len(set(names)) == 12
         for name in names:
             # The record keeps 6 digits; the metrics take images in float32, which is 6e-8 of 1.
             assert summary.mean(name) == pytest.approx(expected[name], rel=2e-5)
-    stored = [path.name for path in (again / "predictions/held_out").iterdir()]
-    assert len(stored) == SUMMARY.read(again).images["held_out"]
+    stored = [path.name for path in (evaluated_again / "predictions/held_out").iterdir()]
+    assert len(stored) == SUMMARY.read(evaluated_again).images["held_out"]
 
 
 def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monkeypatch):
@@ -253,7 +258,7 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, 
 
 
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
-    out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=5")
+    out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=1")
     summary = SUMMARY.read(out)
     assert list(summary.quality) == ["training"]
     assert summary.quality["training"]["psnr_full"].images == 24
@@ -261,8 +266,9 @@ def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_p
     assert evaluate([f"run={out}"]) == 0
 
 
-def test_training_measures_what_its_configuration_asks_for(run_train, tmp_path):
-    out = run_train(tmp_path, "schedule.max_steps=5", "evaluation.novel=[1.5]", "evaluation.presets=[fast]")
+def test_training_measures_what_its_configuration_asks_for(brief):
+    out, _ = brief
+    assert SUMMARY.read(out).latency.clocks["frame"].repeats == Timing().repeats
     trained = NOVEL.read(out)
     assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 2), (-1.5, 2)]
     assert trained.command.startswith("sparsestreet train ")
@@ -278,7 +284,8 @@ def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
         "data.log.settings.num_cameras=1",
     ]
     lens = ["data.log.settings.lens=[-0.3,0.1,0,0,0]", "data.log.lidar=false", "split.offset=1"]
-    out = run_train(tmp_path, *street, *lens, "trainer.fast_dev_run=2")
+    with unchecked():
+        out = run_train(tmp_path, *street, *lens, "trainer.fast_dev_run=2")
     said = (out / "train.log").read_text()
     assert "camera 0: its lens moves pixels by up to" in said
     assert "and is simulated" in said
@@ -331,19 +338,27 @@ def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     [
         (["schedule.max_step=5"], "schedule.max_steps"),
         (["data=drivestudio"], "data.root has no value"),
-        (["data=drivestudio", "data.root=/nowhere/at/all"], "/nowhere/at/all"),
         (["schedule.max_steps=abc"], "must be int"),
         (["resume=/nowhere/at/all"], "there is nothing"),
     ],
 )
-def test_a_slip_is_one_line_and_no_trace(overrides, said, tmp_path):
-    """In a process of its own, since Hydra's report of an error is what must not be seen."""
-    command = [sys.executable, "-m", "sparsestreet", "train", *overrides]
-    done = subprocess.run([*command, f"out={tmp_path / 'run'}"], capture_output=True, text=True, timeout=120)
-    assert done.returncode in (1, 2)
-    assert said in done.stderr
-    assert "Traceback" not in done.stderr
-    assert "Error in call" not in done.stderr
+def test_a_slip_is_one_line_before_hydra_sees_it(overrides, said, tmp_path, capsys):
+    assert train([*overrides, f"out={tmp_path / 'run'}"]) == 2
+    written = capsys.readouterr().err
+    assert said in written
+    assert written.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
+    """It is found inside of Hydra, whose report of an error must not be seen."""
+    with pytest.raises(SystemExit) as ended:
+        train(["data=drivestudio", "data.root=/nowhere/at/all", f"out={tmp_path / 'run'}"])
+    assert ended.value.code == 1
+    written = capsys.readouterr().err
+    assert "/nowhere/at/all" in written
+    assert "Traceback" not in written
+    assert "Error in call" not in written
 
 
 def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):

@@ -66,7 +66,7 @@ def test_a_street_is_read_with_its_bodies(tmp_path):
     exact, noisy = (
         StreetReader(replace(SETTINGS, body_pose_noise=noise), tmp_path / str(noise)) for noise in (0.0, 3.0)
     )
-    log = exact.read()
+    log, others = exact.read(), noisy.read().tracks
     actors = [actor for actor in build_world(SETTINGS).actors if actor.model.class_name == "Pedestrian"]
     people = [track for track in log.tracks if track.body is not None]
     assert 1 < len(people) <= len(actors)
@@ -75,7 +75,7 @@ def test_a_street_is_read_with_its_bodies(tmp_path):
     for track in people:
         person = min(actors, key=lambda actor: abs(actor.model.height - float(track.size[2]))).model
         path = min(actors, key=lambda actor: abs(actor.model.height - float(track.size[2]))).path
-        other = next(again for again in noisy.read().tracks if again.name == track.name)
+        other = next(again for again in others if again.name == track.name)
         assert other.body.valid.tolist() == track.body.valid.tolist()
         for place in track.body.valid.nonzero().flatten().tolist():
             rotations = joint_rotations(person, path.traveled(int(track.frames[place]) / SETTINGS.frame_rate))
