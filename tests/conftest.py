@@ -1,4 +1,4 @@
-"""What all tests share: where recorded data may lie."""
+"""What all tests share: where recorded data may lie, and how long a test may take."""
 
 import os
 from collections.abc import Iterator
@@ -9,9 +9,20 @@ import jaxtyping
 import pytest
 import torch
 
+from tests.cpu_limit import CpuLimit
+
 if not torch.cuda.is_available():
     # Before anything imports triton: its kernels are then interpreted, on CPU tensors.
     os.environ.setdefault("TRITON_INTERPRET", "1")
+
+
+pytest_plugins = ["pytester"]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # On a GPU the first launch of a kernel compiles it.
+    if not torch.cuda.is_available():
+        config.pluginmanager.register(CpuLimit())
 
 
 @pytest.fixture(autouse=True)

@@ -14,6 +14,12 @@ from tests.conftest import unchecked
 from tests.shared import made_once
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "tiny_street" in getattr(item, "fixturenames", ()):
+            item.add_marker("lengthy")
+
+
 class OneStepChecked(Callback):
     """Shapes are checked in the first step of a training: they cost half of each, and the next ones are alike."""
 

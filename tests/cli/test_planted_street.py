@@ -30,6 +30,7 @@ from sparsestreet.training.losses import Depth, MaskSparsity, Photometric, SkyMa
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
+from tests.conftest import unchecked
 from tests.pruning.planted import Views, activated, judge, plant
 
 STEPS = 600
@@ -37,16 +38,21 @@ STEPS = 600
 
 @pytest.fixture(scope="module")
 def planted_street(tiny_street, tmp_path_factory):
-    return planted_in(tiny_street, tmp_path_factory.mktemp("planted"), max_steps=100, max_gaussians=1200, few=120)
+    return planted_in(
+        tiny_street, tmp_path_factory.mktemp("planted"), max_steps=100, max_gaussians=1200, few=100, hidden=24
+    )
 
 
 @pytest.fixture(scope="module")
 def well_trained_street(tiny_street, tmp_path_factory):
     """Masks need a street whose own rows are worth something."""
-    return planted_in(tiny_street, tmp_path_factory.mktemp("planted"), max_steps=300, max_gaussians=2500, few=300)
+    return planted_in(
+        tiny_street, tmp_path_factory.mktemp("planted"), max_steps=300, max_gaussians=2500, few=300, hidden=60
+    )
 
 
-def planted_in(tiny_street: list[str], out: Path, max_steps: int, max_gaussians: int, few: int):
+@unchecked()
+def planted_in(tiny_street: list[str], out: Path, max_steps: int, max_gaussians: int, few: int, hidden: int):
     """A trained background, what was planted into it, and which of its own rows a view would miss: of ``few`` of them,
     since each costs about one rendering of a few views."""
     size = [f"schedule.max_steps={max_steps}", f"node.background.max_gaussians={max_gaussians}"]
@@ -57,7 +63,7 @@ def planted_in(tiny_street: list[str], out: Path, max_steps: int, max_gaussians:
     generator = torch.Generator().manual_seed(0)
     sky = [stored.scene.effects["sky"].background(view).detach() for view in views]
     table = stored.scene.nodes["background"].rows
-    rows, planted = plant(table, cameras, generator, hidden=60, copies=12, backend="cpu", sky_images=sky)
+    rows, planted = plant(table, cameras, generator, hidden=hidden, copies=hidden // 4, backend="cpu", sky_images=sky)
     sample = torch.randperm(int((~planted).sum()), generator=generator)[:few]
     visible = Views(activated(rows), cameras, "cpu", sky).visible(sample)
     return out, data, rows, planted, visible
@@ -71,7 +77,7 @@ def test_removal_finds_what_was_planted_and_spares_what_is_visible(planted_stree
     assert verdict.recall >= 0.95
     assert verdict.visible_lost <= 0.02
     # No test if hardly anything went, or hardly anything is visible.
-    assert verdict.num_visible > 60
+    assert verdict.num_visible > 50
     assert int((~keep & ~planted).sum()) > 100
 
 
