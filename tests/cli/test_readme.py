@@ -41,6 +41,7 @@ def test_the_lines_of_python_train_a_street(tiny_street, tmp_path, monkeypatch, 
     assert (tmp_path / "outputs" / "mine" / "scene.safetensors").is_file()
 
 
+@pytest.mark.lengthy
 def test_every_command_line_is_one_that_is_understood():
     lines = re.findall(r"^\.venv/bin/sparsestreet (.*?)(?:\s+#.*)?$", README, flags=re.M)
     assert len(lines) > 10

@@ -90,6 +90,7 @@ def test_a_protocol_is_chosen(runs, tmp_path):
         assert f"protocol {protocol}: {metric}" in table.read_text()
 
 
+@pytest.mark.lengthy
 def test_the_report_of_a_sweep(tmp_path, capsys):
     """In the layout that the sweep's name asks for; with a figure where one is wanted."""
     sweep, picture = write_sweep(tmp_path), tmp_path / "time.png"

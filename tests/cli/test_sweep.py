@@ -51,6 +51,7 @@ def composed_jobs(name: str, counted: str) -> list[DictConfig]:
     return [composed(*job, *drive, f"count_of={counted}") for job in jobs(name)]
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("name", SWEEPS)
 def test_every_job_of_a_sweep_can_be(name, counted):
     for cfg in composed_jobs(name, counted):
@@ -165,7 +166,6 @@ def test_a_failure_stands_until_its_job_succeeds(tmp_path, monkeypatch, capsys):
     assert sweep_status() == 0
 
 
-@pytest.mark.lengthy
 def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, capsys):
     """The control comes before its run and fails, the other stands; the same command makes it good."""
     command = [
@@ -174,7 +174,7 @@ def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, caps
         f"hydra.sweep.dir={tmp_path}",
         "seed=0",
         "sparsify=random,removal",
-        "schedule.max_steps=20",
+        "schedule.max_steps=10",
         *TIMED_ONCE,
     ]
     assert train(command) == 1
@@ -192,10 +192,6 @@ def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, caps
     assert SUMMARY.path(pruned).stat().st_mtime_ns == made  # skipped
     kept = SUMMARY.read(folder).run.config["callback.pruning.rule.keep.background"]
     assert kept == SUMMARY.read(pruned).gaussians["background"]
-
-    # Another configuration in the same folder is another job.
-    assert train([word.replace("random,removal", "removal").replace("=20", "=10") for word in command]) == 0
-    assert SUMMARY.path(pruned).stat().st_mtime_ns > made
 
 
 def test_a_slip_in_a_sweep_is_one_line(capsys):

@@ -303,9 +303,8 @@ def test_the_scene_is_moved_to_the_device_it_is_told(tmp_path, monkeypatch):
     move = type(scene).to
     monkeypatch.setattr(type(scene), "to", lambda self, device: moved.append(device) or move(self, device))
     device = torch.device("cpu", 0)
-    evaluate_scene(
-        scene, tuple(make_frames(2)), (), run=MADE, options=OPTIONS, out=tmp_path, command="c", device=device
-    )
+    told = {"run": MADE, "options": OPTIONS, "out": tmp_path, "command": "c", "device": device}
+    evaluate_scene(scene, tuple(make_frames(2)), (), **told, timing=Timing(1, 1, 1))
     assert moved == [device]
     assert not scene.training
 

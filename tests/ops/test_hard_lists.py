@@ -76,6 +76,7 @@ def test_16_nothing_is_read_before_it_is_written(backend, dtype, stop):
     assert torch.equal(expected.radii, result.radii)
 
 
+@pytest.mark.lengthy
 @every_fast_precision
 def test_16_numbers_of_every_row_are_written(backend, dtype):
     # The third tile is empty, the stack closes the first one, and the rows at both ends are culled.

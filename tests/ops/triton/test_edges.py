@@ -72,6 +72,7 @@ def test_masked_rows_leave_no_trace():
         assert not dropped.gradients[name][~keep].any()
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("effects", first_interpreted(False, True))
 def test_nothing_is_read_before_it_is_written(effects, monkeypatch):
     # The third tile is empty; the stack closes the first one, so that its pairs behind the 32nd are never looked at.

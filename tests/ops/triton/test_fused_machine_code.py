@@ -25,6 +25,7 @@ from tests.ops.triton.recording import Launch, compile_launches, record_launches
 from tests.ops.triton.test_poses import on_device
 
 # One process compiles for all tests.
+pytestmark = pytest.mark.lengthy
 DEVICE = device_of("triton")
 # Measured with Triton 3.7.1: 64, 94, 41, 64, 22, 32, 40, 64, 64. A streaming multiprocessor has 65536 registers: at 32
 # in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on their

@@ -26,6 +26,7 @@ from tests.ops.triton.test_launch_path import BACKWARD as BACKWARD_PASS
 from tests.ops.triton.test_launch_path import FORWARD as FORWARD_PASS
 
 # One process compiles for all tests.
+pytestmark = pytest.mark.lengthy
 DEVICE = device_of("triton")
 
 STILL = camera(5, 4)
