@@ -35,7 +35,7 @@ quick: lint ## the loop of daily work, under a minute: lint and unit tests witho
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'
 
 test: lint ## what a change must pass: lint and all tests but those marked slow
-	$(PYTEST) -m 'not slow'
+	$(PYTEST) -m 'not slow' --durations=20
 
 test-all: lint ## lint and all tests: every kernel for every architecture, every size of tiles
 	$(PYTEST)

@@ -5,6 +5,8 @@ import pytest
 from tests import cpu_limit
 from tests.cpu_limit import CpuLimit
 
+pytestmark = pytest.mark.lengthy
+
 TESTS = """
 import time
 import pytest

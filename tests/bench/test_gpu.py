@@ -123,6 +123,7 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
     assert any("agrees: equal" in line for line in said)
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("slower", ["packed", "unpacked"])
 def test_gsplats_faster_mode_is_used_after_the_first_size(tmp_path, monkeypatch, slower):
     module = fake_gsplat()

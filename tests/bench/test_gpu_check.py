@@ -18,6 +18,8 @@ from sparsestreet.records.strict_json import write_json
 from tests.evaluation.frames import make_summary
 from tests.ops import scenes
 
+pytestmark = pytest.mark.lengthy
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 TAG = "py3-none-any"

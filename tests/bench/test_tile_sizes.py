@@ -44,6 +44,7 @@ def test_without_a_library_the_point_is_skipped_with_its_reason(monkeypatch):
         with_tiles(64, tile_size)
 
 
+@pytest.mark.lengthy
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
 def test_cmake_refuses_other_sizes(tmp_path):
     command = ["cmake", "-S", str(ROOT), "-B", str(tmp_path), "-DSPARSESTREET_TILE=12"]

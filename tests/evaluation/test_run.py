@@ -29,6 +29,8 @@ from tests.evaluation.frames import make_frame, make_image, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 from tests.metrics.networks import random_weights, write_weights
 
+pytestmark = pytest.mark.lengthy
+
 MADE = make_run("streetgs+paper", 3, training_seconds=12.5, caps={"road": 2}, config={"loss.weight": 0.012345678901})
 
 

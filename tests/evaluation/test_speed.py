@@ -89,6 +89,7 @@ def test_the_cameras_of_a_rig_may_fire_at_times_of_their_own():
     ]
 
 
+@pytest.mark.lengthy
 @pytest.mark.usefixtures("steady")
 def test_what_is_closed_is_taken_out_for_each_time_of_a_rig_before_the_clock_starts(monkeypatch):
     """Of two instants of two cameras that fire 60 ms apart; the scene of each time is made once for a rig's turns."""
@@ -114,6 +115,7 @@ def test_what_is_closed_is_taken_out_for_each_time_of_a_rig_before_the_clock_sta
     assert set(made) == {0.0, 0.06, 0.1, 0.16}
 
 
+@pytest.mark.lengthy
 def test_real_clock_sees_the_whole_render(monkeypatch):
     frame = measure(monkeypatch, lambda view: time.sleep(0.003), warmup=2, repeats=50).clocks[FRAME]
     assert 3 <= frame.p50 <= frame.p90 <= frame.p99

@@ -105,6 +105,7 @@ def drawn(gaussians: Gaussians, view: Camera, backend: str) -> tuple[np.ndarray,
     return fitted_splat(splat(gaussians, view, settings=FITTED, backend=backend).alpha.detach())
 
 
+@pytest.mark.lengthy
 @every_double
 @pytest.mark.parametrize("coefficients", [WIDE, (0.1, 0.02, 0.0, 0.0, 0.0), (0.0,) * 5], ids=["wide", "pin", "zero"])
 def test_against_the_text_book(backend, coefficients):
@@ -199,6 +200,7 @@ def test_what_the_lens_does_not_see_is_culled(backend, dtype):
     assert drawn_rows == [True, True, False, False, False, False]
 
 
+@pytest.mark.lengthy
 @every_double
 def test_float32(backend):
     # An image of real width: pixels are known to 1e-4, of which the covariance takes differences.

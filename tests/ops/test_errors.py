@@ -210,6 +210,7 @@ def test_the_wildest_distortion_that_is_taken_is_finite(name, dtype):
         assert render(gaussians, view, name, dtype).is_finite(), lens
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_last_pixel_of_the_longest_image(axis, name):

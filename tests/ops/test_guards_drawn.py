@@ -36,6 +36,7 @@ def check_against(backend: str, gaussians: Gaussians, view: Camera, settings: Sp
     return counted
 
 
+@pytest.mark.lengthy
 @every_double
 @few
 @given(scene=scenes, effects=st.booleans(), case=st.sampled_from(sorted(CASES)))
@@ -46,6 +47,7 @@ def test_what_is_counted_as_drawn_is_drawn(backend, scene, effects, case):
     check_against(backend, gaussians, view, CASES[case])
 
 
+@pytest.mark.lengthy
 @pytest.mark.slow_if_interpreted
 @every_precision
 @pytest.mark.parametrize("effects", [False, True], ids=["pinhole", "effects"])

@@ -53,6 +53,7 @@ EXTREME_SETTINGS = (
 )
 
 
+@pytest.mark.lengthy
 @pytest.mark.slow_if_interpreted
 @every_precision
 def test_01_no_nan_in_extreme_scenes(backend, dtype):
@@ -67,6 +68,7 @@ def test_01_no_nan_in_extreme_scenes(backend, dtype):
         assert not any(result.gradients[name][culled].any() for name in FIELDS)
 
 
+@pytest.mark.lengthy
 @every_fast_precision
 def test_01_extreme_scenes_are_right(backend, dtype):
     # In float64 all backends agree. What float32 costs such rows depends on the scene, from nothing to all digits: the

@@ -27,6 +27,7 @@ def test_two_balls_by_hand(backend):
     assert changes.squared_change.tolist() == pytest.approx([3 * 0.24**2, 3 * 0.04**2, 0.0], rel=1e-9)
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("behind", [False, True])
 def test_against_images_without_the_row(backend, behind):

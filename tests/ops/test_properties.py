@@ -14,7 +14,7 @@ from sparsestreet.types import Camera, Gaussians, Rendering, Shutter
 from tests.ops.scenes import DEFAULT, FIELDS, camera, cast, device_of, every_backend, every_precision, random_gaussians
 
 # triton/test_shared_properties.py holds two smaller scenes for Triton's interpreter.
-pytestmark = pytest.mark.slow_if_interpreted
+pytestmark = [pytest.mark.slow_if_interpreted, pytest.mark.lengthy]
 few = settings(max_examples=12, derandomize=True, database=None, deadline=None)
 """The same examples in every run: a failure in CI is the failure at home."""
 BAR = {torch.float64: 1e-11, torch.float32: 1e-5}

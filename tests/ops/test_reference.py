@@ -103,6 +103,7 @@ def test_gradient_of_each_field(field, settings):
     assert torch.autograd.gradcheck(images, values[field].requires_grad_(), fast_mode=True)
 
 
+@pytest.mark.lengthy
 def test_screen_offsets_gather_absolute_gradients():
     # Independent: differentiate each pixel on its own with respect to the mean, and add up absolute values.
     view = front_camera(4, 3, 6.0)

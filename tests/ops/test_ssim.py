@@ -88,6 +88,7 @@ def test_finite_differences():
     assert torch.autograd.gradcheck(lambda leaf: ssim(leaf, truth, backend="cpu"), image.requires_grad_())
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_same_bits_for_any_number_of_threads(dtype):
     """Of many blocks, and many images: two orders of adding often round to one sum."""

@@ -46,6 +46,7 @@ def scalar_adam(weight: float, epsilon: float) -> int:
     return step
 
 
+@pytest.mark.lengthy
 def test_unseen_gaussians_go_at_the_same_time_under_any_weight():
     steps = steps_to_removal(1e-15, limit=1600)
     oracle = [scalar_adam(float(weight), 1e-15) for weight in WEIGHTS]
@@ -54,6 +55,7 @@ def test_unseen_gaussians_go_at_the_same_time_under_any_weight():
     assert all(1400 <= step <= 1420 for step in steps)
 
 
+@pytest.mark.lengthy
 def test_the_default_epsilon_of_adam_keeps_them_alive():
     # Gradients are 3e-10 and less, far below 1e-8; the surest one to go would take more than 14,000 steps.
     assert steps_to_removal(1e-8, limit=2000) == [2000] * len(WEIGHTS)

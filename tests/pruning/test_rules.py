@@ -97,6 +97,7 @@ def _selection(scene: SceneGraph, frame: Frame, rule: PruningRule) -> Selection:
     return rule.select(scene, [frame], CONTEXT)["background"]
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("region", ["vehicle", "human"])
 def test_what_shows_a_vehicle_or_a_person_costs_more(region: str):
     # Equal discs side by side, each in its own half of the image; one half is marked.

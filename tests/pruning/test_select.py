@@ -63,6 +63,7 @@ def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, seco
     assert chosen["b"].keep.tolist() == by_hand(second, unwanted[len(first) :], 0)
 
 
+@pytest.mark.lengthy
 @settings(max_examples=200, deadline=None)
 @given(score_lists, score_lists, st.floats(0, 1), st.integers(0, 5))
 def test_rank_rule_drops_a_number_of_the_lowest_of_all_nodes(first, second, share, floor):

@@ -83,6 +83,7 @@ def test_steps_are_medians_of_parts(tmp_path):
     assert step_costs(tmp_path) == {"losses": 4.0, "backward": 13.0, "loop": 0.5, "density": 16.0}
 
 
+@pytest.mark.lengthy
 def test_a_peak_is_seen_and_forgotten():
     """Pages of the system's: an allocator may keep what is freed (``keep_freed_memory`` asks it to)."""
     forget_peaks()

@@ -27,6 +27,7 @@ def found(tmp_path):
     return arms(collect([write_sweep(tmp_path / "sweep", failed=False)]))
 
 
+@pytest.mark.lengthy
 def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
     path = tmp_path / "pareto.svg"
     assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], path)
@@ -39,6 +40,7 @@ def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
     assert "control: random" in text
 
 
+@pytest.mark.lengthy
 def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     first, second = tmp_path / "a.svg", tmp_path / "b.svg"
     pareto(found, DRIVESTUDIO, PARETO_COSTS[0], first)
@@ -53,6 +55,7 @@ def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     assert (tmp_path / "again" / "a.svg").read_text() == one
 
 
+@pytest.mark.lengthy
 def test_figures_over_time(found, tmp_path):
     for draw, word in ((held_out_over_time, "training seconds"), (counts_over_time, "step"), (frame_waterfall, "sky")):
         assert draw(found, tmp_path / "some.svg")

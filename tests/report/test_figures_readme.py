@@ -16,6 +16,7 @@ def test_the_mean_is_over_looks_that_all_curves_have():
     assert mean_curve(curves) == ([11.0, 22.0], [20.5, 23.0])
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("curves", [True, False])
 def test_it_is_written_with_and_without_curves(tmp_path, curves):
     found = arms(collect([write_sweep(tmp_path / "sweep", curves=curves)]))

@@ -9,6 +9,8 @@ import pytest
 from sparsestreet.report.sweep import write_report
 from tests.report.sweep_folder import write_sweep
 
+pytestmark = pytest.mark.lengthy
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 

@@ -173,6 +173,7 @@ torch.save([(image.rgb, image.alpha, image.depth) for image in images], sys.argv
 """
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("backend", ["auto", pytest.param("reference", marks=pytest.mark.slow)])
 def test_a_new_process_shows_the_same_from_a_folder_that_was_moved(tmp_path: Path, backend: str):
     """Nothing but the file: no log, no configuration, no folder that it was written in."""

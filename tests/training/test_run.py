@@ -24,6 +24,8 @@ from sparsestreet.training.run import CPU_TRAINER, train
 from sparsestreet.training.schedule import Interval
 from tests.training.stubs import frame_at
 
+pytestmark = pytest.mark.lengthy
+
 STEPS = 12
 TRAINER = partial(CPU_TRAINER, log_every_n_steps=2)
 

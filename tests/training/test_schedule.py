@@ -6,6 +6,7 @@ import pytest
 from sparsestreet.training.schedule import Interval, milestone
 
 
+@pytest.mark.lengthy
 def test_an_interval_keeps_its_shape_at_any_length():
     interval = Interval(start=0.1, stop=0.5, every=10)
     for steps in (1000, 30000):

@@ -170,6 +170,7 @@ def test_a_closure_computes_gradients_and_parameters_without_any_rest(generator)
     assert unused not in optimizer.state
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize(("visible_only", "kind"), [("false", torch.optim.Adam), ("true", VisibleAdam)])
 def test_the_configuration_chooses(visible_only, kind):
     with initialize_config_dir(str(CONF), version_base="1.3"):

@@ -100,6 +100,7 @@ def test_a_gray_sweep_is_the_sweep_without_its_colors(make, tmp_path):
     assert len({int(gray.colored.sum()) for gray in log.sweeps.gray()}) > 1
 
 
+@pytest.mark.lengthy
 def test_the_room_is_counted_in_bytes_of_all_pixels(tmp_path, decoded):
     """104 frames of 9,600 bytes fit into 1 MB."""
     make_nuscenes(tmp_path, frames=105, cameras=1)

@@ -134,6 +134,7 @@ def reader(*overrides: str) -> StreetReader:
         return instantiate(compose("train", list(overrides)).data.log, _convert_="all")
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("name", ["hdl32", "hdl64", "ideal", "waymo_top"])
 def test_a_sensor_is_chosen_and_changed_from_the_command_line(name):
     plain, lossy = reader(f"data/lidar={name}"), reader(f"data/lidar={name}", "data.lidar.dropout=0.25")

@@ -68,6 +68,7 @@ def surfaces() -> dict[str, Part]:
     return {type(part.surface).__name__: part for part in world.parts_at(0.0)}
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("name", sorted(surfaces()))
 def test_looks_are_colors_and_flatten_with_distance(name):
     part = surfaces()[name]

@@ -11,6 +11,7 @@ def edges_of(template: BodyTemplate) -> torch.Tensor:
     return torch.cat([template.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
 
 
+@pytest.mark.lengthy
 @NUM_VERTICES
 def test_it_is_one_closed_surface(num_vertices):
     template = BuiltinBody(num_vertices).load()

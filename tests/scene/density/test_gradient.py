@@ -187,6 +187,7 @@ def test_reset_lowers_opacities_only_where_they_are_higher():
             GradientDensity(reset_opacity_to=impossible)
 
 
+@pytest.mark.lengthy
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_plans_are_well_formed(data):

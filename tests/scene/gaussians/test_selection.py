@@ -11,6 +11,7 @@ from tests.scene.gaussians.oracle import by_hand
 score_lists = st.lists(st.sampled_from([0.0, 0.005, 0.01, 0.02, 0.5, 0.73, 1.0]), max_size=12)
 
 
+@pytest.mark.lengthy
 @settings(max_examples=300, deadline=None)
 @given(score_lists, st.integers(0, 14), st.sampled_from([torch.float32, torch.float64]))
 def test_the_lowest_are_removed_one_by_one(scores, floor, dtype):
@@ -27,6 +28,7 @@ def test_the_lowest_are_removed_one_by_one(scores, floor, dtype):
     assert not plan.reset_moments
 
 
+@pytest.mark.lengthy
 @settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_each_instance_keeps_its_own_best_and_then_the_node(data):

@@ -109,6 +109,7 @@ def test_scores_of_zero_can_reopen():
     assert opened(static_mask(1), rows_of([-200.0] * 3)) == [1.0] * 3
 
 
+@pytest.mark.lengthy
 @settings(max_examples=300, deadline=None)
 @given(logit_lists, st.sampled_from(GRID[1:-1]), st.integers(0, 14))
 def test_the_lowest_are_removed_one_by_one(logits, threshold, floor):
@@ -133,6 +134,7 @@ def test_the_plan_keeps_survivors_in_order_with_their_moments(logits, floor):
     assert not plan.reset_moments
 
 
+@pytest.mark.lengthy
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-8, 2, width=32), max_size=12, unique=True), st.integers(0, 14))
 def test_rows_dropped_are_exactly_those_the_mask_has_closed(logits, floor):

@@ -104,6 +104,7 @@ def test_the_op_culls_what_has_faded():
     assert radii[~hidden].any()
 
 
+@pytest.mark.lengthy
 def test_in_training_some_steps_take_rows_from_another_time():
     node = vibrating(smoothing_probability=0.5, min_factor=1e-9)
     shifts = []
