@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.geometry import cameras
-from sparsestreet.geometry.cameras import distance_to_view, exact_position, project, ray_directions, ray_matrix
+from sparsestreet.geometry.cameras import distance_to_view, exact_position, moved, project, ray_directions, ray_matrix
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.types import Camera
 from tests.scene.street import camera_at
@@ -36,6 +36,17 @@ def test_exact_position_is_where_the_pose_has_its_zero():
         position = exact_position(Camera(pose, camera.intrinsics, 13, 7))
         assert (pose[:3, :3].double() @ position + pose[:3, 3].double()).abs().max() < 1e-10
         assert (camera.position - position).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_moved_camera_is_elsewhere_turned_as_it_was_in_its_own_dtype(dtype: torch.dtype):
+    camera, vector = camera_of(3), torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
+    camera = replace(camera, camera_from_world=camera.camera_from_world.to(dtype))
+    there = moved(camera, vector)
+    assert there.camera_from_world.dtype == dtype
+    assert torch.equal(there.camera_from_world[:3, :3], camera.camera_from_world[:3, :3])
+    # A float32 pose knows a place at 1 m to 1e-7, three roundings.
+    torch.testing.assert_close(exact_position(there), exact_position(camera) + vector, atol=1e-6, rtol=0)
 
 
 def test_a_point_by_hand():

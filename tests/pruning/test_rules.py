@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, PruningRule, RenderContext
-from sparsestreet.scene.effects import Effect, Sky, SkySettings
+from sparsestreet.pruning.rule import contributions
+from sparsestreet.scene.effects import Effect, LensSettings, Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -173,14 +174,30 @@ def test_costs_are_those_of_images_behind_the_effects(order: list[str]):
 
 
 def test_what_a_gain_makes_noticeable_is_not_free():
-    """The last row moves a pixel by 0.87 steps of 255, and behind a gain of 1.3 by 1.14."""
-    gain = Gain(GainSettings(evenness=0.0), 1)
+    """The last row moves a pixel by 0.87 steps of 255, and behind a gain of 1.3 by 1.14, or of 1.5 at one side."""
+    gain, vignette = Gain(GainSettings(evenness=0.0), 1), Vignette(GainSettings(evenness=0.0))
     with torch.no_grad():
         gain.log_gains.fill_(math.log(1.3))
-    for effects, last in (({}, False), ({"gain": gain}, True)):
+    for effects, last in (({}, False), ({"gain": gain}, True), ({"vignette": vignette}, True)):
         scene = scene_of([0.99, 0.3, 0.5], [2.0, 3.0, 4.0], effects=effects)
         costs = LeaveOneOutRule(0.0).costs(scene, [frame_of(scene, 5)], CONTEXT)["background"]
         assert (costs > 0).tolist() == [True, False, last]
+
+
+def test_no_rule_looks_through_a_lens_that_the_scene_leaves_out():
+    """The images of a camera with a lens are those of a pinhole: so are costs and contributions, the sky's too."""
+    sky = Sky(SkySettings(resolution=4))
+    with torch.no_grad():
+        sky.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
+    scene = scene_of([0.3, 0.2], [2.0, 3.0], effects={"sky": sky, "lens": LensSettings().left_out()})
+    with torch.no_grad():
+        scene.nodes["background"].rows.log_scales.fill_(-2.0)
+    plain = frame_of(scene, 20)
+    bent = replace(plain, camera=replace(plain.camera, distortion=torch.tensor([8.0, 0.0, 0.0, 0.0, 0.0])))
+    costs = [LeaveOneOutRule(0.1, noticeable=0.0).costs(scene, [one], CONTEXT)["background"] for one in (plain, bent)]
+    assert torch.equal(*costs)
+    weights = [view.weight for view, _ in contributions(scene, [plain, bent], CONTEXT)]
+    assert torch.equal(*weights)
 
 
 def test_only_prunable_nodes_are_asked_each_with_its_own_floor():

@@ -101,6 +101,17 @@ def test_the_sky_shines_through_what_alpha_leaves():
     torch.testing.assert_close(with_sky.rgb, expected, atol=1e-6, rtol=0)  # one float32 rounding
 
 
+def test_the_sky_ends_where_the_options_finish_a_pixel():
+    options = RenderOptions(SplatSettings(transmittance_min=0.9), backend="reference")
+    scene = scene_of()
+    with_sky = render(scene, view_at(0.5, CAMERA), options=options)
+    sky = scene.effects["sky"].colors(ray_directions(CAMERA))
+    light = 1 - with_sky.alpha
+    assert ((light > 0.1) & (light < 0.9)).any()
+    expected = with_sky.splats.rgb + torch.where(light > 0.9, light, 0.0)[..., None] * sky
+    torch.testing.assert_close(with_sky.rgb, expected, atol=1e-6, rtol=0)  # one float32 rounding
+
+
 @pytest.mark.parametrize(("backend", "taken"), [("reference", "torch"), ("cpu", "cpu"), ("auto", "auto")])
 def test_the_sky_takes_the_backend_of_the_splats(monkeypatch, backend, taken):
     asked = []

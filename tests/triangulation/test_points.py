@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from sparsestreet.triangulation import ImagePointSettings
 from sparsestreet.triangulation.points import triangulate
@@ -131,6 +132,20 @@ def test_a_point_without_parallax_is_too_uncertain():
     # 2.4 m at 160 to 320 m: half a pixel is 10 % of the distance and more.
     assert len(triangulate(sightings, SETTINGS)) == 0
     assert len(triangulate(sightings, replace(SETTINGS, max_depth_error=0.5))) > 0
+
+
+@pytest.mark.parametrize(("zoom", "found"), [(1.0, True), (2.0, False)])
+def test_the_tolerance_is_in_pixels_of_the_second_image(zoom, found):
+    """A feature 0.35 pixels off the line of a usual camera: 0.7 of one that has twice its focal length."""
+    point, described = np.array([[0.4, 0.0, 12.0]]), descriptors(np.random.default_rng(0), 1)
+    first, second = _sightings(point, described, rail([0.0, 0.8]))
+    camera = second.view.camera
+    zoomed = replace(camera, intrinsics=camera.intrinsics * torch.tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]))
+    off = second.rays + np.array([0.0, 0.35 / FOCAL])
+    second = replace(second, rays=off, view=replace(second.view, camera=zoomed))
+    lenient = replace(SETTINGS, min_views=2, min_support=0.0, max_error=5.0, max_depth_error=1.0)
+    settings = replace(lenient, epipolar_tolerance=0.5)
+    assert (len(triangulate([first, second], settings)) > 0) == found
 
 
 def test_features_that_are_off_by_more_than_the_limit_do_not_agree():

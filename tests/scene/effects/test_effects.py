@@ -15,11 +15,22 @@ from sparsestreet.scene.effects import Effect, EffectSettings, LensSettings, Shu
 from sparsestreet.scene.effects.lens import Pinhole
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
-from sparsestreet.scene.state import FINISHED
+from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.types import Shutter, View
 from tests.cli.toy.gain import Gain, GainSettings
-from tests.scene.street import background, background_settings, camera_at, random_rows, street_log, training_data
+from tests.scene.street import (
+    background,
+    background_settings,
+    camera_at,
+    keyframes,
+    pose,
+    random_rows,
+    rigid,
+    street_log,
+    track,
+    training_data,
+)
 
 CAMERA = camera_at(-6.0, width=17, height=11)
 BENT = replace(CAMERA, distortion=torch.tensor([-0.2, 0.05, 0.0, 0.0, 0.0]))
@@ -156,6 +167,21 @@ def test_other_nodes_are_seen_through_the_same_effects():
     other = scene.with_nodes({"trees": background(random_rows(4, 1))})
     assert other.counts() == {"trees": 4}
     assert [other.effects[name] is effect for name, effect in scene.effects.items()] == [True, True]
+
+
+class Late(Effect):
+    """Shows what is there at the progress of the training."""
+
+    def view(self, view: View, state: SceneState) -> View:
+        return replace(view, time=state.progress)
+
+
+def test_nodes_see_the_view_that_the_effects_make_in_the_state_of_the_training():
+    path = keyframes([track("car", [0, 1], [pose(0, (5.0, 0, 0)), pose(1, (9.0, 0, 0))])], 2)
+    cars = {"cars": rigid(random_rows(3, 1, instances=torch.zeros(3, dtype=torch.int64)), path, max_gap=1.0)}
+    placed = SceneGraph(cars, {"late": Late(GAIN)}).gaussians_at(View(CAMERA, 0.0), SceneState(progress=0.75))
+    assert placed.view.time == 0.75
+    assert torch.equal(placed.gaussians.means, SceneGraph(cars).gaussians_at(View(CAMERA, 0.75)).gaussians.means)
 
 
 def test_a_node_and_an_effect_of_one_name_are_an_error():

@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -72,6 +73,14 @@ def test_points_from_images_bring_limits_by_the_size_of_a_pixel():
     assert seeds.largest.tolist() == pytest.approx([0.1] * 4)
     assert seeds.opacities.tolist() == pytest.approx([0.7] * 4)
     torch.testing.assert_close(seeds.points.colors, torch.tensor([[0.1, 0.2, 0.3]] * 4))
+
+
+@pytest.mark.parametrize("order", ["beyond_first", "random"])
+def test_limits_are_of_the_points_that_were_chosen(order: str):
+    """Of ten points a pixel spans 1, 2 ... 10 cm."""
+    points = replace(ten_points(), pixel_sizes=0.01 * np.arange(1, 11, dtype=np.float32))
+    seeds = drawn(ImagePoints(order=order, smallest_pixels=2.0), 10, data_with(points))
+    torch.testing.assert_close(seeds.smallest, 0.02 * (1 + seeds.points.positions[:, 0]))
 
 
 def test_a_run_without_points_from_images_gives_none():

@@ -193,6 +193,12 @@ def test_people_of_different_spans_have_their_own_keyframes():
     assert (late.opacities[VERTICES:] == 0).all()
 
 
+def test_the_gap_is_counted_in_frames():
+    """Annotated in all five frames, of which training sees the first and the last."""
+    node = smpl(walker(), held_out=frozenset({1, 2, 3}), max_gap=1)
+    assert [node.pose_at(frame / 4).present.item() for frame in range(5)] == [True, True, False, True, True]
+
+
 def test_one_frame_is_enough():
     node = smpl(walker(frames=(2,)), min_path_length=-1.0)
     assert torch.isfinite(node.gaussians_at(view_at(0.5), FINISHED).means).all()
