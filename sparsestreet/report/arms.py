@@ -10,6 +10,7 @@ from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.variants import CLIP_KEYS, control_of, in_few_words, log_config, variants
 
 Value = Callable[[RunSummary], float | None]
+RecordValue = Callable[[RunRecord], float | None]
 Unit = tuple[tuple[str, str], int]
 """A scene with the part of its log, and a seed."""
 
@@ -42,17 +43,26 @@ class Arm:
         """The label of the plain arm that it is compared with."""
         return self.label.partition("+")[0]
 
+    def runs(self, whole: bool = False) -> dict[Unit, list[RunRecord]]:
+        """Returns scene and seed -> its runs that were trained on all views (``whole``), or the others."""
+        found: dict[Unit, list[RunRecord]] = {}
+        for record in self.records:
+            if (record.summary.run.split == "none") == whole:
+                found.setdefault(unit_of(record.summary), []).append(record)
+        return found
+
     def units(self, value: Value, whole: bool = False) -> dict[Unit, float]:
         """Returns scene and seed -> the value of its run, or the mean of several runs.
 
         ``whole`` selects the runs that were trained on all views; otherwise the other runs count.
         """
-        found: dict[Unit, list[float]] = {}
-        for record in self.records:
-            run = record.summary
-            if (run.run.split == "none") == whole and (number := value(run)) is not None:
-                found.setdefault(unit_of(run), []).append(number)
-        return {unit: statistics.fmean(numbers) for unit, numbers in found.items()}
+        return self.units_of_records(lambda record: value(record.summary), whole)
+
+    def units_of_records(self, value: RecordValue, whole: bool = False) -> dict[Unit, float]:
+        """Does the same as ``units`` for a value that may be in another file of a run's folder."""
+        found = {unit: [value(record) for record in records] for unit, records in self.runs(whole).items()}
+        known = {unit: [number for number in numbers if number is not None] for unit, numbers in found.items()}
+        return {unit: statistics.fmean(numbers) for unit, numbers in known.items() if numbers}
 
     def mean(self, value: Value, whole: bool = False) -> float | None:
         """Returns the mean over scenes of the mean over each scene's seeds; None if no run has the value."""

@@ -1,11 +1,12 @@
 """Measurements next to the recorded path (``records/novel.json``): distances to real images, and to the truth."""
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sparsestreet.records.novel import NOVEL
-from sparsestreet.report.arms import Arm, Unit, mean_over_scenes, unit_of
+from sparsestreet.report.arms import Arm, mean_over_scenes
+from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import Cell, Grid
 
 TRUTH = {
@@ -31,17 +32,15 @@ def shifts_of(run: Path) -> dict[float, dict[str, float]]:
 
 
 def mean_beside(arm: Arm, meters: float, name: str) -> float | None:
-    """Returns the mean of an arm in which each scene counts once; None if no run has the number."""
-    return _mean(arm, lambda run: shifts_of(run).get(meters, {}).get(name))
+    """Returns the mean of an arm in which each scene counts once; None if no run has the number.
 
+    Runs that were trained on all views count only if no run that holds views out has the number.
+    """
 
-def _mean(arm: Arm, value: Callable[[Path], float | None]) -> float | None:
-    found: dict[Unit, list[float]] = {}
-    for record in arm.records:
-        number = value(record.folder)
-        if number is not None:
-            found.setdefault(unit_of(record.summary), []).append(number)
-    return mean_over_scenes({unit: statistics.fmean(numbers) for unit, numbers in found.items()})
+    def value(record: RunRecord) -> float | None:
+        return shifts_of(record.folder).get(meters, {}).get(name)
+
+    return mean_over_scenes(arm.units_of_records(value) or arm.units_of_records(value, whole=True))
 
 
 def beside_the_path(arms: Sequence[Arm]) -> Grid | None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.report.arms import Arm, Unit, plain_of, unit_of
+from sparsestreet.report.arms import Arm, Unit, plain_of
 from sparsestreet.report.grid import Cell, Grid
 
 BELOW = (1.0, 0.5, 0.1)
@@ -14,7 +14,7 @@ BELOW = (1.0, 0.5, 0.1)
 
 @dataclass(frozen=True)
 class QualityCurve:
-    """One run's probe of held-out views."""
+    """The probe of held-out views of one run, or the mean of several runs."""
 
     seconds: tuple[float, ...]
     """Seconds of training without evaluation."""
@@ -22,13 +22,27 @@ class QualityCurve:
     """Full image, dB."""
 
 
+def curves_of_runs(arm: Arm) -> dict[Unit, list[QualityCurve]]:
+    """Returns scene and seed -> the curves of its runs, for the runs that hold views out and have a curve."""
+    found = {unit: [_curve(HELD_OUT_CURVE.find(run.folder) or ()) for run in runs] for unit, runs in arm.runs().items()}
+    known = {unit: [curve for curve in curves if curve.seconds] for unit, curves in found.items()}
+    return {unit: curves for unit, curves in known.items() if curves}
+
+
 def curves_of(arm: Arm) -> dict[Unit, QualityCurve]:
-    """Returns scene and seed -> curve, for the runs that hold views out and have a curve."""
-    return {
-        unit_of(record.summary): curve
-        for record in arm.records
-        if record.summary.run.split != "none" and (curve := _curve(HELD_OUT_CURVE.find(record.folder) or ())).seconds
-    }
+    """Returns scene and seed -> the curve of its run, or the mean of several runs."""
+    return {unit: mean_curve(curves) for unit, curves in curves_of_runs(arm).items()}
+
+
+def mean_curve(curves: Sequence[QualityCurve]) -> QualityCurve:
+    """Returns mean seconds and mean dB at each look that all curves have.
+
+    >>> mean_curve([QualityCurve((10.0, 20.0), (22.0, 25.0)), QualityCurve((14.0,), (24.0,))])
+    QualityCurve(seconds=(12.0,), psnr=(23.0,))
+    """
+    looks = range(min(len(curve.seconds) for curve in curves))
+    seconds = tuple(statistics.fmean(curve.seconds[look] for curve in curves) for look in looks)
+    return QualityCurve(seconds, tuple(statistics.fmean(curve.psnr[look] for curve in curves) for look in looks))
 
 
 def _curve(looks: Sequence[HeldOutLook]) -> QualityCurve:

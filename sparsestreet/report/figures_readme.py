@@ -1,6 +1,5 @@
 """One figure of a sweep for a README: quality against training time, and against the time of a frame."""
 
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Value, mean_over_scenes
-from sparsestreet.report.curves import QualityCurve, curves_of
+from sparsestreet.report.curves import curves_of, mean_curve
 from sparsestreet.report.figures import LEGEND, colors, marker, of_sparsify, panels
 
 _DASHES = {"none": "-", "paper": "--", "removal": ":"}
@@ -49,27 +48,15 @@ def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protoco
     if not curves:
         _points(axes, arm, shown, _seconds, protocol)
         return
-    seconds, psnr = mean_curve(curves)
+    mean = mean_curve(curves)
     style = {"color": _paint(arm, shown), "linestyle": _DASHES.get(arm.sparsify, "-."), "marker": marker(arm)}
-    axes.plot(seconds, psnr, **style, markevery=[len(seconds) - 1], label=arm.name)
+    axes.plot(mean.seconds, mean.psnr, **style, markevery=[len(mean.seconds) - 1], label=arm.name)
 
 
 def _paint(arm: Arm, shown: Sequence[Arm]) -> str:
     """Returns the color of the arm's method, or of its sparsification if there is only one method."""
     of_method = colors(shown)
     return of_method[arm.plain_label] if len(of_method) > 1 else of_sparsify(arm)
-
-
-def mean_curve(curves: Sequence[QualityCurve]) -> tuple[list[float], list[float]]:
-    """Returns mean seconds and mean dB at each look that all curves have.
-
-    >>> mean_curve([QualityCurve((10.0, 20.0), (22.0, 25.0)), QualityCurve((14.0,), (24.0,))])
-    ([12.0], [23.0])
-    """
-    looks = min(len(curve.seconds) for curve in curves)
-    seconds = [statistics.fmean(curve.seconds[look] for curve in curves) for look in range(looks)]
-    psnr = [statistics.fmean(curve.psnr[look] for curve in curves) for look in range(looks)]
-    return seconds, psnr
 
 
 def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: Protocol) -> None:

@@ -12,13 +12,13 @@ from sparsestreet.pictures.history import count_curves, marks
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.ledger import LEDGER
 from sparsestreet.report.arms import Arm
-from sparsestreet.report.curves import curves_of
+from sparsestreet.report.curves import curves_of_runs
 from sparsestreet.report.figures import COLORS, GREY, LEGEND, of_sparsify, panels, short, write_svg
 
 
 def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
     """Draws held-out PSNR over training seconds, a panel a method, a line a run. Returns whether a run has a curve."""
-    found = {arm.name: curves_of(arm) for arm in arms}
+    found = {arm.name: [curve for some in curves_of_runs(arm).values() for curve in some] for arm in arms}
     drawn = [arm for arm in arms if found[arm.name]]
     if not drawn:
         return False
@@ -26,7 +26,7 @@ def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
     figure, axes = panels(len(methods))
     for one, method in zip(axes, methods, strict=True):
         for arm in _of(drawn, method):
-            for curve in found[arm.name].values():
+            for curve in found[arm.name]:
                 one.plot(curve.seconds, curve.psnr, **_line(arm), marker=".", markersize=3)
         _finish(one, method, "training seconds")
     axes[0].set_ylabel("held-out PSNR, dB")

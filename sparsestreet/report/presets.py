@@ -1,15 +1,20 @@
 """Scenes rendered with other settings than in training (``records/presets.json``): quality and speed."""
 
+import statistics
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
-from sparsestreet.report.arms import Arm, Unit, mean_over_scenes, unit_of
+from sparsestreet.report.arms import Arm, Unit, mean_over_scenes
+from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import ABSENT, Cell, Grid
 from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
 
 Number = Callable[[RenderedAs], float | None]
+Records = dict[Unit, list[PresetRecord]]
+Rendered = dict[Unit, list[RenderedAs]]
+"""Scene and seed -> what its runs recorded."""
 
 _REGIONS = ("full", "human", "vehicle")
 _COSTS: tuple[tuple[str, str, str, Number], ...] = (
@@ -35,26 +40,40 @@ def rendered_otherwise(arms: Sequence[Arm], protocol: Protocol) -> Grid | None:
         "one scene, the same held-out views; dB to exact: of the image against that of the same scene without cut-off "
         "and early stop; differences paired by scene and seed, with 95 % t intervals, bold where they exclude 0"
     ]
-    if not all(record.noise.quiet for _, records in recorded for record in records.values()):
+    if not all(record.noise.quiet for _, records in recorded for some in records.values() for record in some):
         notes.append("milliseconds of a machine that was not quiet")
     return Grid("presets", "Trained one way, rendered another", tuple(header), tuple(rows), tuple(notes))
 
 
-def _records(arm: Arm) -> dict[Unit, PresetRecord]:
-    found = {unit_of(run.summary): PRESETS.find(run.folder) for run in arm.records}
-    return {unit: record for unit, record in found.items() if record is not None}
+def _records(arm: Arm) -> Records:
+    """Returns the records of the runs that hold views out; if there are none, those of runs trained on all views."""
+    return _found(arm.runs()) or _found(arm.runs(whole=True))
 
 
-def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
+def _found(runs: dict[Unit, list[RunRecord]]) -> Records:
+    found = {unit: [PRESETS.find(run.folder) for run in some] for unit, some in runs.items()}
+    known = {unit: [record for record in some if record is not None] for unit, some in found.items()}
+    return {unit: some for unit, some in known.items() if some}
+
+
+def _rendered(records: Records, wanted: Callable[[RenderedAs], bool]) -> Rendered:
+    """Returns scene and seed -> what its runs recorded of the settings that are wanted."""
+    found = {unit: [one for record in some for one in record.rendered] for unit, some in records.items()}
+    kept = {unit: [one for one in some if wanted(one)] for unit, some in found.items()}
+    return {unit: some for unit, some in kept.items() if some}
+
+
+def _rows(arm: Arm, records: Records, protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
     """``several``: whether several arms have this label. If so, the preset of training, if known, tells them apart."""
     runs = tuple(run.folder.name for run in arm.records)
     metrics = (protocol.psnr, protocol.human[0], protocol.vehicle[0])
-    trained = {unit: one for unit, record in records.items() for one in record.rendered if one.trained}
-    presets = {one.preset for one in trained.values()}
+    trained = _rendered(records, lambda one: one.trained)
+    presets = {one.preset for some in trained.values() for one in some}
     title = f"{arm.label}, {presets.pop()}" if several and len(presets) == 1 else arm.title
-    for preset in dict.fromkeys(one.preset for record in records.values() for one in record.rendered):
-        found = {unit: one for unit, record in records.items() for one in record.rendered if one.preset == preset}
-        name = f"{preset}, as trained" if all(one.trained for one in found.values()) else preset
+    every = [one for some in _rendered(records, lambda one: True).values() for one in some]
+    for preset in dict.fromkeys(one.preset for one in every):
+        found = _rendered(records, lambda one, preset=preset: one.preset == preset)
+        name = f"{preset}, as trained" if all(one.trained for some in found.values() for one in some) else preset
         cells = [Cell(title, runs=runs), Cell(name, runs=runs), Cell(str(len(found)), runs=runs)]
         for metric in metrics:
             cells += _quality(found, trained, metric, runs)
@@ -63,9 +82,7 @@ def _rows(arm: Arm, records: dict[Unit, PresetRecord], protocol: Protocol, sever
         yield tuple(cells)
 
 
-def _quality(
-    found: dict[Unit, RenderedAs], trained: dict[Unit, RenderedAs], metric: str, runs: tuple[str, ...]
-) -> list[Cell]:
+def _quality(found: Rendered, trained: Rendered, metric: str, runs: tuple[str, ...]) -> list[Cell]:
     """Returns the mean over scenes, and the paired difference to the settings of training."""
     ours, theirs = (_values(one, lambda rendered: rendered.quality.get(metric)) for one in (found, trained))
     differences = {unit: ours[unit] - theirs[unit] for unit in ours.keys() & theirs.keys()}
@@ -73,9 +90,10 @@ def _quality(
     return [_mean(ours, "{:.2f}", runs), difference_cell(interval, "{:+.2f}", len(found), runs)]
 
 
-def _values(found: dict[Unit, RenderedAs], number: Number) -> dict[Unit, float]:
-    values = {unit: number(one) for unit, one in found.items()}
-    return {unit: value for unit, value in values.items() if value is not None}
+def _values(found: Rendered, number: Number) -> dict[Unit, float]:
+    """Returns scene and seed -> the number of its run, or the mean of several runs."""
+    values = {unit: [value for one in some if (value := number(one)) is not None] for unit, some in found.items()}
+    return {unit: statistics.fmean(some) for unit, some in values.items() if some}
 
 
 def _mean(values: dict[Unit, float], form: str, runs: tuple[str, ...]) -> Cell:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.evaluation import node_costs
-from sparsestreet.evaluation.node_costs import measure_scene_costs
+from sparsestreet.evaluation.node_costs import OUTPUT, measure_scene_costs
 from sparsestreet.evaluation.scene_parts import without_closed_rows, without_masks
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.geometry.cameras import ray_directions
@@ -120,10 +120,10 @@ def test_a_cost_is_the_median_of_what_rounds_differ_by(monkeypatch):
     whole, without = (10, 20, 30), (9, 11, 28)
     timed(monkeypatch, lambda scene, view: 1e-3 * (whole if scene.counts()["road"] else without)[view.frame_index])
     views = [make_frame(index) for index in range(3)]
-    road = measure_scene_costs(SceneGraph({"road": node_of([[0.4, 0.3, 2.0]])}), views, OPTIONS, repeats=3).nodes[
-        "road"
-    ]
+    costs = measure_scene_costs(SceneGraph({"road": node_of([[0.4, 0.3, 2.0]])}), views, OPTIONS, repeats=3)
+    road = costs.nodes["road"]
     assert (road.ms, road.frame_ms) == (pytest.approx(2), pytest.approx(11))
+    assert costs.frame_ms == {OUTPUT: pytest.approx(20)}
 
 
 def test_megabytes_are_of_rows_and_poses_and_add_up_with_the_sky(monkeypatch):

@@ -103,6 +103,14 @@ def test_comparison_has_a_column_for_each_run_and_lines_of_renders_errors_and_ce
         assert text in written
 
 
+def test_every_picture_has_its_own_error(written):
+    psnr = {"a": [20.0, 21.0], "b": [22.0, 23.0]}
+    columns = [SheetColumn(name, "s", [make_picture(3), make_picture(4)], some) for name, some in psnr.items()]
+    comparison_sheet(columns, title="t", tile_width=120)
+    errors = [text for text in written if text.endswith("dB in this image")]
+    assert errors == [f"error: {one}.00 dB in this image" for one in (20, 22, 21, 23)]
+
+
 def test_only_runs_of_the_same_images_are_compared():
     same = column("plain", COLORS["render"])
     with pytest.raises(ValueError, match=r"different images, \(frame, camera\) \[\[\(3, 1\)\], \[\(4, 1\)\]\]"):

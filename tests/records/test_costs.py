@@ -75,12 +75,13 @@ def test_steps_are_medians_of_parts(tmp_path):
     assert step_costs(tmp_path) == {}
     rows = [
         *((1, name, ms) for name, ms in (("loss l1", 1), ("loss sky", 2), ("backward", 4), ("splat backward", 8))),
+        *((1, name, ms) for name, ms in (("scene backward", 16), ("sky backward", 32), ("ssim backward", 64))),
         *((1, name, ms) for name, ms in (("loop", 0.5), ("logging", 0.25), ("density statistics", 16))),
         *((2, name, ms) for name, ms in (("loss l1", 5), ("backward", 14), ("loop", 0.25))),
     ]
     STEP_PHASES.write(tmp_path, [StepPhase(step, name, float(ms)) for step, name, ms in rows])
     assert STEP_PHASES.path(tmp_path).read_text().splitlines()[:2] == ["step,phase,milliseconds", "1,loss l1,1.0000"]
-    assert step_costs(tmp_path) == {"losses": 4.0, "backward": 13.0, "loop": 0.5, "density": 16.0}
+    assert step_costs(tmp_path) == {"losses": 4.0, "backward": 69.0, "loop": 0.5, "density": 16.0}
 
 
 @pytest.mark.lengthy

@@ -1,6 +1,7 @@
 """A file of a run's folder: where it is, whether it is there, and what a table refuses."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
@@ -66,6 +67,21 @@ def test_what_cannot_be_written_is_named_and_leaves_the_old_table(tmp_path):
     with pytest.raises(RecordError, match=r"^\S*pixels\.csv: pixel 7 is nan, which a record has no number for"):
         PIXELS.write(tmp_path, [Pixel(1, 2.0), Pixel(7, float("nan"))])
     assert PIXELS.read(tmp_path) == [Pixel(1, 2.0)]
+
+
+def test_a_table_that_was_half_written_leaves_the_old_one(tmp_path, monkeypatch):
+    PIXELS.write(tmp_path, [Pixel(1, 2.0)])
+
+    def full(path, text, **options):
+        path.write_bytes(text[: len(text) // 2].encode())
+        raise OSError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_text", full)
+        with pytest.raises(OSError, match="the disk is full"):
+            PIXELS.write(tmp_path, [Pixel(3, 4.0)])
+    assert PIXELS.read(tmp_path) == [Pixel(1, 2.0)]
+    assert [path.name for path in tmp_path.iterdir()] == ["pixels.csv"]
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,17 @@ def test_a_scene_is_the_mean_of_its_runs(tmp_path, seeds):
     assert [row[1].text for row in beside_the_path(arms(runs)).rows] == ["42.25"]
 
 
+@pytest.mark.parametrize(("splits", "distance"), [(("some", "none"), "41"), (("none", "none"), "42")])
+def test_runs_on_all_views_are_in_no_mean_with_the_others(tmp_path, splits, distance):
+    """Their real images are those that they trained on."""
+    runs = []
+    for split, value in zip(splits, (41.0, 43.0), strict=True):
+        folder = tmp_path / str(value)
+        write_beside(folder, {1.0: value, -1.0: value})
+        runs.append(record(make_summary("plain", split=split, training_psnr=20.0), str(folder)))
+    assert [row[1].text for row in beside_the_path(arms(runs)).rows] == [distance]
+
+
 def test_the_truth_comes_before_distances(tmp_path):
     sweep = write_sweep(tmp_path)
     write_beside(sweep / "streetgs_seed0", {1.0: 41.25, -1.0: 41.25, 2.0: 50.0}, name="a_distance", psnr=20.4)

@@ -5,9 +5,10 @@ import json
 import numpy as np
 
 from sparsestreet.pictures.images import picture_path, write_png
+from sparsestreet.records.quality import HELD_OUT, QUALITY
 from sparsestreet.report.arms import arms
 from sparsestreet.report.comparison import comparison_data
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import make_image, make_summary
 from tests.report.sweep_folder import record
 
 
@@ -22,3 +23,12 @@ def test_pictures_are_of_one_seed(tmp_path):
     (view,) = json.loads(comparison_data(arms(runs)))
     assert view["name"] == "street, seed 0, frame 5, camera 0"
     assert [image["name"] for image in view["images"]] == ["truth", "plain"]
+
+
+def test_the_psnr_below_a_picture_is_of_its_view(tmp_path):
+    """Frame 5 has 31 dB in camera 0; other views of the run have other numbers."""
+    for kind in ("truth", "render"):
+        write_png(picture_path(tmp_path / "pictures", 5, 0, kind), np.zeros((3, 4, 3), dtype=np.uint8))
+    QUALITY[HELD_OUT].write(tmp_path, [make_image(0, psnr=20.0), make_image(5, 1, psnr=25.0), make_image(5, psnr=31.0)])
+    (view,) = json.loads(comparison_data(arms([record(make_summary("plain"), str(tmp_path))])))
+    assert view["images"][1]["label"] == "plain, 31.00 dB, 1,200 Gaussians"

@@ -6,7 +6,7 @@ from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
-from sparsestreet.report.curves import QualityCurve, seconds_to, time_to_quality
+from sparsestreet.report.curves import QualityCurve, curves_of, mean_curve, seconds_to, time_to_quality
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, write_sweep
 
@@ -15,6 +15,21 @@ def test_the_first_look_that_is_good_enough():
     curve = QualityCurve((10.0, 20.0, 30.0), (20.0, 22.0, 21.5))
     assert seconds_to(curve, 21.5) == 20.0  # nothing between two looks
     assert seconds_to(curve, 22.1) is None
+
+
+def test_the_mean_is_over_looks_that_all_curves_have():
+    curves = [QualityCurve((10.0, 20.0), (20.0, 22.0)), QualityCurve((12.0, 24.0, 36.0), (21.0, 24.0, 25.0))]
+    assert mean_curve(curves) == QualityCurve((11.0, 22.0), (20.5, 23.0))
+
+
+def test_runs_of_one_scene_and_seed_are_their_mean(tmp_path):
+    """Runs that were trained on all views are in no mean with them."""
+    runs = []
+    for name, seconds, psnr, split in (("a", 10.0, 20.0, "some"), ("b", 12.0, 21.0, "some"), ("c", 99.0, 9.0, "none")):
+        HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(seconds, 9, psnr, None, None)])
+        runs.append(record(make_summary("plain", split=split, training_psnr=20.0), str(tmp_path / name)))
+    (arm,) = arms(runs)
+    assert list(curves_of(arm).values()) == [QualityCurve((11.0,), (20.5,))]
 
 
 def test_seconds_to_the_plain_runs_quality(tmp_path):

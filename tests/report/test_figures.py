@@ -3,14 +3,26 @@
 import re
 
 import pytest
+from matplotlib.figure import Figure
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.records.costs import NodeCost, update_costs
+from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange
 from sparsestreet.records.strict_json import RecordError
-from sparsestreet.report import collect
+from sparsestreet.report import collect, figures_time
 from sparsestreet.report.arms import arms
 from sparsestreet.report.figures import GREY, PARETO_COSTS, front, pareto, short
-from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
-from tests.report.sweep_folder import write_sweep
+from sparsestreet.report.figures_time import (
+    _counts,
+    _frame_costs,
+    counts_over_time,
+    frame_waterfall,
+    held_out_over_time,
+)
+from sparsestreet.report.sweep import _figures
+from tests.evaluation.frames import make_summary
+from tests.report.sweep_folder import record, write_sweep
 
 
 def test_the_front_is_what_nothing_beats():
@@ -60,6 +72,45 @@ def test_figures_over_time(found, tmp_path):
     for draw, word in ((held_out_over_time, "training seconds"), (counts_over_time, "step"), (frame_waterfall, "sky")):
         assert draw(found, tmp_path / "some.svg")
         assert word in (tmp_path / "some.svg").read_text()
+
+
+def test_a_bar_is_the_mean_over_runs(tmp_path):
+    runs = []
+    for seed, ms in enumerate((1.0, 4.0)):
+        update_costs(tmp_path / str(seed), nodes={"rigid": NodeCost(10, 0.1, 4.0, ms)}, effects={"sky": 2 * ms})
+        runs.append(record(make_summary("plain", seed), str(tmp_path / str(seed))))
+    (arm,) = arms(runs)
+    assert _frame_costs(arm) == {"rigid": 2.5, "effect: sky": 5.0}
+
+
+def test_counts_are_of_all_nodes(tmp_path):
+    """100 and 20 Gaussians, of which pruning leaves 30 and 20."""
+    starts = [CountChange(0, name, 0, rows, "start") for name, rows in (("background", 100), ("rigid", 20))]
+    LEDGER.write(tmp_path, [*starts, CountChange(5, "background", 100, 30, PRUNING)])
+    axes = Figure().subplots()
+    _counts(axes, *arms([record(make_summary("plain"))]), tmp_path)
+    line, dots = ([list(values) for values in drawn.get_data()] for drawn in axes.get_lines())
+    assert (line, dots) == ([[0, 5], [120, 50]], [[5], [50]])
+
+
+def test_a_figure_of_an_earlier_report_goes(tmp_path):
+    """Where the records no longer hold what it shows."""
+    for name in ("pareto_frame", "held_out", "counts", "waterfall", "of_somebody_else"):
+        (tmp_path / f"{name}.svg").write_text("<svg/>")
+    assert _figures([], DRIVESTUDIO, tmp_path)[0] == []
+    assert [path.name for path in tmp_path.iterdir()] == ["of_somebody_else.svg"]
+
+
+def test_every_run_has_a_line(tmp_path, monkeypatch):
+    """Two of one scene and seed have two."""
+    runs = []
+    for name in "ab":
+        HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(10.0, 9, 20.0, None, None)])
+        runs.append(record(make_summary("plain"), str(tmp_path / name)))
+    drawn = []
+    monkeypatch.setattr(figures_time, "write_svg", lambda figure, path: drawn.append(figure))
+    assert held_out_over_time(arms(runs), tmp_path / "some.svg")
+    assert len(drawn[0].axes[0].get_lines()) == 2
 
 
 def test_what_was_not_recorded_is_not_drawn(tmp_path):

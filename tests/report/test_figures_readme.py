@@ -5,15 +5,9 @@ import pytest
 from sparsestreet.metrics.protocols import DRIVESTUDIO
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
-from sparsestreet.report.curves import QualityCurve
-from sparsestreet.report.figures_readme import _paint, mean_curve, time_figure
+from sparsestreet.report.figures_readme import _paint, time_figure
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, write_sweep
-
-
-def test_the_mean_is_over_looks_that_all_curves_have():
-    curves = [QualityCurve((10.0, 20.0), (20.0, 22.0)), QualityCurve((12.0, 24.0, 36.0), (21.0, 24.0, 25.0))]
-    assert mean_curve(curves) == ([11.0, 22.0], [20.5, 23.0])
 
 
 @pytest.mark.lengthy

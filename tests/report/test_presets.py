@@ -3,13 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
 from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms
 from sparsestreet.report.presets import rendered_otherwise
-from tests.evaluation.frames import NOISE
-from tests.report.sweep_folder import write_sweep
+from tests.evaluation.frames import NOISE, make_summary
+from tests.report.sweep_folder import record, write_sweep
 
 
 def write_rendered(run: Path, loss: float) -> None:
@@ -25,8 +27,8 @@ def write_rendered(run: Path, loss: float) -> None:
         )
         for name, lost, milliseconds in (("default", 0.0, 20.0), ("fast", loss, 12.0))
     )
-    record = PresetRecord(command="c", device="cpu: x", threads=1, views=3, noise=NOISE, rendered=rendered)
-    PRESETS.write(run, record)
+    made = PresetRecord(command="c", device="cpu: x", threads=1, views=3, noise=NOISE, rendered=rendered)
+    PRESETS.write(run, made)
 
 
 def test_a_row_for_each_arm_and_preset(tmp_path):
@@ -53,6 +55,25 @@ def test_arms_of_one_label_are_told_apart_by_how_they_were_trained(tmp_path):
     other = replace(plain, name="streetgs render.settings.alpha_min=0.1")
     grid = rendered_otherwise([plain, other], DRIVESTUDIO)
     assert [row[0].text for row in grid.rows] == ["streetgs, default"] * 4
+
+
+@pytest.mark.parametrize(
+    ("splits", "expected"),
+    [
+        (("some", "some"), ["1", "29.80", "-0.20"]),  # losses of 0.1 and 0.3 dB, a pair alone
+        (("some", "none"), ["1", "29.90", "-0.10"]),
+        (("none", "none"), ["1", "29.80", "-0.20"]),
+    ],
+)
+def test_runs_of_one_scene_and_seed_are_their_mean(tmp_path, splits, expected):
+    """Those trained on all views count where no other has a record."""
+    runs = []
+    for name, loss, split in zip("ab", (0.1, 0.3), splits, strict=True):
+        write_rendered(tmp_path / name, loss)
+        runs.append(record(make_summary("plain", split=split, training_psnr=20.0), str(tmp_path / name)))
+    default, fast = rendered_otherwise(arms(runs), DRIVESTUDIO).rows
+    assert [cell.text for cell in fast[2:5]] == expected
+    assert default[1].text == "default, as trained"
 
 
 def test_none_recorded_no_table(tmp_path):

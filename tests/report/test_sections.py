@@ -176,6 +176,18 @@ def test_a_mean_over_scenes_takes_clips_of_any_length():
     assert mean.rows[0].runs == "2 scenes, n=2"
 
 
+def test_each_clip_of_a_log_counts_once_in_a_difference():
+    """Differences of -1 and -3 dB in two clips of one log and -5 dB in another log: -3 dB of three."""
+    clips = {("a", 0): -1.0, ("a", 10): -3.0, ("b", 0): -5.0}
+    runs = [
+        make_summary(label, psnr=25.0 + change * (label == "ours"), scene=scene, config={"data.log.first_frame": first})
+        for (scene, first), change in clips.items()
+        for label in ("plain", "ours")
+    ]
+    difference = sections(records(*runs), "plain")[-1].rows[-1]
+    assert (difference.runs, difference.cells[0].mean) == ("3 scenes, n=3", pytest.approx(-3.0))
+
+
 def test_a_mean_over_scenes_leaves_out_who_has_one_scene_only():
     runs = [make_summary("m", scene="a"), make_summary("m", scene="b"), make_summary("other", scene="a")]
     assert [row.label for row in sections(records(*runs))[-1].rows] == ["m"]

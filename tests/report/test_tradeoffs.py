@@ -77,6 +77,7 @@ def test_the_best_arm_of_a_budget(found):
     assert chosen["streetgs, at most 25 % of its Gaussians"]["arm"].text == "none of this sweep"  # 25.1 %
     half = chosen["streetgs, at most 50 % of its Gaussians"]
     assert (half["arm"].text, half["PSNR full, dB"].text, half["share, %"].text) == ("streetgs+removal", "-0.30", "25")
+    assert half["train minutes"].text == "1.67"  # 100 seconds
 
 
 def test_a_larger_arm_within_the_budget_is_better():
