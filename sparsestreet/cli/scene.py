@@ -1,9 +1,11 @@
 """What the commands that open a trained scene have in common."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from hydra.utils import get_class
+from hydra.utils import get_object
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.device import device_of
@@ -16,13 +18,26 @@ def open_scene(path: Path, device: str | None = None) -> StoredScene:
     Raises FileNotFoundError where there is none, ValueError for a device that is not there or a file that is no scene.
     """
     if (path / ".hydra").is_dir():
-        import_nodes(path)
+        import_parts(path)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     return load_scene(path, device_of(device, f"device={device}", "say device=cpu, or check the driver"))
 
 
-def import_nodes(run: Path) -> None:
-    """Make the run's node classes known: a scene file names them, but imports nothing from outside this package."""
-    for node in load_run_config(run).node.values():
-        if not node._target_.startswith("sparsestreet."):
-            get_class(node._target_)
+def import_parts(run: Path) -> None:
+    """Make the classes of a run's nodes and effects known, and of what is set within them (density, masks, sources).
+
+    A scene file names them, but imports nothing from outside this package.
+    """
+    config = OmegaConf.to_container(load_run_config(run))
+    for group in ("node", "effects"):
+        for target in _targets(config.get(group)):
+            if not target.startswith("sparsestreet."):
+                get_object(target)
+
+
+def _targets(tree: object) -> Iterator[str]:
+    if isinstance(tree, dict):
+        if "_target_" in tree:
+            yield tree["_target_"]
+        for value in tree.values():
+            yield from _targets(value)
