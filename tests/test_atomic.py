@@ -1,3 +1,5 @@
+import os
+
 import pytest
 
 from sparsestreet.atomic import atomic_file, atomic_folder
@@ -33,6 +35,16 @@ def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
             assert not temporary.exists()
     assert old.read_text() == "old"
     assert names(tmp_path) == ["old.txt"]
+
+
+def test_of_several_processes_none_removes_what_another_writes(tmp_path, monkeypatch):
+    path = tmp_path / "a.txt"
+    with atomic_file(path) as temporary:
+        temporary.write_text("first")
+        monkeypatch.setattr(os, "getpid", lambda: -1)
+        with atomic_file(path):
+            pass  # the other process has nothing to write
+    assert path.read_text() == "first"
 
 
 @pytest.mark.parametrize("stopped_by", [RuntimeError, KeyboardInterrupt])

@@ -1,6 +1,9 @@
 """Phases and stages: time belongs to the innermost one, all of it to some, and nobody pays where nobody records."""
 
+from unittest.mock import Mock
+
 import pytest
+import torch
 
 from sparsestreet import phases
 from sparsestreet.phases import PhaseRecorder, StageRecorder, phase, stage
@@ -22,6 +25,13 @@ class Ticks(phases.WallClock):
 def clock():
     yield Ticks()
     assert phases._recorder is None  # nothing is left to the next test
+
+
+def test_the_device_measures_milliseconds():
+    """``torch.cuda.Event.elapsed_time`` does, and needs an end that has passed."""
+    start, end = Mock(spec=torch.cuda.Event), Mock(spec=torch.cuda.Event)
+    start.elapsed_time = lambda event: 250.0 if event is end and end.synchronize.called else None
+    assert phases.CudaClock().seconds(start, end) == 0.25
 
 
 def test_time_belongs_to_the_innermost_phase_and_adds_up(clock):

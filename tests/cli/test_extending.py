@@ -188,7 +188,9 @@ def test_a_reader(tmp_path, capsys):
         Image.fromarray(np.full((20, 32, 3), 40 * index, np.uint8)).save(tmp_path / f"{index:03d}.png")
     assert data(["check", *words]) == 0
     assert "3 x 1" in capsys.readouterr().out
-    split = data_of(composed(*words[1:], "split.stride=2", "split.offset=1")).split
+    street = data_of(composed(*words[1:], "split.stride=2", "split.offset=1", "seed=7"))
+    split = street.split
+    assert street.seed == 7  # of the order of its frames
     assert [int(frame.image[0, 0, 0]) for frame in split.train] == [0, 80]
     (view,) = split.held_out.views
     assert (view.time, view.frame_index, view.camera.position.tolist()) == (0.5, 1, [0.0, 0.0, 1.0])

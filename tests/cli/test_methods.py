@@ -80,6 +80,18 @@ def test_schedules_and_capacities(schedule: str, capacity: str):
     assert limits == expected
 
 
+def test_a_preset_reaches_the_density_of_every_node():
+    nodes = recipe_of(composed("preset=current")).nodes.values()
+    assert [settings.density.grad_threshold for settings in nodes] == [5e-4, 5e-4]
+
+
+def test_before_removal_masks_are_pushed_by_a_weight_of_their_own():
+    """In a short run less than masks alone (conf/schedule/short.yaml says why)."""
+    cfg = composed("sparsify=removal")
+    weight = recipe_of(cfg).losses["mask_sparsity"].weight
+    assert weight == cfg.schedule.removal_lambda_m < cfg.schedule.lambda_m
+
+
 def test_k_min_has_one_home():
     cfg = composed("sparsify=paper", "node.background.min_gaussians=2000")
     text = OmegaConf.to_yaml(cfg, resolve=True)

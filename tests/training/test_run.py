@@ -1,5 +1,6 @@
 """A training from Python, without a configuration: what it leaves, how it goes on, and who writes."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -78,6 +79,11 @@ def test_a_run_is_called_after_its_folder_and_leaves_what_the_command_leaves(who
     assert {"train", "evaluate", "save"} < COSTS.read(whole).phases.keys()
     for name in ("views.json", "curves/metrics.csv", "curves/counts.png", "pictures/sheet.png"):
         assert (whole / name).is_file(), name
+
+
+def test_the_seed_of_a_run_is_that_of_its_recipe(tmp_path):
+    described = RunIdentity(label="mine").describe(replace(recipe(tmp_path), seed=3), data(), STEPS)
+    assert described.seed == 3
 
 
 class Steps(Callback):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.fingerprint import LogFiles, hash_files
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 
 FLAVORS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
@@ -77,6 +78,15 @@ def test_a_run_without_lidar_bodies_or_resolution_is_of_the_same_log(make, tmp_p
     """A report compares such runs, and would say that their data differ."""
     before = hash_of(make(tmp_path))
     assert hash_of(tmp_path, lidar=False, bodies=False, width=20, min_lens_shift=None) == before
+
+
+def test_of_boxes_and_poses_every_byte_counts(tmp_path):
+    """Also of more than are read at a time."""
+    boxes = tmp_path / "boxes.json"
+    boxes.write_bytes(bytes(2_500_000))
+    before = hash_files(tmp_path, LogFiles(described=[boxes]))
+    flip(boxes, 1_250_000)
+    assert hash_files(tmp_path, LogFiles(described=[boxes])) != before
 
 
 def test_large_files_are_not_read(tmp_path, monkeypatch):
