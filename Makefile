@@ -9,7 +9,7 @@ $(shell mkdir -p .cache/tmp)
 export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 
 .DEFAULT_GOAL := help
-.PHONY: help quick test test-all lint demo bench tables claims figure clean FORCE
+.PHONY: help quick test test-all lint style types demo bench tables claims figure clean FORCE
 
 help: ## this list
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,19 +31,32 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 # of their names: trainings (tests/cli) come early, where files of few tests would come last and leave a process idle.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-quick: lint ## the loop of daily work, under a minute: lint and unit tests without trainings and Triton's interpreter
+# Types take 40 s of one core: the targets that take minutes check them beside the tests, which leave a core idle, and
+# show what is wrong behind them. Either one fails the target.
+define beside_types
+	@mkdir -p .cache; $(BIN)/pyright >.cache/types.txt & types=$$!; \
+	echo '$(1)'; $(1); tests=$$?; \
+	wait $$types; types=$$?; cat .cache/types.txt; exit $$((tests ? tests : types))
+endef
+
+quick: style ## the loop of daily work, under a minute: style and unit tests without trainings and Triton's interpreter
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'
 
-test: lint ## what a change must pass: lint and all tests but those marked slow
-	$(PYTEST) -m 'not slow' --durations=20
+test: style ## what a change must pass: lint and all tests but those marked slow
+	$(call beside_types,$(PYTEST) -m "not slow" --durations=20)
 
-test-all: lint ## lint and all tests: every kernel for every architecture, every size of tiles
-	$(PYTEST)
+test-all: style ## lint and all tests: every kernel for every architecture, every size of tiles
+	$(call beside_types,$(PYTEST))
 
-lint: $(VENV)/.ok ## style, format, imports that go downwards
+lint: style types ## style, format, imports that go downwards, types
+
+style: $(VENV)/.ok ## lint without types: seconds
 	$(BIN)/python -m ruff check
 	$(BIN)/python -m ruff format --check
 	$(BIN)/lint-imports
+
+types: $(VENV)/.ok
+	$(BIN)/pyright
 
 demo: $(VENV)/.ok ## a synthetic street, trained plain and pruned: one table, pictures in outputs/demo
 	$(BIN)/sparsestreet demo

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 import torch
@@ -63,6 +63,10 @@ class _Made:
 
 class _Reader(pickle._Unpickler):
     """The unpickler written in Python, because only there every step can be replaced."""
+
+    stack: list[Any]
+    append: Callable[[Any], None]
+    dispatch: ClassVar[dict[int, Callable[..., None]]]
 
     def __init__(self, file: BinaryIO, **options: Any) -> None:
         super().__init__(file, **options)
@@ -151,7 +155,7 @@ def _dtype(made: _Made) -> np.dtype:
     if not re.fullmatch(r"[?]|b1|[iu][1248]|f[248]", name):
         raise ValueError(f"it holds an array of {name!r}, not of numbers")
     order = "=" if made.state is None else str(made.state[1])
-    return np.dtype(name).newbyteorder("=" if order == "|" else order)
+    return np.dtype(name).newbyteorder("=" if order == "|" else order)  # pyright: ignore[reportArgumentType]
 
 
 def _encoded(made: _Made) -> bytes:

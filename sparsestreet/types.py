@@ -10,6 +10,7 @@ Conventions, everywhere:
 """
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
@@ -115,6 +116,16 @@ class View:
     stamp: int | None = None
     """Nanoseconds on the log's own clock, whose zero is arbitrary; None: no clock, or between the recorded frames."""
 
+    @property
+    def indices(self) -> tuple[int, int]:
+        """Frame and camera index of a recorded view. Raises ValueError for any other."""
+        if self.frame_index is None or self.camera_index is None:
+            raise ValueError(
+                f"a recorded view has a frame and a camera index, got {self.frame_index} and {self.camera_index}: "
+                "take the views of a log"
+            )
+        return self.frame_index, self.camera_index
+
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(View):
@@ -130,7 +141,7 @@ class Frame(View):
     """Pixels of the recording car itself, such as its hood."""
 
     @classmethod
-    def of(cls, view: View, **pixels: Tensor | None) -> "Frame":
+    def of(cls, view: View, **pixels: Any) -> "Frame":
         """The view, all that it says, with its pixels."""
         return cls(**{entry.name: getattr(view, entry.name) for entry in fields(View)}, **pixels)
 
@@ -206,6 +217,13 @@ class Rendering:
     @property
     def visible(self) -> Bool[Tensor, " n"]:
         return self.radii > 0
+
+    @property
+    def screen_gradients(self) -> Float[Tensor, "n 2"]:
+        """What ``screen_offsets`` gathered. Raises ValueError where no backward pass went through them."""
+        if self.screen_offsets.grad is None:
+            raise ValueError("no backward pass went through screen_offsets: render with screen_gradients=True first")
+        return self.screen_offsets.grad
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import sparsestreet
+from tests.typed import there
 
 ROOMS = (
     "sparsestreet.atomic",
@@ -42,7 +43,7 @@ def public(room: str) -> list[tuple[str, object]]:
     package = importlib.import_module(room)
     if hasattr(package, "__all__"):
         return [(f"{room}.{name}", getattr(package, name)) for name in package.__all__]
-    folder = Path(package.__file__).parent
+    folder = Path(there(package.__file__)).parent
     names = map(name_of, folder.glob("*.py")) if hasattr(package, "__path__") else [room]
     modules = [importlib.import_module(name) for name in names]
     return [

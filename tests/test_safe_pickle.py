@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import torch
+from torch._utils import _rebuild_tensor_v2
 
 from sparsestreet.safe_pickle import read_pickled
 
@@ -58,8 +59,8 @@ def test_arrays_and_tensors_of_joblib(tmp_path):
 def chumpy():
     """The classes that wrap arrays in SMPL's files; the package itself runs on no Python of today."""
     ch, reordering = types.ModuleType("chumpy.ch"), types.ModuleType("chumpy.reordering")
-    ch.Ch = type("Ch", (), {"__module__": "chumpy.ch"})
-    reordering.Select = type("Select", (), {"__module__": "chumpy.reordering"})
+    vars(ch)["Ch"] = type("Ch", (), {"__module__": "chumpy.ch"})
+    vars(reordering)["Select"] = type("Select", (), {"__module__": "chumpy.reordering"})
     modules = {"chumpy": types.ModuleType("chumpy"), "chumpy.ch": ch, "chumpy.reordering": reordering}
     sys.modules.update(modules)
     yield ch.Ch, reordering.Select
@@ -107,7 +108,7 @@ def stored_by_torch(value) -> bytes:
 
 
 def tensor_of(storage: bytes) -> Hostile:
-    return Hostile(torch._utils._rebuild_tensor_v2, Hostile(torch.storage._load_from_bytes, storage), 0, (1,), (1,))
+    return Hostile(_rebuild_tensor_v2, Hostile(torch.storage._load_from_bytes, storage), 0, (1,), (1,))
 
 
 HOSTILE = {

@@ -191,7 +191,7 @@ def _steps(front: Sequence[PlottedPoint]) -> list[PlottedPoint]:
 
 def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
     """Writes names next to points. If names would overlap, the later one moves up or down to the next free place."""
-    axes.get_xlim(), axes.get_ylim()  # fixes the limits, and with them the transform to pixels
+    _ = axes.get_xlim(), axes.get_ylim()  # fixes the limits, and with them the transform to pixels
     bottom, top, end_of_panel = (float(side) for side in (axes.bbox.y0, axes.bbox.y1, axes.bbox.x1))
     pixel = 72 / axes.figure.dpi
     height = 9.5 / pixel

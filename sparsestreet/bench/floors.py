@@ -13,6 +13,7 @@ import torch
 
 from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS
 from sparsestreet.ops.ssim_window import WINDOW
+from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.system import StreetSystem
 
 NUMBER = 4.0
@@ -51,9 +52,8 @@ class StepWork:
     sky_pixels: int
 
     @staticmethod
-    def of(system: StreetSystem, samples: int | None) -> "StepWork":
-        """The work of the last step of the system."""
-        rendering = system.rendering
+    def of(system: StreetSystem, rendering: SceneRendering, samples: int | None) -> "StepWork":
+        """The work of the last step of the system, which made this rendering."""
         stepped = (value.numel() for value in system.scene.parameters() if value.grad is not None)
         degree = system.state().sh_degree
         seen = 1 - rendering.splats.alpha > system.options.settings.transmittance_min
@@ -63,7 +63,7 @@ class StepWork:
             (min(degree, 3) + 1) ** 2,
             samples,
             sum(stepped),
-            tuple(rendering.alpha.shape),
+            (rendering.alpha.shape[0], rendering.alpha.shape[1]),
             int(seen.sum()) if "sky" in system.scene.effects else 0,
         )
 

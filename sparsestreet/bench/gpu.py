@@ -119,13 +119,13 @@ def run_gpu(
     faster one. Each record is on disk as soon as it is measured.
     """
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
-    backend, peer = resolve_backend("auto", device), gsplat_peer.find_gsplat(device)
-    say(f"{name}; backend {backend}; {peer if isinstance(peer, str) else 'gsplat ' + gsplat_peer.version(peer)}")
+    backend, found = resolve_backend("auto", device), gsplat_peer.find_gsplat(device)
+    say(f"{name}; backend {backend}; {found if isinstance(found, str) else 'gsplat ' + gsplat_peer.version(found)}")
     if device.type == "cuda" and backend == "reference":
         say("nothing is measured: the dense reference would take hours at these sizes; install triton")
         return False
     records: list[GpuRecord] = []
-    modes = gsplat_peer.MODES if isinstance(peer, ModuleType) else ()
+    peer, modes = (None, ()) if isinstance(found, str) else (found, gsplat_peer.MODES)
     for workload in _workloads(sizes, street, device):
         for record in _measure_all(workload, name, backend, peer, modes, budget):
             file.write("gpu", record)
@@ -151,7 +151,7 @@ def _measure_all(
     workload: Workload,
     name: str,
     backend: str,
-    peer: ModuleType | str,
+    peer: ModuleType | None,
     modes: Sequence[str],
     budget: TimingBudget,
 ) -> Iterator[GpuRecord]:
@@ -164,6 +164,8 @@ def _measure_all(
     if is_compared and find_library() is not None:
         record = compared(record, partial(_against_truth, workload, backend))
     yield record
+    if peer is None:
+        return
     for mode in modes:
         record = replace(blank, renderer=f"gsplat {gsplat_peer.version(peer)} {mode}")
         record = measure(record, _theirs(workload, peer, mode), workload, budget)
@@ -281,7 +283,7 @@ def line(record: GpuRecord) -> str:
     text = f"{start} forward {_short(record.forward)}  backward {_short(record.backward)}  no grad {inference} ms"
     if record.step is not None:
         text += f"  step {_short(record.step)}"
-    if record.samples is not None:
+    if record.pairs is not None and record.samples is not None:
         text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
     if record.memory_peak is not None:
         text += f"  peak {record.memory_peak:7.0f} MB"

@@ -17,7 +17,7 @@ from sparsestreet.phases import clock_of
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.types import Camera, Gaussians
 
-Seen = Callable[[], tuple[Tensor | None, Tensor]]
+Seen = Callable[[], tuple[Tensor, Tensor]]
 """Absolute screen gradients [n, 2] and radii [n] of a rendering, after its backward pass."""
 Render = Callable[[Gaussians], tuple[Tensor, Seen]]
 
@@ -30,7 +30,7 @@ def our_render(camera: Camera, backend: str) -> Render:
 
     def render(gaussians: Gaussians) -> tuple[Tensor, Seen]:
         rendering = splat(gaussians, camera, settings=gsplat_peer.SETTINGS, backend=backend)
-        return rendering.rgb, lambda: (rendering.screen_offsets.grad, rendering.radii)
+        return rendering.rgb, lambda: (rendering.screen_gradients, rendering.radii)
 
     return render
 

@@ -120,6 +120,6 @@ def _model(settings: SplatSettings) -> tuple[float, float, bool]:
 
 
 def _text(knob: str, value: float | int | bool | str) -> str:
-    if knob == "alpha_min" and value:
-        return f"1/{round(1 / value)}"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return f"1/{round(1 / value)}" if knob == "alpha_min" and value else f"{value:g}"

@@ -12,6 +12,7 @@ from sparsestreet.bench.timing import TimeSpread, TimingBudget, spread
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import init_gaussians
 from sparsestreet.scene.masks import Mask, MaskScope, TemporalMaskSettings
+from sparsestreet.scene.masks.temporal import TemporalMask
 
 ROWS = (5_000, 50_000)
 """Numbers of rows: a few people of a small street, and K_min of the paper's people."""
@@ -63,7 +64,7 @@ def _time(mask: Mask, rows: Rows, budget: TimingBudget) -> TimeSpread:
     return spread(seconds)
 
 
-def _masked_rows(count: int, frames: int) -> tuple[Mask, Rows]:
+def _masked_rows(count: int, frames: int) -> tuple[TemporalMask, Rows]:
     """Rows in a box of 2 m, and a temporal mask with an untrained network."""
     generator = torch.Generator().manual_seed(0)
     scope = MaskScope.whole([frame / (frames - 1) for frame in range(frames)], torch.zeros(3), 1.0)

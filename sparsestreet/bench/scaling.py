@@ -55,7 +55,7 @@ def run_scaling(
     records = [_measure(sized(count), True, budget, file, say) for count in rows]
     if large is not None:
         _measure(large, False, budget, file, say)
-    pairs = [float(record.times.pairs) for record in records]
+    pairs = [float(count) for record in records if (count := record.times.pairs) is not None]  # counted: on the CPU
     times = {part: [record.times.stages[part].median for record in records] for part in ("forward", "backward")}
     lines = {}
     for part, values in times.items():
@@ -73,7 +73,8 @@ def run_scaling(
 def sized(rows: int) -> Size:
     """A 3:2 image with DENSITY splats per pixel; its sides are multiples of 16."""
     side = (rows / DENSITY / 1.5) ** 0.5
-    return Size(*(max(16, round(factor * side / 16) * 16) for factor in (1.5, 1.0)), rows)
+    width, height = (max(16, round(factor * side / 16) * 16) for factor in (1.5, 1.0))
+    return Size(width, height, rows)
 
 
 def _measure(

@@ -16,6 +16,7 @@ from sparsestreet.bench.step_figure import draw_step
 from sparsestreet.bench.step_record import PhaseRecord, StepRecord
 from sparsestreet.bench.timing import last_workspace, spread
 from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.callbacks.phase_times import LOOP
 from sparsestreet.training.system import StreetSystem
 
@@ -44,13 +45,16 @@ class StepWatch(Callback):
     Configure it last, because the work of other callbacks at the end of a step is part of the step.
     """
 
+    _recorder: PhaseRecorder
+    """Of the step that runs; there is one from the first step of the window on."""
+    _mode: TorchDispatchMode
+    """Counts what it does; there is one from the first counted step on."""
+
     def __init__(self, window: StepWindow) -> None:
         self.window = window
         self.seconds: list[dict[str, float]] = []
         self.work: list[StepWork] = []
         self.operations: Counter[str] = Counter()
-        self._recorder: PhaseRecorder | None = None
-        self._mode: TorchDispatchMode | None = None
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: Any, batch: Any, batch_idx: int
@@ -58,8 +62,8 @@ class StepWatch(Callback):
         step, window = trainer.global_step, self.window
         if window.first < step <= window.first + window.timed:
             self.seconds.append(self._recorder.stop())
-            if pl_module.rendering is not None:
-                self.work.append(StepWork.of(pl_module, _samples(pl_module)))
+            if (rendering := pl_module.rendering) is not None:
+                self.work.append(StepWork.of(pl_module, rendering, _samples(rendering)))
         if window.first + window.timed < step <= window.last:
             self._mode.__exit__(None, None, None)
             self._recorder.stop()
@@ -146,9 +150,9 @@ def _total(watch: StepWatch, name: str) -> float:
     return sum(seconds.get(name, 0.0) for seconds in watch.seconds)
 
 
-def _samples(system: StreetSystem) -> int | None:
+def _samples(rendering: SceneRendering) -> int | None:
     """(splat, pixel) samples of the newest rendering, where the backend counts them."""
-    rows = system.rendering.splats.radii
+    rows = rendering.splats.radii
     return last_workspace(rows.dtype).sample_count() if rows.device.type == "cpu" else None
 
 

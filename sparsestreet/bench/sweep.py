@@ -270,7 +270,7 @@ def check_oracle(scene: BenchScene) -> OracleRecord:
 def describe(record: KnobRecord) -> str:
     """One line for the terminal."""
     name = f"  {record.knob} {record.value}" if record.knob != "default" else "  default"
-    if record.skipped is not None:
+    if record.times is None:
         return f"{name:<34} -- {record.skipped}"
     stages = record.times.stages
     times = f"{name:<34}{stages['forward'].median:9.2f} + {stages['backward'].median:9.2f} ms"
@@ -286,5 +286,5 @@ def describe(record: KnobRecord) -> str:
 
 def worst_gradient(error: Errors) -> float:
     """Relative L2 of the parameter group with the largest error; infinite if a group's truth is zero."""
-    values = [group.relative_l2 for group in error.gradients.values()]
-    return float("inf") if None in values else max(values)
+    values = (group.relative_l2 for group in error.gradients.values())
+    return max(float("inf") if value is None else value for value in values)

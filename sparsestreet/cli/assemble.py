@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from hydra.utils import instantiate
 from lightning import Trainer
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from sparsestreet.cli.compose import resolved
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
@@ -34,7 +35,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
 
 def _render_options(cfg: DictConfig) -> RenderOptions:
     """Without the name of the preset: its values stand in the settings."""
-    said = OmegaConf.to_container(cfg.render, resolve=True)
+    said = resolved(cfg.render)
     return instantiate({key: value for key, value in said.items() if key != "preset"}, _convert_="all")
 
 
@@ -60,7 +61,7 @@ def identity_of(cfg: DictConfig, command: str) -> RunIdentity:
         label=cfg.name,
         method=cfg.method.name,
         sparsify=cfg.sparsify.name,
-        config=flat_config(OmegaConf.to_container(cfg, resolve=True)),
+        config=flat_config(resolved(cfg)),
         data_hash=instantiate(cfg.data.log, _convert_="all").data_hash(),
         command=command,
     )

@@ -57,7 +57,7 @@ def _wrong_types(tree: Tree, path: str = "", kind: typing.Any = None) -> Iterato
     hints = _hints(tree, kind)
     for name, value in tree.items():
         key = f"{path}.{name}" if path else name
-        if is_dataclass(kind) and "_target_" not in tree and name not in hints:
+        if isinstance(kind, type) and is_dataclass(kind) and "_target_" not in tree and name not in hints:
             yield f"no key {key!r}: {kind.__name__} has {', '.join(hints)}"
         if name in hints and not isinstance(value, dict) and not _fits(value, hints[name]):
             yield f"{key} must be {_in_words(hints[name])}, got {value!r}"

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -219,6 +219,11 @@ def _keys(tree: object, prefix: str = "") -> list[str]:
     return keys
 
 
+def resolved(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as plain values, with what its interpolations stand for."""
+    return cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
+
+
 def load_run_config(run: Path) -> DictConfig:
     """The configuration that a run wrote, with the log where the run had it.
 
@@ -227,7 +232,7 @@ def load_run_config(run: Path) -> DictConfig:
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
-    cfg = OmegaConf.load(path)
+    cfg = cast(DictConfig, OmegaConf.load(path))
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
     _find_log(cfg, run / ".hydra" / "hydra.yaml")

@@ -10,7 +10,15 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-Options = TypeVar("Options")
+
+@typing.runtime_checkable
+class Dataclass(typing.Protocol):
+    """An instance of any dataclass."""
+
+    __dataclass_fields__: typing.ClassVar[dict[str, Any]]
+
+
+Options = TypeVar("Options", bound=Dataclass)
 
 FEW = 20
 """Keys that an error still lists."""

@@ -1,10 +1,11 @@
 """Going on with a run: its own configuration, its own folder, exactly where it stopped."""
 
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.compose import load_run_config
+from sparsestreet.cli.compose import load_run_config, resolved
 from sparsestreet.records.configuration import IDENTITY_KEYS, flat_config, without
 
 
@@ -22,7 +23,7 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
     run = run_of(Path(given))
     load_run_config(run)  # says what a run's folder is, where this is none
     overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
-    kept = [text for text in overrides if not text.startswith(("resume=", "out="))]
+    kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out="))]
     folder = [] if any(text.startswith("out=") for text in arguments) else [f"out={run}"]
     return [*kept, *arguments, *folder]
 
@@ -34,9 +35,9 @@ def run_of(path: Path) -> Path:
     return path if path.is_dir() else path.resolve().parents[1]
 
 
-def check_resumed(config: dict, run: Path) -> None:
+def check_resumed(config: dict[str, Any], run: Path) -> None:
     """Raises ValueError, naming the options, where a run would go on with another configuration than its own."""
-    before = flat_config(OmegaConf.to_container(load_run_config(run), resolve=True))
+    before = flat_config(resolved(load_run_config(run)))
     now = flat_config(config)
     old, new = (without(flat, (*IDENTITY_KEYS, "trainer.*")) for flat in (before, now))
     changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]

@@ -16,7 +16,7 @@ from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.run import train
 
 
-def run(cfg: DictConfig, out: Path, started: float) -> float:
+def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     """Train and evaluate into a folder; a full-image PSNR, of held-out views where there are any.
 
     ``started`` is ``time.perf_counter`` when the command began.

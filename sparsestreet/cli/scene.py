@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from hydra.utils import get_object
@@ -28,7 +29,7 @@ def import_parts(run: Path) -> None:
 
     A scene file names them, but imports nothing from outside this package.
     """
-    config = OmegaConf.to_container(load_run_config(run))
+    config = cast(dict[str, Any], OmegaConf.to_container(load_run_config(run)))
     for group in ("node", "effects"):
         for target in _targets(config.get(group)):
             if not target.startswith("sparsestreet."):

@@ -11,8 +11,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from sparsestreet.cli.compose import resolved
 from sparsestreet.records.configuration import config_hash, flat_config, only
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
@@ -70,7 +71,7 @@ def sweep_status() -> int:
     return 1 if failures else 0
 
 
-def run_job(cfg: DictConfig, out: Path, train: Callable[[], float]) -> float:
+def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> float | None:
     """One job of a sweep: skipped where its folder holds its record, and written down where it fails.
 
     Answers with the PSNR that ``train`` answered with or the record holds, NaN for a job that failed.
@@ -101,7 +102,7 @@ def finished(cfg: DictConfig, out: Path) -> float | None:
         summary = SUMMARY.read(out)
     except RecordError:
         return None
-    config = flat_config(OmegaConf.to_container(cfg, resolve=True))
+    config = flat_config(resolved(cfg))
     same = summary.run.config_hash == config_hash(config) and only(summary.run.config, _ALIKE) == only(config, _ALIKE)
     if not same or summary.run.steps < summary.run.max_steps:
         return None

@@ -9,9 +9,9 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from sparsestreet.cli.compose import CONF, composed, override_problem, without_flags
+from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, run_job, sentence, sweep_problem, sweep_status
 
@@ -62,12 +62,12 @@ def _problem_of_values(arguments: list[str]) -> str | None:
     problem = config_problem(cfg)
     if problem is None and cfg.resume:
         # Before Hydra writes the configuration of this start over that of the run.
-        check_resumed(OmegaConf.to_container(cfg, resolve=True), run_of(Path(cfg.resume)))
+        check_resumed(resolved(cfg), run_of(Path(cfg.resume)))
     return problem
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
-def app(cfg: DictConfig) -> float:
+def app(cfg: DictConfig) -> float | None:
     """One training with its evaluation; returns a full-image PSNR for sweepers (held out, else of training views)."""
     # The jobs of a sweep begin here.
     started = time.perf_counter() if HydraConfig.get().mode == RunMode.MULTIRUN else _started

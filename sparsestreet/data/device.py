@@ -15,10 +15,13 @@ def to_device(value: T, device: torch.device) -> T:
 
     The host does not wait for the copies to a GPU: they go through pinned memory.
     """
+    return _moved(value, device)
+
+
+def _moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, torch.Tensor):
         pinned = value.pin_memory() if device.type == "cuda" and value.device.type == "cpu" else value
         return pinned.to(device, non_blocking=True)
-    if isinstance(value, Camera) or not is_dataclass(value):
+    if isinstance(value, Camera) or not is_dataclass(value) or isinstance(value, type):
         return value
-    moved: dict[str, Any] = {field.name: to_device(getattr(value, field.name), device) for field in fields(value)}
-    return replace(value, **moved)
+    return replace(value, **{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, Sweeps
-from sparsestreet.types import Frame, Sweep, Track, View
+from sparsestreet.types import Frame, Track, View
 
 _QUANTILES = (0.02, 0.98)
 _MARGIN = 1.1
@@ -30,10 +30,10 @@ class DrivingLog:
     """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centered near its start."""
 
     name: str
-    frames: Frames | tuple[Frame, ...]
-    """Ordered by (frame_index, camera_index), decoded when indexed; a tuple holds frames that are in memory."""
-    sweeps: Sweeps | tuple[Sweep, ...]
-    """Ordered by index, read when indexed; empty where the log has no lidar. A tuple: as for the frames."""
+    frames: Frames
+    """Ordered by (frame_index, camera_index), decoded when indexed; ``Frames.of`` takes frames that are in memory."""
+    sweeps: Sweeps
+    """Ordered by index, read when indexed; ``Sweeps.of(())`` where the log has no lidar."""
     tracks: tuple[Track, ...]
     """Objects annotated in at least one of the frames; poses are in the re-centered world."""
     num_frames: int
@@ -46,10 +46,6 @@ class DrivingLog:
     truth: Truth | None = None
     """What a camera off the recorded path would see; None: unknown, as for any recorded drive."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "frames", Frames.of(self.frames))
-        object.__setattr__(self, "sweeps", Sweeps.of(self.sweeps))
-
     @property
     def views(self) -> tuple[View, ...]:
         """Cameras, times and indices of the frames, for whoever needs no pixels: none is decoded."""
@@ -58,12 +54,13 @@ class DrivingLog:
     @cached_property
     def seconds(self) -> dict[int, float]:
         """Frame index -> seconds of the first of its views since the log's first stamp; empty without a clock."""
-        return {index: view.seconds for index, view in self._first_views().items()}
+        first = self._first_views().items()
+        return {index: view.seconds for index, (_, view) in first if view.seconds is not None}
 
     @cached_property
     def stamps(self) -> dict[int, int]:
         """Frame index -> stamp of the first of its views, nanoseconds on the log's clock; empty without a clock."""
-        return {index: view.stamp for index, view in self._first_views().items()}
+        return {index: stamp for index, (stamp, _) in self._first_views().items()}
 
     @property
     def frame_rate(self) -> float | None:
@@ -77,14 +74,15 @@ class DrivingLog:
         first, last = min(self.stamps), max(self.stamps)
         return 1e9 * (last - first) / (self.stamps[last] - self.stamps[first])
 
-    def _first_views(self) -> dict[int, View]:
-        """Frame index -> the view with the lowest stamp; empty where some view has none."""
-        first: dict[int, View] = {}
+    def _first_views(self) -> dict[int, tuple[int, View]]:
+        """Frame index -> the lowest stamp and the view with it; empty where some view has none."""
+        first: dict[int, tuple[int, View]] = {}
         for view in self.views:
             if view.stamp is None:
                 return {}
-            if view.frame_index not in first or view.stamp < first[view.frame_index].stamp:
-                first[view.frame_index] = view
+            index, _ = view.indices
+            if index not in first or view.stamp < first[index][0]:
+                first[index] = view.stamp, view
         return first
 
     @cached_property
@@ -128,7 +126,7 @@ class Split:
     @property
     def held_out_indices(self) -> frozenset[int]:
         """Integer frames whose images, sweeps and boxes must not be trained on."""
-        return frozenset(view.frame_index for view in self.held_out.views)
+        return frozenset(view.indices[0] for view in self.held_out.views)
 
 
 def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:

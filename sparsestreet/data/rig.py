@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Float, Float64
@@ -12,12 +13,14 @@ from sparsestreet.geometry.distortion import largest_shift
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera
 
+Name = TypeVar("Name", str, int)
+
 
 @dataclass(frozen=True)
-class RigCamera:
+class RigCamera(Generic[Name]):
     """What is the same in all images of a camera."""
 
-    name: str | int
+    name: Name
     """As the data set calls it."""
     index: int
     """As the log counts it."""
@@ -35,7 +38,7 @@ class RigCamera:
 
 
 def rig_camera(
-    name: str | int,
+    name: Name,
     index: int,
     *,
     intrinsics: Float64[Tensor, "3 3"],
@@ -43,7 +46,7 @@ def rig_camera(
     recorded_size: tuple[int, int],
     width: int | None = None,
     min_lens_shift: float | None = 0.5,
-) -> RigCamera:
+) -> RigCamera[Name]:
     """Size after scaling, and intrinsics scaled per axis with it: pixel centers lie at +0.5, so cx and cy scale too.
 
     Args:

@@ -41,7 +41,7 @@ class SceneFolder:
         """
         self._views: dict[int, list[View]] = {}
         for view in views:
-            self._views.setdefault(view.frame_index, []).append(view)
+            self._views.setdefault(view.indices[0], []).append(view)
         self._read_pixels = read_frame
         self._clock = clock
         self._check = check
@@ -57,16 +57,17 @@ class SceneFolder:
     @property
     def sweeps(self) -> Sweeps:
         """Read when indexed, and colored by the images of their instant; empty without lidar. Raises as ``frames``."""
-        return Sweeps(() if self._points is None else self._views, self._sweep, self._gray_sweep)
+        points = self._points
+        if points is None:
+            return Sweeps.of(())
+        return Sweeps(
+            self._views,
+            lambda index: self._explained(lambda: self._sweep(index, points)),
+            lambda index: self._explained(lambda: self._gray_sweep(index, points)),
+        )
 
     def _frame(self, view: View) -> Frame:
-        return self._explained(lambda: self._frames((view.frame_index, view.camera_index)))
-
-    def _sweep(self, index: int) -> Sweep:
-        return self._explained(lambda: self._read_sweep(index))
-
-    def _gray_sweep(self, index: int) -> Sweep:
-        return self._explained(lambda: self._read_gray_sweep(index))
+        return self._explained(lambda: self._frames(view.indices))
 
     def _explained(self, read: Callable[[], T]) -> T:
         try:
@@ -80,15 +81,15 @@ class SceneFolder:
         frame = self._read_pixels(view)
         return frame if self._points is None else replace(frame, depth=depth_image(self._points(index), view.camera))
 
-    def _read_sweep(self, index: int) -> Sweep:
-        frames = [self._frames((index, view.camera_index)) for view in self._views[index]]
-        points = self._points(index)
+    def _sweep(self, index: int, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Sweep:
+        frames = [self._frames(view.indices) for view in self._views[index]]
+        points = read_points(index)
         colors, colored = color_points(points, [(frame.camera, frame.image) for frame in frames])
         return Sweep(index, points, colors, colored, *self._clock.moment(index))
 
-    def _read_gray_sweep(self, index: int) -> Sweep:
+    def _gray_sweep(self, index: int, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Sweep:
         """The same without colors, for which no image need be decoded."""
-        points = self._points(index)
+        points = read_points(index)
         seen = seen_points(points, [view.camera for view in self._views[index]])
         return Sweep(index, points, torch.full_like(points, 0.5), seen, *self._clock.moment(index))
 

@@ -58,8 +58,8 @@ def evaluate_frames(
     for frame in frames:
         pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         if predictions is not None:
-            predictions.write(frame.frame_index, frame.camera_index, pixels)
-            pixels = predictions.read(frame.frame_index, frame.camera_index)
+            predictions.write(*frame.indices, pixels)
+            pixels = predictions.read(*frame.indices)
         yield _quality(pixels, frame, scene.device, lpips)
 
 
@@ -74,7 +74,7 @@ def evaluate_predictions(
     Raises PredictionError for a prediction that is absent or damaged.
     """
     for frame in frames:
-        pixels = predictions.read(frame.frame_index, frame.camera_index)
+        pixels = predictions.read(*frame.indices)
         yield _quality(pixels, frame, device, lpips)
 
 
@@ -90,7 +90,7 @@ def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame, lpips: Mapping[str,
     height, width = frame.image.shape[:2]
     measured = _Measured(rgb, frame.image.float() / 255, lpips)
     regions = {name: measured.within(name, mask) for name, mask in region_masks(frame).items()}
-    return FrameQuality(frame.frame_index, frame.camera_index, width, height, {"full": measured.whole()} | regions)
+    return FrameQuality(*frame.indices, width, height, {"full": measured.whole()} | regions)
 
 
 def region_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
@@ -142,7 +142,7 @@ class _Measured:
         error = metrics.masked_mse(self.rgb, self.truth, mask)
         if error is None:
             return RegionQuality(0, None, None, None)
-        values = {"mse": error, "psnr": metrics.psnr_of_mse(error)}
+        values: dict[str, float | None] = {"mse": error, "psnr": metrics.psnr_of_mse(error)}
         values["psnr8"] = metrics.masked_psnr(self.rgb8, self.truth, mask)
         values |= {name: ssim.masked_ssim_of_map(one, mask) for name, one in self.maps.items()}
         values |= {name: masked_lpips_of_layers(layers, mask) for name, layers in self.layers.items()}

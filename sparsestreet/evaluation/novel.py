@@ -59,7 +59,7 @@ def evaluate_novel(
     if len(frames) < 2:
         extractor, absent = None, "distances need at least two images: hold out more views"
     device = scene.device
-    real = extractor and np.stack([extractor(frame.image.to(device).float() / 255) for frame in frames])
+    real = None if extractor is None else _features(extractor, frames, device)
 
     def shift(offset: float) -> NovelShift:
         views = shifted_views(frames.views, offset, ramp)
@@ -74,7 +74,7 @@ def evaluate_novel(
         return NovelShift(
             offset=offset,
             views=len(views),
-            distances={} if extractor is None else _distances(extractor.name, np.stack(features), real),
+            distances={} if extractor is None or real is None else _distances(extractor.name, np.stack(features), real),
             truth=_means(quality),
             true_views=len(quality),
         )
@@ -87,6 +87,10 @@ def evaluate_novel(
         absent=None if extractor is not None else absent,
         shifts=shifts,
     )
+
+
+def _features(extractor: Extractor, frames: Frames, device: torch.device) -> Float[np.ndarray, "n d"]:
+    return np.stack([extractor(frame.image.to(device).float() / 255) for frame in frames])
 
 
 def _distances(extractor: str, ours: Float[np.ndarray, "n d"], real: Float[np.ndarray, "m d"]) -> dict[str, float]:
@@ -115,15 +119,16 @@ def shifted_views(views: Sequence[View], offset: float, ramp: bool = False) -> l
 
     They keep time and camera, but lose their frame index: nobody recorded them.
     """
-    instants = sorted({view.frame_index for view in views})
+    instants = sorted({view.indices[0] for view in views})
     steps = np.linspace(0, 1, len(instants)) if ramp and len(instants) > 1 else np.ones(len(instants))
     shares = dict(zip(instants, steps.tolist(), strict=True))
     fronts: dict[int, View] = {}
-    for view in sorted(views, key=lambda view: view.camera_index):
-        fronts.setdefault(view.frame_index, view)
+    for view in sorted(views, key=lambda view: view.indices[1]):
+        fronts.setdefault(view.indices[0], view)
     found = []
     for view in views:
-        right = fronts[view.frame_index].camera.camera_from_world[0, :3].double()
-        camera = moved(view.camera, shares[view.frame_index] * offset * right)
+        instant, _ = view.indices
+        right = fronts[instant].camera.camera_from_world[0, :3].double()
+        camera = moved(view.camera, shares[instant] * offset * right)
         found.append(replace(view, camera=camera, frame_index=None))
     return found

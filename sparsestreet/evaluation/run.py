@@ -196,7 +196,7 @@ def _picture(scene: SceneGraph, frame: Frame, options: RenderOptions) -> Picture
     if frame.depth is not None:
         near, beyond = (mask.cpu().numpy() for mask in lidar_masks(frame).values())
         error = draw_lidar_end(error, near, beyond)
-    return Picture(frame.frame_index, frame.camera_index, truth, render, error, _uint8(project_centers(scene, frame)))
+    return Picture(*frame.indices, truth, render, error, _uint8(project_centers(scene, frame)))
 
 
 def _uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

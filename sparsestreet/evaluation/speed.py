@@ -93,8 +93,8 @@ def to_uint8(rgb: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
 
 def instants(views: Sequence[View]) -> list[tuple[View, ...]]:
     """The recorded views of each instant, by their frame index and in its order: cameras fire at times of their own."""
-    ordered = sorted(views, key=lambda view: view.frame_index)
-    return [tuple(group) for _, group in groupby(ordered, key=lambda view: view.frame_index)]
+    ordered = sorted(views, key=lambda view: view.indices[0])
+    return [tuple(group) for _, group in groupby(ordered, key=lambda view: view.indices[0])]
 
 
 def device_name(device: torch.device) -> str:
@@ -175,7 +175,8 @@ def _stretched(items: Sequence[T], count: int) -> list[T]:
 
 
 def _percentiles(times: Sequence[float]) -> Percentiles:
-    return Percentiles(*(float(value) for value in np.percentile(times, (50, 90, 99))), len(times))
+    p50, p90, p99 = (float(value) for value in np.percentile(times, (50, 90, 99)))
+    return Percentiles(p50, p90, p99, len(times))
 
 
 def _wait_for(device: torch.device) -> None:

@@ -69,7 +69,7 @@ def left_to_right(rig: Rig) -> list[int]:
         x, _, z = (front_from_world @ view.camera.camera_from_world[2, :3].double()).tolist()
         return round(math.atan2(x, z), 6)
 
-    return [view.camera_index for view in sorted(rig, key=lambda view: (yaw(view), view.camera_index))]
+    return [_camera_of(view) for view in sorted(rig, key=lambda view: (yaw(view), _camera_of(view)))]
 
 
 def shifted(path: CameraPath, offset: float) -> CameraPath:
@@ -83,7 +83,7 @@ def shifted(path: CameraPath, offset: float) -> CameraPath:
     [2.0, 0.0, 0.0]
     """
 
-    front = min(view.camera_index for view in path[0])
+    front = min(_camera_of(view) for view in path[0])
 
     def beside(rig: Rig) -> Rig:
         vector = offset * _view_of(rig, front).camera.camera_from_world[0, :3].double()
@@ -120,6 +120,12 @@ def resized(path: CameraPath, width: int) -> CameraPath:
     if width < 1:
         raise ValueError(f"an image is at least 1 pixel wide, got width {width}")
     return _each_camera(path, lambda camera: _scaled(camera, width))
+
+
+def _camera_of(view: View) -> int:
+    if view.camera_index is None:
+        raise ValueError("a view of a path has a camera index, got None: take views of the log's cameras")
+    return view.camera_index
 
 
 def _view_of(rig: Rig, camera: int) -> View:
@@ -166,6 +172,7 @@ def _between(a: View, b: View, fraction: float) -> View:
     world_from_camera[:3, 3] = torch.lerp(first[:3, 3], second[:3, 3], fraction)
     pose = inverse(world_from_camera).to(a.camera.camera_from_world.dtype)
     time = a.time + fraction * (b.time - a.time)
-    timed = a.seconds is not None and b.seconds is not None
-    seconds = a.seconds + fraction * (b.seconds - a.seconds) if timed else None
+    seconds = None
+    if a.seconds is not None and b.seconds is not None:
+        seconds = a.seconds + fraction * (b.seconds - a.seconds)
     return View(replace(a.camera, camera_from_world=pose), time, None, a.camera_index, seconds)

@@ -79,7 +79,7 @@ def _write_video(path: Path, pictures: Iterable[Picture], fps: float, quality: f
     if first is None:
         raise ValueError("a video needs pictures, got none")
     height, width = (size + size % 2 for size in first.shape[:2])
-    writer: Generator = _ffmpeg().write_frames(
+    writer: Generator[None, Picture | None, None] = _ffmpeg().write_frames(
         str(path),
         (width, height),
         fps=float(fps),

@@ -20,7 +20,8 @@ def disable_compile(op: Callable[P, Result]) -> Callable[P, Result]:
     @functools.wraps(op)
     def call(*args: P.args, **kwargs: P.kwargs) -> Result:
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(op)(*args, **kwargs)
+            # torch's annotation takes the function for the decorator with options, and so for what makes one.
+            return torch.compiler.disable(op)(*args, **kwargs)  # pyright: ignore[reportCallIssue]
         return op(*args, **kwargs)
 
     return call

@@ -116,7 +116,7 @@ def _acting(
         slope_held, sigma_point_held = slopes_held(in_camera, camera), none
     else:
         axes = axes_in_camera(gaussians, rows, camera)
-        slope_held, sigma_point_held = none, sigma_points_held(in_camera, axes, camera, settings.near_plane)
+        slope_held, sigma_point_held = none, sigma_points_held(in_camera, axes, camera.distortion, settings.near_plane)
     return {
         "identity_quaternion": (gaussians.quaternions[rows] == 0).all(-1),
         "slope_held": slope_held,

@@ -32,6 +32,13 @@ class Placement:
     instances: Int[Tensor, " n"]
 
 
+Inputs = tuple[
+    Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+    Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None,
+]  # fmt: skip
+"""A part as backends take it; see :meth:`RawGaussians.tensors`."""
+
+
 @dataclass(frozen=True)
 class RawGaussians:
     """Gaussians as they are learned, in the world or in the boxes of their instances."""
@@ -52,13 +59,13 @@ class RawGaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def tensors(self) -> list[Tensor | None]:
+    def tensors(self) -> Inputs:
         """The six fields, multipliers, the poses' quaternions and translations, instances and presence, in order."""
-        fields = [self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest]
+        fields = (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest)
         if self.placement is None:
-            return [*fields, self.multipliers, None, None, None, None]
+            return *fields, self.multipliers, None, None, None, None
         poses, instances = self.placement.poses, self.placement.instances
-        return [*fields, self.multipliers, poses.quaternions, poses.translations, instances, poses.present]
+        return *fields, self.multipliers, poses.quaternions, poses.translations, instances, poses.present
 
     def terms(self, sh_degree: int) -> int:
         """Number of coefficients in use up to a degree; rows that store fewer use all of theirs."""

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from sparsestreet.pictures.plots import plot_counts, plot_psnr
 from sparsestreet.records.held_out import HELD_OUT_CURVE
@@ -68,7 +69,7 @@ def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
 
 
 def psnr_curves(
-    rows: Sequence[Mapping[str, str | float | None]], columns: Mapping[str, str], along: str
+    rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str], along: str
 ) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
     """Returns name of a curve -> (steps or seconds, dB), from the rows that have a value.
 

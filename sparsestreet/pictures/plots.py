@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -108,7 +109,7 @@ def _mark(axes: Axes, events: Sequence[tuple[int, str]]) -> None:
         axes.plot([], [], label=name, **style[name])
 
 
-def _line(index: int) -> dict[str, str | float]:
+def _line(index: int) -> dict[str, Any]:
     return {"color": _COLORS[index % len(_COLORS)], "linewidth": 1.6}
 
 

@@ -91,7 +91,8 @@ class LeaveOneOutRule(PruningRule):
         self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
     ) -> dict[str, Float64[Tensor, " _"]]:
         """Returns name of a node -> the cost of each of its rows, relative to the present squared error."""
-        errors = sum(_squared_errors(scene, frame, context) for frame in on_device(scene, frames))
+        none = torch.zeros(3, dtype=torch.float64, device=scene.device)
+        errors = sum((_squared_errors(scene, frame, context) for frame in on_device(scene, frames)), none)
         spans = scene.gaussians_at(frames[0], context.state).spans
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from typing import Any
 
 Setting = bool | int | float | str | list | None
 Configuration = Mapping[str, Setting]
@@ -43,7 +44,7 @@ IDENTITY_KEYS = (
 the configuration's identity."""
 
 
-def flat_config(tree: Mapping[str, object], prefix: str = "") -> dict[str, Setting]:
+def flat_config(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Setting]:
     """Returns a resolved tree of mappings as dotted key -> scalar or list.
 
     Empty mappings vanish; infinities and NaN become words.

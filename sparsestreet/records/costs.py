@@ -4,7 +4,7 @@ Training and evaluation each write their own part and keep the other's.
 """
 
 import statistics
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,7 +94,7 @@ def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[st
     >>> stage_costs({"train": 90.0, "prune/ImportanceRule at step 28000": 4.0})
     ({'train': 90.0, 'prune': 4.0}, {'ImportanceRule at step 28000': 4.0})
     """
-    phases: Counter[str] = Counter()
+    phases: defaultdict[str, float] = defaultdict(float)
     passes = {}
     for name, value in seconds.items():
         stage, _, detail = name.partition("/")

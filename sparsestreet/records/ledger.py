@@ -27,5 +27,9 @@ def _change(cells: Sequence[str]) -> CountChange:
 
 
 LEDGER = CsvFile(
-    "records/counts.csv", tuple(field.name for field in fields(CountChange)), astuple, _change, "train the run"
+    "records/counts.csv",
+    tuple(field.name for field in fields(CountChange)),
+    lambda change: astuple(change),  # as it stands, astuple has two types
+    _change,
+    "train the run",
 )

@@ -133,9 +133,9 @@ def _region_cells(region: str, image: FrameQuality) -> list[object]:
 
 def _image(cells: Sequence[str]) -> FrameQuality:
     named = dict(zip(_COLUMNS, cells, strict=True))
-    numbers = (int(cell) for cell in cells[:4])
+    frame, camera, width, height = (int(cell) for cell in cells[:4])
     regions = {region: _region(region, named) for region in REGIONS if named[metric_id("pixels", region)]}
-    image = FrameQuality(*numbers, regions)
+    image = FrameQuality(frame, camera, width, height, regions)
     if "full" not in regions:
         raise ValueError("the metrics of the full image are missing")
     return image

@@ -111,9 +111,9 @@ def _encoded(value: object, where: str, exact: bool = False) -> Json:
     raise RecordError(f"{where} is a {type(value).__name__}, which JSON cannot hold: convert it first")
 
 
-def _decoded(kind: object, value: Json, where: str) -> typing.Any:
+def _decoded(kind: typing.Any, value: Json, where: str) -> typing.Any:
     """Returns ``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None, or one of plain types."""
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         return _decoded_dataclass(kind, value, where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:

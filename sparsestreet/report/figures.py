@@ -4,6 +4,7 @@ import io
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -24,7 +25,7 @@ _MARKERS = {"none": "o", "paper": "s", "removal": "D", "masks": "^", "importance
 _INK = "#010203"
 """Stands for the color of the page's text."""
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
     "font.size": 9,
@@ -62,7 +63,7 @@ def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figur
 def write_svg(figure: Figure, path: Path) -> None:
     """Writes the figure as SVG in the page's own text color; the same numbers give the same bytes."""
     buffer = io.StringIO()
-    with matplotlib.rc_context(_STYLE | {"svg.hashsalt": path.stem}):
+    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": path.stem}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Title": path.stem})
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(_INK, "currentColor")

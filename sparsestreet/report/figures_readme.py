@@ -1,5 +1,6 @@
 """One figure of a sweep for a README: quality against training time, and against the time of a frame."""
 
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Value, mean_over_scenes
+from sparsestreet.report.arms import Arm, Value, by_scene
 from sparsestreet.report.curves import curves_of, mean_curve
 from sparsestreet.report.figures import LEGEND, colors, marker, of_sparsify, panels
 
@@ -49,8 +50,9 @@ def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protoco
         _points(axes, arm, shown, _seconds, protocol)
         return
     mean = mean_curve(curves)
-    style = {"color": _paint(arm, shown), "linestyle": _DASHES.get(arm.sparsify, "-."), "marker": marker(arm)}
-    axes.plot(mean.seconds, mean.psnr, **style, markevery=[len(mean.seconds) - 1], label=arm.name)
+    dashes, end = _DASHES.get(arm.sparsify, "-."), [len(mean.seconds) - 1]
+    paint = _paint(arm, shown)
+    axes.plot(mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=marker(arm), markevery=end, label=arm.name)
 
 
 def _paint(arm: Arm, shown: Sequence[Arm]) -> str:
@@ -67,8 +69,9 @@ def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: P
         return
     paint = _paint(arm, shown)
     axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
-    mean = [mean_over_scenes({unit: values[unit] for unit in units}) for values in (costs, qualities)]
-    axes.scatter(*([value] for value in mean), s=44, color=paint, marker=marker(arm), label=arm.name, zorder=3)
+    scenes = (by_scene({unit: values[unit] for unit in units}) for values in (costs, qualities))
+    x, y = (statistics.fmean(means.values()) for means in scenes)
+    axes.scatter(x, y, s=44, color=paint, marker=marker(arm), label=arm.name, zorder=3)
 
 
 def _seconds(run: RunSummary) -> float | None:

@@ -4,6 +4,7 @@ import statistics
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter
@@ -105,7 +106,7 @@ def _of(arms: Sequence[Arm], method: str) -> list[Arm]:
     return [arm for arm in arms if arm.plain_label == method]
 
 
-def _line(arm: Arm) -> dict[str, str | float]:
+def _line(arm: Arm) -> dict[str, Any]:
     dashes = {"capped": ":", "random": "--", "opacity": "-."}.get(arm.sparsify, "-")
     paint = GREY if arm.control else of_sparsify(arm)
     name = f"control: {arm.sparsify}" if arm.control else {"none": "plain"}.get(arm.sparsify, arm.sparsify)

@@ -142,9 +142,8 @@ def _sections(
     """Returns the table of a group, and the one by camera if there are several cameras."""
     reference = _reference(found, baseline)
     ordered = sorted(found, key=lambda variant: (variant is not reference, variant.name))
-    compared = ordered[1:] if reference is not None else []
     said = notes(ordered, group.over_scenes, protocol)
-    if compared:
+    if reference is not None and len(ordered) > 1:
         paired = "scene and seed" if group.over_scenes else "seed"
         said.append(f"differences are to {reference.name}, paired by {paired}; per cent is what remains of it")
     elif reference is None and baseline is not None:
@@ -152,7 +151,8 @@ def _sections(
 
     def section(name: str, by_camera: bool, columns: tuple[Quantity, ...], said: list[str]) -> Section:
         rows = [_variant_row(variant, columns, group.over_scenes) for variant in ordered]
-        rows += [_difference_row(variant, reference, columns, group.over_scenes) for variant in compared]
+        if reference is not None:
+            rows += [_difference_row(variant, reference, columns, group.over_scenes) for variant in ordered[1:]]
         return Section(name, group.over_scenes, by_camera, columns, tuple(rows), tuple(said))
 
     whole = section(title, False, quantities(group.runs, protocol), said)

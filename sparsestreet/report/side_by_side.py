@@ -48,7 +48,8 @@ def _column(run: Path, summary: RunSummary, name: str, first: str, gaussians: in
     share = f", {100 * summary.gaussians_total / max(gaussians, 1):.0f} % of {first}" if name != first else ""
     capped = ", held down by a cap" if summary.run.caps else ""
     pictures = read_pictures(run / "pictures")
-    psnr = {(one.frame, one.camera): one.regions["full"].psnr for one in QUALITY[summary.main_split].read(run)}
+    found = {(one.frame, one.camera): one.regions["full"].psnr for one in QUALITY[summary.main_split].read(run)}
+    psnr = {view: value for view, value in found.items() if value is not None}
     missing = [(picture.frame, picture.camera) for picture in pictures if (picture.frame, picture.camera) not in psnr]
     if missing:
         raise ValueError(f"{run} has pictures of (frame, camera) {missing} and no quality of them: evaluate it again")

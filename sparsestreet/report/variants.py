@@ -85,7 +85,8 @@ def variants(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) 
 
 def control_of(run: RunSummary) -> str | None:
     """Returns the kind of control that a run is, or None. A control only copies the size of another run."""
-    return run.run.config.get("sparsify.control", _EARLIER_CONTROLS.get(run.run.sparsify))
+    control = run.run.config.get("sparsify.control", _EARLIER_CONTROLS.get(run.run.sparsify))
+    return None if control is None else str(control)
 
 
 def log_config(run: RunSummary) -> dict[str, Setting]:

@@ -22,10 +22,11 @@ def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
     >>> node_legend(["background"])
     {'background': (76, 153, 230)}
     """
-    return {
-        name: tuple(round(255 * channel) for channel in NODE_COLORS[position % len(NODE_COLORS)])
-        for position, name in enumerate(nodes)
-    }
+    return {name: _rgb8(*NODE_COLORS[position % len(NODE_COLORS)]) for position, name in enumerate(nodes)}
+
+
+def _rgb8(red: float, green: float, blue: float) -> tuple[int, int, int]:
+    return round(255 * red), round(255 * green), round(255 * blue)
 
 
 @torch.no_grad()

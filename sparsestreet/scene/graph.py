@@ -1,7 +1,7 @@
 """The scene graph: nodes and effects by name, one list of Gaussians in a view."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import cast
 
@@ -46,8 +46,8 @@ class SceneGraph(nn.Module):
         if shared := nodes.keys() & effects.keys():
             raise ValueError(f"a node and an effect are both named {', '.join(sorted(shared))}: rename one of them")
         # To a type checker a ModuleDict holds any modules.
-        self.nodes = cast("Mapping[str, Node]", nn.ModuleDict(nodes))
-        self.effects = cast("Mapping[str, Effect]", nn.ModuleDict(effects))
+        self.nodes = cast("MutableMapping[str, Node]", nn.ModuleDict(nodes))
+        self.effects = cast("MutableMapping[str, Effect]", nn.ModuleDict(effects))
 
     @property
     def device(self) -> torch.device:

@@ -83,7 +83,7 @@ def usual_rates() -> dict[str, LearningRate]:
     }
 
 
-def matching_rate(name: str, rates: Mapping[str, LearningRate], where: str) -> LearningRate:
+def matching_rate(name: str, rates: Rates, where: str) -> LearningRate:
     """Returns the rate of a parameter by its dotted name.
 
     A key matches if the name contains its words in a row. It can be a column (``means`` in ``rows.means``) or a module
@@ -97,7 +97,7 @@ def matching_rate(name: str, rates: Mapping[str, LearningRate], where: str) -> L
     found = [key for key in rates if f".{key}." in f".{name}."]
     if not found:
         raise ValueError(f"parameter {name!r} has no learning rate: add one to {where}, which has {_listed(rates)}")
-    return rates[max(found, key=len)]
+    return LearningRate.of(rates[max(found, key=len)])
 
 
 def _listed(keys: Iterable[str]) -> str:

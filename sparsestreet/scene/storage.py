@@ -146,7 +146,10 @@ def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
 
 def _restored_effect(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Effect:
     settings = decode_as(EffectSettings, entry["settings"])
-    return settings.left_out() if settings.when == "off" else settings.restore(tensors, entry["header"])
+    found = settings.left_out() if settings.when == "off" else settings.restore(tensors, entry["header"])
+    if found is None:
+        raise ValueError(f"{type(settings).__name__} leaves nothing in its place where it is off: write the file again")
+    return found
 
 
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -155,7 +155,7 @@ def _numbers(values: Float[Tensor, " n"]) -> Numbers:
 
 
 def _tensor(values: Numbers | Matrix, shape: tuple[int, ...], where: str, name: str) -> Tensor:
-    lengths = {len(row) for row in values} if len(shape) == 2 else {0}
+    lengths = {len(row) for row in values if isinstance(row, tuple)}
     if len(values) != shape[0] or (len(shape) == 2 and lengths != {shape[1]}):
         raise ValueError(f"{where}: {name} must be {' x '.join(map(str, shape))} numbers, got {values}")
     return torch.tensor(values)

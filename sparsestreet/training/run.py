@@ -37,6 +37,7 @@ from sparsestreet.training.callbacks import (
 from sparsestreet.training.costs import record_costs
 from sparsestreet.training.curves import kept_curves
 from sparsestreet.training.identity import RunIdentity
+from sparsestreet.training.lightning import is_dev_run
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.system import StreetSystem
 
@@ -116,9 +117,9 @@ def train(
                 )
         except SystemExit:
             sys.exit(stop.exit_status or 1)
-        if trainer.fast_dev_run:
+        if is_dev_run(trainer):
             log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
-        if trainer.fast_dev_run or not trainer.is_global_zero:
+        if is_dev_run(trainer) or not trainer.is_global_zero:
             return None
 
         device = trainer.strategy.root_device

@@ -87,7 +87,7 @@ class StreetSystem(LightningModule):
                 terms |= self.scene.regularizers(frame, self.rendering.parts, self.rendering.drawn, state)
         if self._logs():
             with phase("logging"):
-                self._log_training(terms, frame)
+                self._log_training(self.rendering, terms, frame)
         return torch.stack(tuple(terms.values())).sum()
 
     def backward(self, loss: Tensor) -> None:
@@ -121,12 +121,12 @@ class StreetSystem(LightningModule):
         # Lightning's own word: in a resumed run its count of batches is not the step.
         return self.trainer._logger_connector.should_update_logs
 
-    def _log_training(self, terms: Mapping[str, Tensor], frame: Frame) -> None:
+    def _log_training(self, rendering: SceneRendering, terms: Mapping[str, Tensor], frame: Frame) -> None:
         """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms.
 
         All as tensors: a number would wait for the device before the backward pass is launched.
         """
-        image = self.rendering.rgb.detach().clamp(0, 1)
+        image = rendering.rgb.detach().clamp(0, 1)
         self.train_psnr.append(psnr_on_device(image, frame.image.to(image.dtype) / 255))
         self.log("psnr", torch.stack(tuple(self.train_psnr)).mean(), batch_size=1)
         self.log("gaussians", float(sum(self.scene.counts().values())), batch_size=1)

@@ -38,10 +38,10 @@ class VisibleAdam(Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
-                    self._update(parameter, group)
+                    self._update(parameter, parameter.grad, group)
         return loss
 
-    def _update(self, parameter: nn.Parameter, group: dict[str, Any]) -> None:
+    def _update(self, parameter: nn.Parameter, gradient: Tensor, group: dict[str, Any]) -> None:
         state = self.state[parameter]
         if not state:
             # On the host, where the bias corrections are computed, as an unfused Adam has it.
@@ -49,7 +49,7 @@ class VisibleAdam(Optimizer):
             state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
         state["step"] += 1
         step = AdamStep(int(state["step"]), group["lr"], tuple(group["betas"]), group["eps"])
-        adam_step_(parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"], seen_rows(parameter.grad), step)
+        adam_step_(parameter, gradient, state["exp_avg"], state["exp_avg_sq"], seen_rows(gradient), step)
 
 
 def seen_rows(gradient: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def find_features(image: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
     zoom = 2 if gray.shape[1] < SIFT_WIDTH else 1
     if zoom > 1:
         gray = cv2.resize(gray, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
-    sift = cv2.SIFT_create(nfeatures=limit, contrastThreshold=CONTRAST, edgeThreshold=EDGE)
+    sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=CONTRAST, edgeThreshold=EDGE)
     points, descriptors = sift.detectAndCompute(gray, None)
     if not points:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))

@@ -137,7 +137,7 @@ def _through_box(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:
 
 def _inside(points: TriangulatedPoints, views: list[int], track: Track) -> TriangulatedPoints:
     """The points that lie in the box; ``views`` are the places of its views among all."""
-    kept = (np.abs(points.positions) <= ENLARGEMENT / 2 * track.size.numpy()).all(1)
+    kept = np.all(np.abs(points.positions) <= ENLARGEMENT / 2 * track.size.numpy(), axis=1)
     number, of_kept = np.cumsum(kept) - 1, kept[points.observed]
     return TriangulatedPoints(
         points.positions[kept],

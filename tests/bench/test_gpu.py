@@ -49,8 +49,7 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
         return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
 
     module = ModuleType("gsplat")
-    module.__version__ = "1.5.3"
-    module.rasterization = rasterization
+    vars(module).update(__version__="1.5.3", rasterization=rasterization)
     return module
 
 
@@ -93,9 +92,9 @@ def test_settings_are_those_of_gsplat():
 
 
 def test_gsplat_is_looked_for_on_a_cuda_device_only(monkeypatch):
-    assert "CUDA" in gsplat_peer.find_gsplat(CPU)
+    assert "CUDA" in str(gsplat_peer.find_gsplat(CPU))
     monkeypatch.setitem(__import__("sys").modules, "gsplat", None)  # makes the import fail
-    assert "cannot be imported" in gsplat_peer.find_gsplat(torch.device("cuda"))
+    assert "cannot be imported" in str(gsplat_peer.find_gsplat(torch.device("cuda")))
     module = fake_gsplat()
     monkeypatch.setitem(__import__("sys").modules, "gsplat", module)
     assert gsplat_peer.find_gsplat(torch.device("cuda")) is module
@@ -133,7 +132,7 @@ def test_gsplats_faster_mode_is_used_after_the_first_size(tmp_path, monkeypatch,
             time.sleep(0.2)  # the image takes a few milliseconds
         return fake_gsplat().rasterization(**given)
 
-    module.rasterization = slow_in_one_mode
+    vars(module).update(rasterization=slow_in_one_mode)
     monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
     file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
     gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20), Size(32, 32, 30)], CPU, ONCE, file, lambda text: None)
@@ -149,7 +148,7 @@ def test_a_record_is_on_disk_before_the_next_is_measured(tmp_path, monkeypatch):
     def cut_off(**given):
         raise KeyboardInterrupt
 
-    module.rasterization = cut_off
+    vars(module).update(rasterization=cut_off)
     monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
     with pytest.raises(KeyboardInterrupt):
         gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, lambda text: None)
@@ -175,7 +174,7 @@ def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
     def broken(**given):
         raise RuntimeError("no kernel image is available\nmore")
 
-    module.rasterization = broken
+    vars(module).update(rasterization=broken)
     monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: module)
     file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
     assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append)

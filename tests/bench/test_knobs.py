@@ -44,10 +44,10 @@ def test_every_tile_size_at_the_default():
 
 
 def test_every_preset_has_one_point():
-    named = [point for point in POINTS if point.preset is not None]
-    assert sorted(point.preset for point in named) == sorted(PRESETS)
-    for point in named:
-        assert point.settings == SplatSettings.preset(point.preset)
+    named = [(point.preset, point.settings) for point in POINTS if point.preset is not None]
+    assert sorted(name for name, _ in named) == sorted(PRESETS)
+    for name, settings in named:
+        assert settings == SplatSettings.preset(name)
 
 
 def test_values_are_readable():

@@ -11,6 +11,7 @@ from sparsestreet.bench.scenes import Size, bench_scenes
 from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.ops import SplatSettings
 from tests.bench.test_records import PROVENANCE
+from tests.typed import there
 
 pytestmark = pytest.mark.lengthy
 
@@ -104,7 +105,7 @@ def test_points_that_cannot_be_had_say_why(swept):
         assert all(record["skipped"] and record["times"] is None and record["exact"] is None for record in triton)
     assert any(" -- " in line for line in swept[1]) or torch.cuda.is_available()
     large = bench_scenes(Size(640, 512, 2000))[0]
-    assert "dense" in sweep.unavailable(large, Point("backend", "reference", DEFAULT, backend="reference"))
+    assert "dense" in there(sweep.unavailable(large, Point("backend", "reference", DEFAULT, backend="reference")))
     assert sweep.unavailable(large, Point("default", "default", DEFAULT)) is None
 
 
@@ -116,7 +117,7 @@ def test_what_nothing_bounds_is_left_out_where_it_does_not_fit(monkeypatch):
     assert default.same_cutoffs is not None
     assert "no exact image" in sweep.describe(default)
     exact = sweep.measure_point(scene, Point("preset", "exact", EXACT), truths, ONCE)
-    assert "nothing bounds" in exact.skipped
+    assert "nothing bounds" in there(exact.skipped)
     monkeypatch.setattr(sweep, "UNBOUNDED_PAIRS", 120 * 6)
     assert sweep.measure_point(scene, Point("preset", "exact", EXACT), truths, ONCE).exact is not None
 

@@ -11,6 +11,7 @@ from sparsestreet.bench.scenes import Size, bench_scenes
 from sparsestreet.bench.tile_sizes import ROOT, Build, build, with_tiles
 from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.ops.cpu.library import tile_size
+from tests.typed import there
 
 ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 
@@ -23,15 +24,15 @@ def test_the_library_in_use_is_not_compiled_again(monkeypatch):
 def test_a_size_that_cannot_be_compiled_says_why(monkeypatch, tmp_path):
     size = 8 if tile_size() == 16 else 16
     monkeypatch.setattr(tile_sizes, "ROOT", tmp_path)
-    assert "without" in build.__wrapped__(size).missing
+    assert "without" in there(build.__wrapped__(size).missing)
     (tmp_path / "CMakeLists.txt").write_text("no such command\n")
     with monkeypatch.context() as patched:
         patched.setattr(shutil, "which", lambda name: None)
-        assert "no cmake" in build.__wrapped__(size).missing
+        assert "no cmake" in there(build.__wrapped__(size).missing)
     if shutil.which("cmake") is not None:
         made = build.__wrapped__(size)
         assert made.library is None
-        assert f"status 1 of 'cmake -S . -B .cache/tiles/{size}" in made.missing
+        assert f"status 1 of 'cmake -S . -B .cache/tiles/{size}" in there(made.missing)
 
 
 def test_without_a_library_the_point_is_skipped_with_its_reason(monkeypatch):

@@ -10,6 +10,7 @@ from lightning import Callback, Trainer
 
 from sparsestreet.cli.data import data
 from sparsestreet.cli.train import train
+from sparsestreet.training.lightning import callbacks_of
 from tests.conftest import unchecked
 from tests.shared import made_once
 
@@ -33,7 +34,7 @@ def one_step_checked() -> Iterator[None]:
 
     def checked_once(trainer: Trainer, *arguments: Any, **options: Any) -> None:
         before = jaxtyping.config.jaxtyping_disable
-        trainer.callbacks.append(OneStepChecked())
+        callbacks_of(trainer).append(OneStepChecked())
         try:
             fit(trainer, *arguments, **options)
         finally:

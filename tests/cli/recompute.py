@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,9 +12,8 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 
 def similarity(x, y, gauss):
     """SSIM per pixel and channel, in float64."""
-    around = (
-        partial(gaussian_filter, sigma=(1.5, 1.5, 0), radius=5) if gauss else partial(uniform_filter, size=(7, 7, 1))
-    )
+    window: Any = (7, 7, 1)
+    around = partial(gaussian_filter, sigma=(1.5, 1.5, 0), radius=5) if gauss else partial(uniform_filter, size=window)
     unbiased = 1 if gauss else 49 / 48
     mean_x, mean_y = around(x), around(y)
     variances = unbiased * (around(x * x) + around(y * y) - mean_x**2 - mean_y**2)
@@ -28,7 +28,7 @@ def recompute(run: Path, log: Path) -> dict[str, float]:
     for path in sorted((run / "predictions" / "held_out").glob("*.png")):
         x = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1] / 65535
         y = np.asarray(Image.open(log / "images" / f"{path.stem}.jpg")) / 255
-        masks = dict.fromkeys(("full", "no_hood"), np.ones(x.shape[:2], bool))
+        masks: dict[str, np.ndarray] = dict.fromkeys(("full", "no_hood"), np.ones(x.shape[:2], bool))
         for kind in ("human", "vehicle"):
             masks[kind] = np.asarray(Image.open(log / "dynamic_masks" / kind / path.name)) > 0
         rounded = np.round(x * 255) / 255

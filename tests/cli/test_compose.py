@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import composed, configuration, load_run_config, override_problem
 from sparsestreet.cli.train import train
+from tests.typed import there
 
 
 def test_the_same_overrides_are_composed_once():
@@ -110,7 +111,7 @@ def test_a_gpu_that_is_not_there(monkeypatch):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "trainer=gpu needs a CUDA device" in config_problem(composed(["trainer=gpu"]))
+    assert "trainer=gpu needs a CUDA device" in there(config_problem(composed(["trainer=gpu"])))
 
 
 def folder_of_the_log(run: Path, started: Path, *overrides: str) -> Path:

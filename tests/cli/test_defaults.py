@@ -9,6 +9,7 @@ from sparsestreet.cli.compose import configuration
 from sparsestreet.scene.nodes import BackgroundSettings, RigidSettings
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.run import CPU_TRAINER
+from tests.typed import as_a
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def test_the_trainer(cfg):
 def test_learning_rates_and_sources(cfg):
     nodes = recipe_of(cfg).nodes
     assert RigidSettings().learning_rates == nodes["rigid"].learning_rates
-    usual, configured = BackgroundSettings(), nodes["background"]
+    usual, configured = BackgroundSettings(), as_a(BackgroundSettings, nodes["background"])
     assert usual.learning_rates.items() >= configured.learning_rates.items()
     assert usual.sources == configured.sources
     assert usual.num_points == configured.num_points

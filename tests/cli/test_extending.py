@@ -22,8 +22,10 @@ from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.views import read_views
+from sparsestreet.training.callbacks import Pruning
 from tests.cli import configurations
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.toy.density import GrowthDensity
@@ -36,6 +38,7 @@ from tests.scene.density.scenes import make_rows as rows_at_random
 from tests.scene.density.scenes import with_statistics
 from tests.scene.street import street_log, training_data
 from tests.training.stubs import background, frame_at, make_rows, set_rows
+from tests.typed import as_a
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
@@ -93,7 +96,7 @@ def test_a_loss(words):
 
 def test_a_rule():
     cfg = composed("sparsify=size")
-    pruning = recipe_of(cfg).callbacks["pruning"]
+    pruning = as_a(Pruning, recipe_of(cfg).callbacks["pruning"])
     assert (pruning.at, pruning.rule, cfg.name) == ((0.6,), SizeRule(meters=1.0), "streetgs+size")
     node = background(20, min_gaussians=19)
     set_rows(node, "log_scales", {3: 1.0, 5: 2.0})
@@ -104,7 +107,9 @@ def test_a_rule():
 
 def test_a_rule_takes_the_place_of_another():
     """By name, in whichever sparsification prunes; what is left of that one are its moments."""
-    pruning = recipe_of(composed("sparsify=paper", "pruning@callback.pruning.rule=size")).callbacks["pruning"]
+    pruning = as_a(
+        Pruning, recipe_of(composed("sparsify=paper", "pruning@callback.pruning.rule=size")).callbacks["pruning"]
+    )
     assert (pruning.at, pruning.rule) == ((0.93334,), SizeRule(meters=1.0))
 
 
@@ -116,7 +121,7 @@ def test_a_density_strategy():
     rows = rows_at_random(10, torch.Generator().manual_seed(0))
     wanted = with_statistics([1.0] * 10)
     for most, after in ((None, 15), (12, 12)):
-        plan = density.densify(
+        plan = as_a(GrowthDensity, density).densify(
             rows, wanted, radius=1e6, progress=0.5, max_gaussians=most, generator=torch.Generator().manual_seed(0)
         )
         assert len(plan.source) == after  # radius 1e6: every row is small, so that each wanted one is cloned
@@ -124,7 +129,7 @@ def test_a_density_strategy():
 
 def test_a_mask():
     settings = recipe_of(composed("sparsify=masks", PROBIT)).nodes["background"]
-    mask = settings.mask_settings.build(settings.min_gaussians)
+    mask = as_a(ProbitMaskSettings, settings.mask_settings).build(settings.min_gaussians)
     assert isinstance(mask, ProbitMask)
     assert mask.settings == ProbitMaskSettings(sparsity_weight=2.5e-3)
     rows = make_rows(3, columns={"mask_logits": torch.tensor([-2.5, -2.0, 1.0])})
@@ -136,7 +141,8 @@ def test_a_mask():
 
 def test_a_source():
     chosen = "source@node.background.sources=[lidar,images,near,far,driven]"
-    background = recipe_of(composed(chosen, "node.background.sources.near.part=0.233")).nodes["background"]
+    nodes = recipe_of(composed(chosen, "node.background.sources.near.part=0.233")).nodes
+    background = as_a(BackgroundSettings, nodes["background"])
     assert list(background.sources) == ["lidar", "images", "near", "far", "driven"]
     source = background.sources["driven"]
     assert source == DrivenPoints(initial_opacity=0.3, part=0.1, height=1.5)

@@ -9,13 +9,16 @@ import torch
 
 from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.lazy import Sweeps
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.types import BodyPoses, Track
 from tests.cli.configurations import composed
 from tests.scene.street import NUM_FRAMES, pose, street_log, track
+from tests.typed import as_a
 
 METHODS = ("3dgs", "deformgs", "pvg", "streetgs", "omnire")
 SMALL = (
@@ -84,7 +87,10 @@ LOGS: dict[str, tuple[DrivingLog, set[str]]] = {
     "no boxes": (with_tracks(), {"background"}),
     "no people": (with_tracks(car(range(NUM_FRAMES))), {"background", "rigid"}),
     "a person and a car": (with_tracks(car(range(NUM_FRAMES)), person()), {"background", "rigid", "smpl"}),
-    "no lidar": (replace(with_tracks(car(range(NUM_FRAMES)), person()), sweeps=()), {"background", "rigid", "smpl"}),
+    "no lidar": (
+        replace(with_tracks(car(range(NUM_FRAMES)), person()), sweeps=Sweeps.of(())),
+        {"background", "rigid", "smpl"},
+    ),
     "a track of a single frame": (with_tracks(car([1])), {"background"}),
     "a turn by 180 degrees": (
         with_tracks(car(range(NUM_FRAMES), lambda frame: math.pi * (frame % 2))),
@@ -114,7 +120,7 @@ def test_a_scene_of_all_nodes_trains_on_it(case: str):
 @pytest.mark.parametrize("method", METHODS)
 def test_one_frame_of_one_camera(method: str):
     log = with_tracks(car(range(NUM_FRAMES)), person())
-    still = replace(log, frames=(log.frames[0],), sweeps=(log.sweeps[0],), tracks=tuple(
+    still = replace(log, frames=log.frames.at([0]), sweeps=log.sweeps.at([0]), tracks=tuple(
         replace(each, frames=each.frames[:1], world_from_object=each.world_from_object[:1],
                 body=None if each.body is None else replace(
                     each.body, rotations=each.body.rotations[:1], valid=each.body.valid[:1]))
@@ -126,7 +132,7 @@ def test_one_frame_of_one_camera(method: str):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_to_start_from_is_an_error_of_one_sentence(method: str):
-    log = replace(with_tracks(), sweeps=())
+    log = replace(with_tracks(), sweeps=Sweeps.of(()))
     recipe = recipe_of(composed(f"method={method}", *SMALL, "node.background.num_points=0"))
     with pytest.raises(ValueError, match="has nothing to start from: none of num_points=0"):
         recipe.build(StreetData(log, stride=4, offset=2))
@@ -142,7 +148,7 @@ def test_two_people_in_one_box_keep_their_own_rows():
 def test_a_turn_by_180_degrees_is_no_jump_of_the_center():
     """Between two frames that face each other's back a car is where it would be without the turn."""
     log = LOGS["a turn by 180 degrees"][0]
-    poses = system_on(log, "streetgs").scene.nodes["rigid"].pose_at(0.125)
+    poses = as_a(Rigid, system_on(log, "streetgs").scene.nodes["rigid"]).pose_at(0.125)
     torch.testing.assert_close(poses.translations[0], torch.tensor([9.0, 1.0, 0.75]))
     assert poses.quaternions.isfinite().all()
     assert bool(poses.present)

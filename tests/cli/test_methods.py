@@ -4,6 +4,7 @@ import csv
 import itertools
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
@@ -12,14 +13,18 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import CONF, override_problem
+from sparsestreet.cli.compose import CONF, override_problem, resolved
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.density import GradientDensity, VibratingDensity
 from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.sources import ImagePoints
+from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.triangulation import ImagePointSettings
 from tests.cli.configurations import composed
+from tests.typed import as_a, there
 
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
@@ -54,7 +59,7 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     added = ([MaskTraining] if masked else []) + ([Pruning] if sparsify in rules else [])
     assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:
-        pruning = recipe.callbacks["pruning"]
+        pruning = as_a(Pruning, recipe.callbacks["pruning"])
         assert type(pruning.rule) is rules[sparsify]
         # The paper prunes once, at 28,000 of 30,000 steps, whatever the schedule.
         assert (pruning.at == (0.93334,)) == (rules[sparsify] is ImportanceRule)
@@ -99,22 +104,23 @@ def test_k_min_has_one_home():
     assert "4000" not in text.replace("num_points: 40000", "")
     settings = recipe_of(cfg).nodes["background"]
     assert settings.min_gaussians == 2000
-    assert settings.mask_settings.build(settings.min_gaussians).min_gaussians == 2000
+    assert as_a(StaticMaskSettings, settings.mask_settings).build(settings.min_gaussians).min_gaussians == 2000
 
 
 def test_the_shares_of_the_sources_are_all_points():
     """Whatever the images show: what one source is not asked for, another is."""
-    sources = recipe_of(composed()).nodes["background"].sources.values()
+    sources = as_a(BackgroundSettings, recipe_of(composed()).nodes["background"]).sources.values()
     for seen in (Coverage(0.5, 0.3), Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0)):
         assert sum(source.share(seen) for source in sources) == pytest.approx(1)
 
 
 def test_sources_are_chosen_left_out_and_refused():
-    chosen = recipe_of(composed("source@node.background.sources=[lidar,far]")).nodes["background"].sources
-    assert list(chosen) == ["lidar", "far"]
+    chosen = recipe_of(composed("source@node.background.sources=[lidar,far]")).nodes["background"]
+    assert list(as_a(BackgroundSettings, chosen).sources) == ["lidar", "far"]
     left = recipe_of(composed("~node.background.sources.near", "node.background.sources.images.order=random"))
-    assert list(left.nodes["background"].sources) == ["lidar", "images", "far"]
-    assert left.nodes["background"].sources["images"].order == "random"
+    sources = as_a(BackgroundSettings, left.nodes["background"]).sources
+    assert list(sources) == ["lidar", "images", "far"]
+    assert as_a(ImagePoints, sources["images"]).order == "random"
     with pytest.raises(InstantiationException, match=r"leave one out with ~node\.background\.sources\.far"):
         recipe_of(composed("node.background.sources.far=null"))
 
@@ -135,11 +141,12 @@ def test_rules_are_chosen_by_name_wherever_something_is_pruned(rule: str):
 
 def test_a_density_strategy_is_a_choice():
     """A node says what differs, whichever it is; the strategy of PVG has the period of the node it is chosen for."""
-    pvg = recipe_of(composed("method=pvg", "node.background.cycle=0.3")).nodes["background"].density
-    assert (type(pvg), pvg.cycle, pvg.cull_scale) == (VibratingDensity, 0.3, 0.5)
+    vibrating = recipe_of(composed("method=pvg", "node.background.cycle=0.3")).nodes["background"].density
+    pvg = as_a(VibratingDensity, vibrating)
+    assert (pvg.cycle, pvg.cull_scale) == (0.3, 0.5)
     other = recipe_of(composed("method=pvg", "density@node.background.density=gradient")).nodes["background"].density
     assert other == GradientDensity()
-    cars = recipe_of(composed()).nodes["rigid"].density
+    cars = as_a(GradientDensity, recipe_of(composed()).nodes["rigid"].density)
     assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
 
 
@@ -150,10 +157,10 @@ def test_settings_of_the_op_are_those_of_a_preset_unless_given():
     changed = recipe_of(composed("render.preset=fine", "render.settings.alpha_min=0.1")).options
     assert (changed.settings, changed.backend) == (SplatSettings(max_sigma=4.0, alpha_min=0.1), "auto")
     # A record holds the values, whatever a preset means later.
-    assert flat_config(OmegaConf.to_container(composed("render.preset=fast"), resolve=True))[
-        "render.settings.alpha_min"
-    ] == pytest.approx(1 / 128)
-    assert "no settings preset 'quick': choose one of ['default'" in config_problem(composed("render.preset=quick"))
+    assert flat_config(resolved(composed("render.preset=fast")))["render.settings.alpha_min"] == pytest.approx(1 / 128)
+    assert "no settings preset 'quick': choose one of ['default'" in there(
+        config_problem(composed("render.preset=quick"))
+    )
 
 
 @pytest.mark.parametrize(
@@ -254,7 +261,7 @@ BASELINE_TERMS = [
 
 
 def test_the_terms_of_the_baselines_are_options():
-    losses = recipe_of(composed(*BASELINE_TERMS)).losses
+    losses: dict[str, Any] = dict(recipe_of(composed(*BASELINE_TERMS)).losses)
     dynamic = losses.pop("dynamic_region")
     assert (dynamic.weight, dynamic.threshold, dynamic.from_progress) == (1.0, 0.2, 0.6666)
     assert {name: loss.weight for name, loss in losses.items()} == {

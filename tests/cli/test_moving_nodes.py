@@ -9,6 +9,8 @@ import torch
 from sparsestreet import load_scene
 from sparsestreet.cli.train import train
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Deformable, Field, Smpl
+from tests.typed import as_a
 
 
 def trained(tiny_street: list[str], out: Path, *overrides: str) -> tuple[SceneGraph, list[dict[str, str]]]:
@@ -43,7 +45,7 @@ def test_a_vibrating_street(tiny_street, tmp_path):
 def test_a_street_deformed_by_a_network(tiny_street, tmp_path):
     """Its loss falls, and what moves is learned from the time on at which it begins."""
     scene, curves = trained(tiny_street, tmp_path / "run", "method=deformgs", "node.background.deform_from=0.5")
-    node = scene.nodes["background"]
+    node = as_a(Field, scene.nodes["background"])
     losses = of_steps(curves, "train/photometric")
     assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
     assert node.network.last.weight.any()
@@ -64,7 +66,7 @@ def test_objects_deformed_by_a_network(tiny_street, tmp_path):
         "node.deformable.points_per_instance=100",
         "node.deformable.min_gaussians=60",
     )
-    node = scene.nodes["deformable"]
+    node = as_a(Deformable, scene.nodes["deformable"])
     losses = of_steps(curves, "train/photometric")
     assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
     assert node.network.last.weight.any()
@@ -88,7 +90,7 @@ def test_people_on_skeletons(tiny_street, tmp_path):
         "schedule.mask_feature_rate=0.25",
         "schedule.lambda_m=3e6",
     )
-    node = scene.nodes["smpl"]
+    node = as_a(Smpl, scene.nodes["smpl"])
     losses = of_steps(curves, "train/photometric")
     assert sum(losses[-12:]) < 0.9 * sum(losses[:12])
     for corrections in (node.rotation_deltas, node.translation_deltas, node.joint_deltas):

@@ -84,7 +84,7 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
     """Five frames, 0.1 s apart: each is shown for 0.1 s, whatever the frames a second of the video."""
     from tests.export.test_video import read_video
 
-    views = [replace(view, seconds=0.1 * view.frame_index) for view in street_views(cameras=(0,))]
+    views = [replace(view, seconds=0.1 * view.indices[0]) for view in street_views(cameras=(0,))]
     write_views(tmp_path / "clock.json", views, [], frame_rate=10.0)
     words = [f"scene={run}", f"views={tmp_path / 'clock.json'}", "cameras=0", "width=24"]
     assert render([*words, f"out={tmp_path / 'own.mp4'}"]) == 0

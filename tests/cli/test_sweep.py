@@ -1,5 +1,6 @@
 """Sweeps: what composes, what is skipped, what fails and stands."""
 
+import importlib
 import math
 
 import pytest
@@ -16,6 +17,7 @@ from sparsestreet.records.summary import SUMMARY
 from tests.cli import configurations
 from tests.cli.conftest import TIMED_ONCE
 from tests.evaluation.frames import make_summary
+from tests.typed import there
 
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
 NEED_DRIVES = [name for name in SWEEPS if name.startswith(OF_DRIVES)]
@@ -27,7 +29,7 @@ def composed(*overrides: str) -> DictConfig:
 
 def problem_of(cfg: DictConfig) -> str | None:
     """Without what only a running app knows."""
-    return config_problem(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]))
+    return config_problem(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
 
 
 def jobs(name: str) -> list[list[str]]:
@@ -99,13 +101,13 @@ def test_a_control_keeps_what_the_other_run_ended_with(counted):
     rule = composed("sparsify=random", f"count_of={counted}").callback.pruning.rule
     assert rule.keep == {"background": 20_000, "rigid": 2000}
     assert composed("sparsify=random").callback.pruning.rule.keep == 0.5
-    assert "that run has no record" in problem_of(composed("sparsify=opacity", f"count_of={counted}/nothing"))
+    assert "that run has no record" in there(problem_of(composed("sparsify=opacity", f"count_of={counted}/nothing")))
 
 
 def test_drives_must_be_named_and_there(tmp_path):
-    assert "give their folders, data.root=DIR,DIR" in sweep_problem(["+sweep=table1_waymo"])
+    assert "give their folders, data.root=DIR,DIR" in there(sweep_problem(["+sweep=table1_waymo"]))
     absent = sweep_problem(["+sweep=table1_waymo", f"data.root={tmp_path},{tmp_path}/no"])
-    assert f"{tmp_path}/no, which is no folder" in absent
+    assert f"{tmp_path}/no, which is no folder" in there(absent)
     assert sweep_problem(["+sweep=table1_waymo", f"data.root={tmp_path}"]) is None
     assert sweep_problem(["+sweep=streets"]) is sweep_problem(["seed=1"]) is None
 
@@ -120,9 +122,9 @@ def test_launchers_compose_or_say_how_they_are_installed():
     assert override_problem(["-m", "+sweep=tiny", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]) is None
     problem = override_problem(["hydra/launcher=submitit_slurm"])
     try:
-        import hydra_plugins.hydra_submitit_launcher  # noqa: F401
+        importlib.import_module("hydra_plugins.hydra_submitit_launcher")
     except ImportError:
-        assert "pip install hydra-submitit-launcher" in problem
+        assert "pip install hydra-submitit-launcher" in there(problem)
     else:
         assert problem is None
 
@@ -156,7 +158,7 @@ def test_a_failure_stands_until_its_job_succeeds(tmp_path, monkeypatch, capsys):
     def fails() -> float:
         raise ValueError("no room")
 
-    assert math.isnan(run_job(cfg, out, fails))
+    assert math.isnan(there(run_job(cfg, out, fails)))
     ((folder, failure),) = read_failures(tmp_path)
     assert (folder, failure.label, failure.seed, failure.error) == (out, "plain", 3, "no room")
     assert sweep_status() == 1

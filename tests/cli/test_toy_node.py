@@ -45,7 +45,7 @@ def test_its_gaussians_come_and_go_for_every_reason(toy_run):
     # Its learned parts have moved, its network too, which rested for the first quarter.
     node = load_scene(toy_run).scene.nodes["bobbing"]
     assert isinstance(node, Bobbing)
-    assert node.lift[0].weight.abs().sum() > 0
+    assert node.lift[0].get_parameter("weight").abs().sum() > 0
     assert len(node.rows) >= node.settings.min_gaussians
 
 

@@ -27,11 +27,13 @@ from sparsestreet.records.novel import NOVEL
 from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import read_views
 from tests.cli.conftest import TIMED_BY_DEFAULT
 from tests.cli.recompute import recompute
 from tests.conftest import unchecked
 from tests.metrics.networks import random_weights, write_weights
+from tests.typed import as_a, there
 
 # One process trains once for the tests that only look.
 
@@ -97,7 +99,7 @@ def test_costs_of_a_run(finished):
     assert sum(costs.passes.values()) == pytest.approx(costs.phases["prune"], rel=1e-4)  # six digits each
     parts = {"scene", "splat", "sky", "losses", "regularizers", "backward", "optimizer", "density", "loop"}
     assert set(costs.step_ms) == parts | {"data"}
-    assert 50 < costs.peak_host_mb < 20_000  # of this process, megabytes and neither KiB nor bytes
+    assert 50 < there(costs.peak_host_mb) < 20_000  # of this process, megabytes and neither KiB nor bytes
     assert costs.peak_device_mb is None
     assert {name: node.gaussians for name, node in costs.nodes.items()} == summary.gaussians
     assert sum(node.megabytes for node in costs.nodes.values()) == pytest.approx(
@@ -154,7 +156,7 @@ def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
         tmp_path, "split.stride=4", "split.offset=3", "seed=3", "trainer.fast_dev_run=2", "data.log.settings.seed=0"
     )
     assert {view.frame_index for view in read_views(out / "views.json").held_out} == {3, 7, 11}
-    keyframes = load_scene(out).scene.nodes["rigid"]
+    keyframes = as_a(Rigid, load_scene(out).scene.nodes["rigid"])
     times = keyframes.keyframe_times[keyframes.keyframe_valid]
     assert not {round(float(time) * 11) for time in times} & {3, 7, 11}
 
@@ -250,7 +252,7 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
 def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, capsys):
     shutil.copytree(finished, tmp_path / "old")
     path = tmp_path / "old/.hydra/config.yaml"
-    cfg = OmegaConf.load(path)
+    cfg = as_a(DictConfig, OmegaConf.load(path))
     del cfg.evaluation
     OmegaConf.save(cfg, path)
     assert evaluate([f"run={tmp_path / 'old'}"]) == 1

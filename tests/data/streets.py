@@ -2,6 +2,7 @@
 
 import torch
 
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.types import Camera, Frame, Sweep
 
@@ -19,4 +20,6 @@ def make_log(num_frames: int = 12, num_cameras: int = 2, sweeps: tuple[Sweep, ..
             camera = Camera(camera_from_world, INTRINSICS, 5, 3)
             sky = torch.zeros(3, 5, dtype=torch.bool)
             frames.append(Frame(camera, index / max(num_frames - 1, 1), index, number, image=image, sky=sky))
-    return DrivingLog("tiny", tuple(frames), sweeps, (), num_frames, num_cameras, torch.eye(4, dtype=torch.float64))
+    return DrivingLog(
+        "tiny", Frames.of(frames), Sweeps.of(sweeps), (), num_frames, num_cameras, torch.eye(4, dtype=torch.float64)
+    )

@@ -1,5 +1,6 @@
 """Stamps, seconds and the rate of a log, on clocks that are exact, rounded, irregular or broken."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 
@@ -12,6 +13,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
 from sparsestreet.types import Frame, View
 from tests.data.streets import make_log
+from tests.typed import there
 
 SINCE_1970 = 1_532_402_927_600_000_251
 """Nanoseconds of one nuScenes drive: as a double of seconds it would be rounded to steps of 238 ns."""
@@ -74,7 +76,7 @@ def test_views_have_normalized_time_and_that_of_the_clock():
         (0.5, 1, 0),
         (1.0, 2, 0),
     ]
-    assert [view.stamp for view in views] == list(clock.stamps)
+    assert [view.stamp for view in views] == list(there(clock.stamps))
     # One rounding of an exact integer quotient.
     assert [view.seconds for view in views] == [0.0, 0.07, float(Fraction(250_000_001, 10**9))]
     early = clock.view(camera(), 0, 1, stamp=SINCE_1970 - 43_000_000)
@@ -96,12 +98,12 @@ def test_a_frame_says_all_that_its_view_says():
     assert frame.camera is view.camera
 
 
-def clocked(stamps: dict[tuple[int, int], int | None]) -> DrivingLog:
+def clocked(stamps: Mapping[tuple[int, int], int | None]) -> DrivingLog:
     """A log whose views of (frame, camera) have these stamps."""
     log = make_log(3, 2)
 
     def timed(view: View) -> View:
-        stamp = stamps[view.frame_index, view.camera_index]
+        stamp = stamps[view.indices]
         return replace(view, stamp=stamp, seconds=None if stamp is None else stamp / 1e9)
 
     return replace(log, frames=Frames([timed(view) for view in log.views], log.frames.load))

@@ -111,7 +111,7 @@ class ToyRigReader(LogReader):
         arrays = {key: torch.tensor(camera[key], dtype=torch.float64) for key in ("k", "lens", "poses")}
         return camera | arrays
 
-    def _mounted(self, name: str, index: int) -> RigCamera:
+    def _mounted(self, name: str, index: int) -> RigCamera[str]:
         camera = self._camera(name)
         return rig_camera(
             name,
@@ -139,9 +139,10 @@ class ToyRigReader(LogReader):
             for name, box in self._log["boxes"].items()
         ]
 
-    def _frame(self, rig: Sequence[RigCamera], view: View) -> Frame:
-        camera = rig[view.camera_index]
-        return Frame.of(view, image=read_image(self._image(camera.name, self._frames()[view.frame_index]), camera.size))
+    def _frame(self, rig: Sequence[RigCamera[str]], view: View) -> Frame:
+        index, number = view.indices
+        camera = rig[number]
+        return Frame.of(view, image=read_image(self._image(camera.name, self._frames()[index]), camera.size))
 
     def _points(self, index: int) -> Float[Tensor, "n 3"]:
         """The lidar sits where the first camera does, with the axes of the world."""

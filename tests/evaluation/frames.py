@@ -1,5 +1,7 @@
 """Small frames and runs for the tests of this folder."""
 
+from typing import Any
+
 import torch
 
 from sparsestreet.records.configuration import Setting, config_hash
@@ -14,7 +16,7 @@ def make_frame(
     index: int = 0,
     camera_index: int = 0,
     size: tuple[int, int] = (9, 12),
-    **known: torch.Tensor,
+    **known: Any,
 ) -> Frame:
     """A frame with a random image (seeded by frame and camera) and the given masks and depth."""
     generator = torch.Generator().manual_seed(100 * index + camera_index)
@@ -109,7 +111,7 @@ def make_summary(
     evaluated: Evaluation | None = None,
     cameras: dict[str, dict[str, float | None]] | None = None,
     absent: dict[str, str] | None = None,
-    **run: object,
+    **run: Any,
 ) -> RunSummary:
     """A record as a run writes it, with the numbers that a test wants to see in the table; ``run`` as in make_run."""
     gaussians = gaussians or {"background": 1000, "rigid": 200}

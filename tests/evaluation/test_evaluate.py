@@ -3,6 +3,7 @@
 import dataclasses
 import statistics
 import weakref
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame, make_image
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 from tests.metrics.networks import random_weights
+from tests.typed import there
 
 SCENE = small_scene()
 
@@ -45,7 +47,8 @@ def test_a_frame_is_compared_with_its_clamped_render():
     truth = frame.image.double().numpy() / 255
     render = np.round(np.clip(noisy(frame).double().numpy(), 0, 1) * 65535) / 65535
     error = (render - truth) ** 2
-    _, similarity = structural_similarity(render, truth, data_range=1, channel_axis=-1, full=True)
+    whole: Any = structural_similarity(render, truth, data_range=1, channel_axis=-1, full=True)
+    similarity = whole[1]
     chosen = vehicle.numpy()
     # uint8 / 255 is rounded to float32 before the comparison: 6e-8 relative to values of order 1.
     assert (quality.frame, quality.camera, quality.width, quality.height) == (7, 2, 12, 9)
@@ -59,7 +62,7 @@ def test_a_frame_is_compared_with_its_clamped_render():
     assert part.ssim_uniform7 == pytest.approx(similarity[chosen].mean(), abs=1e-5)
     rounding = (np.round(render * 255) / 255 - truth) ** 2
     assert part.psnr8 == pytest.approx(-10 * np.log10(rounding[chosen].mean()), abs=1e-5)
-    assert abs(part.psnr8 - part.psnr) > 1e-4
+    assert abs(there(part.psnr8) - there(part.psnr)) > 1e-4
     assert full.psnr8 == pytest.approx(-10 * np.log10(rounding.mean()), abs=1e-5)
     assert quality.regions["no_hood"].mse == full.mse
     assert (full.ssim_gauss11, full.lpips_alex) == (None, None)  # the image is lower than the windows
@@ -102,7 +105,7 @@ def test_near_and_beyond_the_lidar_without_the_sky(monkeypatch):
     near, beyond = regions["near_lidar"], regions["beyond_lidar"]
     assert (near.pixels, beyond.pixels) == (2 * 9, 16 * 9)
     assert beyond.mse == pytest.approx(0.09, abs=5e-6)
-    assert near.ssim_uniform7 > beyond.ssim_uniform7
+    assert there(near.ssim_uniform7) > there(beyond.ssim_uniform7)
 
 
 def test_lidar_regions_at_their_ends(monkeypatch):
@@ -120,7 +123,7 @@ def test_regions_of_masks(monkeypatch):
     """The render is off by 0.1, 0.2, 0.3 and 0.4 in the quarters of a frame, which are what the masks say."""
     columns = torch.arange(48).div(12, rounding_mode="floor")[None].expand(16, 48)
     replace_render(monkeypatch, lambda view: view.image.float() / 255 + 0.1 * (1 + columns[..., None]))
-    masks = {"ego": columns == 0, "human": columns == 1, "vehicle": columns == 2, "sky": columns == 3}
+    masks: dict[str, Any] = {"ego": columns == 0, "human": columns == 1, "vehicle": columns == 2, "sky": columns == 3}
     frame = make_frame(size=(16, 48), **masks)
     frame = dataclasses.replace(frame, image=frame.image // 2)  # so that no render is clamped
     (quality,) = evaluate_frames(SCENE, [frame], OPTIONS)

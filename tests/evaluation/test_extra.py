@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation import extra
 from sparsestreet.evaluation.extra import ExtraMetrics, _of_shifts
@@ -20,7 +21,9 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     """Of three instants the second is held out, or none."""
     monkeypatch.setattr(extra, "open_lpips", lambda device: ({}, {"lpips_alex": "no weights"}))
     frames = tuple(make_frame(index) for index in range(3))
-    data = StreetData(DrivingLog("three", frames, (), (), 3, 1, torch.eye(4).double()), stride=stride, offset=1)
+    data = StreetData(
+        DrivingLog("three", Frames.of(frames), Sweeps.of(()), (), 3, 1, torch.eye(4).double()), stride=stride, offset=1
+    )
     (tmp_path / "records").mkdir()
     said = []
     asked = ExtraMetrics(novel=(1.0,), ramp=ramp, presets=("fast",))

@@ -12,13 +12,14 @@ from sparsestreet.evaluation.scene_parts import without_closed_rows, without_mas
 from sparsestreet.evaluation.speed import measure_latency
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.noise import Calibration
-from sparsestreet.scene.effects import Lens, LensSettings, RollingShutter, ShutterSettings
+from sparsestreet.scene.effects import Lens, LensSettings, RollingShutter, ShutterSettings, Sky
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Shutter
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, masked_scene, node_of, small_scene
 from tests.training.stubs import background, frame_at, rigid
+from tests.typed import as_a
 
 FRAMES = [make_frame(index) for index in range(2)]
 BENT = [
@@ -48,7 +49,7 @@ def test_a_lone_node_leaves_the_sky():
     empty = scene.without("road")
     assert empty.counts() == {"road": 0}
     assert scene.counts() == {"road": 1}
-    assert torch.equal(picture(empty), scene.effects["sky"].colors(ray_directions(FRAMES[0].camera)))
+    assert torch.equal(picture(empty), as_a(Sky, scene.effects["sky"]).colors(ray_directions(FRAMES[0].camera)))
 
 
 def test_the_sky_and_the_masks_can_be_left_out():

@@ -18,6 +18,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, node_of, small_scene
+from tests.typed import there
 
 SCENE = small_scene()
 FRAMES = Frames.of((make_frame(0), make_frame(1, size=(11, 7))))
@@ -34,7 +35,7 @@ def test_each_preset_is_rendered_and_compared():
     assert (record.views, [one.trained for one in record.rendered]) == (2, [True, False])
     for one, settings in zip(record.rendered, (SplatSettings(), COARSE.settings), strict=True):
         options = replace(OPTIONS, settings=settings)
-        expected = [frame.value("psnr", "full") for frame in evaluate_frames(SCENE, FRAMES, options)]
+        expected = [there(frame.value("psnr", "full")) for frame in evaluate_frames(SCENE, FRAMES, options)]
         assert one.quality["psnr_full"] == pytest.approx(np.mean(expected), rel=1e-12)
         assert "psnr_human" not in one.quality  # these frames have no such mask
         distances = []

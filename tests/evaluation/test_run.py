@@ -28,6 +28,7 @@ from sparsestreet.types import View
 from tests.evaluation.frames import make_frame, make_image, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 from tests.metrics.networks import random_weights, write_weights
+from tests.typed import there
 
 pytestmark = pytest.mark.lengthy
 
@@ -118,7 +119,7 @@ def test_perceptual_distances_with_and_without_weights(tmp_path, monkeypatch):
     assert measured.mean("lpips_alex_full") > 0
     assert measured.mean("lpips_alex_full", TRAINING) is None  # of the main split only
     rows = QUALITY[HELD_OUT].read(tmp_path)
-    assert np.mean([row.value("lpips_alex", "full") for row in rows]) == pytest.approx(
+    assert np.mean([there(row.value("lpips_alex", "full")) for row in rows]) == pytest.approx(
         measured.mean("lpips_alex_full"), rel=1e-5
     )
 
@@ -246,8 +247,15 @@ def test_images_are_let_go_one_by_one(tmp_path):
         return Frames([View(one.camera, one.time, one.frame_index, one.camera_index) for one in views], load)
 
     evaluate_scene(
-        *(small_scene(), lazy(0), lazy(1)),
-        **{"run": MADE, "options": OPTIONS, "out": tmp_path, "command": "c", "device": "cpu", "pictures": 0},
+        small_scene(),
+        lazy(0),
+        lazy(1),
+        run=MADE,
+        options=OPTIONS,
+        out=tmp_path,
+        command="c",
+        device="cpu",
+        pictures=0,
         timing=Timing(1, 1, 1),
     )
     assert len(counts) >= 12

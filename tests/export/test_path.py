@@ -9,6 +9,7 @@ import torch
 from sparsestreet.export.path import left_to_right, of_cameras, of_frames, recorded, resampled, resized, shifted
 from sparsestreet.geometry.cameras import project
 from tests.export.street import NUM_FRAMES, street_views
+from tests.typed import there
 
 STEP = 1 / (NUM_FRAMES - 1)
 
@@ -21,14 +22,14 @@ def test_recorded_views_are_rigs_in_order_of_time():
 
 
 def test_a_rig_is_the_views_of_a_frame_though_its_cameras_fire_one_after_the_other():
-    path = recorded([replace(view, time=view.time + 0.02 * view.camera_index) for view in street_views()])
+    path = recorded([replace(view, time=view.time + 0.02 * view.indices[1]) for view in street_views()])
     assert [[view.camera_index for view in rig] for rig in path] == [[0, 1, 2, 3]] * NUM_FRAMES
 
 
 def test_seconds_go_with_time_and_a_stamp_with_what_was_recorded():
     """Frame f at 0.1 f seconds, by cameras that fire 10 ms after one another."""
     views = [
-        replace(view, seconds=0.1 * view.frame_index + 0.01 * view.camera_index, stamp=7 + view.frame_index)
+        replace(view, seconds=0.1 * view.indices[0] + 0.01 * view.indices[1], stamp=7 + view.indices[0])
         for view in street_views()
     ]
     path = recorded(views)
@@ -76,7 +77,7 @@ def test_a_rig_stands_left_to_right_as_the_driver_sees_it():
 def test_a_shifted_rig_moves_as_one_along_the_front_cameras_right():
     path = recorded(street_views())
     for before, after in zip(path, shifted(path, 1.5), strict=True):
-        angle = math.radians(3.0 * before[0].frame_index)
+        angle = math.radians(3.0 * before[0].indices[0])
         right = torch.tensor([math.sin(angle), -math.cos(angle), 0.0])
         for old, new in zip(before, after, strict=True):
             moved = new.camera.position - old.camera.position
@@ -132,7 +133,7 @@ def test_frames_that_are_missing_are_bridged_and_too_many_are_skipped():
 @pytest.mark.parametrize("pieces", [1, 3, 7])
 def test_pieces_of_a_step_meet_every_recorded_instant(pieces):
     """Frames of a log of 50: times and steps are no binary fractions, and are met in spite of the rounding."""
-    views = [replace(view, time=(40 + view.frame_index) / 49) for view in street_views()]
+    views = [replace(view, time=(40 + view.indices[0]) / 49) for view in street_views()]
     finer = resampled(recorded(views), 1 / 49 / pieces)
     assert [rig[0].frame_index for rig in finer[::pieces]] == [0, 1, 2, 3, 4]
     assert len(finer) == 4 * pieces + 1
@@ -163,4 +164,4 @@ def test_lens_and_shutter_stay(tmp_path):
     ]
     path = recorded(views)
     for changed in (shifted(path, 1.0), resampled(path, STEP / 2), resized(path, 20)):
-        assert torch.equal(changed[1][0].camera.distortion, views[0].camera.distortion)
+        assert torch.equal(there(changed[1][0].camera.distortion), there(views[0].camera.distortion))

@@ -18,7 +18,7 @@ def features(count, width, seed, shift=0.0):
 def test_frechet_is_the_one_of_matrix_roots(n, m):
     a, b = features(n, 12, 0), features(m, 12, 1, shift=0.3)
     s, t = np.cov(a, rowvar=False), np.cov(b, rowvar=False)
-    expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(s + t - 2 * sqrtm(s @ t).real)
+    expected = ((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(s + t - 2 * np.real(np.asarray(sqrtm(s @ t))))
     # Roots of eigenvalues lose half of float64's digits at worst.
     assert frechet_distance(a, b) == pytest.approx(expected, rel=1e-7)
 

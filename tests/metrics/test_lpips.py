@@ -1,5 +1,7 @@
 """LPIPS against torchmetrics' own module, with the same weights."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import nn
@@ -34,8 +36,10 @@ def torchvision_features(weights: LpipsWeights) -> nn.Sequential:
 def torchmetrics_lpips(monkeypatch, quantity: str, weights: LpipsWeights, spatial: bool = False) -> nn.Module:
     features = torchvision_features(weights)
     monkeypatch.setattr(peer, "_get_tv_model_features", lambda net, pretrained: features)
-    made = peer._LPIPS(pretrained=False, net=NETWORKS[quantity][0], spatial=spatial, use_dropout=False)
-    for line, channel in zip(made.lins, weights.channels, strict=True):
+    net: Any = NETWORKS[quantity][0]
+    made = peer._LPIPS(pretrained=False, net=net, spatial=spatial, use_dropout=False)
+    lines: Any = made.lins
+    for line, channel in zip(lines, weights.channels, strict=True):
         line.model[0].weight.data = channel[None, :, None, None].clone()
     return made
 

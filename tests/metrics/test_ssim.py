@@ -1,5 +1,7 @@
 """SSIM against scikit-image and by hand, with both windows."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -12,7 +14,7 @@ GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": Fal
 """How scikit-image's documentation says to match Wang et al. 2004."""
 
 
-def expected_ssim(image, truth, window, **options):
+def expected_ssim(image, truth, window, **options) -> Any:
     """scikit-image in float64: its own float32 path loses digits in flat regions."""
     return structural_similarity(
         image.double().numpy(),

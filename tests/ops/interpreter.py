@@ -15,10 +15,12 @@ from triton.runtime.interpreter import InterpretedFunction
 
 def speed_up() -> None:
     """For the whole process."""
-    InterpretedFunction.__call__ = _call_from_a_kernel
+    functions: Any = InterpretedFunction
+    tuples: Any = core.tuple
+    functions.__call__ = _call_from_a_kernel
     interpreter._get_np_dtype = _numpy_type
-    core.tuple.__init__ = _init_tuple
-    core.tuple.type = property(_type_of_tuple, lambda values, kind: setattr(values, "_type", kind))
+    tuples.__init__ = _init_tuple
+    tuples.type = property(_type_of_tuple, lambda values, kind: setattr(values, "_type", kind))
 
 
 def check_overflow(on: bool) -> None:
@@ -58,13 +60,13 @@ def _numpy_type_of_scalar(kind: core.dtype) -> np.dtype:
 _type_for_values = core._type_for_tuple_values
 
 
-def _init_tuple(values: core.tuple, args: Any, type: Any = None) -> None:
+def _init_tuple(values: Any, args: Any, type: Any = None) -> None:
     """Every shape is a tuple, and hardly a shape is asked for its type."""
     values.values = [*args]
     values._type = type if type is None or isinstance(type, core.tuple_type) else core.tuple_type(type)
 
 
-def _type_of_tuple(values: core.tuple) -> core.tuple_type:
+def _type_of_tuple(values: Any) -> core.tuple_type:
     if values._type is None:
         values._type = _type_for_values(values.values)
     return values._type

@@ -1,7 +1,7 @@
 """Small scenes for the tests of the op, and ways to render and differentiate them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import pytest
@@ -122,10 +122,8 @@ def cast(
     """Detached copy in another precision; displacements never ask for a gradient."""
     moved = gaussians.displacements
     fields = (getattr(gaussians, name).detach().clone().to(device, dtype) for name in FIELDS)
-    return Gaussians(
-        *(field.requires_grad_(requires_grad) for field in fields),
-        None if moved is None else moved.detach().to(device, dtype),
-    )
+    copy = Gaussians(*(field.requires_grad_(requires_grad) for field in fields))
+    return copy if moved is None else replace(copy, displacements=moved.detach().to(device, dtype))
 
 
 def cotangents(view: Camera, seed: int = 5) -> tuple[Tensor, Tensor, Tensor]:

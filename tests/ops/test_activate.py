@@ -9,31 +9,35 @@ from sparsestreet.ops.activate import activate
 from sparsestreet.ops.cpu import activate as fused
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT, Placement, Poses, RawGaussians
+from tests.ops.scenes import CPU
 
 ROWS = 2500
 """More than two of the parts in which sums over rows are taken."""
 
 
-def raw_rows(count: int, rest: int, dtype=torch.float64, seed: int = 0, device="cpu") -> RawGaussians:
+def raw_rows(count: int, rest: int, dtype=torch.float64, seed: int = 0, device: torch.device = CPU) -> RawGaussians:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64).to(device, dtype).requires_grad_()
 
-    shapes = ((count, 3), (count, 3), (count, 4), (count,), (count, 1, 3), (count, rest, 3))
-    return RawGaussians(*(normal(*shape) for shape in shapes))
+    return RawGaussians(
+        normal(count, 3), normal(count, 3), normal(count, 4), normal(count), normal(count, 1, 3), normal(count, rest, 3)
+    )
 
 
-def placement(count: int, dtype=torch.float64, instances: int = 3, device="cpu") -> Placement:
+def placement(count: int, dtype=torch.float64, instances: int = 3, device: torch.device = CPU) -> Placement:
     generator = torch.Generator().manual_seed(1)
     turns = torch.randn(instances, 4, generator=generator, dtype=torch.float64)
     shifts = 50 * torch.randn(instances, 3, generator=generator, dtype=torch.float64)
     of_rows = torch.randint(instances, (count,), generator=generator)
-    leaves = [values.to(device, dtype).requires_grad_() for values in (turns / turns.norm(dim=1, keepdim=True), shifts)]
-    return Placement(Poses(*leaves, torch.tensor([True, False, True], device=device)), of_rows.to(device))
+    turns, shifts = (
+        values.to(device, dtype).requires_grad_() for values in (turns / turns.norm(dim=1, keepdim=True), shifts)
+    )
+    return Placement(Poses(turns, shifts, torch.tensor([True, False, True], device=device)), of_rows.to(device))
 
 
-def closed_every_third(count: int, dtype=torch.float64, device="cpu") -> torch.Tensor:
+def closed_every_third(count: int, dtype=torch.float64, device: torch.device = CPU) -> torch.Tensor:
     return (torch.arange(count) % 3 > 0).to(device, dtype).requires_grad_()
 
 
@@ -46,12 +50,20 @@ def values_and_gradients(inputs: list[torch.Tensor], run) -> list[torch.Tensor]:
     outputs = [field for field in vars(run()).values() if field is not None]
     generator = torch.Generator().manual_seed(2)
     cotangents = [torch.randn(out.shape, generator=generator, dtype=torch.float64).to(out) for out in outputs]
-    total = sum((out * cotangent).sum() for out, cotangent in zip(outputs, cotangents, strict=True))
+    total = torch.stack([(out * cotangent).sum() for out, cotangent in zip(outputs, cotangents, strict=True)]).sum()
     gradients = torch.autograd.grad(total, inputs, allow_unused=True, materialize_grads=True)
     return [*(out.detach() for out in outputs), *gradients]
 
 
-def case(rest: int, degree: int, masked: bool, placed: bool, dtype=torch.float64, count: int = ROWS, device="cpu"):
+def case(
+    rest: int,
+    degree: int,
+    masked: bool,
+    placed: bool,
+    dtype=torch.float64,
+    count: int = ROWS,
+    device: torch.device = CPU,
+):
     multipliers = closed_every_third(count, dtype, device) if masked else None
     where = placement(count, dtype, device=device) if placed else None
     raw = replace(raw_rows(count, rest, dtype, device=device), multipliers=multipliers, placement=where)
@@ -75,7 +87,9 @@ def test_the_library_says_what_torch_says(rest, degree, masked, placed):
         torch.testing.assert_close(value, truth, rtol=1e-12, atol=1e-12)
 
 
-def parts_of_three_kinds(dtype=torch.float64, device="cpu") -> tuple[list[torch.Tensor], list[RawGaussians]]:
+def parts_of_three_kinds(
+    dtype=torch.float64, device: torch.device = CPU
+) -> tuple[list[torch.Tensor], list[RawGaussians]]:
     """Plain rows of degree 3; none at all; masked and placed ones of degree 1."""
     where, closed = placement(40, dtype, device=device), closed_every_third(40, dtype, device)
     counts = ((70, 15), (0, 8), (40, 3))

@@ -18,8 +18,9 @@ VIEW = camera(24, 16)
 def stored(count: int = 20) -> RawGaussians:
     drawn = cast(random_gaussians(count, VIEW), torch.float32)
     logits = drawn.opacities.clamp(0.01, 0.99).logit()
-    raw = (drawn.means, drawn.scales.log(), drawn.quaternions, logits, drawn.sh[:, :1], drawn.sh[:, 1:])
-    return RawGaussians(*(values.detach().clone().requires_grad_() for values in raw))
+    fields = (drawn.means, drawn.scales.log(), drawn.quaternions, logits, drawn.sh[:, :1], drawn.sh[:, 1:])
+    means, scales, quaternions, logits, first, rest = (values.detach().clone().requires_grad_() for values in fields)
+    return RawGaussians(means, scales, quaternions, logits, first, rest)
 
 
 def street(raw: RawGaussians, texels: Tensor, view: Camera) -> tuple[Tensor, Tensor, Tensor]:

@@ -27,6 +27,7 @@ from tests.ops.scenes import (
     relative_error,
     with_threads,
 )
+from tests.typed import there
 
 ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 # Not the order in which a pixel blends, only where a distance is rounded depends on the tile: images of colors below
@@ -63,7 +64,7 @@ def drawn(dtype: torch.dtype, variant: int, settings: SplatSettings) -> tuple[di
     plain = cast(gaussians, dtype)
     counted = rasterizer.contribution(plain, view, settings, variant)
     changes = rasterizer.leave_one_out(plain, None, None, view, settings, variant)
-    rows = {name: getattr(leaves, name).grad for name in FIELDS} | {"screen": offsets.grad}
+    rows = {name: getattr(leaves, name).grad for name in FIELDS} | {"screen": there(offsets.grad)}
     rows |= {"weight": counted.weight, "pixels": counted.pixels.double(), "dominant": counted.dominant.double()}
     rows |= {"largest": changes.max_abs_change, "squared": changes.squared_change}
     return {name: layer.detach() for name, layer in layers.items()}, rows
@@ -88,7 +89,7 @@ def test_other_tiles_draw_the_same(size, variant, stop):
 def giant_pairs() -> int:
     """(splat, tile) pairs of a ball that covers the whole image."""
     giant = cast(one_gaussian(scales=[[90.0] * 3]), torch.float32)
-    return work_of(giant, front_camera(WIDTH, HEIGHT, 40.0), SplatSettings(), "cpu")[0]
+    return there(work_of(giant, front_camera(WIDTH, HEIGHT, 40.0), SplatSettings(), "cpu")[0])
 
 
 def test_the_library_has_the_tiles_it_was_compiled_for(size):
@@ -107,8 +108,8 @@ def test_a_tile_size_in_the_sweep(size):
     record = sweep.measure_point(scene, point, sweep.Truths(scene), ONCE)
     default = sweep.measure_point(scene, Point("default", "default", DEFAULT), sweep.Truths(scene), ONCE)
     assert record.tiles_in_use.image.maximum <= 1e-6
-    more, fewer = record.times.pairs > default.times.pairs, record.times.pairs < default.times.pairs
-    assert (more, fewer) == (size < tile_size(), size > tile_size())
+    pairs, by_default = there(record.times.pairs), there(default.times.pairs)
+    assert (pairs > by_default, pairs < by_default) == (size < tile_size(), size > tile_size())
     assert default.tiles_in_use is None
     assert record.exact.image.mean == pytest.approx(default.exact.image.mean, rel=1e-4)
     assert "from the tiles in use" in sweep.describe(record)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import Guards, SplatSettings, contribution, guards
+from sparsestreet.ops.settings import StopRule
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -30,7 +31,8 @@ def test_10_one_opaque_splat_is_drawn(backend, dtype):
     result = render(opaque, front_camera(5, 5, 40.0), backend, dtype)
     assert result.images["alpha"][2, 2] == pytest.approx(0.99, rel=1e-6)
     # It leaves 0.01. With a limit above that the exclusive stop drops it: that is why the default is inclusive.
-    for stop, alpha in (("inclusive", 0.99), ("exclusive", 0.0)):
+    left: dict[StopRule, float] = {"inclusive": 0.99, "exclusive": 0.0}
+    for stop, alpha in left.items():
         settings = SplatSettings(stop=stop, transmittance_min=0.02)
         result = render(opaque, front_camera(1, 1, 40.0), backend, dtype, settings)
         assert result.images["alpha"][0, 0] == pytest.approx(alpha, rel=1e-6)

@@ -26,9 +26,9 @@ Y0 = 0.28209479177387814
 
 
 @every_precision
-@pytest.mark.parametrize("width_height", [(1, 1), (17, 9)])
-def test_15_nothing_to_draw(backend, dtype, width_height):
-    view = front_camera(*width_height, 20.0)
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (17, 9)])
+def test_15_nothing_to_draw(backend, dtype, width, height):
+    view = front_camera(width, height, 20.0)
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     for gaussians in (random_gaussians(0, view), one_gaussian(means=[[0.0, 0.0, -2.0]])):
         result = render(gaussians, view, backend, dtype, background=background)

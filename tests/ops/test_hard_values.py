@@ -259,7 +259,8 @@ def _loss_of(field: str, gaussians: Gaussians, value: torch.Tensor, backend: str
     settings = SplatSettings(alpha_min=1e-9, antialias=True)
     seen = splat(Gaussians(**fields), view, settings=settings, backend=backend)
     images = (seen.rgb, seen.alpha, seen.depth)
-    return sum((image * weight.to(image)).sum() for image, weight in zip(images, cotangents(view), strict=True))
+    weighted = ((image * weight.to(image)).sum() for image, weight in zip(images, cotangents(view), strict=True))
+    return sum(weighted, torch.zeros_like(value[:0]).sum())
 
 
 @functools.cache

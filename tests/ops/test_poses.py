@@ -10,10 +10,12 @@ from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.poses import poses_at
 
 MAX_GAP = 0.15
+Deltas = tuple[torch.Tensor, torch.Tensor]
+"""Corrections of rotations and of translations."""
 TIMES = [0.0, 0.05, 0.1, 0.15, 0.2, 0.35, 0.5, 0.9, 1.0]
 
 
-def tables(dtype=torch.float64, seed: int = 0, size: float = 0.3) -> tuple[Trajectories, torch.Tensor, torch.Tensor]:
+def tables(dtype=torch.float64, seed: int = 0, size: float = 0.3) -> tuple[Trajectories, Deltas]:
     """Instances with 5, 2 and 1 keyframes, one that hardly turns, one that turns by more than half a circle and one
     whose quaternion changes its sign; with corrections."""
     generator = torch.Generator().manual_seed(seed)
@@ -27,11 +29,11 @@ def tables(dtype=torch.float64, seed: int = 0, size: float = 0.3) -> tuple[Traje
     valid = torch.arange(5) < torch.tensor(counts)[:, None]
     spans = torch.tensor([[0.0, 1.0], [0.1, 0.25], [0.1, 0.1], [0.1, 0.8], [0.05, 0.95], [0.1, 0.8]])
     shifts = 20 * torch.randn(6, 5, 3, generator=generator, dtype=torch.float64)
-    deltas = [size * torch.randn(6, 5, 3, generator=generator, dtype=torch.float64) for _ in range(2)]
+    turned, shifted = (size * torch.randn(6, 5, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     table = Trajectories(
         torch.where(valid, times, 0.0).to(dtype), turns.to(dtype), shifts.to(dtype), valid, spans.to(dtype)
     )
-    return table, *(delta.to(dtype).requires_grad_() for delta in deltas)
+    return table, (turned.to(dtype).requires_grad_(), shifted.to(dtype).requires_grad_())
 
 
 def in_double(table: Trajectories) -> Trajectories:
@@ -42,14 +44,14 @@ def values_and_gradients(deltas, run) -> list[torch.Tensor]:
     found = run()
     generator = torch.Generator().manual_seed(1)
     cotangents = [torch.randn(v.shape, generator=generator, dtype=torch.float64).to(v) for v in found[:2]]
-    total = sum((v * c).sum() for v, c in zip(found[:2], cotangents, strict=True))
+    total = torch.stack([(v * c).sum() for v, c in zip(found[:2], cotangents, strict=True)]).sum()
     return [*(v.detach() for v in found), *torch.autograd.grad(total, deltas)]
 
 
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("size", [0.0, 1e-4, 0.3, 3.0])
 def test_the_library_says_what_torch_says(time, size):
-    table, *deltas = tables(size=size)
+    table, deltas = tables(size=size)
     found, expected = (
         values_and_gradients(
             deltas,
@@ -64,10 +66,10 @@ def test_the_library_says_what_torch_says(time, size):
 
 
 def test_gradients_are_those_of_finite_differences():
-    table, *deltas = tables()
+    table, deltas = tables()
 
-    def outputs(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        found = poses_at(table, *values, 0.26, MAX_GAP, backend="cpu")
+    def outputs(turned: torch.Tensor, shifted: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        found = poses_at(table, turned, shifted, 0.26, MAX_GAP, backend="cpu")
         return found.quaternions, found.translations
 
     assert torch.autograd.gradcheck(outputs, deltas)
@@ -78,13 +80,13 @@ def test_single_precision_is_good_to_its_last_digit(variant):
     """Computed in double and rounded once: half a unit in the last place of the result, of 50 m and of 1."""
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
-    table, *deltas = tables(torch.float32)
+    table, deltas = tables(torch.float32)
     doubles = in_double(table)
     for time in TIMES:
         found = fused.poses_at(table, *deltas, time, MAX_GAP, variant)
         # The time itself is rounded as those of the table.
         at = float(torch.tensor(time))
-        truth = fused.poses_at(doubles, *(delta.double() for delta in deltas), at, MAX_GAP)
+        truth = fused.poses_at(doubles, deltas[0].double(), deltas[1].double(), at, MAX_GAP)
         assert found[2].tolist() == truth[2].tolist()
         torch.testing.assert_close(found[0].double(), truth[0], rtol=0.0, atol=6e-8)
         torch.testing.assert_close(found[1].double(), truth[1], rtol=6e-8, atol=1e-7)
@@ -94,7 +96,7 @@ def test_single_precision_is_good_to_its_last_digit(variant):
 @pytest.mark.parametrize(("time", "present"), [(0.05, False), (0.6, True), (0.62, False)])
 def test_padding_is_no_keyframe_and_equal_distances_may_differ_by_rounding(backend, time, present):
     """One keyframe at 0.5; in float32 0.6 is farther from it than 0.1: a car would be gone for a frame."""
-    table, *deltas = tables(torch.float32)
+    table, deltas = tables(torch.float32)
     times, valid = torch.zeros_like(table.times), torch.zeros_like(table.valid)
     times[:, 0], valid[:, 0] = 0.5, True
     spans = torch.tensor([[0.0, 1.0]]).repeat(6, 1)
@@ -103,7 +105,7 @@ def test_padding_is_no_keyframe_and_equal_distances_may_differ_by_rounding(backe
 
 
 def test_quaternions_are_unit_and_agree_with_their_keyframes():
-    table, *deltas = tables(size=0.0)
+    table, deltas = tables(size=0.0)
     found = poses_at(table, *deltas, 0.3, MAX_GAP)
     matrices = quat.to_matrix(table.quaternions[:, 2])
     torch.testing.assert_close(quat.to_matrix(found.quaternions)[[0, 3, 4, 5]], matrices[[0, 3, 4, 5]])
@@ -111,7 +113,7 @@ def test_quaternions_are_unit_and_agree_with_their_keyframes():
 
 
 def test_only_one_output_is_differentiated():
-    table, *deltas = tables()
+    table, deltas = tables()
     for field, moved, resting in (("quaternions", 0, 1), ("translations", 1, 0)):
         gradients = torch.autograd.grad(getattr(poses_at(table, *deltas, 0.26, MAX_GAP), field).sum(), deltas)
         assert gradients[moved].any()
@@ -119,7 +121,7 @@ def test_only_one_output_is_differentiated():
 
 
 def test_no_instances():
-    table, *deltas = tables()
+    table, deltas = tables()
     none = Trajectories(*(values[:0] for values in vars(table).values()))
     found = poses_at(none, deltas[0][:0], deltas[1][:0], 0.5, MAX_GAP)
     assert [len(values) for values in vars(found).values()] == [0, 0, 0]

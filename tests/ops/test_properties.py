@@ -59,8 +59,8 @@ def with_effects(gaussians: Gaussians, view: Camera, noise: Tensor) -> tuple[Gau
 
 def rows_of(gaussians: Gaussians, rows: Tensor) -> Gaussians:
     moved = gaussians.displacements
-    kept = (getattr(gaussians, name)[rows] for name in FIELDS)
-    return Gaussians(*kept, None if moved is None else moved[rows])
+    kept = Gaussians(*(getattr(gaussians, name)[rows] for name in FIELDS))
+    return kept if moved is None else dataclasses.replace(kept, displacements=moved[rows])
 
 
 def pixels_of(gaussians: Gaussians, view: Camera) -> Tensor:

@@ -1,7 +1,9 @@
 """The sky behind an image: every backend against torch in float64, at sizes that the interpreter bears."""
 
 import dataclasses
+from functools import partial
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -219,7 +221,7 @@ def test_every_instruction_set(monkeypatch, variant):
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
     run = cpu.over_sky
-    monkeypatch.setattr(cpu, "over_sky", lambda *arguments: run(*arguments, variant))
+    monkeypatch.setattr(cpu, "over_sky", partial(run, variant=variant))
     view = camera(13, 29)
     for dtype in (torch.float32, torch.float64):
         assert_matches_torch(image(view, 5), view, "cpu", dtype)
@@ -232,8 +234,8 @@ def test_finite_differences(backend, lens):
     given = image(view, 2)
     given["alpha"] = given["alpha"].clamp(0.1, 0.7)  # a step must not cross the limit
 
-    def out(*tensors: Tensor) -> Tensor:
-        return over_sky(*tensors, view, transmittance_min=LIMIT, backend=backend)
+    def out(rgb: Tensor, alpha: Tensor, texels: Tensor) -> Tensor:
+        return over_sky(rgb, alpha, texels, view, transmittance_min=LIMIT, backend=backend)
 
     assert torch.autograd.gradcheck(out, [given[name].requires_grad_() for name in NAMES])
 
@@ -262,7 +264,7 @@ def test_auto_takes_what_is_fast(monkeypatch):
     view = camera(9, 7)
     given = {name: value.float() for name, value in image(view, 3).items()}
 
-    def automatic(**tensors: Tensor) -> Tensor:
+    def automatic(**tensors: Any) -> Tensor:
         return over_sky(**tensors, camera=view, transmittance_min=LIMIT)
 
     assert torch.equal(automatic(**given), over_sky(**given, camera=view, transmittance_min=LIMIT, backend="cpu"))

@@ -35,14 +35,14 @@ def bright_and_flat() -> tuple[Tensor, Tensor]:
     return (truth + 1e-2 * other).float().double(), truth.float().double()
 
 
-CASES = {
+CASES: dict[str, tuple[Tensor, Tensor]] = {
     "one window": noise(11, 11),
     "few windows": noise(12, 37, seed=1),
     "odd sizes": noise(97, 61, seed=2),
     "wider than a block": noise(13, 203, seed=3),
     "out of [0, 1]": (4 * noise(20, 31)[0] - 1, 3 - 5 * noise(20, 31)[1]),
     "bright and flat": bright_and_flat(),
-    "constant": tuple(torch.full((18, 23, 3), value).double() for value in (0.3, 0.7)),
+    "constant": (torch.full((18, 23, 3), 0.3).double(), torch.full((18, 23, 3), 0.7).double()),
 }
 
 

@@ -104,7 +104,8 @@ def test_without_a_visible_number_nothing_changes(shape, visible, backend):
     fields = [torch.full(shape, value, device=device_of(backend)) for value in (1.0, 2.0, 3.0, 4.0)]
     before = [field.clone() for field in fields]
     mask = torch.full(shape[:1], visible, device=fields[0].device)
-    adam_step_(*fields, mask, AdamStep(1, LR), backend=backend)
+    parameter, gradient, first, second = fields
+    adam_step_(parameter, gradient, first, second, mask, AdamStep(1, LR), backend=backend)
     assert all(torch.equal(field, old) for field, old in zip(fields, before, strict=True))
 
 
@@ -137,7 +138,7 @@ def test_moments_of_another_shape_are_an_error(backend):
     fields = [torch.zeros(4, width, device=device_of(backend)) for width in (3, 3, 2, 3)]
     mask = torch.ones(4, dtype=torch.bool, device=fields[0].device)
     with pytest.raises(ValueError, match="one shape"):
-        adam_step_(*fields, mask, AdamStep(1, LR), backend=backend)
+        adam_step_(fields[0], fields[1], fields[2], fields[3], mask, AdamStep(1, LR), backend=backend)
 
 
 @pytest.mark.parametrize(
@@ -147,6 +148,6 @@ def test_moments_of_another_shape_are_an_error(backend):
 def test_what_no_backend_takes_is_an_error(backend, dtype, said):
     if backend == "triton" and not has_triton():
         pytest.skip("the package triton is missing")
-    empty = [torch.zeros(0, 3, dtype=dtype) for _ in range(4)]
+    empty = torch.zeros(0, 3, dtype=dtype)
     with pytest.raises(ValueError, match=said):
-        adam_step_(*empty, torch.zeros(0, dtype=torch.bool), AdamStep(1, LR), backend=backend)
+        adam_step_(empty, empty, empty, empty, torch.zeros(0, dtype=torch.bool), AdamStep(1, LR), backend=backend)

@@ -16,7 +16,7 @@ from tests.evaluation.tiles import COLORS, flat, make_picture
 LEGEND = {"rigid": (250, 150, 40)}
 
 
-def order_of(sheet: np.ndarray, row: int) -> list[tuple[int, int, int]]:
+def order_of(sheet: np.ndarray, row: int) -> list[tuple[int, ...]]:
     """Colors met along a row of pixels, without repeats and without the paper between tiles."""
     paper = tuple(int(value) for value in sheet[-1, -1])
     colors = [tuple(int(value) for value in pixel) for pixel in sheet[row]]
@@ -31,7 +31,8 @@ def row_within(sheet: np.ndarray, color: tuple[int, int, int]) -> int:
 
 
 def error_of(picture: Picture) -> tuple[int, int, int]:
-    return tuple(int(value) for value in picture.error[0, 0])
+    red, green, blue = (int(value) for value in picture.error[0, 0])
+    return red, green, blue
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import copy
 import math
 from bisect import bisect_left
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -24,7 +25,7 @@ CONTEXT = RenderContext(options=OPTIONS)
 
 
 def scene_of(
-    opacities: list[float], depths: list[float], *, min_gaussians: int = 0, effects: dict[str, Effect] | None = None
+    opacities: list[float], depths: list[float], *, min_gaussians: int = 0, effects: Mapping[str, Effect] | None = None
 ) -> SceneGraph:
     """Large white discs across the view, one behind the other."""
     n = len(opacities)

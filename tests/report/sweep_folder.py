@@ -12,6 +12,7 @@ from sparsestreet.records.ledger import LEDGER, CountChange
 from sparsestreet.records.summary import SUMMARY, RunSummary
 from sparsestreet.report import RunRecord
 from tests.evaluation.frames import make_summary
+from tests.typed import there
 
 LOSSES = {0: 0.2, 1: 0.3, 2: 0.4}
 """Seed -> dB that pruning costs."""
@@ -53,7 +54,7 @@ def write_sweep(folder: Path, *, curves: bool = True, failed: bool = True) -> Pa
             image = np.full((30, 48, 3), 40 + 60 * KINDS.index(kind), dtype=np.uint8)
             write_png(picture_path(run / "pictures", 5, 0, kind), image)
         if curves:
-            _write_curve(run, summary.mean("psnr_full"))
+            _write_curve(run, there(summary.mean("psnr_full")))
             nodes = {name: NodeCost(10, 0.1, 4.0, ms) for name, ms in (("background", 3.0), ("rigid", 1.0))}
             steps = {"scene": 1.0, "splat": 2.0, "sky": 0.5, "losses": 0.25, "regularizers": 0.125}
             steps |= {"backward": 4.0, "optimizer": 0.5}

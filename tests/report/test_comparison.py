@@ -10,6 +10,7 @@ from sparsestreet.report.arms import arms
 from sparsestreet.report.comparison import comparison_data
 from tests.evaluation.frames import make_image, make_summary
 from tests.report.sweep_folder import record
+from tests.typed import there
 
 
 def test_pictures_are_of_one_seed(tmp_path):
@@ -20,7 +21,7 @@ def test_pictures_are_of_one_seed(tmp_path):
         for kind in ("truth", "render"):
             write_png(picture_path(folder / "pictures", 5, 0, kind), np.zeros((3, 4, 3), dtype=np.uint8))
         runs.append(record(make_summary(label, seed), str(folder)))
-    (view,) = json.loads(comparison_data(arms(runs)))
+    (view,) = json.loads(there(comparison_data(arms(runs))))
     assert view["name"] == "street, seed 0, frame 5, camera 0"
     assert [image["name"] for image in view["images"]] == ["truth", "plain"]
 
@@ -30,5 +31,5 @@ def test_the_psnr_below_a_picture_is_of_its_view(tmp_path):
     for kind in ("truth", "render"):
         write_png(picture_path(tmp_path / "pictures", 5, 0, kind), np.zeros((3, 4, 3), dtype=np.uint8))
     QUALITY[HELD_OUT].write(tmp_path, [make_image(0, psnr=20.0), make_image(5, 1, psnr=25.0), make_image(5, psnr=31.0)])
-    (view,) = json.loads(comparison_data(arms([record(make_summary("plain"), str(tmp_path))])))
+    (view,) = json.loads(there(comparison_data(arms([record(make_summary("plain"), str(tmp_path))]))))
     assert view["images"][1]["label"] == "plain, 31.00 dB, 1,200 Gaussians"

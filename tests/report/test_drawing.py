@@ -3,10 +3,12 @@
 import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
+from rich.table import Table
 
 from sparsestreet.report import figure, markdown, sections, tables
 from tests.evaluation.frames import make_summary
 from tests.report.test_sections import PLAIN_AND_OURS, STREETS, records, rig, street
+from tests.typed import as_a
 
 
 def text_of(found, baseline=None):
@@ -90,7 +92,8 @@ SWEEP = records(*(make_summary("streetgs+removal", config={"schedule.removal_db"
 
 
 def test_many_variants_are_rows_where_there_is_room():
-    title, table, notes = tables(sections(SWEEP), 200)
+    title, found, notes = tables(sections(SWEEP), 200)
+    table = as_a(Table, found)
     assert table.row_count == 6
     assert str(table.columns[0].header) == "method"
     assert "…" not in printed(SWEEP, 200)

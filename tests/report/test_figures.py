@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -88,8 +89,9 @@ def test_counts_are_of_all_nodes(tmp_path):
     starts = [CountChange(0, name, 0, rows, "start") for name, rows in (("background", 100), ("rigid", 20))]
     LEDGER.write(tmp_path, [*starts, CountChange(5, "background", 100, 30, PRUNING)])
     axes = Figure().subplots()
-    _counts(axes, *arms([record(make_summary("plain"))]), tmp_path)
-    line, dots = ([list(values) for values in drawn.get_data()] for drawn in axes.get_lines())
+    (arm,) = arms([record(make_summary("plain"))])
+    _counts(axes, arm, tmp_path)
+    line, dots = ([np.asarray(values).tolist() for values in drawn.get_data()] for drawn in axes.get_lines())
     assert (line, dots) == ([[0, 5], [120, 50]], [[5], [50]])
 
 

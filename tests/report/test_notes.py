@@ -43,8 +43,8 @@ def test_clocks_of_different_places_are_called_incomparable(other):
 
 
 def test_trainings_at_different_places_are_called_incomparable():
-    for other in ({"threads": 1}, {"machine": OTHER}):
-        said = note("train s are not comparable, trained on: ", make_summary(), make_summary("ours", **other))
+    for other in (make_summary("ours", threads=1), make_summary("ours", machine=OTHER)):
+        said = note("train s are not comparable, trained on: ", make_summary(), other)
         assert "cpu: test, 2 threads, 2 cores" in said
         assert said.count(";") == 1
     assert "cpu: test, 1 thread, 2 cores" in note("trained on", make_summary(threads=1))

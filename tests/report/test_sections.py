@@ -209,7 +209,9 @@ def test_runs_without_held_out_views_show_their_training_views():
 
 def rig(front, back, **summary):
     """A run with a front camera 1, of full, near and beyond PSNR, and one behind, 10, that has no lidar."""
-    metrics = dict(zip(("psnr_full", "psnr_near_lidar", "psnr_beyond_lidar"), front, strict=True))
+    metrics: dict[str, float | None] = dict(
+        zip(("psnr_full", "psnr_near_lidar", "psnr_beyond_lidar"), front, strict=True)
+    )
     return make_summary(cameras={"1": metrics, "10": {"psnr_full": back, "psnr_near_lidar": None}}, **summary)
 
 

@@ -1,9 +1,12 @@
 """Hand-made people: tracks with body poses, and the node that models them."""
 
+from dataclasses import replace
+
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from sparsestreet.data.lazy import Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import JOINTS, NUM_JOINTS
@@ -80,9 +83,7 @@ def people_log(*tracks: Track, returns: bool = True) -> DrivingLog:
         points = torch.cat([torch.zeros(0, 3), *found])
         colored = torch.ones(len(points), dtype=torch.bool)
         sweeps.append(Sweep(sweep.index, points, torch.tensor(SHIRT).expand(len(points), 3), colored))
-    return DrivingLog(
-        log.name, log.frames, tuple(sweeps), tracks, log.num_frames, log.num_cameras, log.dataset_from_world
-    )
+    return replace(log, sweeps=Sweeps.of(tuple(sweeps)), tracks=tracks)
 
 
 def data_of(*tracks: Track, held_out: frozenset[int] = frozenset(), returns: bool = True, **changes) -> TrainingData:

@@ -48,14 +48,14 @@ def background(count: int, seed: int, *, sh_degree: int, masked: bool = False, m
         max_gaussians=None if masked else 1000,
         density=GradientDensity(cull_opacity=0.003),
     )
-    mask = settings.mask.build(min_gaussians) if masked else None
+    mask = StaticMaskSettings(2.5e-3).build(min_gaussians) if masked else None
     return Background(settings, random_rows(count, seed, sh_degree=sh_degree, mask=mask), mask)
 
 
 def cars(count: int = 8, *, sh_degree: int = 1, masked: bool = False) -> Rigid:
     """Two objects with names, poses that were corrected, and boxes of different sizes."""
     settings = rigid_settings(sh_degree=sh_degree, mask=StaticMaskSettings(1e-4), masked=masked, max_gap=3)
-    mask = settings.mask.build(0) if masked else None
+    mask = StaticMaskSettings(1e-4).build(0) if masked else None
     rows = random_rows(count, 5, sh_degree=sh_degree, mask=mask, instances=torch.arange(count) % 2)
     tracks = [
         track("tram", [0, 2, 4], [pose(0.2 * i, (0.3 * i, -1.0, 1.0)) for i in range(3)]),

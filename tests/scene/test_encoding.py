@@ -5,6 +5,7 @@ import math
 import sys
 from dataclasses import dataclass, field
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -29,12 +30,12 @@ class Outer:
     more: dict[str, Inner] = field(default_factory=dict)
 
 
-def through_json(value: object) -> object:
+def through_json(value: object) -> Any:
     return decode(json.loads(json.dumps(encode(value), allow_nan=False)))
 
 
 @pytest.mark.parametrize("value", [None, True, 3, "ünïcode", 0.1 + 0.2, 1e-300, -0.0, math.inf, -math.inf, 2**70])
-def test_plain_values_come_back_as_they_are(value: object):
+def test_plain_values_come_back_as_they_are(value: Any):
     again = through_json(value)
     assert type(again) is type(value)
     assert again == value
@@ -96,7 +97,7 @@ def test_a_class_outside_of_the_package_must_be_imported_first(monkeypatch: pyte
     class Meadow:
         flowers: int
 
-    module.Meadow = Meadow
+    vars(module)["Meadow"] = Meadow
     Meadow.__module__, Meadow.__qualname__ = "my_street", "Meadow"
     encoded = encode(Meadow(3))
     with pytest.raises(ValueError, match="'my_street:Meadow', which this program has not imported: import my_street"):

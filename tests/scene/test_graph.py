@@ -20,6 +20,7 @@ from tests.scene.street import (
     track,
     view_at,
 )
+from tests.typed import there
 
 MASK = static_mask(sparsity_weight=0.25)
 VIEW = view_at(0.0)
@@ -100,8 +101,8 @@ def test_regularizers_are_named_by_node_and_term():
     assert list(terms) == ["heavy/weight", "heavy/age"]
     assert terms["heavy/age"].item() == 0.25
     assert torch.equal(terms["heavy/weight"], heavy.rows.means.sum())
-    sum(terms.values()).backward()
-    assert torch.equal(heavy.rows.means.grad, torch.ones(3, 3))
+    torch.stack(list(terms.values())).sum().backward()
+    assert torch.equal(there(heavy.rows.means.grad), torch.ones(3, 3))
     plain = SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]})
     assert plain.regularizers(VIEW, parts, drawn, SceneState()) == {}
 

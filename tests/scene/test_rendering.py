@@ -6,6 +6,7 @@ from sparsestreet.ops import SplatSettings, over_sky
 from sparsestreet.scene.effects import Sky, SkySettings, sky
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.types import Frame, View
@@ -20,6 +21,7 @@ from tests.scene.street import (
     track,
     view_at,
 )
+from tests.typed import as_a, there
 
 MASK = static_mask(sparsity_weight=0.1)
 CAMERA = camera_at(-6.0, width=17, height=11)
@@ -94,7 +96,7 @@ def test_options_are_those_of_the_op():
 def test_the_sky_shines_through_what_alpha_leaves():
     scene = scene_of()
     with_sky = rendered(scene)
-    sky = scene.effects["sky"].colors(ray_directions(CAMERA))
+    sky = as_a(Sky, scene.effects["sky"]).colors(ray_directions(CAMERA))
     del scene.effects["sky"]
     over_black = rendered(scene)
     expected = over_black.rgb + (1 - over_black.alpha[..., None]) * sky
@@ -105,7 +107,7 @@ def test_the_sky_ends_where_the_options_finish_a_pixel():
     options = RenderOptions(SplatSettings(transmittance_min=0.9), backend="reference")
     scene = scene_of()
     with_sky = render(scene, view_at(0.5, CAMERA), options=options)
-    sky = scene.effects["sky"].colors(ray_directions(CAMERA))
+    sky = as_a(Sky, scene.effects["sky"]).colors(ray_directions(CAMERA))
     light = 1 - with_sky.alpha
     assert ((light > 0.1) & (light < 0.9)).any()
     expected = with_sky.splats.rgb + torch.where(light > 0.9, light, 0.0)[..., None] * sky
@@ -129,7 +131,7 @@ def test_the_sky_takes_the_backend_of_the_splats(monkeypatch, backend, taken):
 def test_an_empty_scene_is_the_sky():
     scene = scene_of(0, 0)
     result = rendered(scene)
-    assert torch.equal(result.rgb, scene.effects["sky"].colors(ray_directions(CAMERA)))
+    assert torch.equal(result.rgb, as_a(Sky, scene.effects["sky"]).colors(ray_directions(CAMERA)))
     assert (result.alpha == 0).all()
 
 
@@ -149,7 +151,7 @@ def test_masked_rows_change_no_bit_of_the_image_when_they_go():
 
 def test_absent_instances_change_no_bit_of_the_image():
     scene = scene_of()
-    scene.nodes["cars"].spans.copy_(torch.tensor([[0.0, 0.2]]))
+    as_a(Rigid, scene.nodes["cars"]).spans.copy_(torch.tensor([[0.0, 0.2]]))
     absent = rendered(scene, 0.8)
     del scene.nodes["cars"]
     assert torch.equal(absent.rgb, rendered(scene, 0.8).rgb)
@@ -166,13 +168,13 @@ def test_the_image_moves_with_the_car():
 
 def test_the_last_frame_is_shown_at_its_own_time():
     scene = scene_of(road_rows=0)
-    last = scene.nodes["cars"].keyframe_translations[0, -1]
+    last = as_a(Rigid, scene.nodes["cars"]).keyframe_translations[0, -1]
     with torch.no_grad():
         scene.nodes["cars"].rows.means.zero_()
     placed = scene.gaussians_at(view_at(1.0, CAMERA)).gaussians
     assert torch.equal(placed.means, last.expand(5, 3))
     means = rendered(scene, 1.0).rgb
-    scene.nodes["cars"].keyframe_translations[0, 0] = 50.0
+    as_a(Rigid, scene.nodes["cars"]).keyframe_translations[0, 0] = 50.0
     assert torch.equal(rendered(scene, 1.0).rgb, means)
 
 
@@ -207,7 +209,7 @@ def test_masks_get_the_gradient_of_opacity_and_scale():
     cotangent = torch.randn(11, 17, 3, generator=torch.Generator().manual_seed(4))
     (rendered(scene).rgb * cotangent).sum().backward()
     for node in scene.nodes.values():
-        assert torch.isfinite(node.rows.mask_logits.grad).all()
+        assert torch.isfinite(there(node.rows.mask_logits.grad)).all()
         assert (node.rows.mask_logits.grad != 0).any()
 
 

@@ -10,7 +10,7 @@ import torch
 from lightning import Callback, LightningDataModule, Trainer
 from torch import Tensor
 
-from sparsestreet.data.datamodule import OrderedFrames
+from sparsestreet.data.datamodule import OrderedFrames, StreetData
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Split
 from sparsestreet.geometry.trajectories import Trajectories
@@ -103,7 +103,7 @@ def set_rows(node: Node, column: str, entries: Mapping[int, float]) -> None:
             node.rows.columns()[column][row] = value
 
 
-def frame_at(index: int = 0, width: int = WIDTH, height: int = HEIGHT, **known: Tensor) -> Frame:
+def frame_at(index: int = 0, width: int = WIDTH, height: int = HEIGHT, **known: Any) -> Frame:
     """A random image seen from the origin along +z, with 90 degrees of horizontal view."""
     focal = width / 2
     intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
@@ -134,19 +134,27 @@ def make_system(
     )
 
 
+class SplitFrames(StreetData):
+    """Frames that are split already, without their log."""
+
+    def __init__(self, split: Split) -> None:
+        LightningDataModule.__init__(self)
+        self.split = split
+
+
 class StubTrainer(Trainer):
     """Takes steps and calls hooks in Lightning's order, without loops, loggers or devices (test_stubs compares)."""
 
     # In place of Lightning's properties.
-    global_step = 0
-    max_steps = 0
-    log_every_n_steps = 1
+    global_step: int = 0
+    max_steps: int = 0
+    log_every_n_steps: int = 1
     optimizers: Sequence[torch.optim.Optimizer] = ()
     datamodule: Any = None
-    is_global_zero = True
-    sanity_checking = False
-    interrupted = False
-    callback_metrics: Mapping[str, Tensor] = {}
+    is_global_zero: bool = True
+    sanity_checking: bool = False
+    interrupted: bool = False
+    callback_metrics: Any = None
 
     def __init__(
         self,
@@ -159,7 +167,7 @@ class StubTrainer(Trainer):
     ) -> None:
         # Not Lightning's __init__: nothing of its machinery is there.
         self.system, self.callbacks, self.max_steps = system, list(callbacks), max_steps
-        self.datamodule = SimpleNamespace(split=Split(Frames.of(train), Frames.of(held_out)))
+        self.datamodule = SplitFrames(Split(Frames.of(train), Frames.of(held_out)))
         self.callback_metrics = {}
         self.log_calls: list[tuple[str, float, dict[str, Any]]] = []
         self.optimizers = [system.configure_optimizers()]
@@ -209,12 +217,12 @@ class StubTrainer(Trainer):
         for callback in self.callbacks:
             callback.on_train_batch_end(self, self.system, None, frame, 0)
 
-    def _log(self, name: str, value: float | Tensor, **how: Any) -> None:
+    def _log(self, name: str, value: Any, *places: Any, **how: Any) -> None:
         self.log_calls.append((name, float(value), how))
         self.callback_metrics[name] = torch.as_tensor(float(value))
 
-    def _log_dict(self, values: Mapping[str, Tensor], **how: Any) -> None:
-        for name, value in values.items():
+    def _log_dict(self, dictionary: Any, *places: Any, **how: Any) -> None:
+        for name, value in dictionary.items():
             self._log(name, value, **how)
 
 

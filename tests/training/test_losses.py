@@ -16,6 +16,7 @@ from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.losses import Depth, Loss, MaskSparsity, Photometric, SkyMask
 from sparsestreet.types import Frame, Rendering
 from tests.training.stubs import background, frame_at, rigid, set_rows
+from tests.typed import there
 
 HEIGHT, WIDTH = 13, 17
 SCENE = SceneGraph({"background": background(1)})
@@ -181,7 +182,7 @@ def test_depth_compares_only_measured_pixels():
     loss = Depth(weight=0.5)(rendering(depth=depth), frame(depth=measured), SCENE)
     assert loss.item() == pytest.approx(0.5 * abs(1 / 2 - 1 / 4))
     loss.backward()
-    assert torch.nonzero(depth.grad).tolist() == [[2, 3]]
+    assert torch.nonzero(there(depth.grad)).tolist() == [[2, 3]]
 
 
 def test_depth_leaves_out_measured_pixels_in_which_nothing_is_rendered():
@@ -195,7 +196,7 @@ def test_depth_leaves_out_measured_pixels_in_which_nothing_is_rendered():
     assert loss.item() == pytest.approx(0.5 * (1 / 2 - 1 / 4))  # the mean of one pixel, not of two
     loss.backward()
     assert bool(depth.grad.isfinite().all())
-    assert torch.nonzero(depth.grad).tolist() == [[2, 3]]
+    assert torch.nonzero(there(depth.grad)).tolist() == [[2, 3]]
 
 
 def test_depth_limits_by_numpy(generator):

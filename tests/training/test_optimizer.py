@@ -9,6 +9,7 @@ from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.visible_adam import VisibleAdam
 from tests.training.stubs import background, group_of, rigid
+from tests.typed import as_a
 
 RATES = {
     "rows": LearningRate(1e-3),
@@ -117,7 +118,7 @@ def test_epsilon_slows_what_has_a_small_gradient(eps, visible_only):
     """Adam's first step by hand: rate * g / (|g| + eps)."""
     street = scene()
     optimizer = OptimizerSettings(eps=eps, visible_only=visible_only).build(street, 1.0)
-    texels = street.effects["sky"].texels
+    texels = as_a(Sky, street.effects["sky"]).texels
     texels.grad = torch.full_like(texels, 1e-3)
     optimizer.step()
     moved = 0.5 - float(texels.detach()[0, 0, 0, 0])

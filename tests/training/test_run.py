@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from lightning import Callback
+from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.strategies import SingleDeviceStrategy
-from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.run import RUN
@@ -33,7 +34,8 @@ TRAINER = partial(CPU_TRAINER, log_every_n_steps=2)
 
 def data() -> StreetData:
     """Five instants, of which 1 and 3 are held out."""
-    log = DrivingLog("five", tuple(frame_at(index) for index in range(5)), (), (), 5, 1, torch.eye(4).double())
+    frames = Frames.of([frame_at(index) for index in range(5)])
+    log = DrivingLog("five", frames, Sweeps.of(()), (), 5, 1, torch.eye(4).double())
     return StreetData(log, stride=2, offset=1)
 
 
@@ -126,7 +128,7 @@ def test_a_run_that_is_not_there_is_an_error_before_anything_is_built(tmp_path):
 class NotTheFirst(SingleDeviceStrategy):
     """As a process that is not the first of several sees itself, without the others."""
 
-    is_global_zero = False
+    is_global_zero: bool = False
 
 
 def test_of_several_processes_the_first_alone_writes(tmp_path, monkeypatch):

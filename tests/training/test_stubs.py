@@ -37,29 +37,30 @@ class Diary(Callback):
         self._note("end", trainer, pl_module)
 
 
-def parts() -> tuple[StreetSystem, list[Callback]]:
+def parts() -> tuple[StreetSystem, list[Callback], Diary]:
     """A training in which rows are split at steps 2 and 4, the masked go at 3, the mask at 5."""
     density = GradientDensity(grad_threshold=1e-4, split_scale=0.005)
     node = background(30, mask=StaticMaskSettings(1.0), density=density)
     set_rows(node, "mask_logits", {3: -9.0, 11: -9.0})
     never = Interval(0.0, 0.0)
+    diary = Diary()
     callbacks = [
         DensityControl(Interval(0.0, 0.7, every=2), 0.7, never),
         MaskTraining(Interval(0.0, 5 / 6, every=3)),
-        Diary(),
+        diary,
     ]
-    return make_system({"background": node}), callbacks
+    return make_system({"background": node}), callbacks, diary
 
 
 def test_lightning_and_the_stub_train_alike():
     frame = frame_at()
-    system, callbacks = parts()
+    system, callbacks, diary = parts()
     real = fit(system, callbacks, STEPS, frame)
-    stub_system, stub_callbacks = parts()
+    stub_system, stub_callbacks, stub_diary = parts()
     stub = StubTrainer(stub_system, stub_callbacks, max_steps=STEPS)
     stub.start()
     stub.train(STEPS, frame)
-    assert stub_callbacks[-1].entries == callbacks[-1].entries
+    assert stub_diary.entries == diary.entries
     theirs, ours = system.scene.state_dict(), stub_system.scene.state_dict()
     assert len(theirs["nodes.background.rows.means"]) > 30  # else nothing was asked
     assert "nodes.background.rows.mask_logits" not in theirs

@@ -20,6 +20,7 @@ from sparsestreet.training.visible_adam import VisibleAdam, seen_rows
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import camera, cast, random_gaussians
 from tests.training.stubs import background
+from tests.typed import there
 
 LR = 0.01
 
@@ -76,7 +77,7 @@ def test_moments_follow_their_rows_through_a_plan(generator):
         give_gradients(rows, torch.rand(len(rows), generator=generator) < 0.5, generator)
         optimizer.step()
         for name, parameter in rows.named_parameters():
-            for row, gradient in zip(simulated[name], parameter.grad, strict=True):
+            for row, gradient in zip(simulated[name], there(parameter.grad), strict=True):
                 row.step(gradient, count)
     for name, parameter in rows.named_parameters():
         state = optimizer.state[parameter]
@@ -126,7 +127,7 @@ def test_the_op_says_what_a_view_has_seen():
     rendering = splat(leaves, view)
     (rendering.rgb.square().sum() + rendering.alpha.sum()).backward()
     for field in (leaves.means, leaves.quaternions, leaves.scales, leaves.opacities, leaves.sh):
-        seen = seen_rows(field.grad)
+        seen = seen_rows(there(field.grad))
         assert 6 <= int(seen.sum()) <= 12
         assert not bool((seen & ~rendering.visible).any())
 

@@ -46,8 +46,7 @@ def scene() -> SceneGraph:
 
 def given() -> tuple[SceneRendering, Frame, SceneGraph]:
     """A rendering and its frame on a device, and the scene there; cameras stay on the host."""
-    known = {"depth": torch.ones(SIZE), "sky": torch.zeros(SIZE, dtype=torch.bool)}
-    frame = frame_at(**known)
+    frame = frame_at(depth=torch.ones(SIZE), sky=torch.zeros(SIZE, dtype=torch.bool))
     known = {name: getattr(frame, name).to(META) for name in ("image", "depth", "sky")}
     placed = scene().to(META)
     spans = {"background": slice(0, 6), "rigid": slice(6, 10)}
@@ -74,15 +73,14 @@ def test_no_regularizer_waits():
     assert all(term.device == META for term in terms.values())
 
 
-def test_logging_does_not_wait():
+def test_logging_does_not_wait(monkeypatch):
     rendering, frame, _ = given()
     system = StubTrainer(make_system({"background": background(3)})).system
     logged: dict[str, Any] = {}
-    system.log = lambda name, value, **how: logged.update({name: value})
-    system.log_dict = lambda values, **how: logged.update(values)
-    system.rendering = rendering
+    monkeypatch.setattr(system, "log", lambda name, value, **how: logged.update({name: value}))
+    monkeypatch.setattr(system, "log_dict", lambda values, **how: logged.update(values))
     for _ in range(3):
-        system._log_training({"depth": rendering.depth.mean()}, frame)
+        system._log_training(rendering, {"depth": rendering.depth.mean()}, frame)
     tensors = {name: value.device for name, value in logged.items() if isinstance(value, Tensor)}
     assert tensors == {"psnr": META, "train/depth": META}
     assert logged["gaussians"] == 3

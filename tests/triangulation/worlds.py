@@ -59,7 +59,7 @@ def sight(
     )
 
 
-def rail(steps: Sequence[float]) -> list[np.ndarray]:
+def rail(steps: Sequence[float] | np.ndarray) -> list[np.ndarray]:
     """Poses of a camera that is moved sideways."""
     return [pose(x=float(x)) for x in steps]
 

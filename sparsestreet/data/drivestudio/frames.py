@@ -14,7 +14,7 @@ from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.types import Frame, View
 
 
-def read_rig(layout: Layout, width: int | None, min_lens_shift: float | None) -> list[RigCamera]:
+def read_rig(layout: Layout, width: int | None, min_lens_shift: float | None) -> list[RigCamera[int]]:
     """The chosen cameras; raises as ``rig_camera``."""
     rig = []
     for index, number in enumerate(layout.cameras):
@@ -33,7 +33,9 @@ def read_rig(layout: Layout, width: int | None, min_lens_shift: float | None) ->
     return rig
 
 
-def read_views(layout: Layout, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> list[View]:
+def read_views(
+    layout: Layout, rig: Sequence[RigCamera[int]], origin: Float64[Tensor, "3"], clock: LogClock
+) -> list[View]:
     """Every view of the window, in the re-centered world; raises LogError for a broken pose."""
     views = []
     for index, frame in enumerate(layout.frames):
@@ -43,9 +45,10 @@ def read_views(layout: Layout, rig: Sequence[RigCamera], origin: Float64[Tensor,
     return views
 
 
-def read_frame(layout: Layout, rig: Sequence[RigCamera], view: View) -> Frame:
+def read_frame(layout: Layout, rig: Sequence[RigCamera[int]], view: View) -> Frame:
     """The view with its image and masks, decoded; raises LogError where a file is broken."""
-    number, camera = layout.frames[view.frame_index], rig[view.camera_index]
+    frame_index, camera_index = view.indices
+    number, camera = layout.frames[frame_index], rig[camera_index]
     paths = {kind: layout.mask(kind, number, camera.name) for kind in MASK_KINDS}
     masks = {
         kind: None if path is None else read_mask(path, camera.size, sky=kind == "sky") for kind, path in paths.items()

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from ctypes import byref
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT
-from sparsestreet.ops.raw import INPUTS, LEARNED, RawGaussians
+from sparsestreet.ops.raw import INPUTS, LEARNED, Inputs, RawGaussians
 from sparsestreet.phases import phase
 from sparsestreet.types import Gaussians
 
@@ -42,7 +43,7 @@ class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, call, *given):
         tensors = [None if tensor is None else tensor.contiguous() for tensor in given]
-        means = tensors[0]
+        means = given[0]
         n = sum(len(part[0]) for part in _parts(tensors))
         widths = ((3,), (4,), (3,), (), (max(call.terms), 3))
         outputs = [means.new_empty(n, *width) for width in widths]
@@ -62,14 +63,14 @@ class _Activate(torch.autograd.Function):
         call, gradients = ctx.call, []
         with phase("scene backward"):
             cotangents = [value.contiguous() for value in cotangents]
-            for rows, part, terms in _walk(list(ctx.saved_tensors), call):
+            for rows, part, terms in _walk(ctx.saved_tensors, call):
                 gradients += _part_backward(part, terms, call, [value[rows] for value in cotangents])
         return None, *gradients
 
 
-def _part_backward(part: list[Tensor | None], terms: int, call: _Call, cotangents: list[Tensor]) -> list[Tensor | None]:
+def _part_backward(part: Inputs, terms: int, call: _Call, cotangents: list[Tensor]) -> list[Tensor | None]:
     """Gradients of a part's inputs from those of its rows."""
-    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
+    gradients: list[Tensor | None] = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
     if part[LEARNED] is None:
         # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
@@ -86,11 +87,11 @@ def _part_backward(part: list[Tensor | None], terms: int, call: _Call, cotangent
     return [*gradients, None, None]
 
 
-def _parts(tensors: list[Tensor | None]) -> list[list[Tensor | None]]:
-    return [tensors[start : start + INPUTS] for start in range(0, len(tensors), INPUTS)]
+def _parts(tensors: Sequence[Tensor | None]) -> list[Inputs]:
+    return [cast(Inputs, tuple(tensors[start : start + INPUTS])) for start in range(0, len(tensors), INPUTS)]
 
 
-def _walk(tensors: list[Tensor | None], call: _Call) -> list[tuple[slice, list[Tensor | None], int]]:
+def _walk(tensors: Sequence[Tensor | None], call: _Call) -> list[tuple[slice, Inputs, int]]:
     """For each part its rows in the table, its inputs, and its number of coefficients."""
     found, start = [], 0
     for part, terms in zip(_parts(tensors), call.terms, strict=True):
@@ -99,7 +100,7 @@ def _walk(tensors: list[Tensor | None], call: _Call) -> list[tuple[slice, list[T
     return found
 
 
-def _rows(part: list[Tensor | None], terms: int, call: _Call) -> native.CRawRows:
+def _rows(part: Inputs, terms: int, call: _Call) -> native.CRawRows:
     *fields, multipliers, turns, shifts, instances, present = part
     return native.CRawRows(
         fields[0].shape[0], fields[-1].shape[1], terms, max(call.terms), call.logit_limit,
@@ -108,7 +109,7 @@ def _rows(part: list[Tensor | None], terms: int, call: _Call) -> native.CRawRows
     )  # fmt: skip
 
 
-def _pointers(tensors: list[Tensor | None]) -> list[int | None]:
+def _pointers(tensors: Sequence[Tensor | None]) -> list[int | None]:
     return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 

@@ -48,7 +48,13 @@ def slopes_held(in_camera: Float[Tensor, "v 3"], camera: Camera) -> Bool[Tensor,
     return ((slopes < lowest) | (slopes > highest)).any(-1)
 
 
-def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera, near: float) -> Footprint:
+def unscented(
+    in_camera: Float[Tensor, "v 3"],
+    axes: Float[Tensor, "v 3 3"],
+    camera: Camera,
+    distortion: Float[Tensor, "5"],
+    near: float,
+) -> Footprint:
     """Mean and covariance of seven sigma points sent through projection and lens.
 
     With alpha = 1, beta = 2, kappa = 0 the points are mu and mu +- sqrt(3) a_k. mu has weight 0 in the mean and 2 in
@@ -60,19 +66,19 @@ def unscented(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], cam
     points = _sigma_points(in_camera, axes)
     normalized = points[..., :2] / points[..., 2:].clamp(min=near)
     # Relative to the principal point, because adding it would cost the differences digits.
-    pixels = distort(normalized, camera.distortion) * K.diagonal()[:2]
+    pixels = distort(normalized, distortion) * K.diagonal()[:2]
     centers = pixels[:, 1:].mean(1)
     weights = pixels.new_tensor([2.0] + [1 / 6] * 6)
     return centers + K[:2, 2], ((pixels - centers[:, None]) * weights.sqrt()[:, None]).mT
 
 
 def sigma_points_held(
-    in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera, near: float
+    in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], distortion: Float[Tensor, "5"], near: float
 ) -> Bool[Tensor, " v"]:
     """Rows with a point that :func:`unscented` moves to ``near``, or that lies past the fold of the lens."""
     points = _sigma_points(in_camera, axes)
     slopes = points[..., :2] / points[..., 2:].clamp(min=near)
-    past_fold = slopes.square().sum(-1) > fold_radius_squared(camera.distortion)
+    past_fold = slopes.square().sum(-1) > fold_radius_squared(distortion)
     return (past_fold | (points[..., 2] < near)).any(-1)
 
 

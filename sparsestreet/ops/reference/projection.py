@@ -136,11 +136,11 @@ def _footprints(
     if camera.distortion is None:
         means, factors = pinhole(in_camera, axes, camera)
     else:
-        means, factors = unscented(in_camera, axes, camera, settings.near_plane)
+        means, factors = unscented(in_camera, axes, camera, camera.distortion, settings.near_plane)
         slopes = in_camera.detach()[:, :2] / in_camera.detach()[:, 2:]
         refusals[Reason.PAST_FOLD] = ~(slopes.square().sum(-1) <= fold_radius_squared(camera.distortion))
     if camera.shutter is not None:
-        motion = screen_motion(gaussians, rows, in_camera, camera)
+        motion = screen_motion(gaussians, rows, in_camera, camera, camera.shutter)
         (means, factors), read = read_out(means, factors, motion, camera.height)
         refusals[Reason.OUTRUNS_SHUTTER] = ~read
     return means, factors, refusals

@@ -13,18 +13,18 @@ from torch import Tensor
 
 from sparsestreet.geometry.distortion import distortion_jacobian
 from sparsestreet.ops.reference.footprint import Footprint
-from sparsestreet.types import Camera, Gaussians
+from sparsestreet.types import Camera, Gaussians, Shutter
 
 SLOWEST_READOUT = 0.1
 """Least a = 1 - u_y / H. A splat that moves down as fast as the readout (a = 0) would be stretched without bound."""
 
 
 def screen_motion(
-    gaussians: Gaussians, rows: Int[Tensor, " v"], in_camera: Float[Tensor, "v 3"], camera: Camera
+    gaussians: Gaussians, rows: Int[Tensor, " v"], in_camera: Float[Tensor, "v 3"], camera: Camera, shutter: Shutter
 ) -> Float[Tensor, "v 2"]:
     """u, pixels per readout: the motion of the mean in the camera frame, times the exact derivative of its pixel."""
-    rotation = camera.shutter.rotation.to(in_camera).detach()
-    motion = -camera.shutter.translation.to(in_camera).detach() - torch.linalg.cross(rotation[None], in_camera)
+    rotation = shutter.rotation.to(in_camera).detach()
+    motion = -shutter.translation.to(in_camera).detach() - torch.linalg.cross(rotation[None], in_camera)
     if gaussians.displacements is not None:
         motion = motion + gaussians.displacements[rows].detach() @ camera.camera_from_world[:3, :3].to(in_camera).T
     depth = in_camera[:, 2:]

@@ -5,6 +5,7 @@ closed mask would make the scale 0.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -54,7 +55,7 @@ class GradientDensity:
     reset_opacity_to: float = 0.01
     """Largest opacity after a reset."""
 
-    watched: ClassVar[tuple[str, ...]] = ()
+    watched: ClassVar[Sequence[str]] = ()
 
     def __post_init__(self) -> None:
         if self.split_children < 2:

@@ -64,7 +64,7 @@ class DensityStatistics:
         self.visits += drawn
         self.largest_screen = torch.maximum(self.largest_screen, radii / max(width, height))
         for name, total in self.watched.items():
-            total += torch.where(drawn, gradients[name].abs(), 0.0)
+            total += torch.where(drawn, (gradients or {})[name].abs(), 0.0)
 
     def mean_gradients(self, column: str | None = None) -> Float[Tensor, " n"]:
         """Returns the mean norm on screen over the visits, or the mean absolute gradient of a watched column.

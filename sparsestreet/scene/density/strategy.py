@@ -1,7 +1,7 @@
 """The interface of a node's density strategy, which decides where it needs more or fewer Gaussians."""
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 
@@ -16,7 +16,7 @@ class DensityStrategy(Protocol):
     ``radius`` is the scene radius in meters, ``progress`` the fraction of the run.
     """
 
-    watched: Sequence[str]
+    watched: ClassVar[Sequence[str]]
     """Names of columns with one number a row whose gradients the statistics must accumulate."""
 
     def densify(

@@ -1,5 +1,6 @@
 """Density control of PVG (Chen et al. 2023), which also grows Gaussians along time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -29,7 +30,7 @@ class VibratingDensity(GradientDensity):
     cycle: float = 0.2
     """The cycle of the node."""
 
-    watched: ClassVar[tuple[str, ...]] = ("life_peaks",)
+    watched: ClassVar[Sequence[str]] = ("life_peaks",)
 
     def urgency(self, statistics: DensityStatistics) -> Float[Tensor, " n"]:
         over_time = statistics.mean_gradients("life_peaks") / self.peak_threshold

@@ -33,7 +33,8 @@ def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         return torch.full((num_points,), MINIMUM_SCALE)
     # The nearest is the point itself or a coincident one. Both have distance 0, so the first can be dropped.
     positions = points.double().numpy()
-    distances, _ = KDTree(positions).query(positions, k=np.arange(2, neighbors + 2))
+    places = np.arange(2, neighbors + 2)
+    distances, _ = KDTree(positions).query(positions, k=places)  # pyright: ignore[reportArgumentType]
     return torch.from_numpy(distances.mean(1)).float().clamp(min=MINIMUM_SCALE)
 
 

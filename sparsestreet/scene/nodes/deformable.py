@@ -1,7 +1,7 @@
 """Objects that change their shape while they move, such as cyclists (as in OmniRe, Chen et al. 2025)."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -39,7 +39,7 @@ class DeformableSettings(TrackedSettings):
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Deformable | None":
         """Builds the node without boxes of frames that have no training image (held out, or outside the range)."""
-        node = super().build(data, generator)
+        node = cast(Deformable | None, super().build(data, generator))  # it builds a node_class
         if node is not None:
             node.start_network(generator.initial_seed())
         return node

@@ -87,7 +87,7 @@ class DeformationNetwork(nn.Module):
         values = torch.relu_(self.first(rows, instants, instances))
         for number, layer in enumerate(self.hidden, start=1):
             values = layer(values)
-            if number == self.settings.skip:
+            if self.again is not None and number == self.settings.skip:
                 values = values + self.again(rows, instants, instances)
             values = torch.relu_(values)
         means, quaternions, *scales = self.last(values).split((3, 4, 3)[: 3 if self.settings.scales else 2], dim=1)
@@ -119,8 +119,8 @@ def encoded(values: Float[Tensor, "n c"], octaves: int) -> Float[Tensor, "n e"]:
     parts = [values]
     for octave in range(octaves):
         if octave == 0:
-            sine, cosine = torch.sin(values), torch.cos(values)
+            parts += [torch.sin(values), torch.cos(values)]
         else:
-            sine, cosine = 2 * sine * cosine, 1 - 2 * sine.square()
-        parts += [sine, cosine]
+            sine, cosine = parts[-2:]
+            parts += [2 * sine * cosine, 1 - 2 * sine.square()]
     return torch.cat(parts, dim=1)

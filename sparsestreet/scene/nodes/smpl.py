@@ -142,7 +142,8 @@ def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "
             colors.append(torch.full_like(vertices, 0.5))
             continue
         tree = KDTree(measured.positions.numpy())
-        _, nearest = tree.query(vertices.numpy(), k=list(range(1, min(_COLORED_BY, len(measured)) + 1)))
+        nearest_first = list(range(1, min(_COLORED_BY, len(measured)) + 1))
+        _, nearest = tree.query(vertices.numpy(), k=nearest_first)  # pyright: ignore[reportArgumentType]
         colors.append(measured.colors[torch.from_numpy(nearest)].mean(1))
     return torch.cat(colors)
 

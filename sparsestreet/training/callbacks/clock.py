@@ -34,7 +34,7 @@ class Clock(Callback):
         if self._interrupted:
             self._started = time.perf_counter()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -7,8 +7,9 @@ from lightning import Callback, Trainer
 
 from sparsestreet.phases import phase
 from sparsestreet.records.ledger import CountChange
-from sparsestreet.scene.density import DensityStatistics
+from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.nodes.node import Node
 from sparsestreet.training.callbacks.resizing import RowListener, resize_rows
 from sparsestreet.training.schedule import Interval, last_step
 from sparsestreet.training.system import StreetSystem
@@ -63,14 +64,17 @@ class DensityControl(Callback, RowListener):
     def on_after_backward(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if not pl_module.screen_gradients:
             return
-        splats = pl_module.rendering.splats
+        rendering = pl_module.rendering
+        assert rendering is not None  # the backward pass of this step went through it
+        splats, gradients = rendering.splats, rendering.splats.screen_gradients
         height, width = splats.alpha.shape
         with phase("density statistics"):
             for name, statistics in self.statistics.items():
-                span = pl_module.rendering.spans[name]
+                span = rendering.spans[name]
                 columns = pl_module.scene.nodes[name].rows.columns()
-                watched = {column: columns[column].grad for column in statistics.watched}
-                statistics.add(splats.screen_offsets.grad[span], splats.radii[span], width, height, watched)
+                found = ((column, columns[column].grad) for column in statistics.watched)
+                watched = {column: gradient for column, gradient in found if gradient is not None}
+                statistics.add(gradients[span], splats.radii[span], width, height, watched)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
@@ -91,7 +95,7 @@ class DensityControl(Callback, RowListener):
             self.last_reset = step
             for name in self.statistics:
                 node = pl_module.scene.nodes[name]
-                resize_rows(trainer, pl_module, name, node.settings.density.reset(node.rows), "opacity reset")
+                resize_rows(trainer, pl_module, name, _strategy(node).reset(node.rows), "opacity reset")
 
     def _recovering(self, step: int) -> bool:
         return self.last_reset is not None and step - self.last_reset <= self.pause_after_reset
@@ -100,7 +104,7 @@ class DensityControl(Callback, RowListener):
         """Densify (while it is time), then cull, then start new statistics."""
         step, steps = trainer.global_step, trainer.max_steps
         node, statistics = system.scene.nodes[name], self.statistics[name]
-        strategy = node.settings.density
+        strategy = _strategy(node)
         when = {"radius": system.radius, "progress": step / steps}
         own = node.settings.densify_until
         if step <= last_step(self.densify_until if own is None else own, steps):
@@ -113,7 +117,7 @@ class DensityControl(Callback, RowListener):
             resize_rows(trainer, system, name, RowPlan.keep(~outside), "outside its box")
         statistics.reset()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {
             "statistics": {name: statistics.state_dict() for name, statistics in self.statistics.items()},
             "generator": self.generator.get_state(),
@@ -124,3 +128,8 @@ class DensityControl(Callback, RowListener):
         self.statistics = {name: DensityStatistics.from_state(s) for name, s in state_dict["statistics"].items()}
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]
+
+
+def _strategy(node: Node) -> DensityStrategy:
+    assert node.settings.density is not None  # statistics are kept for such nodes alone
+    return node.settings.density

@@ -35,7 +35,7 @@ class HeldOutCurve(Callback):
         if trainer.is_global_zero:
             HELD_OUT_CURVE.write(self.run, self.looks)
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {"rows": [astuple(look) for look in self.looks]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

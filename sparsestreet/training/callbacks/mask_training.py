@@ -4,6 +4,7 @@ import logging
 
 from lightning import Callback, Trainer
 
+from sparsestreet.scene.masks import Mask
 from sparsestreet.training.callbacks.resizing import end_mask, resize_rows
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
@@ -32,19 +33,19 @@ class MaskTraining(Callback):
             return
         for name, node in pl_module.scene.nodes.items():
             if node.mask is not None:
-                self._remove(trainer, pl_module, name)
+                self._remove(trainer, pl_module, name, node.mask)
                 if last:
                     end_mask(trainer, pl_module, name)
 
-    def _remove(self, trainer: Trainer, system: StreetSystem, name: str) -> None:
+    def _remove(self, trainer: Trainer, system: StreetSystem, name: str, mask: Mask) -> None:
         node = system.scene.nodes[name]
-        selection = node.mask.keep(node.rows)
-        if selection.floor_hit or node.mask.floor_firings:
+        selection = mask.keep(node.rows)
+        if selection.floor_hit or mask.floor_firings:
             log.info(
                 "step %d: the floor of %d Gaussians (K_min) of node %r held in %d steps since the last removal: "
                 "masks of the best rows stay open",
-                trainer.global_step, node.settings.min_gaussians, name, node.mask.floor_firings,
+                trainer.global_step, node.settings.min_gaussians, name, mask.floor_firings,
             )  # fmt: skip
-            node.mask.floor_firings = 0
+            mask.floor_firings = 0
         if selection.removed:
             resize_rows(trainer, system, name, selection.plan(), REASON)

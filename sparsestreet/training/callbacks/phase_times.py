@@ -51,7 +51,7 @@ class PhaseTimes(Callback):
         # It would be counted as a part of the step that follows it.
         self._forget()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {"rows": [astuple(row) for row in self.rows]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

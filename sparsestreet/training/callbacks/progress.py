@@ -5,7 +5,7 @@ import time
 
 from lightning import Callback, Trainer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sparsestreet.training.system import StreetSystem
 
@@ -21,7 +21,7 @@ class TrainingProgress(Callback):
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
-        self._task = None
+        self._task = TaskID(0)
         self._since = (0, 0.0)
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:

@@ -8,6 +8,7 @@ from lightning import Callback, Trainer
 from sparsestreet.phases import stage
 from sparsestreet.pruning import PruningRule, RenderContext
 from sparsestreet.training.callbacks.resizing import resize_rows
+from sparsestreet.training.lightning import data_of
 from sparsestreet.training.schedule import milestone
 from sparsestreet.training.system import StreetSystem
 
@@ -37,7 +38,7 @@ class Pruning(Callback):
             self._prune(trainer, pl_module)
 
     def _prune(self, trainer: Trainer, pl_module: StreetSystem) -> None:
-        frames = trainer.datamodule.split.train
+        frames = data_of(trainer).split.train
         context = RenderContext(pl_module.state(), pl_module.options)
         for name, selection in self.rule.select(pl_module.scene, frames, context).items():
             log.info(

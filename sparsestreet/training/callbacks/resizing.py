@@ -6,6 +6,7 @@ from lightning import Trainer
 
 from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.training.lightning import callbacks_of
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
@@ -25,7 +26,7 @@ def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan
     rows.resize(plan, trainer.optimizers[0])
     system.rendering = None
     change = CountChange(trainer.global_step, node, before, len(rows), reason)
-    for callback in trainer.callbacks:
+    for callback in callbacks_of(trainer):
         if isinstance(callback, RowListener):
             callback.on_rows_changed(change, plan)
     log.debug("step %d: %s %s, %d -> %d rows", change.step, node, reason, before, change.after)

@@ -35,7 +35,7 @@ class RowLedger(Callback, RowListener):
         if self.changes and not isinstance(exception, OSError):
             self._write(trainer)
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {"changes": [astuple(change) for change in self.changes]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
 from sparsestreet.training.callbacks.clock import Clock
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.callbacks.resizing import RowListener
+from sparsestreet.training.lightning import data_of
 from sparsestreet.training.system import StreetSystem
 
 
@@ -75,7 +76,8 @@ class RunFiles(Callback, RowListener):
             noise=None if before is None else noise_between(before, calibrate(system.device)),
             caps=dict(self.caps),
         )
-        log, split = trainer.datamodule.driving_log, trainer.datamodule.split
+        data = data_of(trainer)
+        log, split = data.driving_log, data.split
         stored = StoredScene(system.scene, system.options, log.name, log.num_frames)
         with stage("save"):
             save_scene(self.folder / FILE_NAME, stored)
@@ -84,7 +86,7 @@ class RunFiles(Callback, RowListener):
             )
             RUN.write(self.folder, description)
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {"caps": self.caps}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

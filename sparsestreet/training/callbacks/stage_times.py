@@ -19,7 +19,7 @@ class StageTimes(Callback):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.recorder.leave()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.recorder.seconds()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -26,6 +26,7 @@ class Depth:
         return frame.depth is not None
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
+        assert frame.depth is not None  # it applies
         measured, rendered = frame.depth, rendering.depth
         valid = (measured > self.nearest) & (measured < self.farthest) & (rendered > self.nearest)
         # Over all pixels, because picking the valid ones would wait for a device; 1 m stands where none is.

@@ -39,5 +39,6 @@ class SkyMask:
         return frame.sky is not None
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
+        assert frame.sky is not None  # it applies
         right = torch.where(frame.sky, 1 - rendering.alpha, rendering.alpha)
         return -self.weight * ((right + self.eps) / (1 + self.eps)).log().mean()

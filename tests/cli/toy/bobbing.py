@@ -55,6 +55,8 @@ class BobbingSettings(NodeSettings):
 class Bobbing(Node):
     """Every row is lifted by what a small network makes of the time, at most a meter."""
 
+    settings: BobbingSettings
+
     def __init__(self, settings: BobbingSettings, rows: Rows, names: tuple[str, ...], mask: Mask | None = None) -> None:
         super().__init__(settings, rows, mask)
         self.names = names
@@ -68,7 +70,7 @@ class Bobbing(Node):
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        return {"stillness": self.settings.stillness * self.lift[2].weight.square().sum()}
+        return {"stillness": self.settings.stillness * self.lift[2].get_parameter("weight").square().sum()}
 
     def instances(self) -> Instances:
         return Instances(self.names, self.rows.instances, torch.ones(len(self.names), 3))

@@ -42,6 +42,8 @@ class GainSettings(EffectSettings):
 class Gain(Effect):
     """Each camera multiplies the light by a factor of its own; a camera beside the log has their geometric mean."""
 
+    settings: GainSettings
+
     def __init__(self, settings: GainSettings, cameras: int) -> None:
         super().__init__(settings)
         self.log_gains = nn.Parameter(torch.zeros(cameras))

@@ -7,7 +7,7 @@ import torch
 
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.images import check_pixels, image_size, read_image
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError, Problem, attempt
 from sparsestreet.data.reader import LogReader
@@ -39,7 +39,7 @@ class PicturesReader(LogReader):
         count = len(list(self.folder.glob("*.png")))
         views = [LogClock(count).view(self._camera(index), index, 0) for index in range(count)]
         no_shift = torch.eye(4, dtype=torch.float64)
-        return DrivingLog(self.folder.name, Frames(views, self._frame), (), (), count, 1, no_shift)
+        return DrivingLog(self.folder.name, Frames(views, self._frame), Sweeps.of(()), (), count, 1, no_shift)
 
     def _camera(self, index: int) -> Camera:
         width, height = image_size(self._path(index))
@@ -49,7 +49,7 @@ class PicturesReader(LogReader):
         return Camera(camera_from_world, intrinsics, width, height)
 
     def _frame(self, view: View) -> Frame:
-        image = read_image(self._path(view.frame_index), (view.camera.width, view.camera.height))
+        image = read_image(self._path(view.indices[0]), (view.camera.width, view.camera.height))
         return Frame.of(view, image=image)
 
     def _path(self, index: int) -> Path:

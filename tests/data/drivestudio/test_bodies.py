@@ -25,7 +25,8 @@ FLAVORS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 
 def person(frames: int = FRAMES) -> dict:
     """As DriveStudio writes it: valid at frames 1, 2 and 3, at 1 and 2 seen by camera 1, at 3 by none."""
-    rotations = Rotation.random(frames * 24, random_state=0).as_matrix().reshape(frames, 24, 3, 3)
+    drawn = Rotation.random(frames * 24, random_state=0)  # pyright: ignore[reportCallIssue]
+    rotations = drawn.as_matrix().reshape(frames, 24, 3, 3)
     valid = np.isin(np.arange(frames), [1, 2])
     return {
         "smpl": {

@@ -51,12 +51,12 @@ def intrinsics(numbers: list[float]) -> Callable[[Path], None]:
     return lambda root: write_lines(root / "intrinsics/1.txt", numbers)
 
 
-def text(name: str, content: str) -> Callable[[Path], None]:
-    return lambda root: (root / name).write_text(content) and None
+def text(name: str, content: str) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_text(content)
 
 
-def truncate(name: str, size: int) -> Callable[[Path], None]:
-    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size]) and None
+def truncate(name: str, size: int) -> Callable[[Path], object]:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size])
 
 
 def image(name: str, height: int, width: int) -> Callable[[Path], None]:

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +14,7 @@ from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 FLAVORS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 
 
-def hash_of(root: Path, **choice: object) -> str:
+def hash_of(root: Path, **choice: Any) -> str:
     return DriveStudioReader(root, **choice).data_hash()
 
 

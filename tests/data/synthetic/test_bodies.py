@@ -33,8 +33,8 @@ def test_joints_are_where_the_limbs_are(traveled):
     joints = posed_joints(PERSON, joint_rotations(PERSON, float(traveled)))
     distances = {}
     for side, name in ((1, "left"), (-1, "right")):
-        rendered = dict(zip(("hip", "knee", "ankle"), PERSON.leg(side, traveled), strict=True))
-        rendered |= zip(("shoulder", "elbow", "wrist"), PERSON.arm(side, traveled), strict=True)
+        limbs = (*PERSON.leg(side, traveled), *PERSON.arm(side, traveled))
+        rendered = dict(zip(("hip", "knee", "ankle", "shoulder", "elbow", "wrist"), limbs, strict=True))
         distances |= {f"{name}_{joint}": joints[f"{name}_{joint}"] - place for joint, place in rendered.items()}
     # The pelvis is where it brings the hips together; the rendered limbs change their length with the gait.
     pelvis = (distances["left_hip"] + distances["right_hip"]) / 2
@@ -67,14 +67,14 @@ def test_a_street_is_read_with_its_bodies(tmp_path):
         StreetReader(replace(SETTINGS, body_pose_noise=noise), tmp_path / str(noise)) for noise in (0.0, 3.0)
     )
     log, others = exact.read(), noisy.read().tracks
-    actors = [actor for actor in build_world(SETTINGS).actors if actor.model.class_name == "Pedestrian"]
+    world = build_world(SETTINGS)
+    actors = [(actor.model, actor.path) for actor in world.actors if isinstance(actor.model, Pedestrian)]
     people = [track for track in log.tracks if track.body is not None]
     assert 1 < len(people) <= len(actors)
     assert all(track.body is None for track in log.tracks if track.class_name != "Pedestrian")
     angles = []
     for track in people:
-        person = min(actors, key=lambda actor: abs(actor.model.height - float(track.size[2]))).model
-        path = min(actors, key=lambda actor: abs(actor.model.height - float(track.size[2]))).path
+        person, path = min(actors, key=lambda actor: abs(actor[0].height - float(track.size[2])))
         other = next(again for again in others if again.name == track.name)
         assert other.body.valid.tolist() == track.body.valid.tolist()
         for place in track.body.valid.nonzero().flatten().tolist():

@@ -83,7 +83,7 @@ def test_files_of_a_street_say_its_lens_and_show_it(tmp_path):
     # Float32 depth is good to 1e-7 of 50 m.
     np.testing.assert_allclose(road[:, 2], 0, atol=1e-4)
     read = StreetReader(SETTINGS, root).read().views[0].camera
-    np.testing.assert_array_equal(read.distortion, np.float32(LENS))
+    np.testing.assert_array_equal(read.distortion, np.array(LENS, np.float32))
     assert StreetReader(SETTINGS, root, min_lens_shift=None).read().views[0].camera.distortion is None
 
 

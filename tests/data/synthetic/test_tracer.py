@@ -10,6 +10,7 @@ from sparsestreet.data.synthetic.shapes import Capsule, Cylinder, Ellipsoid, box
 from sparsestreet.data.synthetic.sky import random_weather
 from sparsestreet.data.synthetic.textures.plain import Plain
 from sparsestreet.data.synthetic.tracer import NOTHING, Rays, first_hits, sunlit
+from tests.typed import as_a
 
 GRAY = Plain((0.5, 0.5, 0.5))
 
@@ -148,6 +149,6 @@ def test_limb_runs_from_start_to_end():
     rotation = part.frame_from_part[:3, :3]
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
-    half = part.shape.half_length
+    half = as_a(Capsule, part.shape).half_length
     ends = [part.frame_from_part @ [0, 0, z, 1] for z in (-half, half)]
     np.testing.assert_allclose([end[:3] for end in ends], [[1, 2, 3], [1.5, 1, 4]], atol=1e-12)

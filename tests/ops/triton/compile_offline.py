@@ -15,9 +15,10 @@ from pathlib import Path
 
 import triton
 import triton.language as tl
+from triton import knobs
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from triton.runtime.jit import KernelInterface
+from triton.runtime.jit import JITFunction
 
 _TOOLS = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
 
@@ -31,14 +32,14 @@ def compile_launch(launch: dict, arch: int) -> dict:
     missing = {name: getattr(module, name) for name in launch.get("without", ())}
     for name in missing:
         delattr(module, name)
-    triton.knobs.compilation.always_compile = bool(missing)
+    knobs.compilation.always_compile = bool(missing)
     try:
         return _compile(getattr(module, launch["name"]), launch, arch)
     finally:
         vars(module).update(missing)
 
 
-def _compile(kernel: KernelInterface, launch: dict, arch: int) -> dict:
+def _compile(kernel: JITFunction, launch: dict, arch: int) -> dict:
     constants = {name: _constant(value) for name, value in launch["constants"].items()}
     types = {**launch["types"], **dict.fromkeys(constants, "constexpr")}
     signature = {name: types[name] for name in kernel.arg_names}

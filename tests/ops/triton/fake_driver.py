@@ -93,4 +93,4 @@ class _Driver:
 
 def install(device: FakeDevice) -> None:
     """Make ``device`` the one that Triton launches on, for the rest of the process."""
-    driver.set_active(_Driver(device))
+    driver.set_active(_Driver(device))  # pyright: ignore[reportArgumentType]

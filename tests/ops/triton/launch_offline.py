@@ -83,12 +83,12 @@ def launch_time(case: Case, repeats: int) -> float:
         spent[-1] += time.perf_counter() - start
 
     for module in MODULES:
-        module.launch = timed
+        vars(module).update(launch=timed)
     for _ in range(repeats):
         case.run()
         spent.append(0.0)
     for module in MODULES:
-        module.launch = launch
+        vars(module).update(launch=launch)
     return statistics.median(spent[:-1]) * 1e6
 
 
@@ -97,7 +97,7 @@ def measure(device: FakeDevice, given: dict) -> dict:
     before = len(device.binaries)
     case = Case(given)
     case.run()
-    answer = {"compiled": [found_in(binary) for binary in device.binaries[before:]]}
+    answer: dict[str, Any] = {"compiled": [found_in(binary) for binary in device.binaries[before:]]}
     device.launches.clear()
     answer["dispatches"] = case.run(backward=False, counted=True)
     answer["forward"] = [binary.name for binary in device.launches]

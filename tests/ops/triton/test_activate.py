@@ -8,7 +8,7 @@ import torch
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import Placement, Poses
 from sparsestreet.ops.triton import activate as fused
-from tests.ops.scenes import device_of, fill_buffers_with_nan
+from tests.ops.scenes import CPU, device_of, fill_buffers_with_nan
 from tests.ops.test_activate import (
     case,
     fields_of,
@@ -36,7 +36,7 @@ def assert_matches_float64(found: list[torch.Tensor], expected: list[torch.Tenso
 
 def results(rest: int, degree: int, masked: bool, placed: bool) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     answers = []
-    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, "cpu")):
+    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, CPU)):
         inputs, run = case(rest, degree, masked, placed, dtype, ROWS, device)
         answers.append(values_and_gradients(inputs, lambda run=run, backend=backend: run(backend)))
     return tuple(answers)
@@ -51,7 +51,7 @@ def test_it_says_what_torch_says(rest, degree, masked, placed):
 def test_parts_stand_one_after_the_other_and_every_output_is_written(monkeypatch, degree):
     fill_buffers_with_nan(monkeypatch)
     answers = []
-    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, "cpu")):
+    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, CPU)):
         inputs, parts = parts_of_three_kinds(dtype, device)
 
         def run(parts=parts, backend=backend):
@@ -70,10 +70,10 @@ def test_programs_that_hold_rows_of_some_instances_only(monkeypatch, lanes):
     generator = torch.Generator().manual_seed(4)
     turns, shifts = torch.randn(5, 4, generator=generator).double(), torch.randn(5, 3, generator=generator).double()
     answers = []
-    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, "cpu")):
+    for backend, dtype, device in (("triton", torch.float32, DEVICE), ("torch", torch.float64, CPU)):
         raw = raw_rows(len(of_rows), 0, dtype, device=device)
         leaves = [value.to(device, dtype, copy=True).requires_grad_() for value in (turns, shifts)]
-        poses = Poses(*leaves, torch.tensor([True, True, False, True, True], device=device))
+        poses = Poses(leaves[0], leaves[1], torch.tensor([True, True, False, True, True], device=device))
         inputs = [*fields_of(raw), *leaves]
         raw = replace(raw, placement=Placement(poses, of_rows.to(device)))
 
@@ -89,7 +89,7 @@ def test_programs_that_hold_rows_of_some_instances_only(monkeypatch, lanes):
 def test_logits_at_and_beyond_the_limit():
     given = [16.0, 15.0, -15.5, -15.0, torch.inf, -torch.inf, torch.nan]
     answers = []
-    for backend, device in (("triton", DEVICE), ("torch", "cpu")):
+    for backend, device in (("triton", DEVICE), ("torch", CPU)):
         raw = raw_rows(len(given), 0, torch.float32, device=device)
         logits = torch.tensor(given, device=device, requires_grad=True)
         opacities = activate([replace(raw, opacity_logits=logits)], sh_degree=0, backend=backend).opacities

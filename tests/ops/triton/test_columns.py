@@ -16,10 +16,11 @@ DEVICE = device_of("triton")
 def copy_reversed(table, to, wanted, rows, COUNT: tl.constexpr, BLOCK: tl.constexpr):
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = row < rows
-    columns, turned = load_columns(table, row, tl.load(wanted + row, given, 0) > 0, COUNT), ()
-    for i in tl.static_range(COUNT):
+    asked = tl.load(wanted + row, given, 0) > 0
+    columns, turned = load_columns(table, row, asked, COUNT), ()  # pyright: ignore[reportCallIssue]
+    for i in tl.static_range(COUNT):  # pyright: ignore[reportGeneralTypeIssues]
         turned += (columns[COUNT - 1 - i],)
-    store_columns(to, row, turned, given, COUNT)
+    store_columns(to, row, turned, given, COUNT)  # pyright: ignore[reportCallIssue]
 
 
 @pytest.mark.parametrize("count", [3, 4, 12, 27, 48])

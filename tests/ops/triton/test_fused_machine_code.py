@@ -59,8 +59,16 @@ def compiled(scope) -> list[tuple[Launch, dict]]:
         launch_nodes(smallest_too)
         launch_images(smallest_too)
         for shape in ((2, 15, 3), (2, 3))[: 1 + smallest_too]:
-            fields = [torch.zeros(shape, device=DEVICE) for _ in range(4)]
-            adam_step_(*fields, torch.ones(2, dtype=torch.bool, device=DEVICE), AdamStep(1, 0.1), backend="triton")
+            values, gradient, first, second = (torch.zeros(shape, device=DEVICE) for _ in range(4))
+            adam_step_(
+                values,
+                gradient,
+                first,
+                second,
+                torch.ones(2, dtype=torch.bool, device=DEVICE),
+                AdamStep(1, 0.1),
+                backend="triton",
+            )
     return compile_launches(launches, arch)
 
 

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution, splat
+from sparsestreet.ops.settings import StopRule
 from sparsestreet.ops.triton import parts, rasterizer
 from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
@@ -59,7 +60,7 @@ _BACKWARD = ("unscented", "unscented_backward", "roll", "roll_backward", "veloci
 EFFECTS = {"project_rows": _FORWARD, "project_rows_backward": _BACKWARD}
 
 
-def launches_of(monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[str, ...]) -> list[Launch]:
+def launches_of(monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[StopRule, ...]) -> list[Launch]:
     """What these cases launch, and all that is counted, with these rules of where a pixel stops."""
     launches = record_launches(monkeypatch)
     for terms, name, moves, settings, output in cases:

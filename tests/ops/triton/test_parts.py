@@ -171,7 +171,7 @@ def test_parts_cover_long_tiles_once(counts, length, limit):
         share, lengths = part_length(pairs), ends - begins
         # Those that are split come first; the others in any order.
         order = torch.sort(lengths >= 2 * share, descending=True, stable=True).indices.int()
-        found = split_tiles(*(part.to(DEVICE) for part in (begins, ends, order, lengths)), pairs)
+        found = split_tiles(begins.to(DEVICE), ends.to(DEVICE), order.to(DEVICE), lengths.to(DEVICE), pairs)
     long = [tile for tile, count in enumerate(counts) if count >= 2 * share]
     if found is None:
         assert not long

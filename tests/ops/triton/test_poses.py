@@ -7,22 +7,23 @@ from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.triton import poses as fused
 from tests.ops.scenes import device_of, fill_buffers_with_nan
-from tests.ops.test_poses import MAX_GAP, in_double, tables, values_and_gradients
+from tests.ops.test_poses import MAX_GAP, Deltas, in_double, tables, values_and_gradients
 
 DEVICE = device_of("triton")
 
 
-def on_device(size: float) -> tuple[Trajectories, list[torch.Tensor]]:
-    table, *deltas = tables(torch.float32, size=size)
-    leaves = [delta.detach().to(DEVICE, copy=True).requires_grad_() for delta in deltas]
-    return Trajectories(*(value.to(DEVICE) for value in vars(table).values())), leaves
+def on_device(size: float) -> tuple[Trajectories, Deltas]:
+    table, deltas = tables(torch.float32, size=size)
+    turned, shifted = (delta.detach().to(DEVICE, copy=True).requires_grad_() for delta in deltas)
+    return Trajectories(*(value.to(DEVICE) for value in vars(table).values())), (turned, shifted)
 
 
 def assert_matches_float64(time: float, size: float) -> None:
     table, deltas = on_device(size)
-    doubles = [delta.detach().cpu().double().requires_grad_() for delta in deltas]
+    turned, shifted = (delta.detach().cpu().double().requires_grad_() for delta in deltas)
+    doubles = turned, shifted
 
-    def run(table, deltas, time, backend):
+    def run(table: Trajectories, deltas: Deltas, time: float, backend: str):
         return tuple(vars(poses_at(table, *deltas, time, MAX_GAP, backend=backend)).values())
 
     found = values_and_gradients(deltas, lambda: run(table, deltas, time, "triton"))
@@ -73,7 +74,7 @@ def test_only_one_output_is_differentiated():
 def test_no_instances():
     table, deltas = on_device(0.3)
     none = Trajectories(*(values[:0] for values in vars(table).values()))
-    found = poses_at(none, *(delta[:0] for delta in deltas), 0.5, MAX_GAP, backend="triton")
+    found = poses_at(none, deltas[0][:0], deltas[1][:0], 0.5, MAX_GAP, backend="triton")
     assert [len(values) for values in vars(found).values()] == [0, 0, 0]
     gradients = torch.autograd.grad(found.translations.sum(), deltas)
     assert not any(bool(gradient.any()) for gradient in gradients)

@@ -75,7 +75,7 @@ def test_a_hostile_file_does_not_run(tmp_path):
     (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(contents() | {"extra": Hostile()}, 2))
     with pytest.raises(ValueError, match=r"asks for posix\.system"):
         SmplFile(str(tmp_path / "SMPL_NEUTRAL.pkl")).load()
-    np.savez(tmp_path / "SMPL_NEUTRAL.npz", **contents() | {"f": np.array([Hostile()])})
+    np.savez(tmp_path / "SMPL_NEUTRAL.npz", **contents() | {"f": np.array([Hostile()])})  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="allow_pickle=False"):
         SmplFile(str(tmp_path / "SMPL_NEUTRAL.npz")).load()
     assert not (tmp_path / "it_ran").exists()

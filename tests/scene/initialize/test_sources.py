@@ -1,16 +1,19 @@
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
 import torch
 
+from sparsestreet.data.lazy import Frames
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
 from tests.scene.street import frame_at, street_log, training_data, triangulated
+from tests.typed import there
 
 
 def drawn(source: PointSource, count: int, data: TrainingData, seed: int = 0) -> Seeds:
@@ -21,6 +24,9 @@ def data_with(points: TriangulatedPoints) -> TrainingData:
     return training_data(points=StreetPoints(points, {}))
 
 
+Order = Literal["beyond_first", "beyond_only", "random"]
+
+
 def ten_points() -> TriangulatedPoints:
     """At x = 0 .. 9; the odd ones are seen in the sky, where the lidar has nothing, the even ones on the road."""
     at_row = [3.5 if point % 2 else 18.5 for point in range(10)]
@@ -29,10 +35,10 @@ def ten_points() -> TriangulatedPoints:
 
 def data_with_lidar() -> TrainingData:
     """``ten_points``, and returns in the lower half of every image."""
-    depth = torch.zeros_like(frame_at(0).sky, dtype=torch.float32)
+    depth = torch.zeros_like(there(frame_at(0).sky), dtype=torch.float32)
     depth[11:] = 5.0
     log = street_log()
-    log = replace(log, frames=tuple(replace(frame, depth=depth) for frame in log.frames))
+    log = replace(log, frames=Frames.of([replace(frame, depth=depth) for frame in log.frames]))
     return training_data(log, points=StreetPoints(ten_points(), {}))
 
 
@@ -45,7 +51,7 @@ def test_shares_are_those_of_the_pixels():
 def test_points_beyond_the_lidar_come_first_alone_or_in_their_turn():
     data = data_with_lidar()
 
-    def taken(order: str, count: int) -> list[int]:
+    def taken(order: Order, count: int) -> list[int]:
         return drawn(ImagePoints(order=order), count, data).points.positions[:, 0].int().tolist()
 
     odd = {1, 3, 5, 7, 9}
@@ -76,7 +82,7 @@ def test_points_from_images_bring_limits_by_the_size_of_a_pixel():
 
 
 @pytest.mark.parametrize("order", ["beyond_first", "random"])
-def test_limits_are_of_the_points_that_were_chosen(order: str):
+def test_limits_are_of_the_points_that_were_chosen(order: Order):
     """Of ten points a pixel spans 1, 2 ... 10 cm."""
     points = replace(ten_points(), pixel_sizes=0.01 * np.arange(1, 11, dtype=np.float32))
     seeds = drawn(ImagePoints(order=order, smallest_pixels=2.0), 10, data_with(points))
@@ -89,7 +95,7 @@ def test_a_run_without_points_from_images_gives_none():
 
 
 @pytest.mark.parametrize("order", ["beyond_first", "random"])
-def test_of_the_points_in_a_cube_one_is_taken(order: str):
+def test_of_the_points_in_a_cube_one_is_taken(order: Order):
     points = triangulated([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.7, 0.1, 0.1]])
     for voxel, count in ((None, 3), (0.5, 2), (1.0, 1)):
         assert len(drawn(ImagePoints(order=order, voxel=voxel), 9, data_with(points))) == count

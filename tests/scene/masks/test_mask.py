@@ -22,6 +22,7 @@ from tests.scene.street import (
     training_data,
     view_at,
 )
+from tests.typed import as_a
 
 MASKS = {"static": static_mask, "rising": RisingMask}
 both = pytest.mark.parametrize("make", MASKS.values(), ids=MASKS.keys())
@@ -48,7 +49,7 @@ def test_the_contract():
     assert isinstance(RisingSettings(), MaskSettings)
     assert not isinstance(static_mask(), MaskSettings)
     with pytest.raises(TypeError, match="abstract"):
-        Mask()
+        Mask()  # pyright: ignore[reportAbstractUsage]
 
 
 @both
@@ -111,7 +112,7 @@ def test_a_node_is_built_with_its_mask(make: type[Mask]):
     assert node.mask.sparsity_weight == 0.5
     if make is RisingMask:
         times = tuple(training_data(held_out=frozenset({2})).times)
-        assert wanted.built_with == [(7, times)]
+        assert as_a(RisingSettings, wanted).built_with == [(7, times)]
         assert len(times) == NUM_FRAMES - 1
     unmasked = replace(settings, masked=False)
     assert unmasked.mask_settings is None
@@ -147,7 +148,7 @@ def test_a_checkpoint_from_after_the_mask_stage_loads_into_a_masked_node(make: t
     finished.finish_mask()
     fresh = SceneGraph({"road": masked(make(), count=4)})
     fresh.load_state_dict(SceneGraph({"road": finished}).state_dict())
-    road = fresh.nodes["road"]
+    road = as_a(Background, fresh.nodes["road"])
     assert road.mask is None
     assert len(road.rows) == len(finished.rows) != 4
     assert road.rows.columns().keys() == finished.rows.columns().keys()
@@ -161,7 +162,7 @@ def test_a_checkpoint_from_the_mask_stage_brings_the_mask_along(make: type[Mask]
     saved, fresh = masked(make()), masked(make(), count=4)
     if make is RisingMask:
         with torch.no_grad():
-            saved.mask.net.bias.fill_(0.2)
+            as_a(RisingMask, saved.mask).net.bias.fill_(0.2)
     fresh.load_state_dict(saved.state_dict())
     assert isinstance(fresh.mask, Mask)
     for time in (0.0, 0.45, 1.0):

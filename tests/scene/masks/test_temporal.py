@@ -14,6 +14,7 @@ from sparsestreet.scene.masks import BakedMask, MaskScope, MaskSettings, Tempora
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import RATES, background, degree, random_rows, view_at
+from tests.typed import there
 
 SETTINGS = TemporalMaskSettings(0.5, features=3, frames=2, width=5, octaves=2)
 TIMES = (0.0, 0.25, 0.5, 1.0)
@@ -104,7 +105,7 @@ def test_the_multipliers_gradient_is_that_of_the_scores():
     found = rows.mask_features.grad.clone()
     rows.mask_features.grad = None
     (mask.scores(rows, torch.tensor([[0.4]]))[:, 0] * cotangent).sum().backward()
-    assert torch.equal(found, rows.mask_features.grad)
+    assert torch.equal(found, there(rows.mask_features.grad))
 
 
 def test_the_image_may_be_kept_from_closing_masks():
@@ -115,7 +116,7 @@ def test_the_image_may_be_kept_from_closing_masks():
     found = rows.mask_features.grad.clone()
     rows.mask_features.grad = None
     (mask.scores(rows, torch.tensor([[0.4]]))[:, 0] * cotangent.clamp(max=0)).sum().backward()
-    assert torch.equal(found, rows.mask_features.grad)
+    assert torch.equal(found, there(rows.mask_features.grad))
     # So small a network has rows that no unit of it answers to: most of those pushed upwards move, the others never.
     moved = found.abs().sum(1) > 0
     assert moved[cotangent < 0].float().mean() > 0.5
@@ -191,9 +192,9 @@ def test_at_the_floor_the_best_rows_stay_and_show():
     # At the floor nothing is hidden, at no time.
     assert torch.stack([shown(node, time) for time in TIMES]).all()
     with torch.no_grad():
-        node.mask.last.bias += 20
-    assert not node.mask.keep(node.rows).floor_hit
-    assert node.mask.limit.item() == pytest.approx(0.01)
+        mask.last.bias.add_(20)
+    assert not mask.keep(node.rows).floor_hit
+    assert mask.limit.item() == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("min_gaussians", [0, 38])
@@ -224,8 +225,9 @@ def test_between_two_frames_a_row_shows_that_shows_at_either():
 def test_bits_of_many_frames_and_of_none():
     """Eleven frames need two bytes a row; an empty table has none."""
     where = scope([[frame / 10 for frame in range(11)]])
-    node = node_of(mask_of(where=where))
-    scores = node.mask.scores(node.rows, where.times)
+    mask = mask_of(where=where)
+    node = node_of(mask)
+    scores = mask.scores(node.rows, where.times)
     node.finish_mask()
     assert node.rows.mask_bits.shape == (40, 2)
     bits = np.unpackbits(node.rows.mask_bits.numpy(), axis=1, bitorder="little")[:, :11]
@@ -280,6 +282,6 @@ def test_settings_that_cannot_be():
     assert isinstance(SETTINGS, MaskSettings)
     for change in ({"features": 0}, {"width": 0}, {"frames": -1}, {"threshold": 1.0}):
         with pytest.raises(ValueError, match="mask"):
-            TemporalMaskSettings(1.0, **change)
+            replace(TemporalMaskSettings(1.0), **change)
     with pytest.raises(ValueError, match="sparsity_weight must be >= 0, got -1"):
         TemporalMaskSettings(-1.0)

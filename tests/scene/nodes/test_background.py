@@ -114,5 +114,5 @@ def test_an_empty_node():
     mask = static_mask(5)
     node = background(random_rows(0, 0, mask=mask), mask)
     assert len(node.gaussians_at(view_at(0.0), degree(1))) == 0
-    assert node.mask.scores(node.rows).shape == (0,)
+    assert mask.scores(node.rows).shape == (0,)
     assert mask.keep(node.rows).removed == 0

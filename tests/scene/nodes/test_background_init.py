@@ -4,10 +4,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
 from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.masks.static import StaticMask
 from sparsestreet.scene.nodes import Background, BackgroundSettings, RigidSettings
 from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Sweep
@@ -22,6 +24,7 @@ from tests.scene.street import (
     training_data,
     triangulated,
 )
+from tests.typed import as_a
 
 LIDAR_ONLY = background_settings(lidar=10_000)
 MOVERS = rigid_settings(classes=("Car", "Cyclist"))
@@ -89,7 +92,7 @@ def street_half_covered():
     log = street_log()
     depth = torch.zeros_like(log.frames[0].sky, dtype=torch.float32)
     depth[14:] = 5.0  # and the row above is near
-    frames = tuple(replace(frame, depth=depth) for frame in log.frames)
+    frames = Frames.of([replace(frame, depth=depth) for frame in log.frames])
     seen = [(point, view, point + 0.5, 8.5) for point in range(33) for view in range(NUM_FRAMES)]
     across = torch.stack((torch.full((33,), 20.0), torch.linspace(-9, 9, 33), torch.full((33,), 3.0)), 1)
     points = StreetPoints(triangulated(across.tolist(), seen, pixel_size=0.01), {})
@@ -154,7 +157,7 @@ def test_duplicated_returns_start_finite():
     log = street_log()
     sweep = log.sweeps[0]
     doubled = Sweep(0, sweep.points.repeat(5, 1), sweep.colors.repeat(5, 1), sweep.colored.repeat(5))
-    node = build(LIDAR_ONLY, log=replace(log, sweeps=(doubled,)))
+    node = build(LIDAR_ONLY, log=replace(log, sweeps=Sweeps.of((doubled,))))
     assert torch.isfinite(node.rows.log_scales).all()
     assert all(torch.isfinite(parameter).all() for parameter in node.parameters())
 
@@ -166,7 +169,7 @@ def test_a_mask_arrives_at_the_node():
     assert node.mask.settings is settings.mask
     assert node.mask.min_gaussians == 3
     assert node.mask.sparsity_weight == 0.5
-    assert node.mask.scores(node.rows).shape == (len(node.rows),)
+    assert as_a(StaticMask, node.mask).scores(node.rows).shape == (len(node.rows),)
 
 
 def test_a_mask_that_is_not_trained_in_this_run_leaves_no_column():
@@ -177,7 +180,7 @@ def test_a_mask_that_is_not_trained_in_this_run_leaves_no_column():
 
 def test_a_log_without_lidar_starts_from_images_and_guesses(caplog):
     points = triangulated([[20.0, 0.0, 1.0]] * 50, [(point, 0, 16.5, 8.5) for point in range(50)])
-    data = training_data(replace(street_log(), sweeps=()), points=StreetPoints(points, {}))
+    data = training_data(replace(street_log(), sweeps=Sweeps.of(())), points=StreetPoints(points, {}))
     with caplog.at_level(logging.INFO):
         node = started(data)
     # 9 of the 16 x 33 pixels of one of five views are near a point: 0.5 of 160 points, the rest is guessed.
@@ -186,7 +189,7 @@ def test_a_log_without_lidar_starts_from_images_and_guesses(caplog):
 
 
 def test_a_log_of_pictures_alone_starts_from_guesses():
-    assert len(started(training_data(replace(street_log(), sweeps=()))).rows) == 160
+    assert len(started(training_data(replace(street_log(), sweeps=Sweeps.of(())))).rows) == 160
 
 
 def test_nothing_to_start_from_is_an_error():

@@ -10,6 +10,7 @@ from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import TemporalMaskSettings
+from sparsestreet.scene.masks.temporal import TemporalMask
 from sparsestreet.scene.nodes import Deformable, DeformableSettings, NetworkSettings
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED, SceneState
@@ -27,6 +28,7 @@ from tests.scene.street import (
     training_data,
     view_at,
 )
+from tests.typed import as_a
 
 NETWORK = NetworkSettings(width=16, depth=3, skip=1, position_octaves=3, time_octaves=3, scales=False)
 SIZES = torch.tensor([[2.0, 0.6, 1.8], [0.8, 0.8, 1.6], [1.0, 1.0, 1.0]])
@@ -177,7 +179,9 @@ def test_a_mask_over_time_counts_places_from_each_box():
     node = settings.build(training_data(movers=settings), torch.Generator().manual_seed(3))
     with torch.no_grad():
         node.rows.means[:2] = torch.tensor([[0.5], [-0.5]]) * node.sizes[node.rows.instances[:2]]
-    torch.testing.assert_close(node.mask._places(node.rows)[:2], torch.tensor([[1.0], [-1.0]]).expand(2, 3))
+    torch.testing.assert_close(
+        as_a(TemporalMask, node.mask)._places(node.rows)[:2], torch.tensor([[1.0], [-1.0]]).expand(2, 3)
+    )
 
 
 def test_rows_come_and_go():
@@ -202,7 +206,7 @@ def test_a_scene_file_keeps_it(tmp_path):
     stored = StoredScene(SceneGraph({"objects": node}), RenderOptions(), "hand-made", 5)
     save_scene(tmp_path / "scene.safetensors", stored)
     loaded = load_scene(tmp_path)
-    again = loaded.scene.nodes["objects"]
+    again = as_a(Deformable, loaded.scene.nodes["objects"])
     assert again.settings == replace(node.settings, classes=list(node.settings.classes))
     assert again.instances().names == ("bicycle", "walker", "unseen")
     assert torch.equal(again.embeddings, node.embeddings)

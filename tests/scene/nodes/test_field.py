@@ -1,5 +1,7 @@
 """A street that a network deforms: which rows, from when on, where it looks, what is learned, what a file keeps."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -12,6 +14,7 @@ from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import RATES, background_settings, camera_at, random_rows, street_log, training_data, view_at
+from tests.typed import as_a, there
 
 CENTER, RADIUS, NUM_FRAMES = torch.tensor([1.0, -2.0, 0.5]), 4.0, 21
 NETWORK = NetworkSettings(width=16, depth=3, skip=1, position_octaves=4, time_octaves=3)
@@ -19,7 +22,7 @@ NETWORK = NetworkSettings(width=16, depth=3, skip=1, position_octaves=4, time_oc
 
 def field_settings(**changes) -> FieldSettings:
     said = {"kind": FieldSettings, "network": NETWORK, "learning_rates": RATES | {"network": LearningRate(0.01)}}
-    return background_settings(**(said | changes))
+    return as_a(FieldSettings, background_settings(**(said | changes)))
 
 
 def street(count: int = 30, *, awake: bool = True, **changes) -> Field:
@@ -56,7 +59,7 @@ def test_all_rows_are_deformed_by_what_the_network_says_of_their_place(reach: fl
     raw, stored = node.raw_at(view_at(0.3), FINISHED), node.stored(view_at(0.3))
     change = node.network(contracted(node.rows.means.detach()).float(), 0.3)
     # Rounding of a position is 512 times as large behind nine octaves; here are four.
-    close = {"rtol": 1e-4, "atol": 1e-5}
+    close: dict[str, Any] = {"rtol": 1e-4, "atol": 1e-5}
     torch.testing.assert_close(raw.means, stored.means + change.means, **close)
     torch.testing.assert_close(raw.quaternions, normalized(stored.quaternions) + change.quaternions, **close)
     torch.testing.assert_close(raw.log_scales, stored.log_scales + change.log_scales, **close)
@@ -138,8 +141,8 @@ def test_gradients_reach_rows_and_network_but_not_positions_through_it():
     node = street()
     raw = node.raw_at(view_at(0.3), FINISHED)
     (raw.means.sum() + raw.log_scales.sum() + raw.quaternions.square().sum()).backward()
-    assert torch.equal(node.rows.means.grad, torch.ones(30, 3))
-    assert torch.equal(node.rows.log_scales.grad, torch.ones(30, 3))
+    assert torch.equal(there(node.rows.means.grad), torch.ones(30, 3))
+    assert torch.equal(there(node.rows.log_scales.grad), torch.ones(30, 3))
     assert all(parameter.grad.any() for parameter in node.network.parameters())
     assert node.rows.quaternions.grad.any()
     assert node.rows.opacity_logits.grad is None
@@ -171,7 +174,7 @@ def test_a_scene_file_keeps_it(tmp_path):
     stored = StoredScene(SceneGraph({"street": node}), RenderOptions(), "hand-made", NUM_FRAMES)
     save_scene(tmp_path / "scene.safetensors", stored)
     loaded = load_scene(tmp_path)
-    again = loaded.scene.nodes["street"]
+    again = as_a(Field, loaded.scene.nodes["street"])
     assert (again.radius, again.num_frames, again.seed) == (RADIUS, NUM_FRAMES, 5)
     assert again.settings.network == NETWORK
     for time in (0.0, 0.4, 1.0):

@@ -25,6 +25,7 @@ from tests.scene.street import (
     track,
     training_data,
 )
+from tests.typed import as_a
 
 NAMES = ["tram 7", "car/A", "car B"]
 SIZES = torch.tensor([[20.0, 3.0, 3.0], [4.0, 2.0, 1.5], [4.0, 2.0, 1.5]])
@@ -98,7 +99,7 @@ def test_through_densify_cull_masks_and_storage(tmp_path: Path):
     assert_whose(node, [1, 2, 1, 2, 1, 2, 1])
     stored = StoredScene(SceneGraph({"cars": node}), RenderOptions(SplatSettings()), "hand-made", 2)
     save_scene(tmp_path / "scene.safetensors", stored)
-    assert_whose(load_scene(tmp_path).scene.nodes["cars"], [1, 2, 1, 2, 1, 2, 1])
+    assert_whose(as_a(Rigid, load_scene(tmp_path).scene.nodes["cars"]), [1, 2, 1, 2, 1, 2, 1])
 
 
 def test_rows_outside_of_their_box_by_more_than_the_margin():
@@ -153,4 +154,4 @@ def test_limits_that_contradict_each_other_are_refused(make: type[NodeSettings])
 def test_a_node_is_said_by_its_fields_only():
     """Positional settings would let a new field change the meaning of an old configuration."""
     with pytest.raises(TypeError):
-        type(background_settings())(("Car",))
+        type(background_settings())(("Car",))  # pyright: ignore[reportCallIssue]

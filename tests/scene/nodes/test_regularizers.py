@@ -147,7 +147,7 @@ def test_nodes_have_the_terms_that_their_settings_weigh():
     assert terms["road/sharp_shape"].item() == pytest.approx(0.5 * sharp_shape(road.rows.log_scales, 2.0).item())
     # |0 + 3 - 4| and |0 + 0 - 2| over three coordinates.
     assert terms["cars/temporal_smooth"].item() == pytest.approx(0.01 * 3 / 3)
-    sum(terms.values()).backward()
+    torch.stack(list(terms.values())).sum().backward()
     assert float(road.rows.log_scales.grad.abs().sum()) > 0
     # Learned corrections, not annotations, are pulled straight.
     assert cars.translation_deltas.grad[0, :, :2].tolist() == [

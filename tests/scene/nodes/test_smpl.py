@@ -14,6 +14,7 @@ from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.masks import StaticMaskSettings, TemporalMaskSettings
+from sparsestreet.scene.masks.temporal import TemporalMask
 from sparsestreet.scene.nodes import Smpl
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED, SceneState
@@ -23,6 +24,7 @@ from sparsestreet.types import Track
 from tests.geometry.test_skeleton import oracle
 from tests.scene.people import SHIRT, bent, data_of, smpl, smpl_settings, walker
 from tests.scene.street import NUM_FRAMES, triangulated, view_at
+from tests.typed import as_a, there
 
 TEMPLATE = BuiltinBody(500).load()
 VERTICES = len(TEMPLATE.vertices)
@@ -45,7 +47,7 @@ def test_terms_are_of_rows_that_are_drawn():
     """Somebody out of view is left alone: Adam would follow the terms alone, at its full rate."""
     node = smpl(walker(), walker("other", y=2.0))
     drawn = node.rows.instances == 1
-    sum(terms(node, drawn=drawn).values()).backward()
+    torch.stack(list(terms(node, drawn=drawn).values())).sum().backward()
     assert not node.rows.log_scales.grad[~drawn].any()
     assert node.rows.log_scales.grad[drawn].any()
     alone = {name: term.item() for name, term in terms(smpl(walker("other", y=2.0))).items()}
@@ -95,7 +97,7 @@ def test_a_mask_over_time_counts_places_from_each_body():
     """From -1 to 1 along each axis, of a child as of somebody tall."""
     people = (walker(height=1.2), walker("tall", height=1.9, y=3.0))
     node = smpl(*people, mask=TemporalMaskSettings(1e-4), masked=True)
-    places = node.mask._places(node.rows).view(2, VERTICES, 3)
+    places = as_a(TemporalMask, node.mask)._places(node.rows).view(2, VERTICES, 3)
     torch.testing.assert_close(places.amax(1), torch.ones(2, 3))
     torch.testing.assert_close(places.amin(1), -torch.ones(2, 3))
 
@@ -139,7 +141,7 @@ def test_corrections_of_joints_turn_in_the_frame_of_the_joint():
     """R exp([delta]), as for boxes; scenes that are stored depend on the order."""
     node = smpl(walker())
     with torch.no_grad():
-        node.joint_deltas += torch.randn(node.joint_deltas.shape, generator=torch.Generator().manual_seed(2))
+        node.joint_deltas.add_(torch.randn(node.joint_deltas.shape, generator=torch.Generator().manual_seed(2)))
     found = node.joint_rotations(1 / (NUM_FRAMES - 1))[0, 1:].detach()
     keyframes = Rotation.from_quat(node.joint_keyframes[0, 1].numpy(), scalar_first=True)
     corrected = keyframes * Rotation.from_rotvec(node.joint_deltas[0, 1].detach().numpy())
@@ -161,9 +163,9 @@ def test_frames_without_a_pose_are_between_those_that_have_one():
 def test_nothing_of_held_out_frames_is_used():
     # Frame 3 has no pose of its own: it is between 1 and 4, not between 2 and 4.
     track = walker(valid=(True, True, True, False, True))
-    changed = replace(track, body=replace(track.body, rotations=track.body.rotations.flip(2)))
+    changed = replace(track, body=replace(there(track.body), rotations=track.body.rotations.flip(2)))
     mixed = torch.where(torch.arange(NUM_FRAMES)[:, None, None] == 2, changed.body.rotations, track.body.rotations)
-    other = replace(track, body=replace(track.body, rotations=mixed))
+    other = replace(track, body=replace(there(track.body), rotations=mixed))
     nodes = [smpl(person, held_out=frozenset({2})) for person in (track, other)]
     for (name, first), second in zip(nodes[0].state_dict().items(), nodes[1].state_dict().values(), strict=True):
         assert torch.equal(first, second), name
@@ -269,7 +271,7 @@ def test_regularizers_by_hand():
 def test_regularizers_have_finite_gradients_where_all_neighbors_are_equal():
     """The slope of a standard deviation of 0 is none."""
     node = smpl(walker(), smoothness_weight=1.0)
-    sum(terms(node).values()).backward()
+    torch.stack(list(terms(node).values())).sum().backward()
     for name, parameter in node.named_parameters():
         assert parameter.grad is None or torch.isfinite(parameter.grad).all(), name
 
@@ -314,8 +316,8 @@ def test_gradients_of_corrections_are_finite_differences():
 def test_a_scene_file_brings_people_back(mask, tmp_path):
     node = smpl(walker(), walker("other", y=2.0, seed=4), mask=mask, masked=mask is not None)
     with torch.no_grad():
-        node.joint_deltas += 0.1 * torch.randn(node.joint_deltas.shape, generator=torch.Generator().manual_seed(2))
-        node.rotation_deltas += 0.1
+        node.joint_deltas.add_(0.1 * torch.randn(node.joint_deltas.shape, generator=torch.Generator().manual_seed(2)))
+        node.rotation_deltas.add_(0.1)
     save_scene(tmp_path / "scene.safetensors", StoredScene(SceneGraph({"people": node}), RenderOptions(), "x", 5))
     again = load_scene(tmp_path / "scene.safetensors").scene.nodes["people"]
     assert isinstance(again, Smpl)
@@ -338,7 +340,7 @@ def test_a_checkpoint_of_fewer_rows_fits():
     small, large = smpl(walker()), smpl(walker())
     small.rows.resize(RowPlan.keep(torch.arange(VERTICES) % 2 == 0))
     with torch.no_grad():
-        small.joint_deltas += 0.1
+        small.joint_deltas.add_(0.1)
     large.load_state_dict(small.state_dict())
     first, second = (node.gaussians_at(view_at(0.4), SceneState()) for node in (small, large))
     assert torch.equal(first.means, second.means)

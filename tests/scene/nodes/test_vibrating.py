@@ -25,6 +25,7 @@ from tests.scene.street import (
     training_data,
     view_at,
 )
+from tests.typed import as_a
 
 NUM_FRAMES = 31
 DURATION = 0.6  # 0.02 a frame
@@ -34,7 +35,7 @@ OWN_RATES = RATES | {name: LearningRate(0.02) for name in NAMES}
 
 def vibrating_settings(**changes) -> VibratingSettings:
     said = {"kind": VibratingSettings, "learning_rates": OWN_RATES, "smoothing_probability": 0.0}
-    return background_settings(**(said | changes))
+    return as_a(VibratingSettings, background_settings(**(said | changes)))
 
 
 def vibrating_rows(count: int, seed: int = 0, mask=None, dtype: torch.dtype = torch.float32) -> Rows:
@@ -234,7 +235,7 @@ def test_a_scene_file_keeps_it(tmp_path):
     stored = StoredScene(SceneGraph({"street": node}), RenderOptions(), "hand-made", NUM_FRAMES)
     save_scene(tmp_path / "scene.safetensors", stored)
     loaded = load_scene(tmp_path)
-    again = loaded.scene.nodes["street"]
+    again = as_a(Vibrating, loaded.scene.nodes["street"])
     assert (again.num_frames, again.seed, again.settings.velocity_weight) == (NUM_FRAMES, 7, 0.25)
     for time in (0.0, 0.4, 1.0):
         assert torch.equal(loaded.render(view_at(time)).rgb, stored.render(view_at(time)).rgb)

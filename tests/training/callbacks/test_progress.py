@@ -10,6 +10,7 @@ from rich.console import Console
 
 from sparsestreet.training.callbacks import TrainingProgress, progress
 from tests.training.stubs import StubTrainer, background, make_system, rigid
+from tests.typed import as_a, there
 
 
 def trainer_of(max_steps: int, resumed_at: int = 0) -> StubTrainer:
@@ -44,14 +45,15 @@ def test_without_a_terminal_there_is_a_line_per_tenth(caplog, max_steps, steps):
 
 
 def test_of_several_processes_the_first_alone_shows_it(caplog, monkeypatch):
-    console = Console(file=io.StringIO(), force_terminal=True)
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True)
     monkeypatch.setattr(progress, "Console", lambda: console)
     trainer = trainer_of(10)
     trainer.is_global_zero = False
     with caplog.at_level(logging.INFO):
         trainer.start()
         trainer.walk(10)
-    assert (caplog.messages, console.file.getvalue()) == ([], "")
+    assert (caplog.messages, screen.getvalue()) == ([], "")
 
 
 def test_a_line_by_hand(caplog, seconds):
@@ -78,10 +80,10 @@ def test_on_a_terminal_there_is_one_bar_until_training_ends(monkeypatch, caplog,
     screen = io.StringIO()
     monkeypatch.setattr(progress, "Console", lambda: Console(file=screen, force_terminal=True, width=200))
     trainer = trainer_of(35, resumed_at=10)
-    callback = trainer.callbacks[0]
+    callback = as_a(TrainingProgress, trainer.callbacks[0])
     with caplog.at_level(logging.INFO):
         trainer.start()
-        bar = callback._bar
+        bar = there(callback._bar)
         assert (bar.tasks[0].completed, bar.tasks[0].total) == (10, 35)
         trainer.walk(19)
         assert bar.tasks[0].completed == 10

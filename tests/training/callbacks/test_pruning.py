@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
 from sparsestreet.pruning import ImportanceRule, PruningRule, RenderContext
@@ -32,8 +33,9 @@ class AskedRule(PruningRule):
 
 def street_data() -> StreetData:
     """Seven instants; 1 and 4 are held out."""
-    frames = tuple(frame_at(index) for index in range(7))
-    return StreetData(DrivingLog("seven", frames, (), (), 7, 1, torch.eye(4).double()), stride=3, offset=1)
+    frames = Frames.of([frame_at(index) for index in range(7)])
+    log = DrivingLog("seven", frames, Sweeps.of(()), (), 7, 1, torch.eye(4).double())
+    return StreetData(log, stride=3, offset=1)
 
 
 def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_todays_look():

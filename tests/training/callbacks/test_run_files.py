@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
 from sparsestreet.records.run import RUN
@@ -36,7 +37,7 @@ def trainer(tmp_path) -> StubTrainer:
     clock.load_state_dict({"seconds": 12.5})
     trainer = StubTrainer(make_system(nodes, options=OPTIONS), [RunFiles(tmp_path, make_run(), clock)], max_steps=10)
     frames = tuple(replace(frame_at(index), seconds=0.25 * index, stamp=250_000_000 * index) for index in range(7))
-    log = DrivingLog("seven", frames, (), (), 7, 1, torch.eye(4).double())
+    log = DrivingLog("seven", Frames.of(frames), Sweeps.of(()), (), 7, 1, torch.eye(4).double())
     trainer.datamodule = StreetData(log, stride=3, offset=1)
     trainer.walk(3)
     return trainer
@@ -100,9 +101,10 @@ def test_run_json_names_the_nodes_that_their_limit_held_down(trainer, tmp_path):
 
 def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
     system = make_system({"background": background(8, max_gaussians=6)})
-    trainer = StubTrainer(system, [RunFiles(tmp_path, make_run(), Clock())])
+    callback = RunFiles(tmp_path, make_run(), Clock())
+    trainer = StubTrainer(system, [callback])
     resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(8) < 6), "cull")
-    assert trainer.callbacks[0].caps == {}
+    assert callback.caps == {}
 
 
 def test_a_resumed_run_remembers_the_limits(trainer, tmp_path):

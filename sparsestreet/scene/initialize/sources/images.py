@@ -11,6 +11,7 @@ from sparsestreet.scene.initialize.coverage import Coverage, beyond_lidar
 from sparsestreet.scene.initialize.points import Points, thinned
 from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.triangulation import TriangulatedPoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,13 +48,14 @@ class ImagePoints(PointSource):
         if data.image_points is None:
             return self.seeds(Points.concatenate([]))
         found = data.image_points.static
-        chosen = self._chosen(count, data, generator)
+        chosen = self._chosen(found, count, data, generator)
         points = Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors)).at(chosen)
         pixel = torch.from_numpy(found.pixel_sizes)[chosen]
         return self.seeds(points, self.smallest_pixels * pixel, self.largest_pixels * pixel)
 
-    def _chosen(self, count: int, data: TrainingData, generator: torch.Generator) -> Int[Tensor, " k"]:
-        found = data.image_points.static
+    def _chosen(
+        self, found: TriangulatedPoints, count: int, data: TrainingData, generator: torch.Generator
+    ) -> Int[Tensor, " k"]:
         if self.voxel is None:
             order = torch.randperm(len(found), generator=generator)
         else:

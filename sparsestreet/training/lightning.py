@@ -1,0 +1,20 @@
+"""What Lightning's trainer holds and does not declare."""
+
+from lightning import Callback, Trainer
+
+from sparsestreet.data.datamodule import StreetData
+
+
+def data_of(trainer: Trainer) -> StreetData:
+    """The data module that it trains on."""
+    return trainer.datamodule  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def callbacks_of(trainer: Trainer) -> list[Callback]:
+    """The callbacks, in their order."""
+    return trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def is_dev_run(trainer: Trainer) -> bool:
+    """Whether it only tries a few steps (``fast_dev_run``)."""
+    return bool(trainer.fast_dev_run)  # pyright: ignore[reportAttributeAccessIssue]
