@@ -26,7 +26,7 @@ def config_problem(cfg: DictConfig) -> str | None:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         return _in_one_line(error)
-    return next(_wrong_types(tree), None) or _device_problem(cfg)
+    return next(_parts_without_keys(tree), None) or next(_wrong_types(tree), None) or _device_problem(cfg)
 
 
 def unresolvable(cfg: DictConfig) -> str | None:
@@ -48,6 +48,14 @@ def _in_one_line(error: OmegaConfBaseException) -> str:
         key = error.full_key
         return f"{key} follows from {absent[1]!r}, which these choices lack: choose another option, or give {key}=..."
     return reason.partition("interpolation: ")[2] or reason
+
+
+def _parts_without_keys(tree: Tree) -> Iterator[str]:
+    """Nodes, effects, losses and callbacks that are a plain value."""
+    for group in ("node", "effects", "loss", "callback"):
+        for name, value in (tree[group] or {}).items():
+            if not isinstance(value, dict):
+                yield f"{group}.{name} has keys of its own, got {value!r}: set one of them, or say ~{group}.{name}"
 
 
 def _wrong_types(tree: Tree, path: str = "", kind: typing.Any = None) -> Iterator[str]:

@@ -46,7 +46,7 @@ class TrainSchema:
     preset: Tree = MISSING
     sparsify: Tree = MISSING
     node: Tree = MISSING
-    effects: Any = None
+    effects: Tree | None = None
     image_points: Any = None
     loss: Tree = MISSING
     callback: Tree = MISSING

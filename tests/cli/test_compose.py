@@ -75,6 +75,8 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
         ("density@node.background.density=vibrating", "density.cycle follows from 'cycle', which these choices"),
         ("node.rigid.prunable=3", "node.rigid.prunable must be bool, got 3"),
         ("effects.sky.when=never", "effects.sky.when must be Literal['auto', 'on', 'off'], got 'never'"),
+        ("effects.sky=none", "effects.sky has keys of its own, got 'none': set one of them, or say ~effects.sky"),
+        ("loss.depth=3", "loss.depth has keys of its own, got 3"),
         ("loss.sky.weight=true", "loss.sky.weight must be float, got True"),
         ("node.rigid.classes=Car", "node.rigid.classes must be"),
         ("data.log.settings.lens=[a,0.1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0]", "data.log.settings.lens must be"),

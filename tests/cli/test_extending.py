@@ -21,7 +21,7 @@ from sparsestreet.records.run import RUN
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.scene.masks import StaticMask
+from sparsestreet.scene.masks import MaskScope, StaticMask
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.views import read_views
@@ -129,7 +129,8 @@ def test_a_density_strategy():
 
 def test_a_mask():
     settings = recipe_of(composed("sparsify=masks", PROBIT)).nodes["background"]
-    mask = as_a(ProbitMaskSettings, settings.mask_settings).build(settings.min_gaussians)
+    scope = MaskScope.whole([0.0, 1.0], torch.zeros(3), radius=1.0)
+    mask = as_a(ProbitMaskSettings, settings.mask_settings).build(settings.min_gaussians, scope)
     assert isinstance(mask, ProbitMask)
     assert mask.settings == ProbitMaskSettings(sparsity_weight=2.5e-3)
     rows = make_rows(3, columns={"mask_logits": torch.tensor([-2.5, -2.0, 1.0])})

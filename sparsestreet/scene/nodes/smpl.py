@@ -16,6 +16,7 @@ from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.body import Body, BodyTemplate, BuiltinBody, surface
+from sparsestreet.scene.body.anatomy import Anatomy
 from sparsestreet.scene.body.people import People, people_of, trained_poses
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.boxes import lidar_in_boxes
@@ -159,25 +160,6 @@ def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
     turn = torch.stack((1 + z, -y, x, torch.zeros_like(z)), 1)
     down = torch.tensor([0.0, 1.0, 0.0, 0.0])
     return quat.normalized(torch.where((z < -0.9999)[:, None], down, turn))
-
-
-@dataclass(frozen=True)
-class Anatomy:
-    """The data that move v vertices of i people, with k keyframes each."""
-
-    vertices: Float[Tensor, "v 3"]
-    """Vertices of the template at rest, which define neighbors."""
-    attached: Int[Tensor, "v m"]
-    """Joints that move each vertex."""
-    weights: Float[Tensor, "v m"]
-    joints: Float[Tensor, "i 24 3"]
-    """Joints at rest, relative to the pelvis, meters."""
-    keyframes: Float[Tensor, "i k 23 4"]
-    """Rotations of all joints but the pelvis, relative to their parents."""
-
-    @staticmethod
-    def of(template: BodyTemplate, people: People) -> "Anatomy":
-        return Anatomy(template.vertices, *template.influences(), people.joints, people.rotations)
 
 
 class Smpl(Tracked):

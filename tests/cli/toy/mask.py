@@ -1,6 +1,5 @@
 """A mask of one's own: settings that build it, and what differs from the mask that is there."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,14 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMask, StaticMaskSettings
+from sparsestreet.scene.masks import MaskScope, StaticMask, StaticMaskSettings
 
 
 @dataclass(frozen=True)
 class ProbitMaskSettings(StaticMaskSettings):
     """The options of the static mask, for another curve between logit and score."""
 
-    def build(self, min_gaussians: int, times: Sequence[float] = ()) -> "ProbitMask":
+    def build(self, min_gaussians: int, scope: MaskScope) -> "ProbitMask":
         return ProbitMask(self, min_gaussians)
 
 
