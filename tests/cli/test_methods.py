@@ -22,6 +22,7 @@ from sparsestreet.scene.initialize.sources import ImagePoints
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
+from sparsestreet.training.losses import MaskSparsity
 from sparsestreet.triangulation import ImagePointSettings
 from tests.cli.configurations import composed
 from tests.typed import as_a, there
@@ -87,13 +88,13 @@ def test_schedules_and_capacities(schedule: str, capacity: str):
 
 def test_a_preset_reaches_the_density_of_every_node():
     nodes = recipe_of(composed("preset=current")).nodes.values()
-    assert [settings.density.grad_threshold for settings in nodes] == [5e-4, 5e-4]
+    assert [as_a(GradientDensity, settings.density).grad_threshold for settings in nodes] == [5e-4, 5e-4]
 
 
 def test_before_removal_masks_are_pushed_by_a_weight_of_their_own():
     """In a short run less than masks alone (conf/schedule/short.yaml says why)."""
     cfg = composed("sparsify=removal")
-    weight = recipe_of(cfg).losses["mask_sparsity"].weight
+    weight = as_a(MaskSparsity, recipe_of(cfg).losses["mask_sparsity"]).weight
     assert weight == cfg.schedule.removal_lambda_m < cfg.schedule.lambda_m
 
 
