@@ -8,17 +8,9 @@ import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-
-@typing.runtime_checkable
-class Dataclass(typing.Protocol):
-    """An instance of any dataclass."""
-
-    __dataclass_fields__: typing.ClassVar[dict[str, Any]]
-
-
-Options = TypeVar("Options", bound=Dataclass)
+Options = TypeVar("Options")
 
 FEW = 20
 """Keys that an error still lists."""
@@ -73,7 +65,8 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | N
     Raises OptionError.
     """
     hints = typing.get_type_hints(kind)
-    names = [field.name for field in fields(kind) if field.name != positional]
+    declared = fields(cast(Any, kind))  # no annotation says that it is a dataclass
+    names = [field.name for field in declared if field.name != positional]
     given: dict[str, Any] = {}
     loose = []
     for word in words:
@@ -91,7 +84,7 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | N
         raise OptionError(f"{loose[0]!r} is no option: write key=value, with one of {', '.join(names)}")
     if positional is not None:
         given[positional] = tuple(_value(positional, word, typing.get_args(hints[positional])[0]) for word in loose)
-    for field in fields(kind):
+    for field in declared:
         if field.default is MISSING and field.name not in given:
             raise OptionError(f"{field.name}=... is missing")
     try:
