@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import jaxtyping
@@ -41,12 +41,21 @@ def kitti() -> Path:
     return root
 
 
-@contextmanager
-def unchecked() -> Iterator[None]:
+def unchecked() -> AbstractContextManager[None]:
     """Without checks of shapes, for what other tests are about: the tracer's many small calls take four times as long
     with them."""
+    return _disabled(True)
+
+
+def checked() -> AbstractContextManager[None]:
+    """With checks of shapes, where a training has ended them (cli/conftest.py)."""
+    return _disabled(False)
+
+
+@contextmanager
+def _disabled(disabled: bool) -> Iterator[None]:
     before = jaxtyping.config.jaxtyping_disable
-    jaxtyping.config.update("jaxtyping_disable", True)
+    jaxtyping.config.update("jaxtyping_disable", disabled)
     try:
         yield
     finally:

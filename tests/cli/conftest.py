@@ -22,7 +22,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class OneStepChecked(Callback):
-    """Shapes are checked in the first step of a training: they cost half of each, and the next ones are alike."""
+    """Shapes are checked up to the first step of a training. The next ones are alike, and of evaluations one is checked
+    (test_train.py): checks take half of the time of both."""
 
     def on_train_batch_end(self, *arguments: Any) -> None:
         jaxtyping.config.update("jaxtyping_disable", True)
@@ -33,16 +34,19 @@ def one_step_checked() -> Iterator[None]:
     fit = Trainer.fit
 
     def checked_once(trainer: Trainer, *arguments: Any, **options: Any) -> None:
-        before = jaxtyping.config.jaxtyping_disable
         callbacks_of(trainer).append(OneStepChecked())
-        try:
-            fit(trainer, *arguments, **options)
-        finally:
-            jaxtyping.config.update("jaxtyping_disable", before)
+        fit(trainer, *arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Trainer, "fit", checked_once)
         yield
+
+
+@pytest.fixture(autouse=True)
+def _checked_again() -> Iterator[None]:
+    """Whatever a training left, of this test or of a fixture before it."""
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

@@ -168,6 +168,7 @@ def test_a_failure_stands_until_its_job_succeeds(tmp_path, monkeypatch, capsys):
     assert sweep_status() == 0
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, capsys):
     """The control comes before its run and fails, the other stands; the same command makes it good."""
     command = [

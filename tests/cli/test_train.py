@@ -31,7 +31,7 @@ from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import read_views
 from tests.cli.conftest import TIMED_BY_DEFAULT
 from tests.cli.recompute import recompute
-from tests.conftest import unchecked
+from tests.conftest import checked, unchecked
 from tests.metrics.networks import random_weights, write_weights
 from tests.typed import as_a, there
 
@@ -59,7 +59,8 @@ def evaluated_again(finished, tmp_path_factory) -> Path:
     shutil.copytree(finished, out)
     before = torch.get_num_threads()
     torch.set_num_threads(before + 1)  # evaluate goes back to the number that trained
-    assert evaluate([f"run={out}"]) == 0
+    with checked():
+        assert evaluate([f"run={out}"]) == 0
     torch.set_num_threads(before)
     return out
 
@@ -225,9 +226,9 @@ def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monk
     out = tmp_path / "again"
     shutil.copytree(finished, out)
     with unchecked():
-        assert evaluate([f"run={out}", "novel=1,2", "presets=default,fast"]) == 0
+        assert evaluate([f"run={out}", "novel=1", "presets=default,fast"]) == 0
     shifts = NOVEL.read(out).shifts
-    assert [(one.offset, one.views) for one in shifts] == [(1.0, 2), (-1.0, 2), (2.0, 2), (-2.0, 2)]
+    assert [(one.offset, one.views) for one in shifts] == [(1.0, 2), (-1.0, 2)]
     for one in shifts:
         assert one.true_views > 0
         # After 60 steps a scene is blurred everywhere: what it shows from a meter aside is no sharper or much worse.

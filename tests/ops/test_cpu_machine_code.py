@@ -60,7 +60,9 @@ def compiled(place: Path, *options: str, file: str = "instance.cpp") -> subproce
     return subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize(
+    "target", ["baseline", *(pytest.param(name, marks=pytest.mark.slow) for name in [*TARGETS][1:])]
+)
 def test_without_effects_the_projection_is_the_same_machine_code(tmp_path, target):
     objects = []
     for name, replaced in (("with", {}), ("without", EMPTY)):

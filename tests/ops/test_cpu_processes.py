@@ -68,14 +68,13 @@ def run(script: Path, text: str, *arguments: str) -> None:
     assert answer.returncode == 0, answer.stderr
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_in_a_worker_process(method, tmp_path):
-    run(tmp_path / "script.py", SCENE + WORKER, method)
+def test_in_a_spawned_process(tmp_path):
+    run(tmp_path / "script.py", SCENE + WORKER, "spawn")
+
+
+def test_loaded_after_torch_and_in_a_forked_process(tmp_path):
+    run(tmp_path / "script.py", SCENE + SUBNORMALS + WORKER, "fork")
 
 
 def test_loaded_before_torch(tmp_path):
     run(tmp_path / "script.py", LOADED_FIRST + SCENE + SUBNORMALS, str(find_library()))
-
-
-def test_loaded_after_torch(tmp_path):
-    run(tmp_path / "script.py", SCENE + SUBNORMALS)
