@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import jaxtyping
@@ -41,15 +41,19 @@ def kitti() -> Path:
     return root
 
 
-def unchecked() -> AbstractContextManager[None]:
+@contextmanager
+def unchecked() -> Iterator[None]:
     """Without checks of shapes, for what other tests are about: the tracer's many small calls take four times as long
     with them."""
-    return _disabled(True)
+    with _disabled(True):
+        yield
 
 
-def checked() -> AbstractContextManager[None]:
+@contextmanager
+def checked() -> Iterator[None]:
     """With checks of shapes, where a training has ended them (cli/conftest.py)."""
-    return _disabled(False)
+    with _disabled(False):
+        yield
 
 
 @contextmanager
