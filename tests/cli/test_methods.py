@@ -31,8 +31,8 @@ METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
 PAIRS = list(itertools.product(METHODS, SPARSIFY))
 DAILY = [("3dgs", "removal"), ("omnire", "removal"), ("pvg", "masks"), ("deformgs", "none")]
-"""The pairs that a daily run trains: every method, every stage. The run of conftest.py is StreetGS; test_toy_node.py has
-the rule of the paper."""
+"""The pairs that a daily run trains: every method, every stage. The run of conftest.py is StreetGS. The rule of the
+paper takes part in test_toy_node.py."""
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 
