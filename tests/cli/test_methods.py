@@ -72,7 +72,7 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [METHODS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in METHODS[1:])])
 def test_every_experiment_composes(experiment: str, method: str):
     recipe_of(composed(f"experiment={experiment}", f"method={method}"))
 

@@ -1,11 +1,14 @@
 """Triton's interpreter in reasonable time: what it needs not do left out, costly cases left to ``make test-all``."""
 
+from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
 
 from sparsestreet.ops.backend import has_triton
+from tests.conftest import unchecked
 
 INTERPRETED = has_triton() and not torch.cuda.is_available()
 if INTERPRETED:
@@ -17,6 +20,16 @@ if INTERPRETED:
     def _overflow(request: pytest.FixtureRequest) -> None:
         """Integers are watched in the tests that only ``make test-all`` runs."""
         check_overflow(request.node.get_closest_marker("slow") is not None)
+
+
+ON_NUMBERS = ("test_hard_", "test_effects_", "test_guards_drawn", "test_properties")
+"""Many small scenes through the whole op, whose shapes the tests of each backend check."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _checks(request: pytest.FixtureRequest) -> Iterator[None]:
+    with unchecked() if request.path.stem.startswith(ON_NUMBERS) else nullcontext():
+        yield
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
