@@ -271,9 +271,10 @@ def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_p
         assert evaluate([f"run={out}"]) == 0
 
 
-def test_training_measures_what_its_configuration_asks_for(brief):
+def test_training_measures_what_its_configuration_asks_for(brief, finished):
     out, _ = brief
     assert SUMMARY.read(out).latency.clocks["frame"].repeats == Timing().repeats
+    assert SUMMARY.read(finished).latency.clocks["frame"].repeats == 2  # that of all other runs here
     trained = NOVEL.read(out)
     assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 2), (-1.5, 2)]
     assert trained.command.startswith("sparsestreet train ")
