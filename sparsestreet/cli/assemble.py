@@ -45,6 +45,19 @@ def data_of(cfg: DictConfig) -> StreetData:
     return StreetData(log, **cfg.split, seed=cfg.seed)
 
 
+def with_views(cfg: DictConfig, data: StreetData) -> DictConfig:
+    """The configuration of a run that knows what training sees: its length and its limits follow from that."""
+    views = data.split.train.views
+    return with_counts(cfg, len(views), sum(view.camera.width * view.camera.height for view in views))
+
+
+def with_counts(cfg: DictConfig, images: int | None, pixels: int | None) -> DictConfig:
+    """The configuration of a run whose training sees so many images and pixels."""
+    known = cfg.copy()
+    known.training_views = {"images": images, "pixels": pixels}
+    return known
+
+
 def trainer_of(cfg: DictConfig) -> Callable[..., Trainer]:
     """What makes Lightning's trainer, once its callbacks are there."""
     return instantiate(cfg.trainer, _partial_=True)

@@ -37,6 +37,8 @@ class TrainSchema:
     seed: int = MISSING
     capacity: str = MISSING
     split: Tree = MISSING
+    training_views: Tree = MISSING
+    budget: Tree = MISSING
     resume: str | None = None
     count_of: str | None = None
     data: Tree = MISSING

@@ -8,6 +8,15 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from sparsestreet.records.summary import SUMMARY
 
+DEFAULT_PIXELS = 108 * 320 * 192
+"""That training sees of the default street, for which conf/node has its numbers."""
+
+DEFAULT_GAUSSIANS = 130_000
+"""That the background of the default street may have."""
+
+MOST = 2_000_000
+"""Gaussians of a background on a CPU: parameters, gradients and moments of each take a kilobyte."""
+
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     """Of conf/node: the entry of the capacity that is chosen."""
@@ -24,6 +33,22 @@ def concat(*lists: Iterable[Any]) -> ListConfig:
 def mul(factor: float, rate: float) -> float:
     """Of conf/node: a rate of the schedule times a number."""
     return float(factor) * float(rate)
+
+
+def steps_of_log(least: int, per_image: float | int, *, _root_: DictConfig) -> int:
+    """Of conf/schedule: steps of a run, in whole hundreds; before the log is read, the least."""
+    images = _root_.training_views.images
+    return least if images is None else max(least, 100 * round(per_image * images / 100))
+
+
+def of_log(count: int, *, _root_: DictConfig) -> int:
+    """Of conf/node: a number of Gaussians that is right for the default street, in proportion to the pixels that
+    training sees, in whole thousands; never less, and at most ``MOST`` in all."""
+    pixels = _root_.training_views.pixels
+    if pixels is None:
+        return count
+    factor = min(max(pixels / DEFAULT_PIXELS, 1.0), MOST / DEFAULT_GAUSSIANS)
+    return max(count, 1000 * round(count * factor / 1000))
 
 
 def of_preset(setting: str, *, _root_: DictConfig) -> Any:
@@ -63,6 +88,8 @@ _RESOLVERS = {
     "by_capacity": by_capacity,
     "concat": concat,
     "mul": mul,
+    "steps_of_log": steps_of_log,
+    "of_log": of_log,
     "min": min,
     "of_preset": of_preset,
     "gaussians_of": gaussians_of,

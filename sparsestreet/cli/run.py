@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of
+from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of, with_views
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.evaluation.memory import forget_peaks
@@ -31,17 +31,20 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     problem = config_problem(cfg)
     if problem:
         raise ValueError(problem)
-    recipe, extra, logger = recipe_of(cfg), instantiate(cfg.evaluation, _convert_="all"), logger_of(cfg)
+    recipe_of(cfg)  # what does not fit together is said before a log is read
+    extra, logger = instantiate(cfg.evaluation, _convert_="all"), logger_of(cfg)
     stages = StageRecorder(started)
     with stages, stage("data"):
         data = data_of(cfg)
+        cfg = with_views(cfg, data)
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(cfg, this_command(["train", *HydraConfig.get().overrides.task]))
     summary = train(
-        recipe,
+        recipe_of(cfg),
         data,
         out,
         max_steps=cfg.trainer.max_steps,
+        minutes=cfg.budget.minutes,
         make_trainer=trainer_of(cfg),
         logger=logger,
         identity=identity,

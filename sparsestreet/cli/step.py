@@ -6,7 +6,7 @@ from pathlib import Path
 from hydra import compose
 from lightning import Callback
 
-from sparsestreet.cli.assemble import data_of, recipe_of, trainer_of
+from sparsestreet.cli.assemble import data_of, recipe_of, trainer_of, with_views
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import configuration
 from sparsestreet.cli.run import silence_known_noise
@@ -32,11 +32,13 @@ def train_with(overrides: Sequence[str], folder: Path) -> Callable[[Callback], S
 
     def train(watch: Callback) -> StreetSystem:
         silence_known_noise()
-        recipe, data = recipe_of(cfg), data_of(cfg)
+        data = data_of(cfg)
+        known = with_views(cfg, data)
+        recipe = recipe_of(known)
         system = build(recipe, data)
         # One recorder at a time.
         callbacks = [callback for callback in recipe.callbacks.values() if not isinstance(callback, PhaseTimes)]
-        fit(system, data, [*callbacks, watch], trainer_of(cfg), folder, max_steps=cfg.trainer.max_steps)
+        fit(system, data, [*callbacks, watch], trainer_of(known), folder, max_steps=known.trainer.max_steps)
         return system
 
     return train

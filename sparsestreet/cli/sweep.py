@@ -98,11 +98,15 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
 
 def finished(cfg: DictConfig, out: Path) -> float | None:
     """The PSNR of a folder that holds the complete record of this very job; None where it has to be trained."""
+    from sparsestreet.cli.assemble import with_counts
+
     try:
         summary = SUMMARY.read(out)
     except RecordError:
         return None
-    config = flat_config(resolved(cfg))
+    seen = only(summary.run.config, ("training_views.*",))
+    known = with_counts(cfg, **{key.rpartition(".")[2]: count for key, count in seen.items()}) if seen else cfg
+    config = flat_config(resolved(known))
     same = summary.run.config_hash == config_hash(config) and only(summary.run.config, _ALIKE) == only(config, _ALIKE)
     if not same or summary.run.steps < summary.run.max_steps:
         return None

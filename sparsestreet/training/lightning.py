@@ -18,3 +18,8 @@ def callbacks_of(trainer: Trainer) -> list[Callback]:
 def is_dev_run(trainer: Trainer) -> bool:
     """Whether it only tries a few steps (``fast_dev_run``)."""
     return bool(trainer.fast_dev_run)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def end_after(trainer: Trainer, steps: int) -> None:
+    """Let a training that runs end after another number of steps."""
+    trainer.fit_loop.epoch_loop.max_steps = steps

@@ -29,6 +29,7 @@ from sparsestreet.training.callbacks import (
     Clock,
     GracefulStop,
     HeldOutCurve,
+    Pace,
     RunFiles,
     StageTimes,
     TrainingProgress,
@@ -61,6 +62,7 @@ def train(
     out: Path,
     *,
     max_steps: int = 2000,
+    minutes: float | None = None,
     make_trainer: Callable[..., Trainer] = CPU_TRAINER,
     logger: Logger | bool | None = None,
     identity: RunIdentity | None = None,
@@ -77,6 +79,8 @@ def train(
         data: the log, split into views to train on and views held out.
         out: the run's folder.
         max_steps: optimizer steps.
+        minutes: of the whole command, from the beginning of ``stages`` on: the steps become as many as fit; None: they
+            stay ``max_steps``.
         make_trainer: Lightning's Trainer, or what makes one; ``fit`` shows what it is given.
         logger: of Lightning, for the curves of the training; None: ``curves/metrics.csv``; False: none.
         identity: what the run is called in its records; None: as its folder.
@@ -103,6 +107,7 @@ def train(
             clock,
             *recipe.callbacks.values(),
             StageTimes(stages),
+            Pace(stages, minutes, extra.timing),
             HeldOutCurve(out, clock),
             TrainingProgress(),
             RunFiles(out, identity.describe(recipe, data, max_steps), clock),

@@ -17,6 +17,7 @@ from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRe
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
+from sparsestreet.training.schedule import Course
 from sparsestreet.types import Frame
 
 
@@ -63,11 +64,19 @@ class StreetSystem(LightningModule):
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
+        self._course: Course | None = None
         self.train_psnr: deque[Tensor] = deque(maxlen=10)
+
+    @property
+    def course(self) -> Course:
+        """How far the run has come at each step."""
+        if self._course is None:
+            self._course = Course(self.trainer.max_steps)
+        return self._course
 
     def state(self, *, training: bool = False) -> SceneState:
         """Where training stands, for whoever renders the scene now."""
-        progress = self.global_step / max(self.trainer.max_steps, 1)
+        progress = self.course.progress(self.global_step)
         # 0.6 / 0.2 is 2.9999999999999996.
         return SceneState(
             progress, int(progress / self.sh_interval + 1e-6), training, training and self.screen_gradients

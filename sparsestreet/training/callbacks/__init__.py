@@ -2,7 +2,7 @@
 
 They act in the order in which they are configured: ``density_control``, ``mask_training``, ``pruning``, all
 through ``resizing``. ``row_ledger``, ``phase_times``, ``held_out_curve`` and ``progress`` look on, ``clock`` and
-``stage_times`` count seconds;
+``stage_times`` count seconds, ``pace`` foretells them;
 ``checkpoints``, ``run_files`` and ``graceful_stop`` see to what a run leaves, also one that is interrupted.
 """
 
@@ -12,6 +12,7 @@ from sparsestreet.training.callbacks.density_control import DensityControl
 from sparsestreet.training.callbacks.graceful_stop import GracefulStop
 from sparsestreet.training.callbacks.held_out_curve import HeldOutCurve
 from sparsestreet.training.callbacks.mask_training import MaskTraining
+from sparsestreet.training.callbacks.pace import Pace
 from sparsestreet.training.callbacks.phase_times import PhaseTimes
 from sparsestreet.training.callbacks.progress import TrainingProgress
 from sparsestreet.training.callbacks.pruning import Pruning
@@ -26,6 +27,7 @@ __all__ = [
     "GracefulStop",
     "HeldOutCurve",
     "MaskTraining",
+    "Pace",
     "PhaseTimes",
     "Pruning",
     "RowLedger",

@@ -79,19 +79,18 @@ class DensityControl(Callback, RowListener):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        step, steps = trainer.global_step, trainer.max_steps
-        if self.refine_in.due(step, steps) and not self._recovering(step):
+        step = trainer.global_step
+        if self.refine_in.due(step, pl_module.course) and not self._recovering(step):
             for name in self.statistics:
                 self._refine(trainer, pl_module, name)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: object, batch_idx: int) -> None:
-        pl_module.screen_gradients = bool(self.statistics) and trainer.global_step < self.refine_in.last(
-            trainer.max_steps
-        )
+        last = self.refine_in.last(pl_module.course)
+        pl_module.screen_gradients = bool(self.statistics) and trainer.global_step < last
         # Before the next step rather than behind the last one: a look at held-out views that falls between the two
         # would see a scene that has just lost its opacities.
         step = trainer.global_step
-        if step > 0 and self.reset_in.due(step, trainer.max_steps):
+        if step > 0 and self.reset_in.due(step, pl_module.course):
             self.last_reset = step
             for name in self.statistics:
                 node = pl_module.scene.nodes[name]
@@ -102,12 +101,12 @@ class DensityControl(Callback, RowListener):
 
     def _refine(self, trainer: Trainer, system: StreetSystem, name: str) -> None:
         """Densify (while it is time), then cull, then start new statistics."""
-        step, steps = trainer.global_step, trainer.max_steps
+        step, course = trainer.global_step, system.course
         node, statistics = system.scene.nodes[name], self.statistics[name]
         strategy = _strategy(node)
-        when = {"radius": system.radius, "progress": step / steps}
+        when = {"radius": system.radius, "progress": course.progress(step)}
         own = node.settings.densify_until
-        if step <= last_step(self.densify_until if own is None else own, steps):
+        if step <= last_step(self.densify_until if own is None else own, course):
             limit = node.settings.max_gaussians
             plan = strategy.densify(node.rows, statistics, max_gaussians=limit, generator=self.generator, **when)
             resize_rows(trainer, system, name, plan, "densify")

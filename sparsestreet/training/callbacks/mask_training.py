@@ -27,9 +27,9 @@ class MaskTraining(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        step, steps = trainer.global_step, trainer.max_steps
-        last = self.remove_in.closes(step, steps)
-        if not last and not self.remove_in.due(step, steps):
+        step, course = trainer.global_step, pl_module.course
+        last = self.remove_in.closes(step, course)
+        if not last and not self.remove_in.due(step, course):
             return
         for name, node in pl_module.scene.nodes.items():
             if node.mask is not None:

@@ -7,6 +7,7 @@ from lightning import Callback, Trainer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from sparsestreet.training.schedule import ROUNDING, Course
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
@@ -37,11 +38,11 @@ class TrainingProgress(Callback):
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        if not trainer.is_global_zero or not self._due(step, trainer.max_steps):
+        if not trainer.is_global_zero or not self._due(step, pl_module.course):
             return
         text = self._status(trainer, pl_module)
         if self._bar is not None:
-            self._bar.update(self._task, completed=step, description=text)
+            self._bar.update(self._task, completed=step, total=trainer.max_steps, description=text)
         else:
             log.info("step %d of %d: %s", step, trainer.max_steps, text)
 
@@ -57,11 +58,11 @@ class TrainingProgress(Callback):
             self._bar.stop()
             self._bar = None
 
-    def _due(self, step: int, steps: int) -> bool:
+    def _due(self, step: int, course: Course) -> bool:
         if self._bar is not None:
-            return step % REFRESH_EVERY == 0 or step == steps
+            return step % REFRESH_EVERY == 0 or step == course.steps
         # Where another tenth is full.
-        return step * LINES // steps > (step - 1) * LINES // steps
+        return last_part(course.progress(step)) > last_part(course.progress(step - 1))
 
     def _status(self, trainer: Trainer, system: StreetSystem) -> str:
         first, then = self._since
@@ -72,6 +73,11 @@ class TrainingProgress(Callback):
         parts += [f"{label} {float(metrics[key]):.2f} dB" for key, label in LABELS.items() if key in metrics]
         parts += [f"{name} {rows:,}" for name, rows in system.scene.counts().items()]
         return ", ".join(parts)
+
+
+def last_part(progress: float) -> int:
+    """Which of the run's ``LINES`` parts is done."""
+    return int(progress * LINES + ROUNDING)
 
 
 LABELS = {"psnr": "train", "val/psnr": "held out"}

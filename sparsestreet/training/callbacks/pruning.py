@@ -32,7 +32,7 @@ class Pruning(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        if trainer.global_step not in {milestone(fraction, trainer.max_steps) for fraction in self.at}:
+        if trainer.global_step not in {milestone(fraction, pl_module.course) for fraction in self.at}:
             return
         with stage(f"prune/{type(self.rule).__name__} at step {trainer.global_step}"):
             self._prune(trainer, pl_module)
