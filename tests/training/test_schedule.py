@@ -75,7 +75,8 @@ def test_what_is_done_stays_done_and_nothing_is_passed_by(steps):
             assert course.progress(step) == pytest.approx(seen[-1], rel=1e-15)
             assert [milestone(fraction, course) for fraction in once if fraction <= seen[-1]] == before
     assert happened == once
-    assert seen == sorted(seen) and seen[-1] == 1.0
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
     # From the last change on the rest is spread evenly; the step after it is still one of the course before.
     half = (18 + course.steps) / 2
     assert course.step_at((seen[18] + 1) / 2) == pytest.approx(half)

@@ -75,7 +75,11 @@ class Pace(Callback):
     ) -> None:
         step, course = trainer.global_step, pl_module.course
         before, seconds = self._seen
-        if self.minutes is None or step + 1 >= course.steps or course.progress(step) < course.progress(before) + 1 / LOOKS:
+        if (
+            self.minutes is None
+            or step + 1 >= course.steps
+            or course.progress(step) < course.progress(before) + 1 / LOOKS
+        ):
             return
         self._step = (self._seconds("train") - seconds) / (step - before) + self._seconds("validate") / step
         self._fit(trainer, pl_module, self._forecast(trainer, pl_module))

@@ -1,0 +1,86 @@
+"""Runs on a clock of their own: what a step takes is said, and nothing waits."""
+
+import logging
+
+import pytest
+from lightning import Callback
+
+from sparsestreet.evaluation.speed import Timing
+from sparsestreet.phases import StageRecorder
+from sparsestreet.records.run import RUN
+from sparsestreet.training.callbacks import Pace, pace
+from sparsestreet.training.forecast import CLOSING_SECONDS
+from sparsestreet.training.run import train
+from tests.training.test_run import TRAINER, data, recipe
+
+BEFORE = 5.0
+"""Seconds until training starts."""
+
+
+class Steps(Callback):
+    """Counts the steps of a run, and notes when each hundredth of it was done."""
+
+    def __init__(self) -> None:
+        self.done = 0
+        self.progress: list[float] = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        self.done = trainer.global_step
+        self.progress.append(pl_module.course.progress(self.done))
+
+
+class Clocked(StageRecorder):
+    """Every step takes a tenth of a second, and twice as much from step 50 on."""
+
+    def __init__(self, steps: Steps) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def seconds(self) -> dict[str, float]:
+        done = self.steps.done
+        return {"start": BEFORE, "train": 0.1 * (done + max(done - 50, 0)), "validate": 0.0}
+
+
+@pytest.fixture
+def clocked(monkeypatch):
+    """Trials say a tenth of a second for a step, half a second for an image, nothing for a rendering."""
+    monkeypatch.setattr(pace, "measured_step", lambda *_: 0.1)
+    monkeypatch.setattr(pace, "measured_evaluation", lambda *_: (0.5, 0.0))
+    monkeypatch.setattr(pace, "growth_of", lambda _: 1.0)
+    return Steps()
+
+
+def trained(out, steps: Steps, **settings):
+    return train(recipe(out, steps), data(), out, make_trainer=TRAINER, stages=Clocked(steps), **settings)
+
+
+def test_a_run_ends_in_the_minutes_it_is_given(tmp_path, clocked, caplog):
+    with caplog.at_level(logging.INFO):
+        summary = trained(tmp_path, clocked, max_steps=12, minutes=0.5)
+    evaluation = 5 * 0.5 + CLOSING_SECONDS
+    spent = sum(Clocked(clocked).seconds().values()) + evaluation
+    assert spent == pytest.approx(30, rel=0.03)  # the last look is a fortieth of the run before its end
+    run = RUN.read(tmp_path)
+    assert run == summary.run
+    assert run.steps == run.max_steps == clocked.done > 12
+    assert clocked.progress == sorted(clocked.progress)
+    assert clocked.progress[-1] == 1.0
+    # At first, all of the time is thought to hold quick steps.
+    assert f"{round((30 - BEFORE - evaluation) / 0.1)} steps" in caplog.text
+
+
+def test_without_a_budget_the_steps_are_those_of_the_schedule(tmp_path, clocked, caplog):
+    with caplog.at_level(logging.INFO):
+        summary = trained(tmp_path, clocked, max_steps=12)
+    assert (summary.run.steps, summary.run.max_steps) == (12, 12)
+    assert clocked.progress == [step / 12 for step in range(1, 13)]
+    assert "12 steps, at most 180 Gaussians, about 0.0 minutes and 0.1 for evaluation" in caplog.text
+
+
+def test_a_budget_that_is_over_takes_two_steps(tmp_path, clocked):
+    assert trained(tmp_path, clocked, max_steps=12, minutes=0.01).run.steps == 2
+
+
+def test_a_budget_is_some_time():
+    with pytest.raises(ValueError, match="more than 0 minutes, got 0"):
+        Pace(StageRecorder(), 0.0, Timing())

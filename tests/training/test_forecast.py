@@ -1,0 +1,74 @@
+import pytest
+import torch
+
+from sparsestreet.data.lazy import Frames
+from sparsestreet.data.log import Split
+from sparsestreet.evaluation.speed import Timing
+from sparsestreet.scene.density import GradientDensity
+from sparsestreet.training.forecast import (
+    CLOSING_SECONDS,
+    GROWS_TO,
+    GROWTH,
+    Forecast,
+    growth_of,
+    largest,
+    measured_evaluation,
+    measured_step,
+    renders_of,
+)
+from tests.training.stubs import SplitFrames, StubTrainer, background, frame_at, make_system, rigid
+
+
+def forecast(**changes) -> Forecast:
+    known = {"step": 0.1, "growth": 3.0, "grown": 0.4, "image": 0.5, "frame": 0.02, "images": 7, "renders": 30}
+    return Forecast(**(known | changes))
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.1, 0.39, 0.4, 0.8])
+def test_the_steps_grow_until_no_gaussians_are_added(progress):
+    """A sum over 100,000 steps of the run in place of the formula."""
+    one = forecast()
+    count = 100_000
+    done = progress + (1 - progress) * (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    # What a step costs now is that at ``progress``; it reaches ``growth`` times as much at ``grown``.
+    rise = ((done - progress) / max(one.grown - progress, 1e-12)).clamp(max=1)
+    factor = 1 + (one.growth - 1) * rise if progress < one.grown else torch.ones(count)
+    expected = float(factor.mean()) * one.step
+    assert one.training(1000, progress) == pytest.approx(1000 * expected, rel=1e-4)  # of the sum
+    assert one.steps(1000 * expected, progress) == pytest.approx(1000, abs=1)
+
+
+def test_evaluation_is_its_images_and_its_clocks():
+    assert forecast().evaluation == pytest.approx(7 * 0.5 + 30 * 0.02 + CLOSING_SECONDS)
+    assert renders_of(Timing(warmup=2, repeats=3, rounds=5), cameras=2, parts=4) == 2 + 3 * 4 + 5 * 2 * 4
+
+
+def test_a_node_grows_to_its_limit_or_to_a_few_times_its_start():
+    kept = background(20, density=None)
+    limited = rigid(10, density=GradientDensity(), max_gaussians=50)
+    free = background(30, density=GradientDensity(), max_gaussians=None)
+    full = background(40, density=GradientDensity(), max_gaussians=35)  # by its start already
+    system = make_system({"kept": kept, "limited": limited, "free": free, "full": full})
+    most = 20 + 50 + GROWS_TO * 30 + 40
+    assert largest(system) == most
+    assert growth_of(system) == pytest.approx((most / 100) ** GROWTH)
+
+
+def test_trials_leave_no_trace():
+    frames = Frames.of([frame_at(index) for index in range(3)])
+    data = SplitFrames(Split(frames, Frames.of(())))
+    system = make_system({"background": background(20)})
+    StubTrainer(system, max_steps=10)
+    before = {name: value.clone() for name, value in system.state_dict().items()}
+    random = torch.get_rng_state()
+    system.train()
+    assert measured_step(system, data) > 0
+    image, frame = measured_evaluation(system, data)
+    assert image > 0
+    assert frame > 0
+    after = system.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert torch.equal(torch.get_rng_state(), random)
+    assert all(parameter.grad is None for parameter in system.parameters())
+    assert system.scene.training
