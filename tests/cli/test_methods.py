@@ -30,6 +30,9 @@ from tests.typed import as_a, there
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
 PAIRS = list(itertools.product(METHODS, SPARSIFY))
+WITH_EACH = ("paper", "removal", "capped")
+COMPOSED = [pair for pair in PAIRS if pair[0] == "streetgs" or pair[1] in WITH_EACH]
+"""The pairs that a daily run composes: each option once; each method with masks, both kinds of pruning and a cap."""
 DAILY = [("3dgs", "removal"), ("omnire", "removal"), ("pvg", "masks"), ("deformgs", "none")]
 """The pairs that a daily run trains: every method, every stage. The run of conftest.py is StreetGS. The rule of the
 paper takes part in test_toy_node.py."""
@@ -46,7 +49,10 @@ def plain_losses(method: str) -> list[str]:
     return list(recipe_of(composed(f"method={method}")).losses)
 
 
-@pytest.mark.parametrize(("method", "sparsify"), PAIRS)
+@pytest.mark.parametrize(
+    ("method", "sparsify"),
+    [pair if pair in COMPOSED else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
+)
 def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     """Masks, their loss and their callback come together; what a method has stays with every sparsification."""
     cfg = composed(f"method={method}", f"sparsify={sparsify}")

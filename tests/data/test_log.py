@@ -18,6 +18,7 @@ def sweep(points: torch.Tensor, colored: torch.Tensor) -> Sweep:
     return Sweep(0, points, torch.full_like(points, 0.5), colored)
 
 
+@pytest.mark.lengthy
 @settings(deadline=None)  # the first example pays for what is built once
 @given(st.integers(2, 30), st.integers(1, 3), st.integers(2, 12), st.data())
 def test_a_split_takes_every_frame_once_and_all_cameras_of_an_instant_together(num_frames, num_cameras, stride, data):

@@ -14,6 +14,7 @@ from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, small_scene
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize(("stride", "views", "ramp"), [(2, 1, True), (0, 3, False)])
 def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_none(
     monkeypatch, tmp_path, stride, views, ramp

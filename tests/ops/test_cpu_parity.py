@@ -94,6 +94,7 @@ def test_gradcheck(field):
     assert torch.autograd.gradcheck(images, values[field].requires_grad_(), fast_mode=True)
 
 
+@pytest.mark.lengthy
 def test_bitwise_equal_for_one_and_two_threads():
     view = camera(70, 50)
     gaussians = random_gaussians(200_000, view, terms=1)
