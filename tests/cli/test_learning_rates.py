@@ -39,7 +39,7 @@ UPSTREAM = {
             "quaternions": (5e-3, 5e-3),
             "sh_dc": (5e-3, 5e-3),
             "sh_rest": (2.5e-4, 2.5e-4),
-            "rotation_deltas": (5e-5, 1e-5),
+            # ins_rotation turns the root (BOXES), smpl_rotation the other 23 joints.
             "joint_deltas": (5e-5, 1e-5),
         },
     },
