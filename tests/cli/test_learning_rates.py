@@ -43,7 +43,10 @@ UPSTREAM = {
             "joint_deltas": (5e-5, 1e-5),
         },
     },
-    "deformgs": {"background": GAUSSIANS | {"network": (5 * 1.6e-4, 5 * 1.6e-6)}},
+    "deformgs": {
+        # Its network decays over 40,000 steps; the run ends after 30,000.
+        "background": GAUSSIANS | {"network": (5 * 1.6e-4, 5 * 1.6e-4 * 0.01 ** (30 / 40))}
+    },
     "pvg": {
         "background": GAUSSIANS
         | {
