@@ -158,6 +158,15 @@ def test_a_density_strategy_is_a_choice():
     assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
 
 
+def test_pvg_grows_by_upstreams_numbers_at_the_papers_length():
+    """But for the screen gradients, which are absolute ones here, and so have a threshold of their own."""
+    node = recipe_of(composed("method=pvg", "schedule=paper", "capacity=paper")).nodes["background"]
+    density = as_a(VibratingDensity, node.density)
+    assert (density.peak_threshold, density.split_span, density.split_scale) == (2e-3, 0.01, 0.01)
+    assert (density.cull_scale, density.split_children, density.split_shrink) == (0.5, 2, 1.6)
+    assert node.max_gaussians == 3_000_000
+
+
 def test_settings_of_the_op_are_those_of_a_preset_unless_given():
     from sparsestreet.ops import SplatSettings
 
