@@ -47,7 +47,10 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["logger=null"], "choose one of csv, none"),
         (["methd=3dgs"], "did you mean 'method'? Its options are 3dgs, deformgs, omnire, pvg, streetgs"),
         (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of strong_masks"),
-        (["sparsify=paper", "pruning@callback.pruning.rule=foo"], "in conf/pruning: choose one of importance, opacity"),
+        (
+            ["sparsify=paper", "pruning@callback.pruning.rule=foo"],
+            "in conf/pruning: choose one of importance, lightgaussian",
+        ),
         (["pruning@callback.pruning.rule=removal"], "with these choices: leave it out, or choose the option that has"),
         (["density@node.background.density=foo"], "no option 'foo' in conf/density: choose one of gradient, vibrating"),
         (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
