@@ -49,10 +49,10 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of strong_masks"),
         (
             ["sparsify=paper", "pruning@callback.pruning.rule=foo"],
-            "in conf/pruning: choose one of importance, lightgaussian",
+            "in conf/pruning: choose one of importance",
         ),
         (["pruning@callback.pruning.rule=removal"], "with these choices: leave it out, or choose the option that has"),
-        (["density@node.background.density=foo"], "no option 'foo' in conf/density: choose one of gradient, vibrating"),
+        (["density@node.background.density=foo"], "no option 'foo' in conf/density: choose one of gradient, mcmc"),
         (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
         (["mask@node.rigd.mask=temporal"], "mask@node.rigid.mask? Its options are static, temporal"),
         (["render=fast"], "set one of render.backend, render.preset, render.settings"),
