@@ -15,11 +15,12 @@ from torch import Tensor
 
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.scene.density.statistics import DensityStatistics
+from sparsestreet.scene.density.strategy import DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan, Rows
 
 
 @dataclass(frozen=True)
-class GradientDensity:
+class GradientDensity(DensityStrategy):
     """Clones, splits, culls and resets by thresholds; the defaults are DriveStudio's for its background node.
 
     Raises ValueError for thresholds that contradict each other.
