@@ -15,6 +15,7 @@ SETTINGS = {
     "antialias": SplatSettings(antialias=True),
     "exact": SplatSettings.preset("exact"),
     "inria": SplatSettings.preset("inria"),
+    "drivestudio": SplatSettings.preset("drivestudio"),
 }
 # Bars of the op: image 1e-5 and gradients 1e-4 in float32; in float64 only the order of sums differs.
 IMAGE_BAR = {torch.float32: 1e-5, torch.float64: 1e-12}

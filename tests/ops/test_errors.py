@@ -276,7 +276,7 @@ def test_settings(field, value):
 
 def test_presets():
     assert SplatSettings.preset("default") == SplatSettings()
-    names = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast")
+    names = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast", "drivestudio")
     assert len({SplatSettings.preset(name) for name in names}) == len(names)
     with pytest.raises(ValueError, match=r"no settings preset 'faster': choose one of .*'fast'"):
         SplatSettings.preset("faster")
