@@ -83,7 +83,7 @@ def test_returns_ahead_of_the_vehicle(tmp_path):
         assert torch.equal(sweep.points, everything.points[kept])
     # nuScenes' points lie in the frame of the sensor.
     flavor = make_nuscenes(tmp_path / "nuscenes")
-    assert len(DriveStudioReader(flavor, lidar_ahead=(-2.0, 8.0)).read().sweeps[1].points) == len(POINTS_IN_WORLD)
+    assert len(DriveStudioReader(flavor, lidar_ahead=(1.0, 8.0)).read().sweeps[1].points) == len(POINTS_IN_WORLD)
 
 
 def test_the_axes_of_the_first_pose(tmp_path):
