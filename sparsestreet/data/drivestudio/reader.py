@@ -58,7 +58,7 @@ class DriveStudioReader(LogReader):
     undistort: bool = False
     """Whether every lens is taken out of images and masks as they are read (DriveStudio, on Waymo), and none is
     simulated. Cameras are then pinholes with the same intrinsics; what they did not record is black."""
-    lidar_ahead: Sequence[float] | None = None
+    lidar_ahead: Sequence[float | int] | None = None
     """Meters ahead of the vehicle, least and most, of the returns that are read (DriveStudio: -2 and 80); of the Waymo
     flavor only. None: all."""
     extent: SceneExtent = "world"

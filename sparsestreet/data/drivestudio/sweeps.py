@@ -28,13 +28,13 @@ def check_sweep_size(layout: Layout, frame: int) -> None:
 
 
 def read_points(
-    layout: Layout, origin: Float64[Tensor, "3"], ahead: Sequence[float] | None, index: int
+    layout: Layout, origin: Float64[Tensor, "3"], ahead: Sequence[float | int] | None, index: int
 ) -> Float[Tensor, "n 3"]:
     """Points of a frame of the window in the re-centered world; ``ahead`` and errors as in ``read_sweep``."""
     return (read_sweep(layout, layout.frames[index], ahead) - origin).float()
 
 
-def read_sweep(layout: Layout, frame: int, ahead: Sequence[float] | None = None) -> Float64[Tensor, "n 3"]:
+def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None = None) -> Float64[Tensor, "n 3"]:
     """Points of one instant in the data set's world, meters; raises LogError for broken rows or a broken pose.
 
     ``ahead``: of Waymo's points, which lie in the frame of the vehicle, only those with x between these numbers.

@@ -34,7 +34,7 @@ class StreetReader(LogReader):
     min_lens_shift: float | None = 0.5
     """Pixels; the settings' lens is simulated if it moves some pixel by at least this much; 0: always, None: never."""
     undistort: bool = False
-    lidar_ahead: Sequence[float] | None = None
+    lidar_ahead: Sequence[float | int] | None = None
     extent: SceneExtent = "world"
     """This and the two above as ``DriveStudioReader`` has them."""
     cache_mb: int = 512
