@@ -44,7 +44,7 @@ class SplatSettings:
     antialias: bool = False
     """Multiply opacity by sqrt(det / det_blurred), so that blur does not brighten small splats (Mip-Splatting)."""
     clamp_colors: bool = False
-    """Clamp colors to at most 1 as well (gradient 0 above). Without it they are only kept from falling below 0."""
+    """Clamp colors to [0, 1] (gradient 0 outside). Without it they are only kept from falling below 0."""
     detach_directions: bool = False
     """Means get no gradient through the direction in which their colors are seen."""
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, guards, splat
-from sparsestreet.ops.spherical_harmonics import basis
+from sparsestreet.ops.spherical_harmonics import basis, view_colors
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -22,6 +22,7 @@ from tests.ops.scenes import (
     relative_error,
     render,
 )
+from tests.typed import there
 
 Y0 = 0.28209479177387814
 RED, GREEN = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
@@ -173,6 +174,21 @@ def test_clamped_colors_by_hand(backend, dtype):
     assert (seen.gradients["sh"][0, 0] != 0).tolist() == [False, True, False]
     open_above = render(ball, front_camera(5, 5, 40.0), backend, dtype)
     assert float(open_above.images["rgb"][2, 2, 0]) == pytest.approx(1.2, abs=1e-6)
+
+
+def test_a_color_at_an_end_may_leave_it_again():
+    """As torch's clamp has it. Backends that fuse products and sums round such colors to one side or the other."""
+    ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    steps = torch.arange(-8, 9)[:, None, None] * 2.0**-52
+    for end in (0.0, 1.0):
+        nearly = (end - 0.5) / Y0 * (1 + steps.double()).expand(-1, 1, 3)
+        for clamped, moves in ((True, True), (False, end == 1.0)):
+            sh = nearly.clone().requires_grad_()
+            colors = view_colors(sh, ahead.expand(len(sh), 3), clamped)
+            exact = (0.5 + basis(ahead, 1)[0, 0] * nearly[:, 0] == end).all(1)
+            assert exact.any()
+            colors.sum().backward()
+            assert (there(sh.grad)[exact] != 0).all() == moves
 
 
 @every_precision

@@ -4,7 +4,6 @@ Notation: u = mean on the screen, d = pixel center - u, Sigma = V V^T + blur I w
 Sigma^-1 = L^T L with L = [[l11, l21], [0, l22]]. A splat's alpha is o exp(-q/2) with q = |L d|^2.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -96,8 +95,7 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
         ratio, floor = bare / determinant, COMPENSATION_FLOOR**2
         opacities = opacities * torch.where(ratio > floor, ratio, floor).sqrt()
     seen_from = in_camera.detach() if settings.detach_directions else in_camera
-    largest = 1.0 if settings.clamp_colors else math.inf
-    colors = view_colors(gaussians.sh[rows], seen_from @ _rotation(camera, in_camera), largest)
+    colors = view_colors(gaussians.sh[rows], seen_from @ _rotation(camera, in_camera), settings.clamp_colors)
     if settings.half_colors:
         colors = _rounded_to_half(colors)
     reaches = _reaches(opacities.detach(), settings)

@@ -89,14 +89,21 @@ def raw_color(values, sh, TERMS: tl.constexpr):
 
 
 @jit
+def inside_unit(channel, v):
+    """The gradient of torch's clamp to [0, 1], which counts both ends as inside."""
+    return tl.where((channel >= 0) & (channel <= 1), v, 0.0)
+
+
+@jit
 def color_backward(rotation, mean, v, sh, TERMS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr):
     """Gradients of the coefficients, and of ``mean`` through the direction (0 if DETACHED)."""
     direction, distance = direction_of(rotation, mean)
     values = basis(direction, TERMS)
     raw = raw_color(values, sh, TERMS)
-    v = (tl.where(raw[0] > 0, v[0], 0.0), tl.where(raw[1] > 0, v[1], 0.0), tl.where(raw[2] > 0, v[2], 0.0))
     if CLAMPED:
-        v = (tl.where(raw[0] <= 1, v[0], 0.0), tl.where(raw[1] <= 1, v[1], 0.0), tl.where(raw[2] <= 1, v[2], 0.0))
+        v = (inside_unit(raw[0], v[0]), inside_unit(raw[1], v[1]), inside_unit(raw[2], v[2]))
+    else:
+        v = (tl.where(raw[0] > 0, v[0], 0.0), tl.where(raw[1] > 0, v[1], 0.0), tl.where(raw[2] > 0, v[2], 0.0))
     v_sh, v_values = (), ()
     for i in tl.static_range(TERMS):
         v_sh += scaled(values[i], v)
