@@ -169,3 +169,38 @@ def test_a_figure_is_saved_twice_and_the_same_again(tmp_path):
     assert first[0].read_text() == second[0].read_text()
     assert ">a title<" in first[0].read_text()  # text stays text
     assert first[1].read_bytes().startswith(b"\x89PNG")
+
+
+def extents(axes: Axes) -> list[tuple[str, float, float, float]]:
+    """Text, left, right and middle of the names beside points, in pixels, by the widths that placed them."""
+    found = []
+    for text in axes.texts:
+        x, y = axes.transData.transform(text.xy).tolist()
+        right, up = (part * axes.figure.dpi / 72 for part in text.get_position())
+        width = 4.9 * len(text.get_text()) * axes.figure.dpi / 72
+        found.append((text.get_text(), x + right, x + right + width, y + up))
+    return found
+
+
+def test_names_keep_clear_of_each_other_and_inside(saved, tmp_path):
+    """Twelve at nearly one place, and one at the right edge, whose name stands to its left."""
+    crowd = [record(1.0 + 1e-3 * place, 1.0, 40.0 - 1e-3 * place, 1e-2, preset=f"name {place}") for place in range(12)]
+    edge = record(50.0, 1.0, 20.0, 1.0, preset="a name that is long enough to leave")
+    draw_pareto([*crowd, edge, record(0.5, 1.0, 60.0, 1e-3)], tmp_path)
+    axes = saved["pareto_image"].axes[0]
+    placed = extents(axes)
+    assert len(placed) == 14
+    height = 9.5 * axes.figure.dpi / 72
+    for place, (text, left, right, middle) in enumerate(placed):
+        for other, start, end, level in placed[:place]:
+            assert right < start or left > end or abs(middle - level) >= height * (1 - 1e-9), (text, other)
+        assert axes.bbox.y0 + height / 2 < middle < axes.bbox.y1 - height / 2
+        assert right < axes.bbox.x1
+    long = next(text for text in axes.texts if text.get_text().startswith("a name"))
+    assert long.get_position()[0] < 0
+    moved = [text for text in axes.texts if text.arrow_patch is not None]
+    assert {text.get_position()[1] != 0 for text in moved} == {True}
+    assert all(text.get_position()[1] == 0 for text in axes.texts if text not in moved)
+    assert len(moved) == 11
+    assert {text.get_fontweight() for text in axes.texts if text.get_text().startswith("name")} == {"bold"}
+    assert [text.get_fontweight() for text in axes.texts if text.get_text() == "alpha min 1/64"] == ["normal"]
