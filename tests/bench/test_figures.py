@@ -204,3 +204,11 @@ def test_names_keep_clear_of_each_other_and_inside(saved, tmp_path):
     assert len(moved) == 11
     assert {text.get_fontweight() for text in axes.texts if text.get_text().startswith("name")} == {"bold"}
     assert [text.get_fontweight() for text in axes.texts if text.get_text() == "alpha min 1/64"] == ["normal"]
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
+def test_names_at_one_height_that_are_apart_stay_where_they_are(saved, tmp_path, order):
+    times = [(1.0, 30.0, 900.0)[place] for place in order]
+    draw_pareto([record(time, 1.0, 40.0, 1e-2, preset=f"at {time:g}") for time in times], tmp_path)
+    texts = saved["pareto_image"].axes[0].texts
+    assert [text.get_position()[1] for text in texts] == [0.0, 0.0, 0.0]
