@@ -25,7 +25,7 @@ def legend_of(figure: Figure) -> list[str]:
 
 
 def test_counts_with_events(tmp_path, drawn):
-    path = tmp_path / "plots" / "counts.png"
+    path = tmp_path / "some" / "plots" / "counts.png"
     counts = {"background": [100, 1200, 400], "rigid": [0, 50, 50]}
     plot_counts(path, [0, 10, 20], counts, [(15, "prune"), (18, "prune"), (20, "mask")])
     assert path.read_bytes().startswith(b"\x89PNG")

@@ -15,7 +15,7 @@ from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect, figures, figures_time
 from sparsestreet.report.arms import arms
-from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, marker, pareto, short
+from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, marker, panels, pareto, short
 from sparsestreet.report.figures_time import (
     _counts,
     _frame_costs,
@@ -66,8 +66,8 @@ def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     ids = [set(re.findall(r'id="([^"]+)"', text)) for text in (one, other)]
     assert not ids[0] & ids[1]
     assert set(re.findall(r"#([a-z0-9]+)[\")]", one.replace("&quot;", '"'))) <= ids[0] | {"8c8c8c", "1f86c9"}
-    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "again" / "a.svg")
-    assert (tmp_path / "again" / "a.svg").read_text() == one
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "once" / "again" / "a.svg")
+    assert (tmp_path / "once" / "again" / "a.svg").read_text() == one
 
 
 @pytest.mark.lengthy
@@ -301,3 +301,13 @@ def test_figures_are_named_and_what_is_absent_is_said(tmp_path):
     assert sorted(path.stem for path in tmp_path.iterdir()) == names
     for (_, svg), cost in zip(drawn, PARETO_COSTS, strict=True):
         assert svg == (tmp_path / f"pareto_{cost[0]}.svg").read_text()
+
+
+def test_panels_are_as_large_as_they_are_asked_to_be(canvas, tmp_path):
+    sizes = [panels(*given)[0].get_size_inches().tolist() for given in ((1,), (3,), (2, 4.6, 4.0))]
+    assert sizes == [pytest.approx(size) for size in ((3.2, 3.4), (9.6, 3.4), (9.2, 4.0))]
+    assert [len(panels(count)[1]) for count in (1, 3)] == [1, 3]
+    for name in ("a", "b"):
+        update_costs(tmp_path / name, nodes={"road": NodeCost(10, 0.1, 4.0, 3.0)})
+    frame_waterfall(arms([record(make_summary(name), str(tmp_path / name)) for name in "ab"]), tmp_path / "w.svg")
+    assert canvas["w.svg"].get_size_inches().tolist() == pytest.approx([7.4, 1.1 + 0.34 * 2])

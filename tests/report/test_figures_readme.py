@@ -17,8 +17,8 @@ from tests.report.sweep_folder import record, write_sweep
 @pytest.mark.parametrize("curves", [True, False])
 def test_it_is_written_with_and_without_curves(tmp_path, curves):
     found = arms(collect([write_sweep(tmp_path / "sweep", curves=curves)]))
-    time_figure(found, DRIVESTUDIO, tmp_path / "figures" / "time.png")
-    assert (tmp_path / "figures" / "time.png").read_bytes().startswith(b"\x89PNG")
+    time_figure(found, DRIVESTUDIO, tmp_path / "docs" / "figures" / "time.png")
+    assert (tmp_path / "docs" / "figures" / "time.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_without_held_out_views_there_is_none(tmp_path):
