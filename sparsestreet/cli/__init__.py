@@ -10,9 +10,9 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
 
   sparsestreet demo                                   make a street, train it three ways, show table and pictures
   sparsestreet train                                  train StreetGS on the embedded synthetic street
-  sparsestreet train sparsify=paper                   the same with the paper's masks and background pruning
+  sparsestreet train sparsify=paper_short             the same with the paper's masks and background pruning
   sparsestreet train method=3dgs sparsify=removal data=drivestudio data.root=DIR    on a drive of your own
-  sparsestreet train -m sparsify=none,paper,removal seed=0,1,2                      a sweep
+  sparsestreet train -m sparsify=none,paper_short,removal seed=0,1,2                a sweep
   sparsestreet train +sweep=streets                   a sweep of conf/sweep; sparsestreet report sweep=DIR shows it
   sparsestreet train resume=RUN                       go on after an interruption
   sparsestreet evaluate run=RUN                       measure a trained run again, without training

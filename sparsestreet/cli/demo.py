@@ -13,10 +13,11 @@ from sparsestreet.scene.centers import node_legend
 USAGE = """\
 sparsestreet demo [key=value ...]
 
-Trains the embedded street three times, in outputs/demo: plain, sparsify=paper (both stages of the paper) and
-sparsify=removal (the paper's masks, then our rule). The overrides go to all three: seed=1, schedule.max_steps=2000 ...
+Trains the embedded street three times, in outputs/demo: plain, sparsify=paper_short (both stages of the paper,
+with numbers for short runs) and sparsify=removal (the paper's masks, then our rule). The overrides go to all three:
+seed=1, schedule.max_steps=2000 ...
 """
-SPARSIFY = ("none", "paper", "removal")
+SPARSIFY = ("none", "paper_short", "removal")
 ASSIGNMENT = "all_rigid"
 """Whoever walks or rides is on a track too, as a figure that keeps its shape: method=omnire takes longer."""
 STEPS = 1200

@@ -25,6 +25,11 @@ def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     return values[_root_.capacity]
 
 
+def as_published(published: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
+    """Of conf/node and conf/mask: the paper's value if the sparsification says ``published``, else the other."""
+    return published if _root_.sparsify.get("published", False) else otherwise
+
+
 def concat(*lists: Iterable[Any]) -> ListConfig:
     """Of conf/assignment: all lists as one."""
     return ListConfig([entry for entries in lists for entry in entries])  # ``--resolve`` takes no list of Python's
@@ -86,6 +91,7 @@ def last_part(path: str) -> str:
 
 _RESOLVERS = {
     "by_capacity": by_capacity,
+    "as_published": as_published,
     "concat": concat,
     "mul": mul,
     "steps_of_log": steps_of_log,

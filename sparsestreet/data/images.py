@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.undistortion import Undistortion
 
 _JPEG_END = b"\xff\xd9"
 _PNG_END = b"IEND\xae\x42\x60\x82"
@@ -74,18 +75,21 @@ def _ends_well(path: Path) -> bool:
         return file.read().endswith((_JPEG_END, _PNG_END))
 
 
-def read_image(path: Path, size: tuple[int, int]) -> UInt8[Tensor, "h w 3"]:
-    """RGB at (width, height); raises LogError where the file cannot be decoded."""
-    return torch.from_numpy(_decode(path, "RGB", size, Image.Resampling.BILINEAR))
+def read_image(path: Path, size: tuple[int, int], undistortion: Undistortion | None = None) -> UInt8[Tensor, "h w 3"]:
+    """RGB at (width, height), without the lens if told; raises LogError where the file cannot be decoded."""
+    pixels = _decode(path, "RGB", size, Image.Resampling.BILINEAR)
+    return torch.from_numpy(pixels if undistortion is None else undistortion(pixels))
 
 
-def read_mask(path: Path, size: tuple[int, int], *, sky: bool) -> Bool[Tensor, "h w"]:
+def read_mask(
+    path: Path, size: tuple[int, int], *, sky: bool, undistortion: Undistortion | None = None
+) -> Bool[Tensor, "h w"]:
     """True where the file is not black, at (width, height); raises LogError where it cannot be decoded.
 
     Sky takes the nearest pixel; other masks keep every pixel an object touches (DriveStudio: bilinear, then > 0).
     """
-    resampling = Image.Resampling.NEAREST if sky else Image.Resampling.BILINEAR
-    return torch.from_numpy(_decode(path, "L", size, resampling) > 0)
+    pixels = _decode(path, "L", size, Image.Resampling.NEAREST if sky else Image.Resampling.BILINEAR)
+    return torch.from_numpy((pixels if undistortion is None else undistortion(pixels)) > 0)
 
 
 def _decode(path: Path, mode: str, size: tuple[int, int] | None, resampling: Image.Resampling) -> np.ndarray:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +20,11 @@ _SEEN_AHEAD = 50.0
 _QUANTILE_POINTS = 1_000_000
 """Quantiles of this many points are as good as of all of them, and take a tenth of a second."""
 
+
+SceneExtent = Literal["world", "first_pose"]
+"""The axes of the scene's box: those of the world, or those of the first pose (``DrivingLog.first_axes``)."""
+_FIRST_POSE_REACH = 20.0
+"""Meters along the last axis of the first pose (Waymo: up) that the box reaches at least (DriveStudio)."""
 
 Truth = Callable[[View], Frame | None]
 """A view of the log's world -> the frame that its camera would have recorded; None where none can be, as inside of a
@@ -45,6 +51,10 @@ class DrivingLog:
     """What is absent, and what a run does without it, one sentence each."""
     truth: Truth | None = None
     """What a camera off the recorded path would see; None: unknown, as for any recorded drive."""
+    first_axes: Float64[Tensor, "3 3"] | None = None
+    """Axes of the first pose, as columns in the world; center and radius are then those of DriveStudio: of a box along
+    these axes around the lidar alone. They do not depend on where the street leads. None: the box lies along the axes
+    of the world, and holds the cameras too."""
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -90,24 +100,33 @@ class DrivingLog:
         """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.
 
         Points that some camera sees count (DriveStudio's rule); without lidar, what lies 50 m ahead of each camera.
+        Along ``first_axes``, if given: there the lidar alone counts, and the box reaches 20 m along the last axis.
         """
-        centers = torch.stack([view.camera.position for view in self.views]).double().numpy()
+        points = self._along_axes(_seen_points(self.sweeps))
+        if len(points) and self.first_axes is not None:
+            low, high = np.quantile(points, _QUANTILES, axis=0)
+            high[2] = max(high[2], _FIRST_POSE_REACH)
+            return low, high
+        centers = self._along_axes(torch.stack([view.camera.position for view in self.views]).double().numpy())
         low, high = centers.min(axis=0), centers.max(axis=0)
-        points = _seen_points(self.sweeps)
         if len(points):
             around = np.quantile(points, _QUANTILES, axis=0)
         else:
             # The third row of camera_from_world is the optical axis in the world.
             axes = torch.stack([view.camera.camera_from_world[2, :3] for view in self.views]).double().numpy()
-            ahead = centers + _SEEN_AHEAD * axes
+            ahead = centers + _SEEN_AHEAD * self._along_axes(axes)
             around = np.stack((ahead.min(axis=0), ahead.max(axis=0)))
         return np.minimum(low, around[0]), np.maximum(high, around[1])
+
+    def _along_axes(self, vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        return vectors if self.first_axes is None else vectors @ self.first_axes.numpy()
 
     @property
     def center(self) -> Float[Tensor, "3"]:
         """Middle of the scene's box in the world, meters."""
         low, high = self._bounds
-        return torch.from_numpy((low + high) / 2).float()
+        middle = torch.from_numpy((low + high) / 2)
+        return (middle if self.first_axes is None else self.first_axes @ middle).float()
 
     @property
     def radius(self) -> float:

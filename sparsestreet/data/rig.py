@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.problems import fault
+from sparsestreet.data.undistortion import Undistortion
 from sparsestreet.geometry.distortion import largest_shift
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera
@@ -31,6 +32,8 @@ class RigCamera(Generic[Name]):
     """Of a lens that is simulated."""
     note: str | None
     """What becomes of the lens, where the camera has one."""
+    undistortion: Undistortion | None = None
+    """Takes a lens out of images and masks at ``size``; None: they are as recorded."""
 
     def at(self, world_from_camera: Float64[Tensor, "4 4"]) -> Camera:
         """The camera at a pose of the log's world."""
@@ -46,6 +49,7 @@ def rig_camera(
     recorded_size: tuple[int, int],
     width: int | None = None,
     min_lens_shift: float | None = 0.5,
+    undistort: bool = False,
 ) -> RigCamera[Name]:
     """Size after scaling, and intrinsics scaled per axis with it: pixel centers lie at +0.5, so cx and cy scale too.
 
@@ -58,6 +62,7 @@ def rig_camera(
         width: to which images are scaled, the height in proportion; None: as recorded.
         min_lens_shift: a lens that moves some pixel, of the images as they are read, by at least this many is
             simulated; 0: every lens, None: none.
+        undistort: whether every lens is taken out of the images instead, and none is simulated.
 
     Raises ValueError for a width that the images do not have.
     """
@@ -67,10 +72,16 @@ def rig_camera(
     size = (full_width, full_height) if width is None else (width, max(1, round(full_height * width / full_width)))
     scale = torch.tensor([size[0] / full_width, size[1] / full_height, 1.0], dtype=torch.float64)
     intrinsics = scale[:, None] * intrinsics
-    simulated, note = False, None
+    simulated, note, undistortion = False, None, None
     if distortion.any():
-        simulated, note = _lens_decision(name, largest_shift(intrinsics, distortion, *size), min_lens_shift)
-    return RigCamera(name, index, intrinsics.float(), size, distortion.float() if simulated else None, note)
+        shift = largest_shift(intrinsics, distortion, *size)
+        if undistort:
+            undistortion = Undistortion.of(intrinsics, distortion, *size)
+            note = f"camera {name}: its lens, which moves pixels by up to {shift:.3g}, is taken out of the images"
+        else:
+            simulated, note = _lens_decision(name, shift, min_lens_shift)
+    lens = distortion.float() if simulated else None
+    return RigCamera(name, index, intrinsics.float(), size, lens, note, undistortion)
 
 
 def check_lens(

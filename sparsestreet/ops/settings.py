@@ -43,6 +43,10 @@ class SplatSettings:
     """Round colors to float16 before blending (gradient as if not rounded)."""
     antialias: bool = False
     """Multiply opacity by sqrt(det / det_blurred), so that blur does not brighten small splats (Mip-Splatting)."""
+    clamp_colors: bool = False
+    """Clamp colors to [0, 1] (gradient 0 outside). Without it they are only kept from falling below 0."""
+    detach_directions: bool = False
+    """Means get no gradient through the direction in which their colors are seen."""
 
     def __post_init__(self) -> None:
         _require(0 < self.alpha_max < 1, "alpha_max must lie in (0, 1)", self.alpha_max)
@@ -58,7 +62,7 @@ class SplatSettings:
     def preset(name: str) -> "SplatSettings":
         """Returns settings by name; raises ValueError with the names of all presets.
 
-        ``gsplat15``, ``gsplat16`` and ``inria`` match those renderers as far as these fields allow.
+        ``gsplat15``, ``gsplat16``, ``inria`` and ``drivestudio`` match those renderers as far as these fields allow.
         """
         if name not in _PRESETS:
             raise ValueError(f"no settings preset {name!r}: choose one of {sorted(_PRESETS)}")
@@ -77,6 +81,10 @@ _PRESETS = {
     "gsplat15": SplatSettings(alpha_max=0.999, stop="exclusive", near_plane=0.01),
     "gsplat16": SplatSettings(stop="exclusive", near_plane=0.01),
     "inria": SplatSettings(stop="exclusive"),
+    # gsplat 1.3.0 as DriveStudio (e59bda4) calls it: it gives gsplat colors in [0, 1], seen from detached means.
+    "drivestudio": SplatSettings(
+        alpha_max=0.999, stop="exclusive", near_plane=0.1, clamp_colors=True, detach_directions=True
+    ),
     # Splats end at 4 standard deviations instead of at an alpha. This is at least 20 dB nearer to "exact" than the
     # default, and takes little more time where stacks are shallow (docs/scaling.md).
     "fine": SplatSettings(alpha_min=0.0, max_sigma=4.0),

@@ -42,11 +42,14 @@ def basis(directions: Float[Tensor, "n 3"], terms: int) -> Float[Tensor, "n k"]:
     return torch.stack(values, dim=-1)
 
 
-def view_colors(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Colors max(0, 0.5 + sum_i basis_i(direction) sh_i) along directions of any non-zero length, camera to Gaussian.
+def view_colors(
+    sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"], clamped: bool = False
+) -> Float[Tensor, "n 3"]:
+    """Colors 0.5 + sum_i basis_i(direction) sh_i along directions of any non-zero length, camera to Gaussian.
 
-    Gradients go to coefficients and directions; they are zero where the clamp acts.
+    They are kept from falling below 0, or ``clamped`` to [0, 1]. Gradients go to coefficients and directions. They are
+    zero below 0 and, if clamped, above 1; a color of exactly 0 has one only if clamped, as torch's clamp gives it.
     """
     unit = directions / directions.norm(dim=-1, keepdim=True)
     colors = 0.5 + (basis(unit, sh.shape[1])[..., None] * sh).sum(1)
-    return torch.where(colors > 0, colors, 0.0)
+    return colors.clamp(0, 1) if clamped else torch.where(colors > 0, colors, 0.0)

@@ -1,13 +1,14 @@
 """Scores Gaussians over all training views and selects which to keep.
 
 ``rule`` is the interface of the rules, ``importance`` the paper's score, ``rules`` the paper's rule and ours (leave
-one out). ``controls`` keep a given number at random or by opacity. ``select`` drops rows by scores but respects the
-``floors`` of a node and its instances.
+one out). ``published`` has the rules of other papers, ``controls`` those that look at no image. ``counts`` keep a given
+number of each node, ``select`` drops rows by scores but respects the ``floors`` of a node and its instances.
 """
 
 from sparsestreet.pruning.controls import OpacityRule, RandomRule
 from sparsestreet.pruning.floors import Floors, InstanceAreas
 from sparsestreet.pruning.importance import Importance, measure_importance
+from sparsestreet.pruning.published import LightGaussianRule, MiniSplattingRule
 from sparsestreet.pruning.rule import PruningRule, RenderContext
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
@@ -18,6 +19,8 @@ __all__ = [
     "ImportanceRule",
     "InstanceAreas",
     "LeaveOneOutRule",
+    "LightGaussianRule",
+    "MiniSplattingRule",
     "OpacityRule",
     "PruningRule",
     "RandomRule",

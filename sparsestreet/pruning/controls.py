@@ -1,15 +1,16 @@
 """Controls for the other rules: they keep a given number of Gaussians without looking at the images."""
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.pruning.counts import Keep, check_keep, keep_counts
 from sparsestreet.pruning.rule import PruningRule, RenderContext
-from sparsestreet.scene.gaussians import Rows, Selection, keep_best
+from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import Frame
@@ -19,14 +20,11 @@ from sparsestreet.types import Frame
 class CountRule(PruningRule):
     """Keeps a given number of each node's rows, those with the highest scores, or more if a floor demands it."""
 
-    keep: int | float | Mapping[str, int | float]
-    """One value for every node, or name of a node -> its value; a node without a value keeps all rows. Values up to 1
-    are fractions of the rows before the pass; larger ones are numbers of rows."""
+    keep: Keep
+    """How many rows stay (see ``counts.Keep``)."""
 
     def __post_init__(self) -> None:
-        wrong = [value for value in self._numbers() if not value >= 0]
-        if wrong:
-            raise ValueError(f"keep must be a fraction in [0, 1] or a number of Gaussians, got {wrong[0]}")
+        check_keep(self.keep)
 
     @abstractmethod
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
@@ -34,21 +32,9 @@ class CountRule(PruningRule):
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
-        selections = {}
-        for name, floors in self.floors(scene, frames, context).items():
-            scores = self.scores(name, scene.nodes[name].rows)
-            unwanted = torch.ones_like(scores, dtype=torch.bool)
-            # Among equal scores the lower row stays, as at the floors.
-            unwanted[torch.sort(scores, descending=True, stable=True).indices[: self._count(name, len(scores))]] = False
-            selections[name] = keep_best(scores, unwanted, *floors)
-        return selections
-
-    def _numbers(self) -> Sequence[int | float]:
-        return tuple(self.keep.values()) if isinstance(self.keep, Mapping) else (self.keep,)
-
-    def _count(self, name: str, rows: int) -> int:
-        keep = self.keep.get(name, 1.0) if isinstance(self.keep, Mapping) else self.keep
-        return round(keep * rows if keep <= 1 else keep)
+        floors = self.floors(scene, frames, context)
+        scores = {name: self.scores(name, scene.nodes[name].rows) for name in floors}
+        return keep_counts(scores, self.keep, floors, context)
 
 
 @dataclass(frozen=True)

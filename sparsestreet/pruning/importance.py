@@ -32,9 +32,9 @@ class Importance:
     [0.75, 0.0]
     """
 
-    def __init__(self, gate: bool = True) -> None:
-        """``gate=False`` omits the indicator."""
-        self.gate = gate
+    def __init__(self, gate: bool = True, *, per_pixel: bool = True) -> None:
+        """``gate=False`` omits the indicator, ``per_pixel=False`` the division by S."""
+        self.gate, self.per_pixel = gate, per_pixel
         self.views = 0
         # float64, because float32 sums of many views depend on their order, and thresholds are exactly zero.
         self._total: Float64[Tensor, " n"] | None = None
@@ -58,14 +58,17 @@ class Importance:
                 f"every view must score the same rows, but view {self.views} has {weight.shape[0]} and those before "
                 f"{self._total.shape[0]}: start a new Importance after rows were added or removed"
             )
-        score = weight / contribution.pixels.clamp(min=1)
+        score = weight / contribution.pixels.clamp(min=1) if self.per_pixel else weight
         if self.gate:
             score = torch.where(contribution.dominant > 0, score, 0.0)
         self._total = score if self._total is None else self._total + score
         self.views += 1
 
     def scores(self) -> Float64[Tensor, " n"]:
-        """Returns I_i in [0, 1]. Raises ValueError before the first view: zero scores would remove the whole scene."""
+        """Returns I_i; per pixel it lies in [0, 1].
+
+        Raises ValueError before the first view: zero scores would remove the whole scene.
+        """
         if self._total is None:
             raise ValueError("importance needs at least one view, got none: add the training views first")
         return self._total / self.views

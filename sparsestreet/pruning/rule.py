@@ -17,10 +17,14 @@ from sparsestreet.types import Contribution, Frame
 
 @dataclass(frozen=True)
 class RenderContext:
-    """How a rule renders the scene: with the state and options of training."""
+    """How a rule renders the scene: with the state and options of training; and which pass of how many it is."""
 
     state: SceneState = FINISHED
     options: RenderOptions = DEFAULT_OPTIONS
+    passes: int = 1
+    """Number of passes of the run."""
+    passed: int = 0
+    """Number of passes before this one."""
 
 
 @dataclass(frozen=True, kw_only=True)

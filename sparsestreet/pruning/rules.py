@@ -8,6 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.ops import leave_one_out
+from sparsestreet.pruning.counts import Keep, check_keep, keep_counts
 from sparsestreet.pruning.importance import Importance
 from sparsestreet.pruning.rule import PruningRule, RenderContext, contributions, on_device
 from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
@@ -33,10 +34,16 @@ class ImportanceRule(PruningRule):
     remove: int | float | None = None
     """For comparisons at equal count: the rule removes this many rows instead, the least important of all its nodes
     together. A value up to 1 is a fraction of the rows of the whole scene; a larger one is a number of rows."""
+    keep: Keep | None = None
+    """For comparisons at equal count, node by node: the most important rows of each node stay (see ``counts.Keep``)."""
 
     def __post_init__(self) -> None:
         if self.remove is not None and not self.remove >= 0:
             raise ValueError(f"remove must be a fraction in [0, 1] or a number of Gaussians, got {self.remove}")
+        if self.keep is not None:
+            check_keep(self.keep)
+            if self.remove is not None:
+                raise ValueError(f"a rule removes or keeps a number, got remove={self.remove} and keep={self.keep}")
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
@@ -46,6 +53,8 @@ class ImportanceRule(PruningRule):
             areas.add(view, spans)
         every, floors = importance.scores(), areas.floors()
         scores = {name: every[spans[name]] for name in floors}
+        if self.keep is not None:
+            return keep_counts(scores, self.keep, floors, context)
         if self.remove is None:
             return {name: keep_by_importance(scores[name], floors[name]) for name in floors}
         return keep_by_rank(scores, round(self.remove * len(every) if self.remove <= 1 else self.remove), floors)
@@ -74,8 +83,13 @@ class LeaveOneOutRule(PruningRule):
     """Decibels that a pass may cost before training continues, >= 0; 0: only rows that cost nothing are removed."""
     noticeable: float = 1 / 255
     """One step of an 8-bit image; 0: every change counts."""
+    keep: Keep | None = None
+    """For comparisons at equal count, node by node: the most expensive rows of each node stay instead, whatever that
+    costs (see ``counts.Keep``)."""
 
     def __post_init__(self) -> None:
+        if self.keep is not None:
+            check_keep(self.keep)
         if not self.allowed_db >= 0:
             raise ValueError(f"allowed_db must be >= 0 dB of training PSNR, got {self.allowed_db}")
         if not self.noticeable >= 0:
@@ -84,6 +98,8 @@ class LeaveOneOutRule(PruningRule):
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
         costs, floors = self.costs(scene, frames, context), self.floors(scene, frames, context)
+        if self.keep is not None:
+            return keep_counts(costs, self.keep, floors, context)
         return keep_by_cost({name: costs[name] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
 
     @torch.no_grad()

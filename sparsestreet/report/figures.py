@@ -21,7 +21,8 @@ from sparsestreet.report.arms import Arm, Value, plain_of
 # Okabe and Ito's palette with a slightly lighter blue: distinguishable with any color vision, on white and on black.
 COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 GREY = "#8c8c8c"
-_MARKERS = {"none": "o", "paper": "s", "removal": "D", "masks": "^", "importance": "v", "random": "x", "opacity": "+"}
+_MARKERS = {"none": "o", "paper": "s", "paper_short": "s", "removal": "D", "masks": "^", "importance": "v"}
+_MARKERS |= {"random": "x", "opacity": "+"}
 _INK = "#010203"
 """Stands for the color of the page's text."""
 
@@ -81,8 +82,8 @@ def colors(arms: Sequence[Arm]) -> dict[str, str]:
 
 def of_sparsify(arm: Arm) -> str:
     """Returns the color of an arm's sparsification, for figures of one method."""
-    known = ("none", "paper", "removal", "masks", "importance")
-    return COLORS[known.index(arm.sparsify) if arm.sparsify in known else len(known)]
+    known = {"none": 0, "paper": 1, "paper_short": 1, "removal": 2, "masks": 3, "importance": 4}
+    return COLORS[known.get(arm.sparsify, 5)]
 
 
 def short(value: float) -> str:

@@ -14,7 +14,7 @@ from sparsestreet.report.arms import Arm, Value, by_scene
 from sparsestreet.report.curves import curves_of, mean_curve
 from sparsestreet.report.figures import LEGEND, colors, marker, of_sparsify, panels
 
-_DASHES = {"none": "-", "paper": "--", "removal": ":"}
+_DASHES = {"none": "-", "paper": "--", "paper_short": "--", "removal": ":"}
 
 
 def time_figure(arms: Sequence[Arm], protocol: Protocol, path: Path) -> None:

@@ -111,8 +111,8 @@ _PRUNING = PublishedTable(
     "pruning strategies on Waymo",
     _ABLATION,
     _rows("""
-Global Pruning | omnire | importance nodes=null | 32.18 0.940 0.077 26.07 23.89 0.33e6
-Background Pruning | omnire | importance nodes=[ | 33.32 0.945 0.073 26.54 26.66 0.39e6
+Global Pruning | omnire | importance +global_pruning | 32.18 0.940 0.077 26.07 23.89 0.33e6
+Background Pruning | omnire | importance +importance | 33.32 0.945 0.073 26.54 26.66 0.39e6
 """),
     _UNSAID,
 )

@@ -5,6 +5,11 @@ import zlib
 import torch
 
 
+def named_seed(seed: int, name: str) -> int:
+    """Returns the seed of the stream with this name."""
+    return seed + zlib.crc32(name.encode())
+
+
 def named_generator(seed: int, name: str) -> torch.Generator:
     """Returns the random stream of the part with this name; it does not depend on what other parts draw.
 
@@ -12,4 +17,4 @@ def named_generator(seed: int, name: str) -> torch.Generator:
     >>> one.initial_seed() == again.initial_seed(), one.initial_seed() == other.initial_seed()
     (True, False)
     """
-    return torch.Generator().manual_seed(seed + zlib.crc32(name.encode()))
+    return torch.Generator().manual_seed(named_seed(seed, name))

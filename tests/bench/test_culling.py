@@ -13,6 +13,7 @@ from sparsestreet.ops.cpu.library import tile_size
 from sparsestreet.ops.cpu.rasterizer import rasterize
 from sparsestreet.types import Gaussians
 
+pytestmark = pytest.mark.lengthy
 SCENES = bench_scenes(Size(75, 53, 300))
 DEFAULT = SplatSettings()
 SETTINGS = {

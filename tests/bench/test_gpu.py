@@ -14,9 +14,10 @@ from sparsestreet.bench.device_profile import stage_of
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
 from sparsestreet.bench.gpu import GpuRecord
 from sparsestreet.bench.records import RecordFile, read_records
-from sparsestreet.bench.scenes import Size
+from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.timing import TimeSpread, TimingBudget, leaves
 from sparsestreet.ops import splat
+from sparsestreet.phases import WallClock
 from sparsestreet.types import Camera, Gaussians
 from tests.bench.test_records import PROVENANCE
 
@@ -298,3 +299,94 @@ def test_a_step_trains_all_fields_and_counts_the_view(rows):
     assert all(bool((old != new).any()) for old, new in zip(before, step.parameters, strict=True))
     assert bool((step.statistics.gradient_sum > 0).any())
     assert all(parameter.grad is None for parameter in step.parameters)
+
+
+def test_every_number_of_a_record_is_in_its_line():
+    values = [TimeSpread(float(place), 0.5, None, 3) for place in range(1, 5)]
+    record = GpuRecord("sparsestreet triton", "a device", "a street", 1234, 640, 480)
+    assert gpu.line(dataclasses.replace(record, failed="RuntimeError: no")).split() == [
+        *("sparsestreet", "triton", "a", "street", "1234", "640x480", "FAILED:", "RuntimeError:", "no"),
+    ]
+    inference, forward, backward, step = values
+    record = dataclasses.replace(record, inference=inference, forward=forward, backward=backward)
+    start = "sparsestreet triton     a street             1234 640x480    forward 2.000  backward 3.000"
+    assert gpu.line(record) == f"{start}  no grad 1.000 ms"
+    assert gpu.line(dataclasses.replace(record, inference=None)) == f"{start}  no grad - ms"
+    assert gpu.line(dataclasses.replace(record, backward=None, failed="why")).endswith("FAILED: why")
+    image = ImageError(0.1, 0.2, 61.25)
+    whole = dataclasses.replace(
+        record, step=step, pairs=2_500_000, samples=70_000_000, memory_before=10.0, memory_peak=345.0,
+        parity=Errors(image, {}), agrees=True, failed="late",
+    )  # fmt: skip
+    assert gpu.line(whole) == (
+        f"{start}  no grad 1.000 ms  step 4.000  2.50 M pairs, 70 M samples  peak     345 MB  agrees: 61.2 dB"
+        "  FAILED: late"
+    )
+    for one in ("pairs", "samples"):
+        assert " M pairs" not in gpu.line(dataclasses.replace(whole, **{one: None}))
+
+
+def test_a_record_is_of_its_workload(tmp_path, monkeypatch):
+    """Two sizes and a street between them, each with its own scene, rows and image; wider than high, and higher."""
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: "none")
+    camera = frustum_camera(40, 56)
+    street = BenchScene("a street", "of a run", frustum_gaussians(30, camera, sigma_pixels=2.0, terms=4), camera)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    assert gpu.run_gpu([Size(48, 32, 60), Size(32, 48, 20)], CPU, ONCE, file, said.append, street)
+    records = read_records(file.path)
+    assert [(one["kind"], one["scene"], one["rows"], one["width"], one["height"]) for one in records] == [
+        ("gpu", "random frustum", 60, 48, 32),
+        ("gpu", "of a run", 30, 40, 56),
+        ("gpu", "random frustum", 20, 32, 48),
+    ]
+    assert {one["device"] for one in records} == {"cpu: these are no GPU timings"}
+    assert said[0] == "cpu: these are no GPU timings; backend cpu; none"
+    assert said[-1] == "3 of 3 measured and in agreement"
+    assert all(one["step"]["median"] > 0 and one["memory_peak"] is None for one in records)
+
+
+def test_memory_and_stages_are_of_a_whole_step(rows, monkeypatch):
+    """On a device: before and peak, in this order, and kernels of forward and backward."""
+    camera = frustum_camera(48, 32)
+    workload = gpu.Workload("a scene", rows, camera)
+    monkeypatch.setattr(gpu.Workload, "device", torch.device("cuda"))
+    monkeypatch.setattr(gpu, "clock_of", lambda device: WallClock())
+    drawn = []
+
+    def draw(given: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
+        drawn.append(torch.is_grad_enabled())
+        rendering = splat(given, camera, settings=gsplat_peer.SETTINGS)
+        return rendering.rgb, rendering.alpha
+
+    def run_once(step, answer):
+        before = len(drawn)
+        step()
+        assert drawn[before:] == [True]
+        assert rows.means.grad is None
+        return answer
+
+    stages = {"blend": TimeSpread(1.0, 1.0, None, 1)}
+    monkeypatch.setattr(gpu, "peak_megabytes", lambda step: run_once(step, (10.0, 30.0)))
+    monkeypatch.setattr(gpu, "kernel_milliseconds", lambda step: run_once(step, stages))
+    record = gpu.measure(GpuRecord("r", "d", "s", 60, 48, 32), draw, workload, ONCE)
+    assert (record.memory_before, record.memory_peak, record.stages) == (10.0, 30.0, stages)
+    assert (record.forward.repeats, record.backward.repeats, record.inference.repeats) == (1, 1, 1)
+    assert drawn.count(False) == 2  # without gradients: a warm-up and one that counts
+    assert record.ok
+
+
+def test_peaks_are_megabytes_of_the_device(monkeypatch):
+    log = []
+    for name in ("synchronize", "empty_cache", "reset_peak_memory_stats"):
+        monkeypatch.setattr(torch.cuda, name, lambda name=name: log.append(name))
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda: log.append("before") or 2_500_000)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: log.append("peak") or 7_000_000)
+    assert device_profile.peak_megabytes(lambda: log.append("run")) == pytest.approx((2.5, 7.0))
+    assert log == ["synchronize", "empty_cache", "reset_peak_memory_stats", "before", "run", "synchronize", "peak"]
+
+
+@pytest.mark.parametrize(
+    ("failed", "agrees", "ok"), [(None, None, True), (None, True, True), (None, False, False), ("why", True, False)]
+)
+def test_a_failure_or_a_disagreement_is_not_ok(failed, agrees, ok):
+    assert GpuRecord("r", "d", "s", 1, 2, 3, failed=failed, agrees=agrees).ok is ok

@@ -25,7 +25,7 @@ class Sample:
 
 
 def test_lines_are_there_as_soon_as_written(tmp_path):
-    file = RecordFile(tmp_path / "deep" / "a.jsonl", PROVENANCE)
+    file = RecordFile(tmp_path / "deep" / "er" / "a.jsonl", PROVENANCE)
     file.write("sample", Sample("one", (1.0, 1 / 3)))
     assert len(read_records(file.path)) == 1
     file.write("sample", Sample("two", ()))

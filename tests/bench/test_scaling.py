@@ -18,6 +18,7 @@ def test_density_is_the_same_at_every_size():
     assert (min(ROWS), max(ROWS)) == (1_000, 3_000_000)
 
 
+@pytest.mark.lengthy
 def test_a_line_through_small_sizes(tmp_path):
     file, said = RecordFile(tmp_path / "scaling.jsonl", PROVENANCE), []
     run_scaling((300, 1200), Size(64, 48, 500), TimingBudget(repeats=2, least=1), file, tmp_path, said.append)

@@ -9,6 +9,7 @@ from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.reference import on_screen, visible_rows
 from tests.ops.scenes import camera, cast, cotangents, random_gaussians, relative_error
 
+pytestmark = pytest.mark.lengthy
 SETTINGS = SplatSettings()
 
 

@@ -1,15 +1,22 @@
 """``sparsestreet bench``: modes, help, and the street of a run."""
 
 import json
+from pathlib import Path
 
 import pytest
 import torch
 
-from sparsestreet.bench import gpu, scaling
+from sparsestreet.bench import blend, figures, gpu, knobs, masks, scaling, scenes, step, sweep
+from sparsestreet.bench.scenes import Size
+from sparsestreet.bench.timing import TimingBudget
+from sparsestreet.cli import bench as cli_bench
+from sparsestreet.cli import step as cli_step
 from sparsestreet.cli.bench import bench, trained_street
 from sparsestreet.ops import splat
-from sparsestreet.scene.storage import load_scene
-from sparsestreet.scene.views import read_views
+from sparsestreet.records.provenance import this_machine, this_source
+from sparsestreet.scene.storage import load_scene, save_scene
+from sparsestreet.scene.views import read_views, write_views
+from tests.export.street import stored_street, street_views
 
 
 def test_help_teaches_by_example(capsys):
@@ -104,3 +111,102 @@ def test_the_street_of_a_run_is_what_the_run_renders(run_train, tmp_path):
         again = splat(street.gaussians, street.camera)
     assert torch.equal(again.rgb, load_scene(run).render(view).splats.rgb)  # without the sky
     assert float(again.alpha.mean()) > 0.2
+
+
+@pytest.fixture
+def handed(monkeypatch):
+    """What each mode hands to its measurement, which is replaced: positional and named arguments."""
+    given = {}
+
+    def replaced(module, name, answer):
+        monkeypatch.setattr(module, name, lambda *args, **named: given.update({name: (args, named)}) or answer)
+
+    for module, name in ((sweep, "run_sweep"), (blend, "run_blend"), (masks, "run_masks"), (scaling, "run_scaling")):
+        replaced(module, name, None)
+    replaced(gpu, "run_gpu", True)
+    replaced(step, "run_step", None)
+    monkeypatch.setattr(
+        figures, "draw_pareto", lambda records, folder: given.update(drawn=(records, folder)) or ["a.svg"]
+    )
+    monkeypatch.setattr(cli_bench, "trained_street", lambda run: given.update(street=run) or "the street")
+    monkeypatch.setattr(scenes, "bench_scenes", lambda *given: ("scenes", *given))
+    return given
+
+
+TRIAL = TimingBudget(repeats=2, least=1)
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "expected"),
+    [
+        (["knobs"], "run_sweep", (("scenes", sweep.FULL, None), ("scenes", sweep.SMALL), knobs.points(), sweep.BUDGET)),
+        (["--quick", "--street", "RUN"], "run_sweep",
+         (("scenes", sweep.QUICK, "the street"), ("scenes", sweep.SMALL), knobs.points(), sweep.QUICK_BUDGET)),
+        (["blend"], "run_blend", (blend.MAIN, blend.TRAINING, TimingBudget(20, 10.0, 3), TimingBudget(3, 10.0, 3))),
+        (["blend", "--quick"], "run_blend", (Size(64, 48, 300), [Size(48, 32, 200)], TRIAL, TRIAL)),
+        (["masks"], "run_masks", ((5_000, 50_000), 150, TimingBudget(100, 10.0, 3))),
+        (["masks", "--quick"], "run_masks", ((100,), 150, TRIAL)),
+        (["scaling"], "run_scaling", (scaling.ROWS, scaling.LARGE, TimingBudget(seconds=15.0, least=5))),
+        (["scaling", "--quick"], "run_scaling", ((200, 400, 800), None, TRIAL)),
+        (["gpu"], "run_gpu",
+         ([Size(w, h, rows) for w, h in gpu.IMAGES for rows in gpu.ROWS], torch.device("cuda"), gpu.BUDGET)),
+        (["gpu", "--quick"], "run_gpu", ([Size(64, 48, 500)], torch.device("cuda"), TRIAL)),
+        (["step", "seed=3"], "run_step", ("train seed=3", "trains", step.FULL)),
+        (["step", "seed=3", "--quick"], "run_step", ("train seed=3", "trains", step.QUICK)),
+    ],
+)  # fmt: skip
+def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, name, expected):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    trained = []
+    monkeypatch.setattr(
+        cli_step, "train_with", lambda overrides, folder: trained.append((overrides, folder)) or "trains"
+    )
+    assert bench([*words, "--out", str(tmp_path / "o")]) == 0
+    args, named = handed[name]
+    assert args[: len(expected)] == expected
+    mode = words[0] if not words[0].startswith("-") else "knobs"
+    file, *folder = args[len(expected) :]
+    assert file.path == tmp_path / "o" / f"{mode}.jsonl"
+    assert folder == ([tmp_path / "o"] if mode in ("scaling", "step") else [])
+    assert named == ({"street": None} if words == ["gpu"] else {})
+    if mode == "knobs":
+        assert handed["drawn"] == ([], tmp_path / "o")
+        assert handed.get("street") == (Path("RUN") if "--street" in words else None)
+    if mode == "step":
+        ((overrides, _),) = trained
+        assert overrides == ["seed=3"]
+
+
+def test_a_street_is_beside_the_sizes_of_a_gpu(handed, monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert bench(["gpu", "--street", "RUN", "--out", str(tmp_path)]) == 0
+    assert (handed["run_gpu"][1], handed["street"]) == ({"street": "the street"}, Path("RUN"))
+
+
+def test_threads_and_words_stand_in_the_record(handed, monkeypatch, tmp_path):
+    before = torch.get_num_threads()
+    numbers = []
+    monkeypatch.setattr(torch, "set_num_threads", numbers.append)
+    bench(["masks", "--threads", str(before + 1), "--out", str(tmp_path / "a b")])
+    assert numbers == [before + 1]
+    provenance = handed["run_masks"][0][3]._provenance
+    assert provenance.command == f"sparsestreet bench masks --threads {before + 1} --out '{tmp_path / 'a b'}'"
+    assert (provenance.threads, provenance.machine, provenance.source) == (before, this_machine(), this_source())
+    numbers.clear()
+    bench(["masks", "--out", str(tmp_path)])
+    assert numbers == []
+
+
+def test_the_street_of_a_run_is_the_view_in_its_middle(tmp_path):
+    """Of five frames and four cameras, 20 views, in their order: the eleventh."""
+    save_scene(tmp_path / "run" / "scene.safetensors", stored_street())
+    views = street_views()
+    write_views(tmp_path / "run" / "views.json", views[:15], views[15:])
+    street, stored = trained_street(tmp_path / "run"), load_scene(tmp_path / "run")
+    middle = read_views(tmp_path / "run" / "views.json").all[10]
+    assert (street.name, street.source) == (
+        "trained street", f"trained: run on {stored.name}, frame {middle.frame_index}",
+    )  # fmt: skip
+    assert torch.equal(street.camera.camera_from_world, middle.camera.camera_from_world)
+    assert torch.equal(street.gaussians.means, stored.scene.gaussians_at(middle).gaussians.means)
+    assert not street.gaussians.means.requires_grad

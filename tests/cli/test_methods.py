@@ -19,6 +19,7 @@ from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.density import GradientDensity, VibratingDensity
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.sources import ImagePoints
+from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
@@ -30,6 +31,9 @@ from tests.typed import as_a, there
 METHODS = sorted(path.stem for path in (CONF / "method").glob("*.yaml"))
 SPARSIFY = sorted(path.stem for path in (CONF / "sparsify").glob("*.yaml"))
 PAIRS = list(itertools.product(METHODS, SPARSIFY))
+WITH_EACH = ("paper", "removal", "capped")
+COMPOSED = [pair for pair in PAIRS if pair[0] == "streetgs" or pair[1] in WITH_EACH]
+"""The pairs that a daily run composes: each option once; each method with masks, both kinds of pruning and a cap."""
 DAILY = [("3dgs", "removal"), ("omnire", "removal"), ("pvg", "masks"), ("deformgs", "none")]
 """The pairs that a daily run trains: every method, every stage. The run of conftest.py is StreetGS. The rule of the
 paper takes part in test_toy_node.py."""
@@ -38,7 +42,8 @@ EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
-    assert {"none", "masks", "importance", "paper", "removal", "random", "opacity", "capped"} <= set(SPARSIFY)
+    assert {"none", "masks", "importance", "paper", "paper_short", "removal", "random", "opacity"} <= set(SPARSIFY)
+    assert {"capped", "mcmc", "uncapped"} <= set(SPARSIFY)
 
 
 @cache
@@ -46,7 +51,10 @@ def plain_losses(method: str) -> list[str]:
     return list(recipe_of(composed(f"method={method}")).losses)
 
 
-@pytest.mark.parametrize(("method", "sparsify"), PAIRS)
+@pytest.mark.parametrize(
+    ("method", "sparsify"),
+    [pair if pair in COMPOSED else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
+)
 def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     """Masks, their loss and their callback come together; what a method has stays with every sparsification."""
     cfg = composed(f"method={method}", f"sparsify={sparsify}")
@@ -55,9 +63,9 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
     assert list(recipe.losses) == [*plain_losses(method), *(["mask_sparsity"] if masked else [])]
     # Which rule and which masks a sparsification has is the paper's matter, and that of its name.
-    rules = {"importance": ImportanceRule, "paper": ImportanceRule, "removal": LeaveOneOutRule}
-    rules |= {"random": RandomRule, "opacity": OpacityRule}
-    assert masked or sparsify not in ("masks", "paper", "removal")
+    rules = dict.fromkeys(("importance", "paper", "paper_short"), ImportanceRule)
+    rules |= {"removal": LeaveOneOutRule, "random": RandomRule, "opacity": OpacityRule}
+    assert masked or sparsify not in ("masks", "paper", "paper_short", "removal")
     added = ([MaskTraining] if masked else []) + ([Pruning] if sparsify in rules else [])
     assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:
@@ -85,6 +93,64 @@ def test_schedules_and_capacities(schedule: str, capacity: str):
     background, rigid = recipe.nodes["background"], recipe.nodes["rigid"]
     limits = (background.min_gaussians, background.max_gaussians, rigid.min_gaussians, rigid.max_gaussians)
     assert limits == expected
+
+
+def papers_numbers(capacity: str, schedule: str) -> dict[str, Any]:
+    """What sparsify=paper says of masks and pruning, with every node that the paper has."""
+    cfg = composed("method=omnire", "sparsify=paper", f"schedule={schedule}", f"capacity={capacity}")
+    recipe = recipe_of(cfg)
+    removal = as_a(MaskTraining, recipe.callbacks["mask_training"]).remove_in
+    pruning = as_a(Pruning, recipe.callbacks["pruning"])
+    rule = as_a(ImportanceRule, pruning.rule)
+    masks = {name: cfg.node[name].mask for name in recipe.nodes}
+    rates = {name: recipe.nodes[name].learning_rates for name in recipe.nodes}
+    return {
+        "lambda_m": as_a(MaskSparsity, recipe.losses["mask_sparsity"]).weight,
+        "masks end": removal.stop,
+        "pruned at": pruning.at,
+        "rule": (rule.gate, rule.remove, list(rule.nodes or ())),
+        "lambda_n": {name: mask.sparsity_weight for name, mask in masks.items()},
+        "epsilon": {mask.threshold for mask in masks.values()},
+        "only where visible": {mask.visible_only for mask in masks.values()},
+        "the image closes": {masks[name].image_closes for name in ("smpl", "deformable")},
+        "rate": {LearningRate.of(each["mask_logits"]).initial for each in rates.values()},
+        "K_min": {name: settings.min_gaussians for name, settings in recipe.nodes.items()},
+    }
+
+
+@pytest.mark.parametrize(("capacity", "part"), [("paper", 1), ("small", 10)])
+@pytest.mark.parametrize("schedule", ["short", "paper"])
+def test_the_papers_method_has_its_numbers_at_any_length(schedule: str, capacity: str, part: int):
+    """Those of its text: steps 24,000 and 28,000 of 30,000 as fractions, lambda_n, K_min; a small run has a tenth of
+    its Gaussians and of its floors. lambda_m, epsilon and the rate, which it leaves open, as stated in conf."""
+    assert papers_numbers(capacity, schedule) == {
+        "lambda_m": 1.0,
+        "masks end": 24_000 / 30_000,
+        "pruned at": (pytest.approx(28_000 / 30_000, abs=1e-5),),
+        "rule": (True, None, ["background"]),
+        "lambda_n": {"background": 2.5e-3, "rigid": 1e-4, "smpl": 1e-5, "deformable": 1e-5},
+        "epsilon": {0.01},
+        "only where visible": {False},
+        "the image closes": {True},
+        "rate": {0.01},
+        "K_min": {
+            "background": 40_000 // part, "rigid": 10_000 // part, "smpl": 50_000 // part, "deformable": 5_000 // part
+        },
+    }  # fmt: skip
+
+
+def test_the_short_variant_is_the_schedules():
+    """And what it was called before stays what it was: with the paper's schedule and capacity both are one."""
+    cfg = composed("method=omnire", "sparsify=paper_short")
+    assert cfg.loss.mask_sparsity.weight == cfg.schedule.lambda_m == 12.0
+    assert (cfg.schedule.mask_in.stop, cfg.schedule.mask_learning_rate) == (0.9, 0.03)
+    assert (cfg.node.rigid.mask.visible_only, cfg.node.smpl.mask.image_closes) == (True, False)
+    assert cfg.node.deformable.min_gaussians == 5000
+    at_length = ("method=omnire", "schedule=paper", "capacity=paper")
+    short, exact = (resolved(composed(*at_length, f"sparsify={one}")) for one in ("paper_short", "paper"))
+    for one in (short, exact):
+        one.pop("sparsify"), one.pop("name"), one.pop("out", None)
+    assert short == exact
 
 
 def test_a_preset_reaches_the_density_of_every_node():
@@ -150,6 +216,15 @@ def test_a_density_strategy_is_a_choice():
     assert other == GradientDensity()
     cars = as_a(GradientDensity, recipe_of(composed()).nodes["rigid"].density)
     assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
+
+
+def test_pvg_grows_by_upstreams_numbers_at_the_papers_length():
+    """But for the screen gradients, which are absolute ones here, and so have a threshold of their own."""
+    node = recipe_of(composed("method=pvg", "schedule=paper", "capacity=paper")).nodes["background"]
+    density = as_a(VibratingDensity, node.density)
+    assert (density.peak_threshold, density.split_span, density.split_scale) == (2e-3, 0.01, 0.01)
+    assert (density.cull_scale, density.split_children, density.split_shrink) == (0.5, 2, 1.6)
+    assert node.max_gaussians == 3_000_000
 
 
 def test_settings_of_the_op_are_those_of_a_preset_unless_given():

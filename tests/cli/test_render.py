@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sparsestreet.cli import scene
 from sparsestreet.cli.render import USAGE, RenderRequest, render
 from sparsestreet.export import video
 from sparsestreet.export.path import shifted
@@ -144,3 +145,34 @@ def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
 def test_the_help_names_every_option():
     for field in fields(RenderRequest):
         assert f"\n  {field.name} " in USAGE
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], {"fps": 4.0, "quality": 7.0, "device": None, "count": 5, "size": (48, 32)}),
+        (["quality=2.5", "fps=8", "device=cpu", "width=24", "frames=1:4"],
+         {"fps": 8.0, "quality": 2.5, "device": "cpu", "count": 5, "size": (24, 16)}),
+        (["log_fps=2", "fps=1"], {"fps": 1.0, "quality": 7.0, "device": None, "count": 3, "size": (48, 32)}),
+    ],
+)  # fmt: skip
+def test_everything_that_is_asked_for_arrives(run, tmp_path, monkeypatch, capsys, words, expected):
+    """Five frames at 4 a second; a video of 8 a second of three of them has five, one of half the speed three."""
+    views = read_views(run / "views.json")
+    write_views(run / "views.json", views.training, views.held_out, frame_rate=4.0)
+    opened, given = [], {}
+    stored = stored_street()
+    monkeypatch.setattr(scene, "open_scene", lambda *place: opened.append(place) or stored)
+    monkeypatch.setattr(video, "path_pictures", lambda *told: given.update(path=told) or iter(()))
+    monkeypatch.setattr(video, "write_pictures", lambda *told, **how: given.update(written=(told, how)) or 77)
+    assert render([f"scene={run}", f"out={tmp_path / 'o'}", "cameras=[2,0]", *words]) == 0
+    assert opened == [(run, expected["device"])]
+    shown, path = given["path"]
+    assert shown is stored
+    assert len(path) == expected["count"]
+    assert {(view.camera.width, view.camera.height) for rig in path for view in rig} == {expected["size"]}
+    assert {tuple(view.camera_index for view in rig) for rig in path} == {(2, 0)}
+    (out, _), how = given["written"]
+    assert out == tmp_path / "o"
+    assert how == {"fps": expected["fps"], "quality": expected["quality"]}
+    assert f"{tmp_path / 'o'}: 77 frames of camera 2, 0 at {expected['fps']:g} a second" in capsys.readouterr().out

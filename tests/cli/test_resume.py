@@ -15,7 +15,7 @@ import torch
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.resume import check_resumed
+from sparsestreet.cli.resume import check_resumed, resumed_overrides
 from sparsestreet.cli.train import train
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.summary import SUMMARY
@@ -193,3 +193,52 @@ def test_what_may_change_when_a_run_goes_on(tmp_path, change, refused):
     OmegaConf.save(config, tmp_path / ".hydra" / "config.yaml")
     with nullcontext() if refused is None else pytest.raises(ValueError, match=refused):
         check_resumed(config | change, tmp_path)
+
+
+def small_run(folder: Path, *overrides: str) -> Path:
+    """What is asked of a run that goes on: its words and its configuration."""
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "last.ckpt").touch()
+    OmegaConf.save(list(overrides), folder / ".hydra" / "overrides.yaml")
+    OmegaConf.save(
+        {"seed": 3, "a": {"b": 1}, "out": "x", "trainer": {"precision": 16}}, folder / ".hydra" / "config.yaml"
+    )
+    return folder
+
+
+def test_a_run_goes_on_with_its_own_words_then_those_that_are_given(tmp_path):
+    run = small_run(tmp_path / "run", "seed=3", "out=old", "resume=null", "a.b=1")
+    own = ["seed=3", "a.b=1"]
+    assert resumed_overrides([f"resume={run}", "c=2"]) == [*own, f"resume={run}", "c=2", f"out={run}"]
+    checkpoint = run / "checkpoints" / "last.ckpt"
+    assert resumed_overrides([f"resume={checkpoint}"]) == [*own, f"resume={checkpoint}", f"out={run}"]
+    assert resumed_overrides([f"resume={run}", "out=else"]) == [*own, f"resume={run}", "out=else"]
+    for words in (["seed=1"], ["resume=null"], ["resume="], []):
+        assert resumed_overrides(words) == words
+
+
+def test_what_cannot_go_on_is_said(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing: there is nothing; give a run's folder or one of its check"):
+        resumed_overrides([f"resume={tmp_path / 'nothing'}"])
+    with pytest.raises(FileNotFoundError, match=r"is no run: it has no \.hydra/config\.yaml; give a folder that train"):
+        resumed_overrides([f"resume={tmp_path}"])
+    for flag in ("-m", "--multirun"):
+        with pytest.raises(ValueError, match="a sweep cannot go on with one run: leave out -m or resume"):
+            resumed_overrides([flag, f"resume={tmp_path}"])
+
+
+def test_options_that_differ_are_named_with_what_they_were(tmp_path):
+    """The seed first, then the first two others; where a run writes and how it is trained may change."""
+    run = small_run(tmp_path / "run")
+    same = {"seed": 3, "a": {"b": 1}, "out": "y", "trainer": {"precision": 32, "more": 1}}
+    check_resumed(same, run)
+    with pytest.raises(ValueError, match=r"but 1 options differ: a\.b \(1 before\); start a new run"):
+        check_resumed(same | {"a": {"b": 2}}, run)
+    with pytest.raises(ValueError, match=r"but 1 options differ: seed \(3 before\);"):
+        check_resumed(same | {"seed": 4}, run)
+    many = same | {"a": {}, "c": 1, "d": 2, "seed": 4}
+    with pytest.raises(
+        ValueError, match=r"but 4 options differ: seed \(3 before\), a\.b \(1 before\), c \(None before\);"
+    ):
+        check_resumed(many, run)

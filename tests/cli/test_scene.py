@@ -4,9 +4,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.scene import import_parts
+from sparsestreet.cli import scene
+from sparsestreet.cli.scene import import_parts, open_scene
+from tests.export.street import stored_street
 
 
 @pytest.mark.parametrize(
@@ -24,3 +27,24 @@ def test_every_part_from_outside_is_imported(where: str, tmp_path: Path, monkeyp
     OmegaConf.save(config, tmp_path / ".hydra" / "config.yaml")
     import_parts(tmp_path)
     assert sys.modules.pop(name).Settings
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+@pytest.mark.parametrize("asked", [None, "cpu", "cuda"])
+def test_a_scene_opens_where_it_is_asked_for(tmp_path, monkeypatch, gpu, asked):
+    """Of a run its parts are imported first; a file alone says nothing of them."""
+    done: list[object] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    monkeypatch.setattr(scene, "import_parts", lambda run: done.append(run))
+    stored = stored_street()
+    monkeypatch.setattr(scene, "load_scene", lambda *given: done.append(given) or stored)
+    (tmp_path / "run" / ".hydra").mkdir(parents=True)
+    device = asked or ("cuda" if gpu else "cpu")
+    if device == "cuda" and not gpu:
+        with pytest.raises(ValueError, match="device=cuda needs a CUDA device and torch sees none: say device=cpu"):
+            open_scene(tmp_path / "run", asked)
+        return
+    assert open_scene(tmp_path / "run", asked) is stored
+    assert open_scene(tmp_path / "run" / "scene.safetensors", asked) is stored
+    run, file = tmp_path / "run", tmp_path / "run" / "scene.safetensors"
+    assert done == [run, (run, torch.device(device)), (file, torch.device(device))]

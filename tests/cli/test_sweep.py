@@ -14,6 +14,7 @@ from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, run_job, sweep
 from sparsestreet.cli.train import train
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY
+from sparsestreet.report.published import TABLES
 from tests.cli import configurations
 from tests.cli.conftest import TIMED_ONCE
 from tests.evaluation.frames import make_summary
@@ -70,6 +71,28 @@ def test_the_rows_of_table_1_are_the_papers():
         labels += [composed(f"method={method}", *rest).name for method in params.method.split(",")]
     plain = ["3dgs-legacy", "deformgs-legacy", "pvg-legacy", "streetgs-legacy", "omnire-legacy"]
     assert labels == [*plain, "streetgs-legacy+paper", "omnire-legacy+paper"]
+
+
+def test_global_pruning_of_table_3_is_global():
+    """No floor holds it back; background pruning has the paper's of the background."""
+    rest = ["+sweep=table3_pruning", "data.root=/drives/172", "method=omnire", "sparsify=importance"]
+    arms = [
+        composed(*rest, f"experiment={choice}") for choice in composed(*rest).hydra.sweeper.params.experiment.split(",")
+    ]
+    assert [arm.name for arm in arms] == ["omnire-legacy+importance", "omnire-legacy+global_pruning"]
+    background, everywhere = arms
+    assert background.callback.pruning.rule.nodes == ["background"]
+    assert background.node.background.min_gaussians == 40_000
+    assert everywhere.callback.pruning.rule.nodes is None
+    assert {name: node.min_gaussians for name, node in everywhere.node.items()} == dict.fromkeys(everywhere.node, 0)
+    floors = [node.get("min_instance_gaussians", 0.0) for node in everywhere.node.values()]
+    assert floors == [0.0] * 4
+    told = [[all(word in arm.name for word in row.options) for arm in arms] for row in TABLES["table3_pruning"].rows]
+    assert told == [[False, True], [True, False]]  # the report finds the published row of each
+    # But for this, the arms are alike.
+    rule = background.callback.pruning.rule
+    assert OmegaConf.merge(rule, {"nodes": None}) == everywhere.callback.pruning.rule
+    assert background.callback.pruning.at == everywhere.callback.pruning.at == [0.93334]
 
 
 @pytest.mark.parametrize("name", ["drives", "streets", "tiny"])

@@ -71,6 +71,7 @@ def test_validation_looks_at_frames_from_the_whole_drive(limit):
     assert {places[0], places[-1]} == ({29} if limit == 1 else {0, 59})
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("num_cameras", [2, 3, 5])
 def test_validation_meets_every_camera(num_cameras):
     """Also where every k-th held-out image would be of one camera."""

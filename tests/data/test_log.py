@@ -18,6 +18,7 @@ def sweep(points: torch.Tensor, colored: torch.Tensor) -> Sweep:
     return Sweep(0, points, torch.full_like(points, 0.5), colored)
 
 
+@pytest.mark.lengthy
 @settings(deadline=None)  # the first example pays for what is built once
 @given(st.integers(2, 30), st.integers(1, 3), st.integers(2, 12), st.data())
 def test_a_split_takes_every_frame_once_and_all_cameras_of_an_instant_together(num_frames, num_cameras, stride, data):
@@ -72,6 +73,32 @@ def test_the_box_reaches_around_the_cameras():
     log = make_log(num_frames=41, num_cameras=1, sweeps=(sweep(points, torch.zeros(10, dtype=torch.bool)),))
     assert log.radius == pytest.approx(1.1 * 40 / 2)
     assert torch.allclose(log.center, torch.tensor([20.0, 0, 0]))
+
+
+def test_along_the_first_pose_the_size_is_the_same_wherever_the_street_leads():
+    """80 m ahead, 20 m across, 3 m high: DriveStudio's box ends 20 m up and leaves the cameras out."""
+    forward = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (4000, 3))) * torch.tensor([40.0, 10.0, 1.5])
+    low, high = np.quantile(forward.numpy(), (0.02, 0.98), axis=0)
+    middle = torch.from_numpy((low + np.array((high[0], high[1], 20.0))) / 2)
+    for degrees in (0, 45, 130):
+        turn = torch.eye(3, dtype=torch.float64)
+        sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+        turn[:2, :2] = torch.tensor([[cosine, -sine], [sine, cosine]])
+        points = (forward @ turn.T).float()
+        log = make_log(num_frames=300, num_cameras=1, sweeps=(sweep(points, torch.ones(4000, dtype=torch.bool)),))
+        along = replace(log, first_axes=turn)
+        assert along.radius == pytest.approx(1.1 * (high[0] - low[0]) / 2, rel=1e-6)
+        assert torch.allclose(along.center, (turn @ middle).float(), atol=1e-4)
+        # Around 300 m of cameras.
+        assert log.radius > 150
+
+
+def test_along_the_first_pose_without_lidar():
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    log = make_log(num_frames=3, num_cameras=1)
+    along = replace(log, first_axes=turn)
+    assert along.radius == pytest.approx(log.radius)  # a quarter turn
+    assert torch.allclose(along.center, log.center, atol=1e-5)
 
 
 def test_without_lidar_cameras_see_fifty_metres_ahead():

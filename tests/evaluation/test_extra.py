@@ -7,13 +7,17 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation import extra
-from sparsestreet.evaluation.extra import ExtraMetrics, _of_shifts
+from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts
+from sparsestreet.ops import SplatSettings
+from sparsestreet.phases import StageRecorder
 from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
-from sparsestreet.records.presets import PRESETS
-from tests.evaluation.frames import make_frame
+from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
+from sparsestreet.scene.rendering import RenderOptions
+from tests.evaluation.frames import NOISE, make_frame
 from tests.evaluation.scenes import OPTIONS, small_scene
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize(("stride", "views", "ramp"), [(2, 1, True), (0, 3, False)])
 def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_none(
     monkeypatch, tmp_path, stride, views, ramp
@@ -43,3 +47,74 @@ def test_what_is_said_of_a_side():
     record = NovelRecord(command="c", ramp=False, real_views=6, absent=None, shifts=tuple(shifts))
     said = [f"2 m to the {side} (n=6): fid 42, 20.00 dB to the truth" for side in ("right", "left")]
     assert list(_of_shifts(record)) == said
+
+
+def street(count=4, **changes):
+    """Of so many instants the second and fourth are held out."""
+    frames = tuple(make_frame(index) for index in range(count))
+    log = DrivingLog("some", Frames.of(frames), Sweeps.of(()), (), count, 1, torch.eye(4).double(), **changes)
+    return StreetData(log, stride=2, offset=1)
+
+
+NETWORK = object()
+
+
+@pytest.mark.parametrize("weights", [{}, {"lpips_alex": NETWORK, "lpips_vgg": object()}])
+def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
+    asked = {}
+    novel = NovelRecord(command="n", ramp=True, real_views=2, absent="no weights", shifts=())
+    rendered = PresetRecord(command="p", device="d", threads=1, views=2, noise=NOISE, rendered=())
+    for name, answer in (("evaluate_novel", novel), ("evaluate_presets", rendered)):
+        monkeypatch.setattr(extra, name, lambda *args, n=name, a=answer, **how: asked.update({n: (args, how)}) or a)
+    opened = []
+    monkeypatch.setattr(
+        extra, "open_lpips", lambda device: opened.append(device) or (weights, {"lpips_alex": "a", "lpips_vgg": "v"})
+    )
+    monkeypatch.setattr(extra, "LastLayer", lambda *given: ("features", *given))
+    scene, data = small_scene(), street(truth=lambda view: None)
+    truth = data.driving_log.truth
+    told = ExtraMetrics(novel=(1.0, 2.5), ramp=True, presets=("fast", "fine"))
+    said = []
+    with StageRecorder() as stages:
+        told.measure(scene, data, OPTIONS, out=tmp_path, command="typed", say=said.append)
+    views = data.split.held_out
+    assert asked["evaluate_novel"] == (
+        (scene, views, (1.0, 2.5), OPTIONS),
+        {"command": "typed", "truth": truth, "absent": "a", "ramp": True,
+         "extractor": ("features", "alexnet", NETWORK) if weights else None},
+    )  # fmt: skip
+    ways = {name: RenderOptions(SplatSettings.preset(name)) for name in ("fast", "fine")}
+    assert asked["evaluate_presets"] == ((scene, views, ways, OPTIONS), {"command": "typed"})
+    assert opened == [scene.device]
+    assert (NOVEL.read(tmp_path), PRESETS.read(tmp_path)) == (novel, rendered)
+    assert said == ["no distances: no weights"]
+    assert set(stages.seconds()) == {"other", "novel", "presets"}
+
+
+def test_nothing_is_measured_where_nothing_is_asked(tmp_path):
+    ExtraMetrics().measure(small_scene(), street(), OPTIONS, out=tmp_path, command="c", say=pytest.fail)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_said_of_presets():
+    ways = [
+        RenderedAs(
+            preset=name, trained=trained, quality={"psnr_full": psnr}, psnr_to_exact=exact, frame_ms=ms, repeats=3
+        )
+        for name, trained, psnr, exact, ms in (("fast", False, 24.125, 41.25, 7.75), ("fine", True, 25.5, 52.5, 9.25))
+    ]
+    record = PresetRecord(command="p", device="d", threads=1, views=2, noise=NOISE, rendered=tuple(ways))
+    assert list(_of_presets(record)) == [
+        "fast: 24.12 dB, 41.2 dB to the exact image, 7.8 ms/frame",
+        "fine (as trained): 25.50 dB, 52.5 dB to the exact image, 9.2 ms/frame",
+    ]
+
+
+def test_metrics_that_cannot_be_are_refused():
+    for asked, said in (
+        ({"novel": (1.0, 0.0)}, r"above 0, got \[1.0, 0.0\]"),
+        ({"ramp": True}, "say novel=1,2,3 too"),
+        ({"presets": ("fast", "quick")}, "no settings preset 'quick'"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            ExtraMetrics(**asked)

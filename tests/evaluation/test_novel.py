@@ -68,6 +68,7 @@ def test_a_ramp_reaches_the_whole_shift_at_the_last_instant():
     assert float(alone.camera.position[2]) == pytest.approx(3 - 2)  # right of one that looks along x is -z
 
 
+@pytest.mark.lengthy
 def test_distances_are_of_shifted_renders_and_real_images():
     frames = rig(3)
     record = evaluate(frames, (1.0, 2.0), extractor=MeanColor())
@@ -125,6 +126,7 @@ def test_nothing_to_shift_is_an_error(frames, offsets):
         evaluate(frames, offsets)
 
 
+@pytest.mark.lengthy
 def test_one_image_is_alive_at_a_time(monkeypatch):
     alive = count_live(monkeypatch)
     evaluate(rig(3), (1.0, 2.0), extractor=MeanColor())

@@ -29,6 +29,7 @@ def evaluated(presets, trained=OPTIONS):
     return evaluate_presets(SCENE, FRAMES, presets, trained, command="c")
 
 
+@pytest.mark.lengthy
 def test_each_preset_is_rendered_and_compared():
     """The distance to the exact image in numpy; quality as evaluation says it of that way to render."""
     record = evaluated({"default": RenderOptions(), "coarse": COARSE})

@@ -12,6 +12,7 @@ from PIL import Image
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.evaluate import evaluate_predictions
+from sparsestreet.evaluation.node_costs import SceneCosts
 from sparsestreet.evaluation.predictions import PredictionError, Predictions
 from sparsestreet.evaluation.run import choose_pictures, evaluate_scene
 from sparsestreet.evaluation.speed import Timing
@@ -19,13 +20,15 @@ from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.pictures.images import LIDAR_END, picture_path, read_pictures
+from sparsestreet.records.costs import COSTS, NodeCost
+from sparsestreet.records.latency import LATENCY, clock_rows
 from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, RegionQuality, summarize
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View
-from tests.evaluation.frames import make_frame, make_image, make_run
+from tests.evaluation.frames import NOISE, make_frame, make_image, make_latency, make_run
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
 from tests.metrics.networks import random_weights, write_weights
 from tests.typed import there
@@ -349,3 +352,82 @@ def test_pictures_are_chosen_by_vehicles_and_spacing(pixels, count, expected):
 def test_choice_does_without_masks():
     quality = [make_image(index) for index in range(11)]
     assert len(set(choose_pictures(quality, 4))) == 4
+
+
+def unlike(index, camera, size, **known):
+    return dataclasses.replace(make_frame(index, camera, size), **known)
+
+
+def test_everything_reaches_its_measurement(tmp_path, monkeypatch):
+    """Two sizes and cameras held out, one trained on: each measurement sees the right ones."""
+    held_out = [unlike(3, 1, (9, 12)), unlike(5, 2, (12, 9))]
+    training = [unlike(4, 1, (10, 11))]
+    scene, device, seen = small_scene(), torch.device("cpu", 0), {}
+    latency = dataclasses.replace(make_latency(7.5), device="cpu: somewhere", threads=3)
+    costs = SceneCosts({"splat": 1.0}, {"road": NodeCost(1, 2.0, 3.0, 4.0)}, {"sky": 5.0}, NOISE)
+    alarming = Guards(**{field.name: place for place, field in enumerate(dataclasses.fields(Guards))})
+
+    def replaced(name, answer):
+        monkeypatch.setattr(
+            run_module, name, lambda *args, **how: seen.setdefault(name, []).append((args, how)) or answer
+        )
+
+    for name, answer in (("measure_latency", latency), ("measure_scene_costs", costs), ("guards", alarming)):
+        replaced(name, answer)
+    true = run_module.evaluate_frames
+    monkeypatch.setattr(
+        run_module, "evaluate_frames", lambda *args: seen.setdefault("frames", []).append(args) or true(*args)
+    )
+    lpips, absent = {}, {"lpips_alex": "none"}
+    monkeypatch.setattr(run_module, "open_lpips", lambda device: seen.update(lpips=device) or (lpips, absent))
+    told = {"run": MADE, "options": OPTIONS, "command": "typed", "timing": Timing(3, 4, 5)}
+    summary = evaluate_scene(scene, tuple(held_out), tuple(training), out=tmp_path, device=device, pictures=1, **told)
+    views = [(3, 1), (5, 2)]
+    for name, how in (
+        ("measure_latency", {"warmup": 3, "repeats": 4}), ("measure_scene_costs", {"repeats": 5}),
+    ):  # fmt: skip
+        (((one, some, options), given),) = seen[name]
+        assert (one, [view.indices for view in some], options, given) == (scene, views, OPTIONS, how)
+    first, second = seen["frames"]
+    assert [frame.indices for frame in first[1]] == views
+    assert [frame.indices for frame in second[1]] == [(4, 1)]
+    assert (first[2], second[2]) == (OPTIONS, OPTIONS)
+    assert (first[3], second[3]) == (Predictions.of(tmp_path, HELD_OUT), None)
+    assert first[4] is lpips
+    assert [(args[1].width, how) for args, how in seen["guards"]] == [
+        (12, {"settings": OPTIONS.settings}), (9, {"settings": OPTIONS.settings}),
+    ]  # fmt: skip
+    total = dataclasses.replace(
+        alarming, **{name: 2 * count for name, count in dataclasses.asdict(alarming).items()}
+    )  # fmt: skip
+    assert (summary.guards.rows, summary.guards.alarms) == (dataclasses.asdict(total), total.alarms)
+    assert summary.resolutions == ("11x10", "12x9", "9x12")
+    assert (summary.absent, summary.run, summary.latency) == (absent, MADE, latency)
+    assert summary.latency_protocol == latency.protocol
+    assert (summary.evaluated.command, summary.evaluated.device, summary.evaluated.threads) == (
+        "typed", "cpu: somewhere", 3,
+    )  # fmt: skip
+    assert list(summary.by_camera[HELD_OUT]) == ["1", "2"]
+    assert list(summary.by_camera[TRAINING]) == ["1"]
+    assert LATENCY.read(tmp_path) == list(clock_rows(latency))
+    written = COSTS.read(tmp_path)
+    assert (written.frame_ms, written.nodes, written.effects, written.noise) == (
+        costs.frame_ms, costs.nodes, costs.effects, costs.noise,
+    )  # fmt: skip
+    assert seen["lpips"] == scene.device
+
+
+@pytest.mark.usefixtures("dark")
+@pytest.mark.parametrize(("splits", "views"), [(("held", "trained"), "2 held-out"), (("trained",), "3 training")])
+def test_the_sheet_says_what_it_shows(tmp_path, monkeypatch, splits, views):
+    drawn = []
+    blank = np.zeros((4, 4, 3), dtype=np.uint8)
+    monkeypatch.setattr(run_module, "picture_sheet", lambda chosen, **how: drawn.append((chosen, how)) or blank)
+    summary = evaluate(
+        tmp_path, make_frames(2) if "held" in splits else (), make_frames(3, first=1), run=MADE, pictures=1
+    )  # fmt: skip
+    (((picture,), how),) = drawn
+    psnr = summary.mean("psnr_full")
+    assert how["title"] == f"street, streetgs+paper, seed 3: {psnr:.2f} dB over {views} images, 4 Gaussians"
+    assert how["legend"] == node_legend({"road": 2, "cars": 2})
+    assert (picture.frame, picture.camera) == ((10, 1) if "held" in splits else (21, 0))

@@ -34,6 +34,7 @@ def steady(monkeypatch):
     monkeypatch.setattr(speed, "calibrate", lambda device: Calibration(1.0, 0.0, None))
 
 
+@pytest.mark.lengthy
 @pytest.mark.usefixtures("steady")
 def test_percentiles_of_known_durations(monkeypatch):
     """On a clock that only the renders move."""
@@ -156,6 +157,7 @@ def test_the_scene_is_what_is_timed(stopped):
     assert latency.removed == {}
 
 
+@pytest.mark.lengthy
 @pytest.mark.usefixtures("steady")
 def test_taking_closed_rows_out_is_no_part_of_a_frame(stopped):
     """Somebody who wants to be fast does so beforehand."""
@@ -172,6 +174,7 @@ def test_an_image_for_a_screen_is_clamped_and_rounded(monkeypatch):
     assert image[0, 0].tolist() == [0, 128, 255]
 
 
+@pytest.mark.lengthy
 @pytest.mark.usefixtures("steady")
 def test_closed_gaussians_are_timed_masked_and_removed(monkeypatch):
     """The mask closes two rows at time 0 and one at time 0.1; what is removed is not in the scene that is drawn."""

@@ -152,6 +152,11 @@ def test_another_width_shows_the_same():
     pixels, _, _ = project(view.camera, points)
     expected = pixels * torch.tensor([20 / 48, 14 / 33])
     torch.testing.assert_close(project(small.camera, points)[0], expected)
+    # Half of 48 pixels is the focal length; each axis has its own factor, 20 / 48 and 14 / 33.
+    x, y = 20 / 48, 14 / 33
+    expected = torch.tensor([[24 * x, 0, 24 * x], [0, 24 * y, 16.5 * y], [0, 0, 1]])
+    torch.testing.assert_close(small.camera.intrinsics, expected)
+    assert torch.equal(small.camera.camera_from_world, view.camera.camera_from_world)
     assert small.frame_index == view.frame_index
     with pytest.raises(ValueError, match="at least 1 pixel"):
         resized(path, 0)

@@ -34,6 +34,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / ((a.astype(np.float64) - b) ** 2).mean()))
 
 
+@pytest.mark.lengthy
 def test_a_video_of_a_scene_shows_what_it_renders(tmp_path):
     stored = stored_street()
     path = of_cameras(recorded(street_views(width=64, height=48)), [1, 0])

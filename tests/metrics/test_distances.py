@@ -56,6 +56,7 @@ def test_kernel_distance_is_the_double_loop(n, m):
     assert kernel_distance(a, b) == pytest.approx(expected, rel=1e-10, abs=1e-12)
 
 
+@pytest.mark.lengthy
 def test_kernel_distance_of_samples_of_one_law_is_zero_on_average():
     values = [kernel_distance(features(8, 5, 2 * seed), features(8, 5, 2 * seed + 1)) for seed in range(200)]
     spread = np.std(values) / 200**0.5

@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
-from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, metric_id
+from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, REGIONS, metric_id, quantities_of
 from sparsestreet.metrics.image import masked_psnr, psnr, psnr_of_mse, psnr_on_device, rounded
 from tests.metrics.images import SIZES, TOLERANCE, image_pair
 
@@ -79,3 +79,20 @@ def test_every_id_has_a_definition_that_names_its_region():
     assert "without a lidar return of the same instant within 0.04" in DEFINITIONS["ssim_uniform7_beyond_lidar"]
     assert "{" not in "".join(DEFINITIONS.values())
     assert len(set(DEFINITIONS.values())) == len(DEFINITIONS) == 6 * 7 + 2 * 3
+
+
+def test_a_definition_says_over_what_it_is_averaged():
+    """Windows leave the full image at its border; in a region they do not, and its pixels are averaged."""
+    whole = {
+        "ssim_uniform7": "less its 3 pixel border",
+        "ssim_gauss11": "less its 5 pixel border",
+        "lpips_alex": "each layer averaged over the image",
+        "lpips_vgg": "each layer averaged over the image",
+    }
+    of_map = dict.fromkeys(("ssim_uniform7", "ssim_gauss11"), "the map of the full image, borders by reflection")
+    of_map |= dict.fromkeys(("lpips_alex", "lpips_vgg"), "each layer's map of the full image")
+    for region in REGIONS:
+        for quantity in quantities_of(region):
+            text = DEFINITIONS[metric_id(quantity, region)]
+            expected = (whole if region == "full" else of_map).get(quantity)
+            assert {said for said in (*whole.values(), *of_map.values()) if said in text} == {expected} - {None}

@@ -12,6 +12,7 @@ from sparsestreet.metrics.lpips import ALEX, VGG16, Lpips, LpipsWeights, lpips_o
 from sparsestreet.metrics.lpips_weights import open_lpips
 from tests.metrics.networks import random_weights
 
+pytestmark = pytest.mark.lengthy
 NETWORKS = {"lpips_alex": ("alex", ALEX), "lpips_vgg": ("vgg", VGG16)}
 # Float32 of two orders of summation; the peer guards zero lengths by 1e-8 below the root, which moves unit features
 # by less than 1e-8 of their length squared.

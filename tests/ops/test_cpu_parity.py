@@ -15,6 +15,7 @@ SETTINGS = {
     "antialias": SplatSettings(antialias=True),
     "exact": SplatSettings.preset("exact"),
     "inria": SplatSettings.preset("inria"),
+    "drivestudio": SplatSettings.preset("drivestudio"),
 }
 # Bars of the op: image 1e-5 and gradients 1e-4 in float32; in float64 only the order of sums differs.
 IMAGE_BAR = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -94,6 +95,7 @@ def test_gradcheck(field):
     assert torch.autograd.gradcheck(images, values[field].requires_grad_(), fast_mode=True)
 
 
+@pytest.mark.lengthy
 def test_bitwise_equal_for_one_and_two_threads():
     view = camera(70, 50)
     gaussians = random_gaussians(200_000, view, terms=1)

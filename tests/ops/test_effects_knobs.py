@@ -1,12 +1,14 @@
-"""The box, the bits of the depth that are sorted, and half-precision colors, against hand-computed pixels."""
+"""The box, the bits of the depth that are sorted, and what is done to colors, against hand-computed pixels."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, guards, splat
+from sparsestreet.ops.spherical_harmonics import basis, view_colors
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -20,6 +22,7 @@ from tests.ops.scenes import (
     relative_error,
     render,
 )
+from tests.typed import there
 
 Y0 = 0.28209479177387814
 RED, GREEN = [[[1.0 / Y0, 0.0, 0.0]]], [[[0.0, 1.0 / Y0, 0.0]]]
@@ -160,6 +163,68 @@ def test_half_colors_in_a_scene(backend, dtype):
     assert torch.equal(plain.gradients["sh"], rounded.gradients["sh"])
     for name in FIELDS:
         assert relative_error(rounded.gradients[name], plain.gradients[name]) < 1e-2
+
+
+@every_precision
+def test_clamped_colors_by_hand(backend, dtype):
+    # Colors 0.5 + x at alpha 0.8; a red that is clamped away from 1 has no gradient, nor has a blue below 0.
+    ball = one_gaussian(sh=[[((np.array([1.5, 0.75, -0.25]) - 0.5) / Y0).tolist()]])
+    seen = render(ball, front_camera(5, 5, 40.0), backend, dtype, SplatSettings(clamp_colors=True))
+    assert seen.images["rgb"][2, 2].tolist() == pytest.approx([0.8, 0.6, 0.0], abs=1e-6)
+    assert (seen.gradients["sh"][0, 0] != 0).tolist() == [False, True, False]
+    open_above = render(ball, front_camera(5, 5, 40.0), backend, dtype)
+    assert float(open_above.images["rgb"][2, 2, 0]) == pytest.approx(1.2, abs=1e-6)
+
+
+def test_a_color_at_an_end_may_leave_it_again():
+    """As torch's clamp has it. Backends that fuse products and sums round such colors to one side or the other."""
+    ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    steps = torch.arange(-8, 9)[:, None, None] * 2.0**-52
+    for end in (0.0, 1.0):
+        nearly = (end - 0.5) / Y0 * (1 + steps.double()).expand(-1, 1, 3)
+        for clamped, moves in ((True, True), (False, end == 1.0)):
+            sh = nearly.clone().requires_grad_()
+            colors = view_colors(sh, ahead.expand(len(sh), 3), clamped)
+            exact = (0.5 + basis(ahead, 1)[0, 0] * nearly[:, 0] == end).all(1)
+            assert exact.any()
+            colors.sum().backward()
+            assert (there(sh.grad)[exact] != 0).all() == moves
+
+
+@every_precision
+def test_detached_colors_are_those_of_rows_without_a_direction(backend, dtype):
+    """An independent oracle: rows that have the seen colors, clamped, as harmonics of degree 0."""
+    view = camera(17, 13)
+    rows = random_gaussians(12, view, terms=16, seed=3)
+    rows = replace(rows, sh=3 * rows.sh)
+    toward = torch.nn.functional.normalize(rows.means - view.position, dim=1)
+    colors = (0.5 + (basis(toward, 16)[..., None] * rows.sh).sum(1)).clamp(0, 1)
+    assert (colors == 1).any()
+    assert (colors == 0).any()
+    settings = SplatSettings(clamp_colors=True, detach_directions=True)
+    seen = render(rows, view, backend, dtype, settings)
+    frozen = render(replace(rows, sh=((colors - 0.5) / Y0)[:, None]), view, "reference")
+    # The bars of the op in its precision.
+    image_bar, gradient_bar = (1e-12, 1e-10) if dtype == torch.float64 else (1e-5, 1e-4)
+    assert (seen.images["rgb"] - frozen.images["rgb"]).abs().max() < image_bar
+    for name in ("means", "quaternions", "scales", "opacities", "screen"):
+        assert relative_error(seen.gradients[name], frozen.gradients[name]) < gradient_bar, name
+    through = render(rows, view, backend, dtype, replace(settings, detach_directions=False))
+    assert relative_error(through.gradients["means"], seen.gradients["means"]) > 1e-2
+
+
+@every_double
+def test_gradients_of_clamped_colors_are_right(backend):
+    view = camera(6, 5)
+    rows = random_gaussians(8, view, terms=9, seed=3)
+    values = {name: getattr(rows, name).clone() for name in FIELDS} | {"sh": 3 * rows.sh}
+    settings = SplatSettings(alpha_min=1e-9, clamp_colors=True)
+    for field in ("means", "sh"):
+
+        def image(value, field=field):
+            return splat(Gaussians(**(values | {field: value})), view, settings=settings, backend=backend).rgb
+
+        assert torch.autograd.gradcheck(image, values[field].clone().requires_grad_(), fast_mode=True)
 
 
 def test_what_is_off_is_not_run(monkeypatch):

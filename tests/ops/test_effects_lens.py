@@ -126,6 +126,7 @@ def test_against_the_text_book(backend, coefficients):
     assert compared > 10
 
 
+@pytest.mark.lengthy
 @every_double
 def test_sigma_points_past_the_fold_and_behind_the_near_plane(backend):
     # 40 degrees off the axis and as large as its distance: sigma points lie past the fold and behind the camera.

@@ -197,6 +197,7 @@ def test_distortion_that_no_lens_has(place, k):
         splat(one_gaussian(), dataclasses.replace(VIEW, distortion=lens), backend="reference")
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_wildest_distortion_that_is_taken_is_finite(name, dtype):
@@ -275,7 +276,7 @@ def test_settings(field, value):
 
 def test_presets():
     assert SplatSettings.preset("default") == SplatSettings()
-    names = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast")
+    names = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast", "drivestudio")
     assert len({SplatSettings.preset(name) for name in names}) == len(names)
     with pytest.raises(ValueError, match=r"no settings preset 'faster': choose one of .*'fast'"):
         SplatSettings.preset("faster")

@@ -74,6 +74,7 @@ def test_files_that_were_not_written_leave_their_picture_out(tmp_path, drawn):
     assert drawn == {}
 
 
+@pytest.mark.lengthy
 def test_the_pictures_are_drawn(tmp_path):
     LEDGER.write(tmp_path, CHANGES)
     draw_history(tmp_path)

@@ -84,3 +84,18 @@ def test_missing_pictures_are_named(tmp_path):
     write_png(picture_path(tmp_path, 3, 1, "truth"), flat((1, 2, 3)))
     with pytest.raises(FileNotFoundError, match="003_1_render"):
         read_pictures(tmp_path)
+
+
+def test_the_knots_of_the_map_are_infernos():
+    """Between two of them colors lie on a straight line."""
+    knots = np.linspace(0, 1, 17)
+    expected = (matplotlib.colormaps["inferno"](knots)[:, :3] * 255).round()
+    assert color_map(knots).tolist() == expected.tolist()
+    between = color_map(knots[:-1] + 1 / 32).astype(float)
+    assert np.abs(between - (expected[:-1] + expected[1:]) / 2).max() <= 0.5
+
+
+def test_an_image_makes_its_folders(tmp_path):
+    write_png(tmp_path / "a" / "b" / "c.png", flat((1, 2, 3)))
+    write_png(tmp_path / "a" / "b" / "d.png", flat((1, 2, 3)))
+    assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == ["c.png", "d.png"]

@@ -25,7 +25,7 @@ def legend_of(figure: Figure) -> list[str]:
 
 
 def test_counts_with_events(tmp_path, drawn):
-    path = tmp_path / "plots" / "counts.png"
+    path = tmp_path / "some" / "plots" / "counts.png"
     counts = {"background": [100, 1200, 400], "rigid": [0, 50, 50]}
     plot_counts(path, [0, 10, 20], counts, [(15, "prune"), (18, "prune"), (20, "mask")])
     assert path.read_bytes().startswith(b"\x89PNG")
@@ -64,3 +64,63 @@ def test_runs_are_points_in_the_color_of_their_name(tmp_path, drawn):
     assert ours.get_offsets().tolist() == [[310, 24]]
     assert plain.get_facecolor().tolist() != ours.get_facecolor().tolist()
     assert legend_of(drawn[0]) == ["plain (n=2)", "ours (n=1)"]
+
+
+def test_colors_and_marks_begin_anew_behind_the_last(tmp_path, drawn):
+    """Eight of each: the ninth looks as the first, and no two of the first eight alike."""
+    names = [f"m{index}" for index in range(9)]
+    plot_runs(tmp_path / "runs.png", {name: [(1000 * (place + 1), 20.0)] for place, name in enumerate(names)})
+    dots = drawn[0].axes[0].collections
+    paths = [str(one.get_paths()[0].vertices.tolist()) for one in dots]
+    paint = [tuple(one.get_facecolor()[0]) for one in dots]
+    assert len(set(paths[:8])) == len(set(paint[:8])) == 8
+    assert (paths[8], paint[8]) == (paths[0], paint[0])
+    plot_counts(tmp_path / "counts.png", [0, 5], {name: [10, 20] for name in names})
+    plot_psnr(tmp_path / "psnr.png", {name: ([0, 5], [10.0, 20.0]) for name in names})
+    for figure in drawn[1:]:
+        paint = [line.get_color() for line in figure.axes[0].lines]
+        assert (len(set(paint[:8])), paint[8]) == (8, paint[0])
+
+
+def test_every_plot_says_what_it_shows(tmp_path, drawn):
+    plot_counts(tmp_path / "a.png", [0, 5], {"road": [10, 20]})
+    plot_counts(tmp_path / "a.png", [0, 5], {"road": [10, 20]}, title="mine")
+    plot_psnr(tmp_path / "b.png", {"plain": ([0, 5], [10.0, 20.0])})
+    plot_psnr(tmp_path / "b.png", {"plain": ([0, 5], [10.0, 20.0])}, (), "other", "seconds")
+    plot_runs(tmp_path / "c.png", {"plain": [(1000, 25.0)]})
+    plot_runs(tmp_path / "c.png", {"plain": [(1000, 25.0)]}, "third")
+    said = [(axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) for axes in (figure.axes[0] for figure in drawn)]
+    assert said == [
+        ("Gaussians per node", "step", "Gaussians"),
+        ("mine", "step", "Gaussians"),
+        ("PSNR over training", "step", "PSNR (dB)"),
+        ("other", "seconds", "PSNR (dB)"),
+        ("Quality against size", "Gaussians", "held-out PSNR, full image (dB)"),
+        ("third", "Gaussians", "held-out PSNR, full image (dB)"),
+    ]
+    scales = [(axes.get_xscale(), axes.get_yscale()) for axes in (figure.axes[0] for figure in drawn[::2])]
+    assert scales == [("linear", "log"), ("linear", "linear"), ("log", "linear")]
+    assert drawn[0].axes[0].lines[0].get_drawstyle() == "steps-post"
+    numbers = [formatter(value, 0) for formatter in (drawn[0].axes[0].yaxis.get_major_formatter(),
+               drawn[4].axes[0].xaxis.get_major_formatter(), drawn[4].axes[0].xaxis.get_minor_formatter())
+               for value in (950.0, 1000.0, 12_500.0, 1e6)]  # fmt: skip
+    assert numbers == ["950", "1k", "12.5k", "1M"] * 3
+
+
+def test_events_of_one_name_share_a_style_behind_the_curves(tmp_path, drawn):
+    events = [(3, "mask"), (5, "prune"), (7, "mask"), (9, "reset"), (11, "more")]
+    plot_psnr(tmp_path / "psnr.png", {"plain": ([0, 20], [10.0, 20.0])}, events)
+    curve, *lines = drawn[0].axes[0].lines
+    marks, named = lines[:5], lines[5:]
+    assert [line.get_xdata()[0] for line in marks] == [3, 5, 7, 9, 11]
+    assert {line.get_zorder() for line in marks} == {0}
+    assert curve.get_zorder() > 0
+    assert [line.get_linestyle() for line in marks] == ["--", ":", "--", "-.", "--"]
+    assert [(line.get_label(), line.get_linestyle()) for line in named] == [
+        ("mask", "--"), ("prune", ":"), ("reset", "-."), ("more", "--"),
+    ]  # fmt: skip
+
+
+def test_a_plot_without_a_name_has_no_legend(tmp_path, drawn):
+    plot_psnr(tmp_path / "deep" / "psnr.png", {})
+    assert drawn[0].axes[0].get_legend() is None

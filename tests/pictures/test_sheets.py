@@ -2,15 +2,10 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sparsestreet.pictures import sheets
-from sparsestreet.pictures.images import LIDAR_END, Picture, write_picture
+from sparsestreet.pictures.images import LIDAR_END, Picture
 from sparsestreet.pictures.sheets import SheetColumn, comparison_sheet, picture_sheet
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING
-from sparsestreet.records.summary import SUMMARY
-from sparsestreet.report.side_by_side import compare_runs
-from tests.evaluation.frames import make_image, make_summary
 from tests.evaluation.tiles import COLORS, flat, make_picture
 
 LEGEND = {"rigid": (250, 150, 40)}
@@ -118,62 +113,3 @@ def test_only_runs_of_the_same_images_are_compared():
         comparison_sheet([same, column("plain", COLORS["render"], frame=4)], title="t")
     with pytest.raises(ValueError, match="at least two runs, got 1"):
         comparison_sheet([same], title="t")
-
-
-def write_run(folder, color, psnr, split=HELD_OUT, **summary):
-    views = {"psnr": psnr} if split == HELD_OUT else {"psnr": None, "training_psnr": psnr}
-    SUMMARY.write(folder, make_summary(**views, **summary))
-    quality = [make_image(3, 1, psnr=psnr + 1)]
-    QUALITY[split].write(folder, quality)
-    write_picture(folder / "pictures", make_picture(render=color))
-    return folder
-
-
-def test_run_folders_make_a_sheet(tmp_path, written):
-    """Each run shows its own renders, PSNR and size; shares are of the first run."""
-    colors = {"plain": (10, 200, 10), "paper": (60, 180, 60), "removal": (10, 120, 10)}
-    runs = [
-        write_run(tmp_path / "plain", colors["plain"], 25.0, label="plain", caps={"background": 1000}),
-        write_run(tmp_path / "paper", colors["paper"], 24.0, label="paper", gaussians={"background": 600}),
-        write_run(tmp_path / "removal", colors["removal"], 24.5, label="removal", gaussians={"background": 300}),
-    ]
-    compare_runs(runs, tmp_path / "sheets" / "comparison.png", legend=LEGEND)
-    with Image.open(tmp_path / "sheets" / "comparison.png") as image:
-        sheet = np.asarray(image)
-    assert sheet.shape[1] > 4 * 480
-    assert order_of(sheet, row_within(sheet, colors["plain"])) == [COLORS["truth"], *colors.values()]
-    for text in (
-        *("street: PSNR over 6 held-out images", "plain, 25.00 dB", "paper, 24.00 dB", "removal, 24.50 dB"),
-        *("error: 26.00 dB in this image", "error: 25.00 dB in this image", "error: 25.50 dB in this image"),
-        *("1,200 Gaussians, held down by a cap", "600 Gaussians, 50 % of plain", "300 Gaussians, 25 % of plain"),
-    ):
-        assert text in written
-
-
-def test_runs_of_one_label_are_told_apart(tmp_path, written):
-    by_option = [
-        write_run(tmp_path / str(value), COLORS["render"], 25.0, label="m", config={"x": value}) for value in (1, 2)
-    ]
-    compare_runs(by_option, tmp_path / "sheet.png")
-    assert {"m x=1, 25.00 dB", "m x=2, 25.00 dB"} < set(written)
-    by_seed = [write_run(tmp_path / str(seed), COLORS["render"], 25.0, label="m", seed=seed) for seed in (1, 2)]
-    compare_runs(by_seed, tmp_path / "sheet.png")
-    assert {"m (seed 1), 25.00 dB", "m (seed 2), 25.00 dB"} < set(written)
-
-
-def test_runs_without_held_out_views_show_training_views(tmp_path, written):
-    runs = [write_run(tmp_path / name, COLORS["render"], 30.0, TRAINING, label=name) for name in ("plain", "ours")]
-    compare_runs(runs, tmp_path / "sheet.png")
-    assert "street: PSNR over 6 training images" in written
-    assert "plain, 30.00 dB" in written
-    assert "error: 31.00 dB in this image" in written
-
-
-def test_what_cannot_be_compared_is_named(tmp_path):
-    plain = write_run(tmp_path / "plain", COLORS["render"], 25.0)
-    other = write_run(tmp_path / "other", COLORS["render"], 25.0, scene="kitti")
-    with pytest.raises(ValueError, match="different scenes, kitti, street: compare runs of one scene"):
-        compare_runs([plain, other], tmp_path / "sheet.png")
-    QUALITY[HELD_OUT].write(other, [])
-    with pytest.raises(ValueError, match=r"pictures of \(frame, camera\) \[\(3, 1\)\] and no quality of them"):
-        compare_runs([other, other], tmp_path / "sheet.png")

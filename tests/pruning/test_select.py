@@ -12,6 +12,7 @@ from tests.scene.gaussians.oracle import by_hand
 score_lists = st.lists(st.sampled_from([0.0, 0.005, 0.01, 0.02, 0.5, 0.73, 1.0]), max_size=12)
 
 
+@pytest.mark.lengthy
 @settings(max_examples=300, deadline=None)
 @given(score_lists, st.integers(0, 14))
 def test_importance_rule_removes_only_zeros(scores, floor):
@@ -49,6 +50,7 @@ def test_impossible_inputs_are_refused():
         keep_by_importance(torch.tensor([-0.1, 0.2]), Floors(0))
 
 
+@pytest.mark.lengthy
 @settings(max_examples=200, deadline=None)
 @given(score_lists, score_lists, st.floats(0, 3), st.integers(0, 5))
 def test_cost_rule_drops_the_cheapest_of_all_nodes_within_the_budget(first, second, allowed, floor):

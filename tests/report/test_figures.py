@@ -1,19 +1,21 @@
 """What figures draw, and that their ink is the page's."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
 from sparsestreet.records.costs import NodeCost, update_costs
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange
 from sparsestreet.records.strict_json import RecordError
-from sparsestreet.report import collect, figures_time
+from sparsestreet.report import collect, figures, figures_time
 from sparsestreet.report.arms import arms
-from sparsestreet.report.figures import GREY, PARETO_COSTS, front, pareto, short
+from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, marker, panels, pareto, short
 from sparsestreet.report.figures_time import (
     _counts,
     _frame_costs,
@@ -64,8 +66,8 @@ def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     ids = [set(re.findall(r'id="([^"]+)"', text)) for text in (one, other)]
     assert not ids[0] & ids[1]
     assert set(re.findall(r"#([a-z0-9]+)[\")]", one.replace("&quot;", '"'))) <= ids[0] | {"8c8c8c", "1f86c9"}
-    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "again" / "a.svg")
-    assert (tmp_path / "again" / "a.svg").read_text() == one
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "once" / "again" / "a.svg")
+    assert (tmp_path / "once" / "again" / "a.svg").read_text() == one
 
 
 @pytest.mark.lengthy
@@ -127,3 +129,185 @@ def test_costs_of_another_format_are_named(found, tmp_path):
     path.write_text("{}")
     with pytest.raises(RecordError, match=r"cost\.json: .*has format None"):
         frame_waterfall(found, tmp_path / "some.svg")
+
+
+@pytest.fixture
+def canvas(monkeypatch):
+    """The figures that would have been written, by the name of their file."""
+    drawn = {}
+    for module in (figures, figures_time):
+        monkeypatch.setattr(module, "write_svg", lambda figure, path: drawn.update({path.name: figure}))
+    return drawn
+
+
+def two_methods():
+    """Of each a plain, a pruned and a control run; costs and qualities are all different."""
+    runs = {
+        "a": (20.0, 1000, 10.0, 600.0), "a+paper": (19.0, 100, 4.0, 720.0), "a+random": (15.0, 110, 5.0, 60.0),
+        "b": (22.0, 9000, 20.0, 900.0), "b+removal": (18.0, 200, 6.0, 960.0),
+    }  # fmt: skip
+    found = []
+    for label, (psnr, rows, ms, seconds) in runs.items():
+        numbers = {"vehicle_psnr": psnr - 7, "milliseconds": ms, "training_seconds": seconds}
+        found.append(record(make_summary(label, 0, psnr, {"x": rows}, **numbers), label))
+    return arms(found)
+
+
+def points(collection):
+    return [tuple(point) for point in np.asarray(collection.get_offsets()).tolist()]
+
+
+def arrows(axes):
+    return {(tuple(map(float, one.xyann)), tuple(map(float, one.xy))) for one in axes.texts}
+
+
+@pytest.mark.parametrize(
+    ("cost", "x"),
+    [
+        (PARETO_COSTS[0], (1000, 100, 110, 9000, 200)),
+        (PARETO_COSTS[1], tuple(59 * 4e-6 * rows for rows in (1000, 100, 110, 9000, 200))),
+        (PARETO_COSTS[2], (10.0, 4.0, 5.0, 20.0, 6.0)),
+        (PARETO_COSTS[3], (10.0, 12.0, 1.0, 15.0, 16.0)),
+    ],
+    ids=[cost[0] for cost in PARETO_COSTS],
+)
+def test_a_panel_has_marks_arrows_and_the_front(canvas, tmp_path, cost, x):
+    found = two_methods()
+    assert [arm.name for arm in found] == ["a", "a+paper", "a+random", "b", "b+removal"]
+    assert pareto(found, DRIVESTUDIO, cost, tmp_path / "p.svg")
+    full, vehicles = canvas["p.svg"].axes
+    assert [axes.get_title() for axes in (full, vehicles)] == ["full image", "vehicles"]
+    assert {axes.get_xlabel() for axes in (full, vehicles)} == {cost[1]}
+    assert [axes.get_ylabel() for axes in (full, vehicles)] == ["held-out PSNR, dB", ""]
+    for axes, less in ((full, 0.0), (vehicles, 7.0)):
+        y = [quality - less for quality in (20.0, 19.0, 15.0, 22.0, 18.0)]
+        places = [pytest.approx(place) for place in zip(x, y, strict=True)]
+        runs, means = axes.collections[::2], axes.collections[1::2]
+        assert [points(one)[0] for one in runs] == places
+        assert [points(one)[0] for one in means] == places
+        assert {one.get_sizes().tolist()[0] for one in runs} == {9.0}
+        assert {one.get_sizes().tolist()[0] for one in means} == {48.0}
+        paint = [to_hex(one.get_facecolor()[0][:3]) for one in means]
+        first, second = (color.lower() for color in COLORS[:2])
+        assert paint == [first, first, GREY, second, second]
+        # From plain to pruned, of no control.
+        pairs = arrows(axes)
+        assert pairs == {((x[0], y[0]), (x[1], y[1])), ((x[3], y[3]), (x[4], y[4]))}
+        (line,) = axes.get_lines()
+        drawn = list(zip(*(np.asarray(values).tolist() for values in line.get_data()), strict=True))
+        kept = [place for index, place in enumerate(zip(x, y, strict=True)) if index != 2]
+        assert drawn == [place for place in sorted(kept) if not any(beats(other, place) for other in kept)]
+        assert axes.get_xscale() == "log"
+
+
+def beats(one, other):
+    """At most as costly, at least as good, and not the same."""
+    return one != other and one[0] <= other[0] and one[1] >= other[1]
+
+
+def test_marks_in_the_legend_are_those_of_the_panel(canvas, tmp_path):
+    found = two_methods()
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "p.svg")
+    (legend,) = canvas["p.svg"].legends
+    handles = {text.get_text(): handle for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True)}
+    assert list(handles) == ["a", "b", "plain", "paper", "control: random", "removal", "front of the means"]
+    assert [handles[name].get_color() for name in ("a", "b", "control: random")] == [*COLORS[:2], GREY]
+    assert [handles[name].get_marker() for name in list(handles)[2:6]] == ["o", "s", "x", "D"]
+    assert [marker(arm) for arm in found] == ["o", "s", "x", "o", "D"]
+    assert marker(replace(found[0], sparsify="of somebody else")) == "P"
+
+
+def test_a_figure_of_one_region_or_none(canvas, tmp_path):
+    only = arms([record(make_summary("a", vehicle_psnr=None))])
+    assert pareto(only, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "p.svg")
+    assert [axes.get_title() for axes in canvas["p.svg"].axes] == ["full image"]
+    canvas.clear()
+    assert not pareto(only, STRICT, PARETO_COSTS[0], tmp_path / "p.svg")
+    assert not pareto(
+        arms([record(make_summary("a", training_seconds=None))]), DRIVESTUDIO, PARETO_COSTS[3], tmp_path / "p"
+    )
+    assert canvas == {}
+
+
+def test_bars_of_a_frame_lie_behind_each_other(canvas, tmp_path):
+    """Each arm has a row, each part a color; an effect is hatched."""
+    parts = {"a": (3.0, 1.0, 0.5), "a+paper": (1.5, 0.25, 0.75)}
+    for name, (road, cars, sky) in parts.items():
+        nodes = {node: NodeCost(10, 0.1, 4.0, ms) for node, ms in (("road", road), ("cars", cars))}
+        update_costs(tmp_path / name, nodes=nodes, effects={"sky": sky})
+    found = arms([record(make_summary(name), str(tmp_path / name)) for name in parts])
+    assert frame_waterfall(found, tmp_path / "w.svg")
+    (axes,) = canvas["w.svg"].axes
+    bars = [
+        (bar.get_y() + bar.get_height() / 2, bar.get_x(), bar.get_width()) for bar in axes.patches if bar.get_width()
+    ]
+    expected = [
+        (row, sum(values[:place]), value)
+        for row, values in enumerate(parts.values())
+        for place, value in enumerate(values)
+    ]
+    assert bars == [pytest.approx(bar) for bar in expected]
+    paint = [to_hex(bar.get_facecolor()) for bar in axes.patches]
+    assert paint == [color.lower() for color in COLORS[:3]] * 3
+    assert [bar.get_hatch() for bar in axes.patches] == [None, None, "//"] * 3
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["a", "a+paper"]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first on top
+    (legend,) = canvas["w.svg"].legends
+    assert [text.get_text() for text in legend.get_texts()] == ["road", "cars", "effect: sky"]
+    assert [to_hex(one.get_facecolor()) for one in legend.get_patches()] == paint[:3]
+
+
+def test_a_curve_is_the_runs_own(canvas, tmp_path):
+    """A panel a method; colors and dashes tell sparsifications apart, controls are gray."""
+    runs = []
+    for place, name in enumerate(("a", "a+paper", "a+capped", "b")):
+        folder = tmp_path / name
+        HELD_OUT_CURVE.write(folder, [HeldOutLook(10.0 + place, 9, 20.0 + place, 1.0, 2.0),
+                                      HeldOutLook(30.0 + place, 19, 25.0 - place, 1.0, 2.0)])  # fmt: skip
+        rows = 100 * (place + 1)
+        LEDGER.write(folder, [CountChange(0, "x", 0, rows, "start"), CountChange(5, "x", rows, 50, PRUNING)])
+        runs.append(record(make_summary(name), str(folder)))
+    found = arms(runs)
+    for draw, x_label, y_label, drawn in (
+        (held_out_over_time, "training seconds", "held-out PSNR, dB",
+         [([10.0 + place, 30.0 + place], [20.0 + place, 25.0 - place]) for place in range(4)]),
+        (counts_over_time, "step", "Gaussians", [([0, 5], [100 * (place + 1), 50]) for place in range(4)]),
+    ):  # fmt: skip
+        assert draw(found, tmp_path / "c.svg")
+        one, other = canvas["c.svg"].axes
+        assert [(axes.get_title(), axes.get_xlabel()) for axes in (one, other)] == [("a", x_label), ("b", x_label)]
+        assert [axes.get_ylabel() for axes in (one, other)] == [y_label, ""]
+        lines = [line for axes in (one, other) for line in axes.get_lines() if line.get_linestyle() != "None"]
+        assert [tuple(np.asarray(part).tolist() for part in line.get_data()) for line in lines] == drawn
+        looks = [(line.get_label(), line.get_color(), line.get_linestyle()) for line in lines]
+        assert looks == [
+            *(("plain", COLORS[0], "-"), ("paper", COLORS[1], "-"), ("control: capped", GREY, ":")),
+            ("plain", COLORS[0], "-"),
+        ]
+        legends = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in (one, other)]
+        assert legends == [["plain", "paper", "control: capped"], ["plain"]]
+
+
+def test_figures_are_named_and_what_is_absent_is_said(tmp_path):
+    found = two_methods()
+    drawn, absent = _figures(found, DRIVESTUDIO, tmp_path)
+    assert [caption.partition(":")[0] for caption, _ in drawn] == [
+        f"Held-out PSNR against {label}" for label in ("Gaussians", "MB", "milliseconds a frame", "training minutes")
+    ]
+    assert [note.partition(":")[0] for note in absent] == [
+        "no curves of held-out PSNR over seconds", "no counts over time", "no milliseconds by node and effect",
+    ]  # fmt: skip
+    names = [f"pareto_{name}" for name in ("frame", "gaussians", "megabytes", "training")]
+    assert sorted(path.stem for path in tmp_path.iterdir()) == names
+    for (_, svg), cost in zip(drawn, PARETO_COSTS, strict=True):
+        assert svg == (tmp_path / f"pareto_{cost[0]}.svg").read_text()
+
+
+def test_panels_are_as_large_as_they_are_asked_to_be(canvas, tmp_path):
+    sizes = [panels(*given)[0].get_size_inches().tolist() for given in ((1,), (3,), (2, 4.6, 4.0))]
+    assert sizes == [pytest.approx(size) for size in ((3.2, 3.4), (9.6, 3.4), (9.2, 4.0))]
+    assert [len(panels(count)[1]) for count in (1, 3)] == [1, 3]
+    for name in ("a", "b"):
+        update_costs(tmp_path / name, nodes={"road": NodeCost(10, 0.1, 4.0, 3.0)})
+    frame_waterfall(arms([record(make_summary(name), str(tmp_path / name)) for name in "ab"]), tmp_path / "w.svg")
+    assert canvas["w.svg"].get_size_inches().tolist() == pytest.approx([7.4, 1.1 + 0.34 * 2])

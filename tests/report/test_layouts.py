@@ -1,13 +1,16 @@
 """The paper's tables: its figures beside ours, its rows, and runs that failed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
 from sparsestreet.records.failures import FailedRun
-from sparsestreet.report.arms import arms
-from sparsestreet.report.layouts import paper_table
+from sparsestreet.records.quality import HELD_OUT, TRAINING, MetricSummary
+from sparsestreet.report.arms import Arm, arms
+from sparsestreet.report.layouts import metric_id, paper_table
 from sparsestreet.report.published import TABLES
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record
@@ -88,3 +91,86 @@ def test_published_tables_are_the_papers():
     }  # fmt: skip
     for table in TABLES.values():
         assert all(len(row.values) == len(table.columns) for row in table.rows)
+
+
+def told_apart(quality):
+    """Held-out metrics one apart from ``quality`` on, those of training views 100 more, in the order of DEFINITIONS."""
+    return {
+        split: {name: MetricSummary(first + place, None, 1, 0) for place, name in enumerate(DEFINITIONS)}
+        for split, first in ((HELD_OUT, quality), (TRAINING, quality + 100))
+    }
+
+
+@pytest.mark.parametrize("protocol", [DRIVESTUDIO, STRICT])
+def test_every_column_of_ours_is_its_own(protocol):
+    """FPS: 1000 / 8 ms. 2,500,000 Gaussians. Reconstruction of the run on all views: 500 more."""
+    summaries = [
+        replace(make_summary("omnire", 0, training_psnr=1.0, milliseconds=8.0, gaussians={"a": 2_500_000}, split=split),
+                quality=told_apart(quality))
+        for split, quality in (("some", 0.0), ("none", 500.0))
+    ]  # fmt: skip
+    found = arms([record(one, name) for one, name in zip(summaries, "ab", strict=True)])
+    row = rows_of(paper_table(found, [], protocol, "table1_waymo"))["omnire"]
+    values = {name: float(place) for place, name in enumerate(DEFINITIONS)}
+    expected = {"method": "omnire", "n": "2", "Gaussians (M)": "2.5", "FPS": "125.0"}
+    regions = {"full": (protocol.psnr, protocol.ssim), "human": protocol.human, "vehicle": protocol.vehicle}
+    for region, (psnr, ssim) in regions.items():
+        for views, more in (("novel views", 0.0), ("reconstruction", 600.0)):
+            expected[f"{views} {region} PSNR"] = f"{values[psnr] + more:.2f}"
+            expected[f"{views} {region} SSIM"] = f"{values[ssim] + more:.3f}"
+    ours = {name: cell for name, cell in row.items() if not name.endswith(", paper")}
+    assert {name: cell.text for name, cell in ours.items()} == expected
+    assert {(cell.runs, cell.published) for cell in ours.values()} == {(("a", "b"), False)}
+    theirs = [cell for name, cell in row.items() if name.endswith(", paper")]
+    assert {(cell.runs, cell.published) for cell in theirs} == {((), True)}
+    assert len(theirs) == len(ours) - 2
+
+
+def test_a_scene_on_all_views_alone_has_counts_and_speed_but_no_novel_views():
+    only = make_summary("omnire", psnr=None, training_psnr=30.0, milliseconds=8.0, gaussians={"a": 10}, split="none")
+    row = rows_of(paper_table(arms([record(only)]), [], DRIVESTUDIO, "table1_waymo"))["omnire"]
+    assert (row["FPS"].text, row["Gaussians (M)"].text) == ("125.0", "1e-05")
+    assert (row["reconstruction full PSNR"].text, row["novel views full PSNR"].text) == ("30.00", "-")
+
+
+@pytest.mark.parametrize(("protocol", "metric"), [(DRIVESTUDIO, "lpips_alex_full"), (STRICT, "lpips_alex_no_hood")])
+def test_lpips_is_of_the_full_image(protocol, metric):
+    assert metric_id(protocol, "full", "lpips") == metric
+    assert metric_id(protocol, "human", "lpips") is None
+    assert metric_id(protocol, "full", "fid") is None
+
+
+def test_headers_and_notes_of_a_table():
+    found = arms([record(make_summary("omnire")), record(make_summary("omnire+random"))])
+    ablation = paper_table(found, [], DRIVESTUDIO, "table5_ablation")
+    assert ablation.header[2:4] == (("novel views", "full PSNR"), ("novel views", "full PSNR, paper"))
+    assert ablation.header[-2:] == (("", "Gaussians (M)"), ("", "Gaussians (M), paper"))
+    assert ablation.header[6] == ("novel views", "full LPIPS")
+    assert ablation.title.startswith("Table 5 of the paper: ")
+    assert ablation.notes[0].endswith("clock and machine, on its drives")
+    assert ablation.notes[0].startswith("paper: published in Table 5, ")
+    assert "control random: as many Gaussians, drawn at random" in ablation.notes
+    assert any(note.startswith("reconstruction: of the training views of the runs") for note in ablation.notes)
+    assert "failed runs are in no mean" not in ablation.notes
+    assert f"protocol drivestudio: {', '.join(DRIVESTUDIO.metrics)}" in ablation.notes[1]
+    whole = arms([record(make_summary("omnire", psnr=None, training_psnr=30.0, split="none"))])
+    of_any = paper_table(whole, [], DRIVESTUDIO, None)
+    assert not any(note.startswith("reconstruction: of the training") for note in of_any.notes)
+    assert of_any.title == "All arms, in the layout of the paper's Table 1"
+    failure = FailedRun(label="m", seed=2, command="", error="e", trace="")
+    alone = paper_table([], [(Path("x"), failure)], DRIVESTUDIO, None)
+    assert [len(row) for row in alone.rows] == [len(alone.header)]
+    assert alone.rows[0][0].runs == ("x",)
+
+
+def test_words_of_a_rows_options_choose_its_arm():
+    """Rows of one method and sparsification differ in what an arm's name says."""
+    table = TABLES["table3_pruning"]
+    named = [row for row in table.rows if row.options]
+    assert named
+    for row in table.rows:
+        name = " ".join((row.method or "", *row.options))
+        summary = make_summary("x")
+        arm = Arm(name, "x", row.method or "", row.sparsify, (), (record(summary),))
+        grid = paper_table([arm], [], DRIVESTUDIO, "table3_pruning")
+        assert grid.rows[[one.name for one in table.rows].index(row.name)][0].text == name

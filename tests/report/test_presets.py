@@ -78,3 +78,50 @@ def test_runs_of_one_scene_and_seed_are_their_mean(tmp_path, splits, expected):
 
 def test_none_recorded_no_table(tmp_path):
     assert rendered_otherwise(arms(collect([write_sweep(tmp_path)])), DRIVESTUDIO) is None
+
+
+@pytest.mark.parametrize("protocol", [DRIVESTUDIO, STRICT])
+def test_every_column_is_its_own(tmp_path, protocol):
+    """Of two scenes: full, people and vehicles lose 0.1, 0.2 and 0.3 dB in the first, 0.2 dB more in the second."""
+    names = (protocol.psnr, protocol.human[0], protocol.vehicle[0])
+    runs = []
+    for scene in (0, 1):
+        ways = [
+            RenderedAs(
+                preset=preset,
+                trained=preset == "fine",
+                quality={name: 30.0 + place - lost * (0.1 * (place + 1) + 0.2 * scene)
+                         for place, name in enumerate(names)} | {"psnr_sky": 1.0},
+                psnr_to_exact=60.0 + scene - 10 * lost,
+                frame_ms=20.0 + scene - 5 * lost,
+                repeats=12,
+            )
+            for preset, lost in (("fast", 1.0), ("fine", 0.0))
+        ]  # fmt: skip
+        made = PresetRecord(command="c", device="d", threads=1, views=3, noise=NOISE, rendered=tuple(ways))
+        folder = tmp_path / str(scene)
+        PRESETS.write(folder, made)
+        runs.append(record(make_summary("m", scene=f"s{scene}"), str(folder)))
+    grid = rendered_otherwise(arms(runs), protocol)
+    assert grid.header == (
+        *(("", "trained"), ("", "rendered"), ("", "n")),
+        *((f"PSNR {region}", what) for region in ("full", "human", "vehicle") for what in ("dB", "- as trained")),
+        *(("", "dB to exact"), ("", "ms/frame")),
+    )
+    fast, fine = ([cell.text for cell in row] for row in grid.rows)
+    # Two differences 0.2 apart: half width 12.706 x 0.1414 / sqrt(2) = 1.27.
+    assert fast == [
+        *("m", "fast", "2", "29.80", "-0.20 [-1.47, +1.07]", "30.70", "-0.30 [-1.57, +0.97]"),
+        *("31.60", "-0.40 [-1.67, +0.87]", "50.5", "15.50"),
+    ]
+    assert fine == ["m", "fine, as trained", "2", "30.00", "-", "31.00", "-", "32.00", "-", "60.5", "20.50"]
+    assert {cell.runs for row in grid.rows for cell in row if cell.text != "-"} == {("0", "1")}
+
+
+def test_a_machine_that_was_not_quiet_is_named(tmp_path):
+    write_rendered(tmp_path, 0.1)
+    path = PRESETS.path(tmp_path)
+    PRESETS.write(tmp_path, replace(PRESETS.read(tmp_path), noise=replace(NOISE, quiet=False)))
+    assert path.is_file()
+    grid = rendered_otherwise(arms([record(make_summary("m"), str(tmp_path))]), DRIVESTUDIO)
+    assert grid.notes[-1] == "milliseconds of a machine that was not quiet"

@@ -1,10 +1,14 @@
 """Differences and best arms against numbers worked out by hand."""
 
+from dataclasses import replace
+
 import pytest
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.metrics.definitions import DEFINITIONS
+from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report.arms import arms
-from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, paired
+from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, street_runs
 
@@ -96,3 +100,79 @@ def test_a_gain_is_no_loss():
     grid = matched_quality(arms([record(run) for run in runs]), DRIVESTUDIO)
     chosen = [by_heading(grid, row) for row in grid.rows]
     assert [(row["arm"].text, row["PSNR full, dB"].text) for row in chosen] == [("plain+removal", "+0.60")] * 3
+
+
+def apart(label, quality, gaussians, milliseconds, seconds):
+    """A run whose held-out metrics are one apart, in the order of DEFINITIONS, and others on training views."""
+    metrics = {name: quality + place for place, name in enumerate(DEFINITIONS)}
+    summary = make_summary(label, 0, gaussians={"a": gaussians}, milliseconds=milliseconds, training_seconds=seconds,
+                           training_psnr=1.0)  # fmt: skip
+    held_out = {name: MetricSummary(value, None, 1, 0) for name, value in metrics.items()}
+    return replace(summary, quality=summary.quality | {HELD_OUT: held_out})
+
+
+@pytest.mark.parametrize("protocol", [DRIVESTUDIO, STRICT])
+def test_every_column_has_a_difference_of_its_own(protocol):
+    """Ours is better by 0.5 in every metric, has a quarter of the Gaussians, half of the frame and 90 % of training."""
+    plain, ours = apart("m", 20.0, 1000, 40.0, 200.0), apart("m+removal", 20.5, 250, 20.0, 180.0)
+    grid = differences(arms([record(plain, "p"), record(ours, "r")]), protocol)
+    networks = {DRIVESTUDIO: ("LPIPS alex",), STRICT: ("LPIPS alex", "LPIPS vgg")}[protocol]
+    (row,) = (by_heading(grid, row) for row in grid.rows)
+    assert {heading: cell.text for heading, cell in row.items()} == {
+        "arm - plain": "m+removal - m",
+        "n": "1",
+        **dict.fromkeys(("PSNR full", "PSNR human", "PSNR vehicle"), "+0.50"),
+        **dict.fromkeys(("SSIM full", *networks), "+0.5000"),
+        **{"Gaussians, %": "-75.0", "MB, %": "-75.0", "ms/frame, %": "-50.0", "train s, %": "-10.0"},
+    }
+    assert {cell.runs for cell in row.values()} == {("r", "p")}
+    # Which metric a column holds: the plain run's own number.
+    values = {one.heading: one.value(plain) for one in measures(protocol)}
+    wanted = (protocol.psnr, protocol.human[0], protocol.vehicle[0], protocol.ssim, *protocol.lpips)
+    assert [values[name] for name in list(values)[: len(wanted)]] == [plain.mean(name) for name in wanted]
+    assert [values[name] for name in ("Gaussians", "MB", "ms/frame", "train s")] == [1000.0, 0.236, 40.0, 200.0]
+
+
+def test_a_chosen_arm_is_shown_with_all_its_numbers():
+    """A third of 1,200 Gaussians for 0.25 dB; MB: 59 float32 a Gaussian."""
+    plain = make_summary("m", 0, 25.0, {"a": 1200}, milliseconds=40.0, training_seconds=200.0)
+    ours = make_summary("m+removal", 0, 24.75, {"a": 400}, milliseconds=25.0, training_seconds=150.0)
+    found = arms([record(plain, "p"), record(ours, "r")])
+    for grid, allowed in ((matched_quality, "at most 0.3 dB"), (matched_budget, "at most 50 % of its Gaussians")):
+        chosen = grid(found, DRIVESTUDIO)
+        assert [heading for _, heading in chosen.header[1:]] == [
+            *("arm", "PSNR full, dB", "share, %", "Gaussians", "MB", "ms/frame", "train minutes"),
+        ]
+        (row,) = (row for row in chosen.rows if row[0].text == f"m, {allowed}")
+        assert [cell.text for cell in row[1:]] == ["m+removal", "-0.25", "33", "400", "0.09", "25.00", "2.50"]
+        assert {cell.runs for cell in row[1:]} == {("r",)}
+    assert [row[1].text for row in matched_quality(found, DRIVESTUDIO).rows] == ["m", "m+removal", "m+removal"]
+    shares = [row[1].text for row in matched_budget(found, DRIVESTUDIO).rows]
+    assert shares == ["none of this sweep", "m+removal", "m+removal"]
+
+
+def test_a_limit_itself_is_allowed():
+    """Half of the Gaussians, and half a dB less: 0.5 is exact in floats."""
+    runs = [make_summary("m", 0, 25.0, {"a": 8}), make_summary("m+removal", 0, 24.5, {"a": 4})]
+    found = arms([record(run) for run in runs])
+    assert [row[1].text for row in matched_quality(found, DRIVESTUDIO).rows] == ["m", "m", "m+removal"]
+    assert matched_budget(found, DRIVESTUDIO).rows[1][1].text == "m+removal"
+
+
+def test_an_interval_of_fewer_pairs_than_the_row_says_how_many():
+    """Two seeds, of which one lacks vehicles."""
+    runs = [make_summary(label, seed, vehicle_psnr=None if seed else 20.0, training_seconds=100.0 + seed)
+            for label in ("m", "m+removal") for seed in (0, 1)]  # fmt: skip
+    (row,) = differences(arms([record(run) for run in runs]), DRIVESTUDIO).rows
+    texts = [cell.text for cell in row]
+    assert texts[1] == "2"
+    assert "+0.00 (n=1)" in texts
+
+
+def test_who_has_no_plain_value_has_no_relative_difference():
+    runs = [make_summary("m", training_seconds=None), make_summary("m+removal", training_seconds=100.0)]
+    grid = differences(arms([record(run) for run in runs]), DRIVESTUDIO)
+    assert by_heading(grid, grid.rows[0])["train s, %"].text == "-"
+    zero = [make_summary("m", training_seconds=0.0), make_summary("m+removal", training_seconds=100.0)]
+    grid = differences(arms([record(run) for run in zero]), DRIVESTUDIO)
+    assert by_heading(grid, grid.rows[0])["train s, %"].text == "-"

@@ -15,7 +15,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Split
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.records.ledger import CountChange
-from sparsestreet.scene.density import DensityStatistics
+from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.effects import Effect
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
@@ -274,7 +274,7 @@ class Listener(Callback, RowListener):
         return [(change.step, change.node, change.reason) for change, _ in self.heard]
 
 
-class AskedStrategy:
+class AskedStrategy(DensityStrategy):
     """A density strategy that writes down what it is asked, and changes nothing."""
 
     watched = ()

@@ -3,28 +3,42 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
-from lightning import Callback
+from lightning import Callback, Trainer
 from lightning.fabric.utilities.rank_zero import rank_zero_only
+from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.evaluation.speed import Timing
+from sparsestreet.ops import SplatSettings
+from sparsestreet.phases import StageRecorder
+from sparsestreet.records.configuration import config_hash
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.run import RUN
+from sparsestreet.records.run import RUN, CodeVersion, Machine
+from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import BackgroundSettings
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import load_scene
-from sparsestreet.training.callbacks import DensityControl, RowLedger
+from sparsestreet.training import costs, run
+from sparsestreet.training import identity as identity_module
+from sparsestreet.training.callbacks import Clock, DensityControl, GracefulStop, RowLedger, TrainingProgress
 from sparsestreet.training.identity import RunIdentity
 from sparsestreet.training.recipe import Recipe
-from sparsestreet.training.run import CPU_TRAINER, train
+from sparsestreet.training.run import CPU_TRAINER, fit, train
 from sparsestreet.training.schedule import Interval
-from tests.training.stubs import frame_at
+from tests.evaluation.frames import make_summary
+from tests.training.stubs import background, frame_at, make_system
 
 pytestmark = pytest.mark.lengthy
 
@@ -163,3 +177,140 @@ def test_parts_that_do_not_fit_are_an_error_before_anything_is_built(tmp_path):
     with pytest.raises(ValueError, match="every node's density is null"):
         train(broken, data(), tmp_path)
     assert files(tmp_path) == []
+
+
+class Finished(Trainer):
+    """What is asked of a trainer behind its last step."""
+
+    is_global_zero: bool = True
+    fast_dev_run: bool = False
+    strategy = SimpleNamespace(root_device=torch.device("cpu", 0))
+
+    def __init__(self) -> None: ...
+
+
+def test_a_trainer_is_made_of_what_fit_is_given(tmp_path):
+    """From the start and from a checkpoint; its own files stay off."""
+    made, fitted = [], []
+
+    class Made(Finished):
+        def __init__(self, **given: Any) -> None:
+            made.append(given)
+
+        def fit(self, *system: Any, **how: Any) -> None:
+            fitted.append((system, how))
+
+    system, frames, watch = make_system({"background": background(1)}), data(), [RowLedger(tmp_path / "a.csv")]
+    logger = CSVLogger(tmp_path, name="n")
+    given = {"max_steps": 7, "logger": logger}
+    assert isinstance(fit(system, frames, watch, Made, tmp_path / "o", **given), Made)
+    expected = {"max_steps": 7, "max_epochs": -1, "callbacks": watch, "logger": logger}
+    expected |= {"default_root_dir": str(tmp_path / "o")}
+    off = dict.fromkeys(("enable_model_summary", "enable_progress_bar", "enable_checkpointing"), False)
+    assert made == [expected | off]
+    assert fitted == [((system,), {"datamodule": frames})]
+    torch.save({"global_step": 3}, tmp_path / "c.ckpt")
+    curves = tmp_path / "o" / "curves" / "metrics.csv"
+    curves.parent.mkdir(parents=True)
+    curves.write_text("psnr,step\n10,2\n11,3\n")
+    fit(system, frames, watch, Made, tmp_path / "o", **given, start=tmp_path / "c.ckpt")
+    assert fitted[1] == ((system,), {"datamodule": frames, "ckpt_path": tmp_path / "c.ckpt", "weights_only": False})
+    assert curves.read_text() == "psnr,step\n10,2\n10,2\n11,3\n"  # nobody began the file anew
+
+
+def test_an_evaluation_is_handed_all_that_it_is_given(tmp_path, monkeypatch):
+    called = []
+    summary = make_summary()
+    monkeypatch.setattr(run, "evaluate_scene", lambda *args, **how: called.append((args, how)) or summary)
+    monkeypatch.setattr(run, "draw_history", lambda out: called.append(out))
+    monkeypatch.setattr(ExtraMetrics, "measure", lambda self, *args, **how: called.append((self, args, how)))
+    RUN.write(tmp_path, summary.run)
+    scene, frames, extra = SceneGraph({"background": background(1)}), data(), ExtraMetrics(timing=Timing(3, 4, 5))
+    options, device, said = RenderOptions(SplatSettings(near_plane=0.3)), torch.device("cpu", 0), print
+    told = {"out": tmp_path, "device": device, "command": "typed"}
+    with StageRecorder() as stages:
+        assert run.evaluate(scene, options, frames, **told, extra=extra, say=said) is summary
+    held_out, training = frames.split.held_out, frames.split.train
+    measured = {"run": summary.run, "options": options, "timing": extra.timing} | told
+    assert called == [
+        ((scene, held_out, training), measured),
+        (extra, (scene, frames, options), {"out": tmp_path, "command": "typed", "say": said}),
+        tmp_path,
+    ]
+    assert set(stages.seconds()) == {"other", "evaluate", "pictures"}
+
+
+def test_a_training_hands_on_what_it_is_given(tmp_path, monkeypatch):
+    """To the trainer, to the callbacks, to the evaluation and to the costs."""
+    called: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = {}
+    system, device = make_system({"background": background(1)}), torch.device("cpu", 0)
+    trainer = Finished()
+
+    def replaced(name, answer):
+        monkeypatch.setattr(run, name, lambda *args, **how: called.update({name: (args, how)}) or answer)
+
+    summary = make_summary()
+    for name, answer in (("build", system), ("fit", trainer), ("evaluate", summary), ("record_costs", None)):
+        replaced(name, answer)
+    parts, frames, extra = recipe(tmp_path), data(), ExtraMetrics(timing=Timing(3, 4, 5))
+    stages, checkpoint = StageRecorder(), tmp_path / "some.ckpt"
+    checkpoint.touch()
+    identity = RunIdentity(label="mine", command="typed")
+    told = {"max_steps": 9, "make_trainer": TRAINER, "logger": False, "identity": identity, "extra": extra}
+    assert train(parts, frames, tmp_path / "o", **told, resume=checkpoint, stages=stages) is summary
+    assert called["build"] == ((parts, frames), {})
+    (one, of, callbacks, make, out), how = called["fit"]
+    assert (one, of, make, out) == (system, frames, TRAINER, tmp_path / "o")
+    assert how == {"max_steps": 9, "logger": False, "start": checkpoint}
+    evaluated = {"device": device, "command": "typed", "extra": extra}
+    assert called["evaluate"] == ((system.scene, system.options, frames, tmp_path / "o"), evaluated)
+    assert called["record_costs"] == ((tmp_path / "o", stages, device), {})
+    # In this order: a clock first, then those of the recipe, a signal last.
+    clock, *own, times, curve, progress, files, checkpoints, stop = callbacks
+    assert own == list(parts.callbacks.values())
+    assert isinstance(clock, Clock)
+    assert (times.recorder, curve.run, curve.clock) == (stages, tmp_path / "o", clock)
+    assert isinstance(progress, TrainingProgress)
+    assert (files.folder, files.clock, files.description) == (
+        tmp_path / "o", clock, identity.describe(parts, frames, 9),
+    )  # fmt: skip
+    assert (checkpoints.folder, checkpoints.every) == (tmp_path / "o" / "checkpoints", 1000)
+    assert isinstance(stop, GracefulStop)
+
+
+def test_curves_go_into_the_folder_unless_a_logger_is_given(tmp_path, monkeypatch):
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(run, "build", lambda *parts: make_system({"background": background(1)}))
+    trainer = Finished()
+    trainer.is_global_zero = False
+    monkeypatch.setattr(run, "fit", lambda *args, **how: given.update(how) or trainer)
+    assert train(recipe(tmp_path), data(), tmp_path / "o") is None
+    assert Path(given["logger"].log_dir) == tmp_path / "o" / "curves"
+    assert (given["max_steps"], given["start"]) == (2000, None)
+
+
+def test_a_run_is_described_by_its_parts(monkeypatch):
+    machine, source = Machine("p", 3, "s", "v", "t"), CodeVersion("abc", True)
+    monkeypatch.setattr(identity_module, "this_machine", lambda: machine)
+    monkeypatch.setattr(identity_module, "this_source", lambda: source)
+    config = {"seed": 4, "a": 1}
+    who = RunIdentity(label="l", method="m", sparsify="s", config=config, data_hash="h", command="c")
+    found = who.describe(Recipe(nodes={}, seed=6), data(), 17)
+    expected = {"label": "l", "method": "m", "sparsify": "s", "config": config, "data_hash": "h", "command": "c"}
+    expected |= {"config_hash": config_hash(config), "scene": "five", "seed": 6, "split": "every 2th frame from 1"}
+    expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
+    expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2}
+    assert vars(found) == expected
+
+
+def test_costs_are_those_of_the_stages_and_the_device(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(costs, "peak_megabytes", lambda device: asked.append(device) or (800.0, 6000.0))
+    stages, spent = StageRecorder(), {"train": 5.0, "prune/Rule at step 7": 1.5, "other": 0.25}
+    monkeypatch.setattr(stages, "seconds", lambda: spent)
+    STEP_PHASES.write(tmp_path, [StepPhase(3, "splat", 2.5)])
+    costs.record_costs(tmp_path, stages, torch.device("cpu", 0))
+    found = COSTS.read(tmp_path)
+    assert (found.wall_seconds, found.phases) == (6.75, {"train": 5.0, "prune": 1.5, "other": 0.25})
+    assert (found.passes, found.step_ms) == ({"Rule at step 7": 1.5}, {"splat": 2.5})
+    assert (found.peak_host_mb, found.peak_device_mb, asked) == (800.0, 6000.0, [torch.device("cpu", 0)])

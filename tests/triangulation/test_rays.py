@@ -71,6 +71,7 @@ def test_the_derivative_of_the_reprojection_is_that_of_finite_differences(poses,
         np.testing.assert_allclose(jacobian[:, :, axis], (after - before) / (2 * step), atol=1e-5)
 
 
+@pytest.mark.lengthy
 def test_the_predicted_error_is_that_of_drawn_noise(poses):
     """One point, seen in 4 views 4000 times: the spread along its least certain direction, over its distance."""
     rng = np.random.default_rng(4)

@@ -14,7 +14,9 @@ from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.types import Frame, View
 
 
-def read_rig(layout: Layout, width: int | None, min_lens_shift: float | None) -> list[RigCamera[int]]:
+def read_rig(
+    layout: Layout, width: int | None, min_lens_shift: float | None, undistort: bool = False
+) -> list[RigCamera[int]]:
     """The chosen cameras; raises as ``rig_camera``."""
     rig = []
     for index, number in enumerate(layout.cameras):
@@ -28,6 +30,7 @@ def read_rig(layout: Layout, width: int | None, min_lens_shift: float | None) ->
                 recorded_size=image_size(layout.image(layout.frames[0], number)),
                 width=width,
                 min_lens_shift=min_lens_shift,
+                undistort=undistort,
             )
         )
     return rig
@@ -49,14 +52,16 @@ def read_frame(layout: Layout, rig: Sequence[RigCamera[int]], view: View) -> Fra
     """The view with its image and masks, decoded; raises LogError where a file is broken."""
     frame_index, camera_index = view.indices
     number, camera = layout.frames[frame_index], rig[camera_index]
+    lens = camera.undistortion
     paths = {kind: layout.mask(kind, number, camera.name) for kind in MASK_KINDS}
     masks = {
-        kind: None if path is None else read_mask(path, camera.size, sky=kind == "sky") for kind, path in paths.items()
+        kind: None if path is None else read_mask(path, camera.size, sky=kind == "sky", undistortion=lens)
+        for kind, path in paths.items()
     }
     ego = layout.ego_mask(camera.name)
     return Frame.of(
         view,
-        image=read_image(layout.image(number, camera.name), camera.size),
-        ego=None if ego is None else read_mask(ego, camera.size, sky=False),
+        image=read_image(layout.image(number, camera.name), camera.size, lens),
+        ego=None if ego is None else read_mask(ego, camera.size, sky=False, undistortion=lens),
         **masks,
     )

@@ -46,14 +46,13 @@ def world_from_camera(layout: Layout, frame: int, camera: int) -> Float64[Tensor
     return read_pose(layout.sweep_pose(frame)) @ extrinsics @ WAYMO_FROM_OPENCV
 
 
-def world_origin(layout: Layout) -> Float64[Tensor, "3"]:
-    """The point of the data set's world that the log is re-centered on; the axes are kept.
+def first_pose(layout: Layout) -> Float64[Tensor, "4 4"]:
+    """Pose of the vehicle (Waymo) or the front camera (nuScenes) in the data set's world at the first frame read.
 
-    Position of the vehicle (Waymo) or the front camera (nuScenes) at the first frame read.
+    The log is re-centered on its position; the axes are kept.
     """
     first = layout.frames[0]
-    path = layout.sweep_pose(first) if layout.waymo else layout.extrinsics(first, layout.front)
-    return read_pose(path)[:3, 3]
+    return read_pose(layout.sweep_pose(first) if layout.waymo else layout.extrinsics(first, layout.front))
 
 
 def read_clock(layout: Layout) -> LogClock:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -14,10 +15,10 @@ from sparsestreet.data.drivestudio.files import hashed_files
 from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
-from sparsestreet.data.drivestudio.poses import read_clock, world_origin
+from sparsestreet.data.drivestudio.poses import first_pose, read_clock
 from sparsestreet.data.drivestudio.sweeps import read_points
 from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world
 from sparsestreet.data.problems import LogError, Problem
@@ -54,8 +55,24 @@ class DriveStudioReader(LogReader):
     min_lens_shift: float | None = 0.5
     """Pixels; a lens that moves some pixel of the image, as it is read, by at least so much is simulated; 0: every lens
     that is one, None: none. The log's notes say which."""
+    undistort: bool = False
+    """Whether every lens is taken out of images and masks as they are read (DriveStudio, on Waymo), and none is
+    simulated. Cameras are then pinholes with the same intrinsics; what they did not record is black."""
+    lidar_ahead: Sequence[float | int] | None = None
+    """Meters ahead of the vehicle, least and most, of the returns that are read (DriveStudio: -2 and 80); of the Waymo
+    flavor only. None: all."""
+    extent: SceneExtent = "world"
+    """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes); a frame takes about 10 bytes a pixel."""
+
+    def __post_init__(self) -> None:
+        if self.extent not in get_args(SceneExtent):
+            raise ValueError(f"extent must be one of {', '.join(get_args(SceneExtent))}, got {self.extent!r}")
+        if self.lidar_ahead is not None and not (
+            len(self.lidar_ahead) == 2 and self.lidar_ahead[0] < self.lidar_ahead[1]
+        ):
+            raise ValueError(f"lidar_ahead needs a least and a larger distance, got {self.lidar_ahead}: say [-2, 80]")
 
     @property
     def folder(self) -> Path:
@@ -73,13 +90,14 @@ class DriveStudioReader(LogReader):
         problems = check_layout(layout, contents=False)
         if problems:
             raise LogError(problems)
-        origin = world_origin(layout)
+        start = first_pose(layout)
+        origin = start[:3, 3]
         tracks, people = _read_tracks(layout, origin)
-        clock, rig = read_clock(layout), read_rig(layout, self.width, self.min_lens_shift)
+        clock, rig = read_clock(layout), read_rig(layout, self.width, self.min_lens_shift, self.undistort)
         folder = SceneFolder(
             read_views(layout, rig, origin, clock),
             partial(read_frame, layout, rig),
-            partial(read_points, layout, origin) if layout.has_lidar else None,
+            partial(read_points, layout, origin, self.lidar_ahead) if layout.has_lidar else None,
             clock=clock,
             cache_bytes=1_000_000 * self.cache_mb,
             check=lambda: check_layout(layout, contents=True),
@@ -93,6 +111,7 @@ class DriveStudioReader(LogReader):
             num_cameras=len(rig),
             dataset_from_world=dataset_from_world(origin),
             notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
+            first_axes=start[:3, :3] if self.extent == "first_pose" else None,
         )
 
     def files(self) -> LogFiles:

@@ -1,11 +1,12 @@
 """The built-in default log: a street that is made when it is first needed, and read like any other log."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -32,6 +33,10 @@ class StreetReader(LogReader):
     """False: the log has no body poses of the street's pedestrians."""
     min_lens_shift: float | None = 0.5
     """Pixels; the settings' lens is simulated if it moves some pixel by at least this much; 0: always, None: never."""
+    undistort: bool = False
+    lidar_ahead: Sequence[float | int] | None = None
+    extent: SceneExtent = "world"
+    """This and the two above as ``DriveStudioReader`` has them."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
@@ -53,7 +58,14 @@ class StreetReader(LogReader):
     def _made(self) -> DriveStudioReader:
         root = make_street(self.settings, self.folder, self._report)
         return DriveStudioReader(
-            root, lidar=self.lidar, bodies=self.bodies, min_lens_shift=self.min_lens_shift, cache_mb=self.cache_mb
+            root,
+            lidar=self.lidar,
+            bodies=self.bodies,
+            min_lens_shift=self.min_lens_shift,
+            undistort=self.undistort,
+            lidar_ahead=self.lidar_ahead,
+            extent=self.extent,
+            cache_mb=self.cache_mb,
         )
 
     def _report(self, done: int, total: int) -> None:

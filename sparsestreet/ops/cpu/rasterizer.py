@@ -173,6 +173,8 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
         exclusive_stop=settings.stop == "exclusive",
         antialias=settings.antialias,
         half_colors=settings.half_colors,
+        clamp_colors=settings.clamp_colors,
+        detach_directions=settings.detach_directions,
         depth_bits=settings.depth_bits,
         has_lens=camera.distortion is not None,
         has_shutter=camera.shutter is not None,

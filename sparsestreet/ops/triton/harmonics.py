@@ -79,7 +79,7 @@ def direction_of(rotation, mean):
 
 @jit
 def raw_color(values, sh, TERMS: tl.constexpr):
-    """0.5 + sum_i basis_i sh_i, before the clamp at 0."""
+    """0.5 + sum_i basis_i sh_i, before the clamp."""
     red, green, blue = 0 * values[0] + 0.5, 0 * values[0] + 0.5, 0 * values[0] + 0.5
     for i in tl.static_range(TERMS):
         red += values[i] * sh[3 * i]
@@ -89,16 +89,28 @@ def raw_color(values, sh, TERMS: tl.constexpr):
 
 
 @jit
-def color_backward(rotation, mean, v, sh, TERMS: tl.constexpr):
-    """Gradients of the coefficients, and of ``mean`` through the direction."""
+def inside_unit(channel, v):
+    """The gradient of torch's clamp to [0, 1], which counts both ends as inside."""
+    return tl.where((channel >= 0) & (channel <= 1), v, 0.0)
+
+
+@jit
+def color_backward(rotation, mean, v, sh, TERMS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr):
+    """Gradients of the coefficients, and of ``mean`` through the direction (0 if DETACHED)."""
     direction, distance = direction_of(rotation, mean)
     values = basis(direction, TERMS)
     raw = raw_color(values, sh, TERMS)
-    v = (tl.where(raw[0] > 0, v[0], 0.0), tl.where(raw[1] > 0, v[1], 0.0), tl.where(raw[2] > 0, v[2], 0.0))
+    if CLAMPED:
+        v = (inside_unit(raw[0], v[0]), inside_unit(raw[1], v[1]), inside_unit(raw[2], v[2]))
+    else:
+        v = (tl.where(raw[0] > 0, v[0], 0.0), tl.where(raw[1] > 0, v[1], 0.0), tl.where(raw[2] > 0, v[2], 0.0))
     v_sh, v_values = (), ()
     for i in tl.static_range(TERMS):
         v_sh += scaled(values[i], v)
         v_values += (dot((sh[3 * i], sh[3 * i + 1], sh[3 * i + 2]), v),)
-    v_direction = basis_backward(direction, v_values, TERMS)
-    across = plus(v_direction, scaled(-dot(v_direction, direction), direction))
-    return v_sh, times(rotation, scaled(1.0 / distance, across))
+    v_mean = (0 * distance, 0 * distance, 0 * distance)
+    if not DETACHED:
+        v_direction = basis_backward(direction, v_values, TERMS)
+        across = plus(v_direction, scaled(-dot(v_direction, direction), direction))
+        v_mean = times(rotation, scaled(1.0 / distance, across))
+    return v_sh, v_mean

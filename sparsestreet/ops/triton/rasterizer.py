@@ -125,7 +125,8 @@ class _Blend(torch.autograd.Function):
             rows_backward.project_rows_backward, len(fields[0]), rows_backward.block_of(view),
             *fields, given_or(ctx.displacements, fields[0]), screen.table, screen.records, screen.tile_counts, sums,
             *outputs, v_screen, len(fields[0]),
-            TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, **effects(view, ctx.displacements),
+            TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, CLAMPED=view.settings.clamp_colors,
+            DETACHED=view.settings.detach_directions, **effects(view, ctx.displacements),
         )  # fmt: skip
         return *outputs, v_screen, None, None, None
 

@@ -95,13 +95,15 @@ def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
 
 
 @jit
-def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, HALF_COLORS: tl.constexpr):
+def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, CLAMPED: tl.constexpr, HALF_COLORS: tl.constexpr):
     """Colors of the rows that are seen, and which of these have finite coefficients; other rows are not read."""
     coefficients, color = load_columns(sh, row, seen, 3 * TERMS), ()
     raw = raw_color(basis(direction, TERMS), coefficients, TERMS)
     for i in tl.static_range(3):
         # As in torch.where(color > 0, color, 0).
         channel = tl.where(raw[i] > 0, raw[i], 0.0)
+        if CLAMPED:
+            channel = tl.minimum(channel, 1.0)
         if HALF_COLORS:
             channel = tl.minimum(channel, HALF_LARGEST).to(tl.float16).to(tl.float32)
         color += (channel,)
@@ -111,8 +113,9 @@ def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, HALF_COLORS: tl.co
 @partial(jit, do_not_specialize=["rows"])
 def project_rows(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, numbers, rows,
-    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, HALF_COLORS: tl.constexpr, BOUNDED: tl.constexpr,
-    DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, HALF_COLORS: tl.constexpr,
+    BOUNDED: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
@@ -151,7 +154,7 @@ def project_rows(
     tiles = count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED)
     tl.store(tile_counts + row, tiles, given)
 
-    color, good = seen_color(sh, row, seen, direction_of(rotation, mean)[0], TERMS, HALF_COLORS)
+    color, good = seen_color(sh, row, seen, direction_of(rotation, mean)[0], TERMS, CLAMPED, HALF_COLORS)
     # In the order of records.py.
     values = (x, y, l11, l21, l22, log2_opacity, cutoff, color[0], color[1], color[2], mean[2], 0 * x)
     store_columns(records, row, values, seen & (tiles > 0), record.RECORD)

@@ -59,8 +59,8 @@ def screen_gradient(s, to, mask):
 def project_rows_backward(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
     v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,
-    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr,
-    DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr,
+    DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -73,7 +73,8 @@ def project_rows_backward(
     s = load_columns(sums, row, seen, record.RECORD)
     coefficients = load_columns(sh, row, seen, 3 * TERMS)
     # This comes first, so that nothing else holds registers meanwhile.
-    v_coefficients, v_mean = color_backward(rotation, mean, (s[8], s[9], s[10]), coefficients, TERMS)
+    v_colors = (s[8], s[9], s[10])
+    v_coefficients, v_mean = color_backward(rotation, mean, v_colors, coefficients, TERMS, CLAMPED, DETACHED)
     store_columns(v_sh, row, v_coefficients, given, 3 * TERMS)
 
     size = load_row(scales, row, seen, 3)

@@ -40,8 +40,9 @@ def project(gaussians: Gaussians, view: KernelView) -> Screen:
     launch(
         rows.project_rows, n, rows.block_of(view),
         *fields, given_or(displacements, means), table, splats, tile_counts, radii, numbers, n,
-        TERMS=sh.shape[1], ANTIALIAS=settings.antialias, HALF_COLORS=settings.half_colors, BOUNDED=view.bounded,
-        **effects(view, displacements), options={"enable_fp_fusion": False},
+        TERMS=sh.shape[1], ANTIALIAS=settings.antialias, CLAMPED=settings.clamp_colors,
+        HALF_COLORS=settings.half_colors, BOUNDED=view.bounded, **effects(view, displacements),
+        options={"enable_fp_fusion": False},
     )  # fmt: skip
     places = (tile_counts > 0).cumsum(0, dtype=torch.int32)
     pairs, visible, bad = wait_for(numbers.sum(0))

@@ -15,11 +15,12 @@ from torch import Tensor
 
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.scene.density.statistics import DensityStatistics
+from sparsestreet.scene.density.strategy import DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan, Rows
 
 
 @dataclass(frozen=True)
-class GradientDensity:
+class GradientDensity(DensityStrategy):
     """Clones, splits, culls and resets by thresholds; the defaults are DriveStudio's for its background node.
 
     Raises ValueError for thresholds that contradict each other.
@@ -92,8 +93,9 @@ class GradientDensity:
         large = _largest_scale(rows) > self.split_size(rows, radius)
         if progress <= self.screen_size_until:
             large = large | (statistics.largest_screen > self.split_screen)
-        wanted = wanted & _within_cap(urgency, wanted, large, self, max_gaussians)
-        return self.grow(rows, wanted & large, wanted & ~large, generator)
+        split, clone = self.decisions(rows, statistics, large)
+        wanted = wanted & _within_cap(urgency, wanted, split, clone, self, max_gaussians)
+        return self.grow(rows, wanted & split, wanted & clone, generator)
 
     def urgency(self, statistics: DensityStatistics) -> Float[Tensor, " n"]:
         """Returns how much detail the image asks of each row; rows above 1 are cloned or split, the highest first."""
@@ -103,10 +105,23 @@ class GradientDensity:
         """Returns the largest scale, meters, up to which a row is cloned."""
         return self.split_scale * radius
 
+    def cull_size(self, rows: Rows, radius: float) -> float | Float[Tensor, " n"]:
+        """Returns the largest scale, meters, that a row may have late in a run."""
+        return self.cull_scale * radius
+
+    def decisions(
+        self, rows: Rows, statistics: DensityStatistics, large: Bool[Tensor, " n"]
+    ) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
+        """Returns which rows are split and which are cloned if they grow; ``large``: those above ``split_size``."""
+        return large, ~large
+
     def grow(
         self, rows: Rows, split: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], generator: torch.Generator
     ) -> RowPlan:
-        """Returns the plan that splits and clones the given rows; the children come last."""
+        """Returns the plan that splits and clones the given rows; the children come last.
+
+        A row of both kinds shrinks first, and is cloned as it is then.
+        """
         survivors = torch.nonzero(torch.ones_like(split) if self.keep_parent else ~split).squeeze(-1)
         clones = torch.nonzero(clone).squeeze(-1)
         children = torch.nonzero(split).squeeze(-1).repeat_interleave(self.split_children)
@@ -130,7 +145,7 @@ class GradientDensity:
         _check_same_rows(rows, statistics)
         drop = torch.sigmoid(rows.opacity_logits.detach()) < self.cull_opacity
         if progress > self.cull_scale_from:
-            drop = drop | (_largest_scale(rows) > self.cull_scale * radius)
+            drop = drop | (_largest_scale(rows) > self.cull_size(rows, radius))
         if progress <= self.screen_size_until:
             drop = drop | (statistics.largest_screen > self.cull_screen)
         return RowPlan.keep(~drop)
@@ -178,7 +193,8 @@ def _largest_scale(rows: Rows) -> Float[Tensor, " n"]:
 def _within_cap(
     urgency: Float[Tensor, " n"],
     wanted: Bool[Tensor, " n"],
-    large: Bool[Tensor, " n"],
+    split: Bool[Tensor, " n"],
+    clone: Bool[Tensor, " n"],
     settings: GradientDensity,
     max_gaussians: int | None,
 ) -> Bool[Tensor, " n"]:
@@ -186,7 +202,7 @@ def _within_cap(
     if max_gaussians is None:
         return torch.ones_like(wanted)
     split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
-    growth = torch.where(large, split_growth, 1) * wanted
+    growth = (split_growth * split + 1 * clone) * wanted
     order = torch.sort(urgency, descending=True, stable=True).indices
     room = max(max_gaussians - wanted.shape[0], 0)
     allowed = torch.zeros_like(wanted)

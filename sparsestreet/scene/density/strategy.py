@@ -1,9 +1,11 @@
 """The interface of a node's density strategy, which decides where it needs more or fewer Gaussians."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from sparsestreet.scene.density.statistics import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan, Rows
@@ -39,3 +41,14 @@ class DensityStrategy(Protocol):
     def reset(self, rows: Rows) -> RowPlan:
         """Returns the plan that lowers opacities; needed rows grow back, and the others stay faint."""
         ...
+
+    def noise(self, rows: Rows, rate: float, seed: int) -> Float[Tensor, "n 3"] | None:
+        """Returns what is added to the means after a step; None: nothing.
+
+        ``rate`` is the means' learning rate of the step, and ``seed`` differs from step to step.
+        """
+        return None
+
+    def regularizers(self, rows: Rows) -> Mapping[str, Float[Tensor, ""]]:
+        """Returns terms of the loss that the strategy needs, by name, each with its weight."""
+        return {}

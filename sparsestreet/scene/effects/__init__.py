@@ -1,9 +1,10 @@
 """Effects: what cameras and light do to the image of a scene, each in a module of its own.
 
 ``effect`` says what one is, ``linearized`` how all of a scene change an image together. The sky is an image behind the
-splats; lens and shutter are what a camera brings, and what takes them away from it.
+splats, the affine map one of their colors; lens and shutter are what a camera brings, and what takes them away from it.
 """
 
+from sparsestreet.scene.effects.affine import Affine, AffineSettings
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
@@ -11,6 +12,8 @@ from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
 from sparsestreet.scene.effects.sky import Sky, SkySettings
 
 __all__ = [
+    "Affine",
+    "AffineSettings",
     "Effect",
     "EffectSettings",
     "Finding",

@@ -43,6 +43,23 @@ def outside_boxes(
     return outside
 
 
+def outside_swept_boxes(
+    tracks: Sequence[Track], points: Float[Tensor, "n 3"], held_out: frozenset[int] = frozenset()
+) -> Bool[Tensor, " n"]:
+    """Returns whether world points lie in none of the tracks' boxes at any frame, those held out left aside."""
+    outside = torch.ones(points.shape[0], dtype=torch.bool)
+    for track in tracks:
+        centers = track.world_from_object[:, :3, 3].to(points.dtype)
+        reach = track.size.norm() / 2
+        # Few points lie near the path of an object; only these are taken to its boxes, of which there are many.
+        near = ((points >= centers.amin(0) - reach) & (points <= centers.amax(0) + reach)).all(1).nonzero().flatten()
+        for frame in sorted(set(track.frames.tolist()) - held_out):
+            in_box_frame = points_in_box_frame(track, frame, points[near])
+            if in_box_frame is not None:
+                outside[near[inside_box(in_box_frame, track.size)]] = False
+    return outside
+
+
 def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Generator) -> Float[Tensor, "n 3"]:
     """Returns random points on the faces of a box about the origin, spread evenly over its area.
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_generator
+from sparsestreet.scene.initialize.boxes import outside_swept_boxes
 from sparsestreet.scene.initialize.coverage import Coverage, coverage
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
@@ -48,9 +49,13 @@ class BackgroundSettings(NodeSettings):
     """
 
     num_points: int = 40_000
-    """Largest number of points of all sources together. The coverage of the training images sets each one's share."""
+    """Largest number of points of all sources together, but for those with a ``number``. The coverage of the training
+    images sets each one's share."""
     sources: Mapping[str, PointSource] = field(default_factory=usual_sources)
     """Name -> source of points. Each draws from its own stream, so changing one leaves the points of the others."""
+    clear_swept_boxes: bool = False
+    """Whether a point of any source goes that lies in the box of a moving object at any training frame (DriveStudio):
+    what a car drives over starts empty."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +67,8 @@ class BackgroundSettings(NodeSettings):
                     f"a background's sources give points, got {name}={source}: leave one out with "
                     f"~node.background.sources.{name}"
                 )
-        most = max(sum(source.share(seen) for source in self.sources.values()) for seen in _EXTREMES)
+        sharing = [source for source in self.sources.values() if source.number is None]
+        most = max(sum(source.share(seen) for source in sharing) for seen in _EXTREMES)
         if most > 1 + 1e-6:
             raise ValueError(
                 f"the shares of the sources {', '.join(self.sources)} may add up to 1 at most, got {most:g}: "
@@ -75,20 +81,19 @@ class BackgroundSettings(NodeSettings):
 
     def seeds(self, data: TrainingData, generator: torch.Generator) -> Seeds:
         """Returns the points of the sources. Raises ValueError if there is not a single point."""
-        seen = coverage(data)
+        shared = any(source.number is None for source in self.sources.values())
+        seen = coverage(data) if shared else Coverage(0.0, 0.0)  # of which nobody asks for a share
         drawn = {
-            name: source.draw(
-                round(self.num_points * source.share(seen)), data, named_generator(generator.initial_seed(), name)
-            )
+            name: source.draw(self._asked(source, seen), data, named_generator(generator.initial_seed(), name))
             for name, source in self.sources.items()
         }
-        _log.info(
-            "the lidar covers %.0f %% of the pixels that are not sky, images %.0f %% more; points from %s",
-            100 * seen.lidar,
-            100 * seen.images,
-            ", ".join(f"{name}: {len(seeds)}" for name, seeds in drawn.items()),
-        )
+        counts = ", ".join(f"{name}: {len(seeds)}" for name, seeds in drawn.items())
+        _log.info("%spoints from %s", _covered(seen) if shared else "", counts)
         seeds = Seeds.concatenate(list(drawn.values()))
+        if self.clear_swept_boxes:
+            kept = outside_swept_boxes(data.moving, seeds.points.positions, data.held_out)
+            _log.info("%d of them lie where a moving object passes, and go", int((~kept).sum()))
+            seeds = seeds.where(kept)
         if len(seeds) == 0:
             raise ValueError(
                 f"the background of {data.log.name!r} has nothing to start from: none of "
@@ -96,6 +101,10 @@ class BackgroundSettings(NodeSettings):
                 f"num_points, add a source, or check the poses of the {len(data.frames)} training views"
             )
         return seeds
+
+    def _asked(self, source: PointSource, seen: Coverage) -> int:
+        """Returns how many points a source is asked for: its own number, or its share by what the images show."""
+        return round(self.num_points * source.share(seen)) if source.number is None else source.number
 
     def start_from(
         self,
@@ -110,6 +119,13 @@ class BackgroundSettings(NodeSettings):
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Background":
         return Background(self, rows)
+
+
+def _covered(seen: Coverage) -> str:
+    return (
+        f"the lidar covers {100 * seen.lidar:.0f} % of the pixels that are not sky, images {100 * seen.images:.0f} % "
+        "more; "
+    )
 
 
 class Background(Node):

@@ -206,12 +206,14 @@ class Node(nn.Module, ABC):
     def regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns the node's own terms, and those of every node that have a weight in the settings."""
+        """Returns the node's own terms, those of its density strategy, and those that have a weight in the settings."""
         settings = self.settings
         shape = {}
         if settings.sharp_shape > 0:
             # Activation applies the mask, so hidden Gaussians still have their shape here.
             shape["sharp_shape"] = settings.sharp_shape * sharp_shape(self.rows.log_scales, settings.max_axis_ratio)
+        if settings.density is not None:
+            shape |= settings.density.regularizers(self.rows)
         return shape | self.own_regularizers(raw, drawn, state)
 
     def outside(self) -> Bool[Tensor, " n"] | None:

@@ -40,12 +40,14 @@ _APART = 100.0
 
 @dataclass(frozen=True, kw_only=True)
 class SmplSettings(TrackedSettings):
-    """Settings of people, who start with a Gaussian at each vertex, in the color of points measured near it."""
+    """Settings of people, who start with a Gaussian at each vertex."""
 
     has_body_pose: bool | None = True
     initial_opacity: float = 0.99
     body: Body = field(default_factory=BuiltinBody)
     """The surface, and the joints that move it."""
+    random_colors: bool = False
+    """Whether vertices start in random colors (DriveStudio); False: in that of points measured near them."""
     neighbors: int = 3
     """K: number of neighboring Gaussians on the body, itself included, that should be alike."""
     neighbor_weight: float = 1.0e-3
@@ -111,9 +113,13 @@ class SmplSettings(TrackedSettings):
         areas, normals = (torch.cat(parts) for parts in zip(*surfaces, strict=True))
         radii = (areas / torch.pi).sqrt()
         low, high = people.vertices.amin(1), people.vertices.amax(1)
+        if self.random_colors:
+            colors = torch.rand(count * per_person, 3, generator=generator)
+        else:
+            colors = _colors(tracks, data, people.places)
         rows, mask = self.start(
             data,
-            Points(people.vertices.flatten(0, 1), _colors(tracks, data, people.places)),
+            Points(people.vertices.flatten(0, 1), colors),
             radii,
             torch.full_like(radii, self.initial_opacity),
             generator,

@@ -31,7 +31,8 @@ class TrackedSettings(NodeSettings):
 
     points_per_instance: int = 5000
     box_points: int = 1000
-    """An instance with fewer points than this gets additional random points on the faces of its box."""
+    """An instance with fewer points than this gets additional random points on the faces of its box; 0: none does, and
+    an instance without any point is left out."""
     initial_opacity: float = 0.1
     max_gap: int = 2
     """Frames; within its span, an object is present up to this far from a training annotation."""
@@ -50,7 +51,10 @@ class TrackedSettings(NodeSettings):
         """The node class of these settings."""
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Tracked | None":
-        """Builds the node without boxes of frames that have no training image (held out, or outside the range)."""
+        """Builds the node without boxes of frames that have no training image (held out, or outside the range).
+
+        Instances without any point are left out; None if there is no instance.
+        """
         tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
         if not tracks:
             return None
@@ -59,6 +63,10 @@ class TrackedSettings(NodeSettings):
             self._object_points(track, Points.concatenate([_from_images(track, data), returns]), generator)
             for track, returns in zip(tracks, measured, strict=True)
         ]
+        tracks = [track for track, points in zip(tracks, objects, strict=True) if len(points)]
+        objects = [points for points in objects if len(points)]
+        if not tracks:
+            return None
         counts = torch.tensor([len(points) for points in objects])
         keyframes = Trajectories.from_tracks(tracks, data.held_out, data.log.num_frames)
         sizes = torch.stack([track.size.float() for track in tracks])

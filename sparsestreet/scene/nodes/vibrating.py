@@ -25,8 +25,8 @@ from sparsestreet.types import View
 class VibratingSettings(BackgroundSettings):
     """Settings of a node that starts from the points of a background, at rest.
 
-    A lidar return peaks at the time of its sweep, any other point at a random time. Raises ValueError for impossible
-    times or probabilities.
+    A lidar return peaks at the time of its sweep, any other point where ``random_life_peaks`` says. Raises ValueError
+    for impossible times or probabilities.
     """
 
     frame_time: float = 0.02
@@ -35,6 +35,8 @@ class VibratingSettings(BackgroundSettings):
     """Period of a swing."""
     initial_life_span: float = math.sqrt(0.1)
     """Initial standard deviation of the opacity over time."""
+    random_life_peaks: bool = True
+    """Whether points without a time of measurement peak at random times; False: at the first frame (DriveStudio)."""
     min_factor: float = 0.05
     """A row whose opacity has faded to this fraction of its peak or below is not drawn."""
     velocity_weight: float = 0.001
@@ -58,7 +60,9 @@ class VibratingSettings(BackgroundSettings):
         """Raises ValueError if there is not a single point to start from."""
         seed, num_frames = generator.initial_seed(), data.log.num_frames
         seeds = self.seeds(data, generator)
-        anywhere = torch.rand(len(seeds), generator=named_generator(seed, "life peaks"))
+        anywhere = torch.zeros(len(seeds))
+        if self.random_life_peaks:
+            anywhere = torch.rand(len(seeds), generator=named_generator(seed, "life peaks"))
         peaks = torch.where(seeds.times.isnan(), anywhere, seeds.times) * self.frame_time * (num_frames - 1)
         columns = {
             "velocities": torch.zeros(len(seeds), 3),

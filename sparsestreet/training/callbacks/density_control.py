@@ -9,6 +9,7 @@ from sparsestreet.phases import phase
 from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.training.callbacks.resizing import RowListener, resize_rows
 from sparsestreet.training.schedule import Interval, last_step
@@ -23,7 +24,7 @@ class DensityControl(Callback, RowListener):
         densify_until: fraction of the run after which no rows are added any more, unless a node's settings say another.
         reset_in: when opacities are pulled down, so that what is not needed can be culled.
         pause_after_reset: steps after a reset without refinement: opacities must recover first.
-        seed: of the positions of split children.
+        seed: of the positions of split children, of rows drawn and of noise.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class DensityControl(Callback, RowListener):
             )
         self.refine_in, self.densify_until, self.reset_in = refine_in, densify_until, reset_in
         self.pause_after_reset = pause_after_reset
-        self.generator = torch.Generator().manual_seed(seed)
+        self.seed, self.generator = seed, torch.Generator().manual_seed(seed)
         self.statistics: dict[str, DensityStatistics] = {}
         self.last_reset: int | None = None
 
@@ -80,6 +81,8 @@ class DensityControl(Callback, RowListener):
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
+        for name in self.statistics:
+            self._shake(trainer, pl_module, name)
         if self.refine_in.due(step, pl_module.course) and not self._recovering(step):
             for name in self.statistics:
                 self._refine(trainer, pl_module, name)
@@ -95,6 +98,16 @@ class DensityControl(Callback, RowListener):
             for name in self.statistics:
                 node = pl_module.scene.nodes[name]
                 resize_rows(trainer, pl_module, name, _strategy(node).reset(node.rows), "opacity reset")
+
+    @torch.no_grad()
+    def _shake(self, trainer: Trainer, system: StreetSystem, name: str) -> None:
+        """Add what noise the strategy asks for; a resumed run has the same, because it follows from the step."""
+        node = system.scene.nodes[name]
+        means = node.rows.means
+        (rate,) = (g["lr"] for g in trainer.optimizers[0].param_groups if any(means is one for one in g["params"]))
+        noise = _strategy(node).noise(node.rows, rate, named_seed(self.seed, f"noise {name} {trainer.global_step}"))
+        if noise is not None:
+            means += noise
 
     def _recovering(self, step: int) -> bool:
         return self.last_reset is not None and step - self.last_reset <= self.pause_after_reset

@@ -32,14 +32,15 @@ class Pruning(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        if trainer.global_step not in {milestone(fraction, pl_module.course) for fraction in self.at}:
+        moments = sorted({milestone(fraction, pl_module.course) for fraction in self.at})
+        if trainer.global_step not in moments:
             return
         with stage(f"prune/{type(self.rule).__name__} at step {trainer.global_step}"):
-            self._prune(trainer, pl_module)
+            passed = moments.index(trainer.global_step)
+            self._prune(trainer, pl_module, RenderContext(pl_module.state(), pl_module.options, len(moments), passed))
 
-    def _prune(self, trainer: Trainer, pl_module: StreetSystem) -> None:
+    def _prune(self, trainer: Trainer, pl_module: StreetSystem, context: RenderContext) -> None:
         frames = data_of(trainer).split.train
-        context = RenderContext(pl_module.state(), pl_module.options)
         for name, selection in self.rule.select(pl_module.scene, frames, context).items():
             log.info(
                 "step %d: pruning takes %d of %d Gaussians of %r%s",

@@ -67,6 +67,7 @@ def test_ego_heading_is_the_tangent():
         assert 6 < np.linalg.norm(tangent) < 10
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize(
     "settings",
     [
@@ -110,6 +111,7 @@ def test_people_walk_on_footways_and_cars_on_the_road():
         assert bottom == pytest.approx(0.0 if on_road else layout.CURB_HEIGHT, abs=1e-9)
 
 
+@pytest.mark.lengthy
 def test_seeds_give_other_streets_and_counts_can_be_zero():
     first, again, other = (build_world(StreetSettings(seed=seed)) for seed in (0, 0, 1))
     poses = [[actor.pose(0.0) for actor in world.actors] for world in (first, again, other)]

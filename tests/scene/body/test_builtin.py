@@ -4,7 +4,7 @@ import torch
 from sparsestreet.geometry.skeleton import JOINTS, rest_joints
 from sparsestreet.scene.body import BodyTemplate, BuiltinBody, surface
 
-NUM_VERTICES = pytest.mark.parametrize("num_vertices", [700, 6000])
+NUM_VERTICES = pytest.mark.parametrize("num_vertices", [700, pytest.param(6000, marks=pytest.mark.lengthy)])
 
 
 def edges_of(template: BodyTemplate) -> torch.Tensor:

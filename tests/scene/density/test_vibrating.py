@@ -58,21 +58,69 @@ def test_either_gradient_asks_for_more_the_most_urgent_first():
     rows = vibrating_rows(torch.zeros(5, 3), [0.001] * 5)
     # Urgency 0.9, 1.1 (screen), 3 (peak, of either sign), 2 (both), 0.
     statistics = statistics_of([0.09, 0.11, 0.0, 0.2, 0.0], [0.0, 0.0, -0.03, 0.015, 0.0])
-    assert densified(rows, statistics).source.tolist() == [0, 1, 2, 3, 4, 1, 2, 3]
-    assert densified(rows, statistics, maximum=6).source.tolist() == [0, 1, 2, 3, 4, 2]
-    assert densified(rows, statistics, maximum=7).source.tolist() == [0, 1, 2, 3, 4, 2, 3]
+    # A small row is cloned; with a gradient of its peak, and a long life, it is also split.
+    assert densified(rows, statistics).source.tolist() == [0, 1, 2, 3, 4, 1, 2, 3, 2, 2, 3, 3]
+    assert densified(rows, statistics, maximum=7).source.tolist() == [0, 1, 2, 3, 4]
+    assert densified(rows, statistics, maximum=8).source.tolist() == [0, 1, 2, 3, 4, 2, 2, 2]
+    assert densified(rows, statistics, maximum=11).source.tolist() == [0, 1, 2, 3, 4, 2, 3, 2, 2, 3, 3]
 
 
-def test_far_rows_may_be_larger_before_they_are_split():
-    """The median of the means is (10, 0, 0): limits of 1 % of 1 m (nearer ones), 20 m and 30 m."""
-    means = torch.tensor([[10.0, 0.0, 0.0], [10.0, 0.0, 0.5], [30.0, 0.0, 0.0], [30.0, 0.0, 0.0], [-20.0, 0.0, 0.0]])
-    means = torch.cat((means, torch.tensor([[-20.0, 0.0, 0.0], [10.0, 0.0, 0.0]])))
-    rows = vibrating_rows(means, [0.009, 0.011, 0.19, 0.21, 0.29, 0.31, 0.009])
+@pytest.mark.parametrize(
+    ("gradient", "peak", "scale", "span", "clones", "children"),
+    [
+        (1.0, 0.0, 0.009, 0.3, 1, 0),
+        (1.0, 0.0, 0.011, 0.3, 0, 2),
+        (1.0, 0.0, 0.009, 0.009, 1, 0),
+        (0.0, 1.0, 0.009, 0.3, 1, 2),
+        (0.0, 1.0, 0.011, 0.3, 0, 2),
+        (0.0, 1.0, 0.009, 0.009, 1, 0),
+        (0.0, 1.0, 0.011, 0.009, 1, 2),
+        (0.0, 0.0, 0.011, 0.3, 0, 0),
+    ],
+    ids=[
+        "in space, small: cloned",
+        "in space, large: split",
+        "in space a short life counts for nothing",
+        "in time, small, long: cloned and split",
+        "in time, large, long: split by either",
+        "in time, small, short: cloned by either",
+        "in time, large, short: split and cloned",
+        "without gradients",
+    ],
+)
+def test_space_clones_what_is_small_and_time_splits_what_lives_long(gradient, peak, scale, span, clones, children):
+    """One row in the middle: its limits are 1 % of 1 m in space and 0.01 in time."""
+    rows = vibrating_rows(torch.zeros(1, 3), [scale])
+    with torch.no_grad():
+        rows.log_life_spans.fill_(math.log(span))
+    peaks = rows.life_peaks.detach().clone()
+    plan = densified(rows, statistics_of([gradient], [peak]))
+    assert len(plan.source) == 1 + clones + children
+    assert plan.fresh.tolist() == [False] + [True] * (clones + children)
+    rows.resize(plan)
+    # Whatever is split shrinks, and its clone with it; nobody's life is shortened.
+    shrunk = scale / 1.6 if children else scale
+    torch.testing.assert_close(rows.log_scales.exp(), torch.full_like(rows.log_scales, shrunk))
+    torch.testing.assert_close(rows.log_life_spans.exp(), torch.full((len(rows),), span))
+    assert (rows.life_peaks == peaks).tolist() == [True] * (1 + clones) + [False] * children
+
+
+def test_far_rows_may_be_larger_before_they_are_split_or_culled():
+    """The median of the means is (10, 0, 0) and R = 40 m: units of 1 m (at 0.04 m), 19 m (0.5 m) and 799 m (20 m)."""
+    means = torch.tensor([[10.0, 0.0, 0.0], [10.0, 0.0, 0.04], [10.0, 0.5, 0.0], [10.0, -0.5, 0.0], [30.0, 0.0, 0.0]])
+    means = torch.cat((means, torch.tensor([[-10.0, 0.0, 0.0], [10.0, 0.0, 0.0]])))
+    rows = vibrating_rows(means, [0.009, 0.011, 0.189, 0.191, 7.98, 8.0, 0.009])
     plan = densified(rows, statistics_of([1.0] * 7, [0.0] * 7))
     assert plan.source[7:].tolist() == [0, 2, 4, 6, 1, 1, 3, 3, 5, 5]
+    rows = vibrating_rows(means, [0.49, 0.51, 9.4, 9.6, 399.0, 400.0, 0.49])
+    with torch.no_grad():
+        rows.opacity_logits.fill_(0.0)
+    culled = VibratingDensity(cull_scale=0.5).cull(rows, statistics_of([1.0] * 7, [0.0] * 7), radius=40.0, progress=0.5)
+    assert culled.source.tolist() == [0, 2, 4, 6]
 
 
-def test_children_peak_within_their_parents_life_and_lie_where_it_takes_them():
+@pytest.mark.parametrize(("gradient", "change"), [(1.0, 0.0), (0.0, 1.0)], ids=["split in space", "split in time"])
+def test_children_peak_within_their_parents_life_and_lie_where_it_takes_them(gradient, change):
     children = 40_000
     mean, velocity, peak, span = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[5.0, 0.0, -1.0]]), 0.4, 0.1
     rows = vibrating_rows(mean, [0.5])
@@ -84,7 +132,7 @@ def test_children_peak_within_their_parents_life_and_lie_where_it_takes_them():
     density = VibratingDensity(grad_threshold=0.1, split_scale=1e-9, split_children=children, keep_parent=False)
     plan = density.densify(
         rows,
-        statistics_of([1.0], [0.0]),
+        statistics_of([gradient], [change]),
         radius=1.0,
         progress=0.5,
         max_gaussians=None,

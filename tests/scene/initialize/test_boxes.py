@@ -1,6 +1,8 @@
 import torch
 
-from sparsestreet.scene.initialize.boxes import box_surface_points
+from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.scene.initialize.boxes import box_surface_points, outside_swept_boxes
+from tests.scene.street import car_pose, street_log
 
 
 def test_box_points_are_spread_by_area():
@@ -13,3 +15,17 @@ def test_box_points_are_spread_by_area():
     # Areas 2, 4, 8 of 14; standard deviation of a share of 9,000 draws is 0.005.
     torch.testing.assert_close(share, torch.tensor([2.0, 4.0, 8.0]) / 14, atol=0.02, rtol=0)
     assert ((points[:, 2] > 0).float().mean() - 0.5).abs() < 0.03
+
+
+def test_swept_boxes_are_those_of_every_frame_but_the_held_out_ones():
+    driving = street_log().tracks[1]
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([20.0, 6.0, 3.0])
+    points = points + torch.tensor([2.0, -2.0, -0.5])
+    for held_out in (frozenset(), frozenset({0, 1})):
+        inside = torch.zeros(len(points), dtype=torch.bool)
+        for frame in set(range(5)) - held_out:
+            in_box = transform_points(inverse(car_pose(frame)), points.double())
+            inside |= (2 * in_box.abs() <= driving.size).all(1)
+        assert inside.sum() > 100
+        assert torch.equal(outside_swept_boxes([driving], points, held_out), ~inside)
+    assert outside_swept_boxes([], points).all()

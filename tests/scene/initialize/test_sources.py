@@ -12,7 +12,7 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
-from tests.scene.street import frame_at, street_log, training_data, triangulated
+from tests.scene.street import frame_at, rigid_settings, street_log, training_data, triangulated
 from tests.typed import there
 
 
@@ -139,6 +139,46 @@ def test_guesses_are_limited_by_the_distance_from_the_nearest_camera(kind: type)
     assert seeds.opacities.tolist() == pytest.approx([0.05] * 30)
 
 
+def by_hand(positions: torch.Tensor, data: TrainingData) -> torch.Tensor:
+    """Which positions some training view has in its image, by the pinhole's formula."""
+    seen = torch.zeros(len(positions), dtype=torch.bool)
+    for camera in (view.camera for view in data.views):
+        x, y, z = (positions @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]).unbind(1)
+        column = camera.intrinsics[0, 0] * x / z + camera.intrinsics[0, 2]
+        row = camera.intrinsics[1, 1] * y / z + camera.intrinsics[1, 2]
+        seen |= (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return seen
+
+
+@pytest.mark.parametrize("kind", [NearPoints, FarPoints])
+def test_blind_guesses_are_all_that_a_training_view_has_in_its_image(kind: type, monkeypatch):
+    source, data = kind(part=0.0, largest_scale=None, blind=True), training_data(held_out=frozenset({1}))
+    monkeypatch.setattr(Frames, "__getitem__", lambda *_: pytest.fail("an image was decoded"))
+    seeds = drawn(source, 2000, data)
+    center, generator = data.log.center, torch.Generator().manual_seed(0)
+    candidates = source.positions(6000, center, data.log.radius, generator)
+    assert torch.equal(seeds.points.positions, candidates[by_hand(candidates, data)])
+    distance = (candidates - center).norm(dim=1) / data.log.radius
+    if kind is NearPoints:
+        # In a ball the cube of the distance is uniform; the standard error of a mean of 6,000 is 0.004.
+        assert float((distance**3).mean()) == pytest.approx(0.5, abs=0.02)
+    else:
+        # u = R / distance: a fiftieth of all is clamped to 0.02, the others are uniform above it.
+        u = 1 / distance
+        assert float((u < 0.0201).float().mean()) == pytest.approx(0.02, abs=0.006)
+        assert float(u[u > 0.0201].mean()) == pytest.approx(0.51, abs=0.02)
+    # Uniform colors: mean 1/2, standard deviation 1 / sqrt(12).
+    assert float(seeds.points.colors.std()) == pytest.approx(12**-0.5, abs=0.02)
+    assert set(seeds.largest.tolist()) == {math.inf}
+
+
+def test_returns_from_moving_objects_if_no_box_is_cut_out():
+    data = training_data(movers=rigid_settings())
+    inside = sum(int(sweep.colored.sum()) for sweep in data.sweeps)
+    assert len(drawn(LidarPoints(box_enlargement=None), 10_000, data)) == inside
+    assert len(drawn(LidarPoints(), 10_000, data)) <= inside - 5 * 60
+
+
 def test_seeds_of_several_sources_follow_each_other():
     points, twice = Points(torch.ones(2, 3), torch.zeros(2, 3)), torch.ones(2)
     one = Seeds(points, twice, 2 * twice, 0.3 * twice, 0.2 * twice)
@@ -160,6 +200,7 @@ def test_seeds_of_several_sources_follow_each_other():
     [
         (lambda: LidarPoints(initial_opacity=0.0), "initial_opacity must lie between 0 and 1, got 0.0"),
         (lambda: ImagePoints(initial_opacity=1.0), "initial_opacity must lie between 0 and 1, got 1.0"),
+        (lambda: NearPoints(part=0.5, number=-1), "number must be >= 0, got -1"),
         (lambda: LidarPoints(voxel=0.0), "voxel must be larger than 0, got 0.0"),
         (lambda: LidarPoints(box_enlargement=-1.0), "box_enlargement must be larger than 0, got -1.0"),
         (lambda: ImagePoints(voxel=-0.5), "voxel must be larger than 0, got -0.5"),

@@ -114,6 +114,41 @@ def test_each_source_gives_its_share_and_the_log_says_so(caplog):
     )
 
 
+def test_a_source_with_a_number_takes_no_share(caplog, monkeypatch):
+    """Then the images need not be measured; a source of a share still has its own."""
+    numbers = {"lidar": 7, "images": 3, "near": 9, "far": 2}
+    numbered = {name: replace(SOURCES[name], number=number) for name, number in numbers.items()}
+    with caplog.at_level(logging.INFO):
+        node = started(street_half_covered(), {**numbered, "far": SOURCES["far"]})
+    assert "points from lidar: 7, images: 3, near: 9, far: 25" in caplog.text
+    monkeypatch.setattr("sparsestreet.scene.nodes.background.coverage", lambda _: pytest.fail("images were measured"))
+    assert len(started(street_half_covered(), numbered).rows) == 7 + 3 + 9 + 2
+    assert len(node.rows) == 7 + 3 + 9 + 25
+
+
+def test_no_point_starts_where_a_moving_object_passes(caplog):
+    """The car's own returns, and what it drives over at other instants, of every source."""
+    sources = {"lidar": LidarPoints(box_enlargement=None, number=10_000), "near": NearPoints(part=0.0, number=5000)}
+    data = training_data(movers=MOVERS)
+    kept = {}
+    for cleared in (False, True):
+        settings = background_settings(sources=sources, num_points=0, clear_swept_boxes=cleared)
+        with caplog.at_level(logging.INFO):
+            kept[cleared] = settings.seeds(data, torch.Generator().manual_seed(0))
+    outside = torch.ones(len(kept[False]), dtype=torch.bool)
+    for track in data.moving:
+        for pose in track.world_from_object:
+            in_box = transform_points(inverse(pose), kept[False].points.positions.double())
+            outside &= ~(2 * in_box.abs() <= track.size).all(1)
+    # Five sweeps of 60 returns of the car, and guesses.
+    assert int((~outside).sum()) > 300
+    for name in ("positions", "colors"):
+        assert torch.equal(getattr(kept[True].points, name), getattr(kept[False].points, name)[outside])
+    for name in ("smallest", "largest", "opacities"):
+        assert torch.equal(getattr(kept[True], name), getattr(kept[False], name)[outside])
+    assert f"{int((~outside).sum())} of them lie where a moving object passes, and go" in caplog.text
+
+
 def test_a_source_says_how_opaque_and_how_large_its_gaussians_start():
     opacities = dict(zip(SOURCES, (0.2, 0.3, 0.4, 0.5), strict=True))
     sources = {name: replace(source, initial_opacity=opacities[name]) for name, source in SOURCES.items()}

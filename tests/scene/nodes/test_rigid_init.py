@@ -12,6 +12,7 @@ from tests.scene.street import (
     NUM_FRAMES,
     car_pose,
     degree,
+    pose,
     rigid_settings,
     street_log,
     track,
@@ -76,6 +77,25 @@ def test_an_instance_that_lidar_never_hit_is_a_gray_box():
     node = build(CARS, log=replace(street_log(), sweeps=Sweeps.of(())))
     assert instance_counts(node) == [50]
     assert (node.rows.sh_dc.abs() < 1e-6).all()
+
+
+def test_without_points_on_the_box_only_what_was_measured_starts():
+    node = build(replace(CARS, box_points=0), log=street_log(car_points=2))
+    assert instance_counts(node) == [2 * NUM_FRAMES]
+    one = build(replace(CARS, box_points=0, points_per_instance=1), log=street_log(car_points=2))
+    assert instance_counts(one) == [1]
+    assert one.gaussians_at(street_log().frames[2], degree(0)).means.isfinite().all()
+
+
+def test_without_points_on_the_box_an_instance_that_lidar_never_hit_is_left_out():
+    log, settings = street_log(), replace(CARS, box_points=0)
+    far_away = [pose(0.0, (500.0 + 3 * frame, 0.0, 1.0)) for frame in range(NUM_FRAMES)]
+    two = replace(log, tracks=(track("far away", list(range(NUM_FRAMES)), far_away), *log.tracks))
+    node = build(settings, log=two)
+    assert node.names == ("driving",)
+    assert torch.equal(node.rows.means, build(settings).rows.means)
+    assert torch.equal(node.keyframe_translations, build(settings).keyframe_translations)
+    assert build(settings, log=replace(log, sweeps=Sweeps.of(()))) is None
 
 
 def test_points_from_images_in_the_box_join_those_of_the_lidar():

@@ -79,6 +79,18 @@ def test_without_returns_a_person_is_gray():
     torch.testing.assert_close(node.rows.sh_dc, torch.zeros(VERTICES, 1, 3))
 
 
+def test_a_person_in_random_colors():
+    """Uniform in [0, 1]: of 3 colors a vertex, of two people, each its own."""
+    two = data_of(walker(), walker("tall", height=1.9, y=3.0))
+    node = smpl_settings(random_colors=True).build(two, torch.Generator().manual_seed(0))
+    colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0].detach()
+    assert len(colors.unique()) > 0.99 * colors.numel()
+    assert (colors.min() >= -1e-6, colors.max() <= 1 + 1e-6) == (True, True)
+    # The standard error of the mean of n uniform numbers is 1 / sqrt(12 n).
+    assert float(colors.mean()) == pytest.approx(0.5, abs=4 / (12 * colors.numel()) ** 0.5)
+    assert float(colors.std()) == pytest.approx(12**-0.5, rel=0.1)
+
+
 @pytest.mark.parametrize(("returns", "elsewhere"), [(True, SHIRT), (False, HAIR)])
 def test_points_of_images_color_what_is_near_them(returns, elsewhere):
     """Four above the head; the returns are in the middle of the box."""

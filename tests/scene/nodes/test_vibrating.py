@@ -197,6 +197,9 @@ def test_it_starts_at_rest_and_returns_peak_when_they_were_measured():
     assert node.rows.life_peaks[:60].tolist() == pytest.approx(measured, rel=1e-6)
     guessed = node.rows.life_peaks[60:].detach() / duration
     assert (guessed.min() < 0.2, guessed.max() > 0.8, len(guessed.unique())) == (True, True, 40)
+    first = replace(settings, random_life_peaks=False).build(data, torch.Generator().manual_seed(3)).rows.life_peaks
+    assert first[:60].tolist() == pytest.approx(measured, rel=1e-6)
+    assert not first[60:].any()
     assert not node.rows.velocities.any()
     torch.testing.assert_close(node.rows.log_life_spans.exp(), torch.full((100,), 0.3))
     still = background_settings(lidar=60, near=40).build(data, torch.Generator().manual_seed(3))

@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.nodes import Node
 from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.schedule import Interval
@@ -248,3 +250,30 @@ def test_a_state_has_the_number_of_rows_of_its_moment():
 def test_densification_outside_the_refinement_is_refused(densify_until):
     with pytest.raises(ValueError, match="densify_until must lie between"):
         every_ten(densify_until=densify_until)
+
+
+class Shaking(AskedStrategy):
+    """Moves every mean by the rate, and by a number that follows from the seed."""
+
+    def noise(self, rows: Rows, rate: float, seed: int) -> torch.Tensor:
+        return torch.full_like(rows.means, rate + (seed % 1000))
+
+
+def test_noise_is_added_after_every_step_and_follows_from_the_step():
+    """Whether a run was interrupted or not, and to the nodes alone whose strategy asks for it."""
+    means = {}
+    for resumed in (False, True):
+        node, still = background(3, density=Shaking()), background(3, density=AskedStrategy())
+        trainer, _, _ = started(every_ten(seed=5), near=node, far=still)
+        start, before = node.rows.means.detach().clone(), still.rows.means.detach().clone()
+        if resumed:
+            trainer.global_step = 2
+        trainer.walk(3)
+        means[resumed] = node.rows.means.detach() - start
+        assert torch.equal(still.rows.means, before)
+        assert node.rows.means.grad is None
+    rate = 0.01  # that of the rows
+    added = [rate + named_seed(5, f"noise near {step}") % 1000 for step in (1, 2, 3)]
+    # Sums of float32 numbers up to a thousand.
+    torch.testing.assert_close(means[False], torch.full((3, 3), sum(added)), rtol=1e-6, atol=1e-3)
+    torch.testing.assert_close(means[True], torch.full((3, 3), added[2]), rtol=1e-6, atol=1e-3)

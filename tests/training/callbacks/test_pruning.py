@@ -55,7 +55,8 @@ def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_t
         assert [frame.frame_index for frame in frames] == [0, 2, 3, 5, 6]
         assert frames == data.split.train
     states = [SceneState(0.2, 0), SceneState(0.55, 1), SceneState(1.0, 3)]
-    assert [context for _, _, context in rule.asked] == [RenderContext(state, options) for state in states]
+    contexts = [RenderContext(state, options, passes=3, passed=passed) for passed, state in enumerate(states)]
+    assert [context for _, _, context in rule.asked] == contexts
 
 
 def test_the_rows_that_the_rule_names_go_with_their_moments(caplog):

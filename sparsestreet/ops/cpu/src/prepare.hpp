@@ -78,6 +78,8 @@ inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, 
   load_columns<T>([&](int lane) { return in.sh + 3 * in.terms * row(lane); }, int(3 * in.terms), sh);
   const Vector<Lanes<T>> color = view_color(camera, in_camera, sh, in.terms).raw;
   s.color[0] = positive_part(color.x), s.color[1] = positive_part(color.y), s.color[2] = positive_part(color.z);
+  if (camera.clamp_colors)
+    for (auto& channel : s.color) channel = channel < T(1) ? channel : same(T(1));
   if (camera.half_colors)
     for (auto& channel : s.color) channel = rounded_to_half<T>(channel);
 }

@@ -71,13 +71,16 @@ template <class T, class V>
 inline Vector<V> color_backward(const Camera<T>& camera, const Vector<V>& in_camera, const Vector<V>& v_colors,
                                 const V* sh, int64_t terms, V* sh_out) {
   const ViewColor<V> c = view_color(camera, in_camera, sh, terms);
-  const Vector<V> v = {c.raw.x > V{} ? v_colors.x : V{}, c.raw.y > V{} ? v_colors.y : V{},
-                       c.raw.z > V{} ? v_colors.z : V{}};
+  const auto in_unit = [](const V& channel) { return channel >= V{} && channel <= T(1); };
+  Vector<V> v = {c.raw.x > V{} ? v_colors.x : V{}, c.raw.y > V{} ? v_colors.y : V{}, c.raw.z > V{} ? v_colors.z : V{}};
+  if (camera.clamp_colors)
+    v = {in_unit(c.raw.x) ? v_colors.x : V{}, in_unit(c.raw.y) ? v_colors.y : V{}, in_unit(c.raw.z) ? v_colors.z : V{}};
   V v_values[16];
   for (int64_t k = 0; k < terms; ++k) {
     v_values[k] = sh[3 * k] * v.x + sh[3 * k + 1] * v.y + sh[3 * k + 2] * v.z;
     sh_out[3 * k] = c.values[k] * v.x, sh_out[3 * k + 1] = c.values[k] * v.y, sh_out[3 * k + 2] = c.values[k] * v.z;
   }
+  if (camera.detach_directions) return {V{}, V{}, V{}};
   const Vector<V> v_direction = basis_backward(c.direction, terms, v_values);
   const V along = dot(v_direction, c.direction);
   return camera.rotation * ((1 / c.distance) * (v_direction + -along * c.direction));

@@ -19,6 +19,10 @@ class FarPoints(Guesses):
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """Returns points in uniform directions at distance radius / u with u uniform; density falls with distance."""
-        u = FARTHEST_RATIO + (1 - FARTHEST_RATIO) * torch.rand(count, 1, generator=generator)
+        """Returns points in uniform directions at distance radius / u; density falls with distance.
+
+        u is uniform in [FARTHEST_RATIO, 1]. If ``blind``, it is uniform in [0, 1] and clamped, as in DriveStudio.
+        """
+        u = torch.rand(count, 1, generator=generator)
+        u = u.clamp(min=FARTHEST_RATIO) if self.blind else FARTHEST_RATIO + (1 - FARTHEST_RATIO) * u
         return center + radius / u * directions(count, generator)

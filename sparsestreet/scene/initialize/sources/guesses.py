@@ -36,9 +36,13 @@ class Guesses(PointSource):
 
     part: float
     """Fraction of the share of pixels that nothing covers."""
-    largest_scale: float = 0.02
-    """Largest scale as a fraction of a point's distance from the nearest camera, here 1.1 degrees. Neighbors of guesses
-    are meters away. Without a limit, guesses start as a fog that hides other points and slows every early step."""
+    largest_scale: float | None = 0.02
+    """Largest scale as a fraction of a point's distance from the nearest camera, here 1.1 degrees; None: no limit.
+    Neighbors of guesses are meters away. Without a limit, guesses start as a fog that hides other points and slows
+    every early step."""
+    blind: bool = False
+    """Whether no image is looked at, as in DriveStudio: three times as many positions as asked for are drawn once. All
+    that lie in the image of some training view are kept, also in the sky, in random colors."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,7 +57,14 @@ class Guesses(PointSource):
 
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
         center = torch.as_tensor(data.log.center, dtype=torch.float32)
-        points = random_points(self.positions, count, center, data.log.radius, data.frames, generator)
+        if self.blind:
+            candidates = self.positions(CANDIDATES_PER_POINT * count, center, data.log.radius, generator)
+            found = in_some_view(candidates, data.views)
+            points = Points(found, torch.rand(found.shape, generator=generator))
+        else:
+            points = random_points(self.positions, count, center, data.log.radius, data.frames, generator)
+        if self.largest_scale is None:
+            return self.seeds(points)
         limit = self.largest_scale * _camera_distances(points.positions, data.views)
         return self.seeds(points, largest=limit.clamp(min=MINIMUM_SCALE))
 
@@ -97,6 +108,17 @@ def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Poi
         kept.append(seen if frame.sky is None else seen.where(~frame.sky[row, column]))
         undecided = undecided[~inside]
     return Points.concatenate(kept)
+
+
+def in_some_view(positions: Float[Tensor, "n 3"], views: Iterable[View]) -> Float[Tensor, "k 3"]:
+    """Returns the positions that lie inside the image of at least one view, in their order."""
+    unseen = torch.arange(len(positions))
+    for view in views:
+        _, _, inside = project(view.camera, positions[unseen])
+        unseen = unseen[~inside]
+    seen = torch.ones(len(positions), dtype=torch.bool)
+    seen[unseen] = False
+    return positions[seen]
 
 
 def directions(count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:

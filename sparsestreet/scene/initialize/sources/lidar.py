@@ -13,13 +13,14 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 
 @dataclass(frozen=True, kw_only=True)
 class LidarPoints(PointSource):
-    """Colored returns of the training sweeps outside all moving boxes of their instant.
+    """Colored returns of the training sweeps, outside all moving boxes of their instant if ``box_enlargement`` is set.
 
     Raises ValueError for impossible settings.
     """
 
-    box_enlargement: float = 1.1
-    """Factor on the sides of a moving object's box, because points may lie just outside an imprecise box."""
+    box_enlargement: float | None = 1.1
+    """Factor on the sides of a moving object's box, because points may lie just outside an imprecise box; None: returns
+    from moving objects are taken too."""
     voxel: float | None = None
     """Side of a cube, meters, from which one return is taken; None: all returns."""
 
@@ -33,8 +34,10 @@ class LidarPoints(PointSource):
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
         parts, times = [], [torch.zeros(0)]
         for sweep in data.sweeps:
-            outside = outside_boxes(data.moving, sweep.index, sweep.points, self.box_enlargement)
-            parts.append(Points(sweep.points, sweep.colors).where(sweep.colored & outside))
+            taken = sweep.colored
+            if self.box_enlargement is not None:
+                taken = taken & outside_boxes(data.moving, sweep.index, sweep.points, self.box_enlargement)
+            parts.append(Points(sweep.points, sweep.colors).where(taken))
             times.append(torch.full((len(parts[-1]),), sweep.index / max(data.log.num_frames - 1, 1)))
         points = Points.concatenate(parts)
         rows = torch.arange(len(points)) if self.voxel is None else thinned(points.positions, self.voxel, generator)

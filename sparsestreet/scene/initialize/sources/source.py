@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.scene.initialize.coverage import Coverage
@@ -29,6 +29,11 @@ class Seeds:
     def __len__(self) -> int:
         return len(self.points)
 
+    def where(self, mask: Bool[Tensor, " n"]) -> "Seeds":
+        return Seeds(
+            self.points.where(mask), self.smallest[mask], self.largest[mask], self.opacities[mask], self.times[mask]
+        )
+
     @staticmethod
     def concatenate(parts: Sequence["Seeds"]) -> "Seeds":
         empty = torch.zeros(0)
@@ -49,14 +54,18 @@ class PointSource(ABC):
     """
 
     initial_opacity: float = 0.1
+    number: int | None = None
+    """How many points the source is asked for, whatever the images show; None: its share of the node's points."""
 
     def __post_init__(self) -> None:
         if not 0 < self.initial_opacity < 1:
             raise ValueError(f"initial_opacity must lie between 0 and 1, got {self.initial_opacity}: take 0.1")
+        if self.number is not None and self.number < 0:
+            raise ValueError(f"number must be >= 0, got {self.number}: 0 points, or null for a share of the node's")
 
     @abstractmethod
     def share(self, coverage: Coverage) -> float:
-        """Returns the fraction of the node's points that the source is asked for.
+        """Returns the fraction of the node's points that the source is asked for if it has no ``number``.
 
         The fractions of a node's sources add up to 1 at most; the rest of the points is left out.
         """

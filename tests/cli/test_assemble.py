@@ -1,0 +1,190 @@
+"""From words to the objects of a run: every value of a configuration arrives where it belongs."""
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from hydra.core.hydra_config import HydraConfig
+from lightning import Callback
+from omegaconf import OmegaConf
+
+from sparsestreet.cli import evaluate as evaluate_module
+from sparsestreet.cli import run as run_module
+from sparsestreet.cli import step as step_module
+from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of
+from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.evaluate import evaluate
+from sparsestreet.cli.run import run
+from sparsestreet.cli.step import NEVER, train_with
+from sparsestreet.data.synthetic.reader import StreetReader
+from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.evaluation.speed import Timing
+from sparsestreet.phases import StageRecorder
+from sparsestreet.records.configuration import flat_config
+from sparsestreet.records.run import RUN
+from sparsestreet.training.callbacks import DensityControl, PhaseTimes, RowLedger
+from tests.cli.configurations import composed
+from tests.data.streets import make_log
+from tests.evaluation.frames import make_run, make_summary
+from tests.training.stubs import background, make_system
+
+WORDS = (
+    "seed=7",
+    "name=mine",
+    "method=3dgs",
+    "sparsify=removal",
+    "split.stride=4",
+    "split.offset=1",
+    "split.val_frames=2",
+    "schedule.max_steps=90",
+    "schedule.sh_interval=0.17",
+    "optimizer.eps=1e-9",
+    "optimizer.visible_only=true",
+    "render.backend=reference",
+    "render.preset=fine",
+    "render.settings.near_plane=0.7",
+    "evaluation.novel=[1.5]",
+    "evaluation.timing.rounds=3",
+    "effects.sky.resolution=8",
+    "trainer.log_every_n_steps=4",
+)
+
+
+@pytest.fixture
+def log(monkeypatch) -> Any:
+    """In place of a street that would be traced."""
+    log = make_log()
+    monkeypatch.setattr(StreetReader, "read", lambda self: log)
+    monkeypatch.setattr(StreetReader, "data_hash", lambda self: "c0ffee")
+    return log
+
+
+def test_every_value_of_a_recipe():
+    cfg = composed(*WORDS)
+    recipe = recipe_of(cfg)
+    assert (recipe.seed, recipe.sh_interval) == (7, 0.17)
+    assert (recipe.optimizer.eps, recipe.optimizer.visible_only) == (1e-9, True)
+    assert (recipe.options.backend, recipe.options.settings.near_plane) == ("reference", 0.7)
+    assert set(recipe.nodes) == set(cfg.node)
+    assert set(recipe.losses) == set(cfg.loss)
+    assert list(recipe.callbacks) == list(cfg.callback)
+    assert set(recipe.effects) == {"sky", "lens", "shutter"}
+    assert getattr(recipe.effects["sky"], "resolution") == 8  # noqa: B009 - of its own settings
+    assert recipe.image_points is not None
+    assert recipe_of(composed("~effects.sky", "~effects.lens", "~effects.shutter")).effects == {}
+
+
+def test_the_split_and_the_order_are_the_configurations(log):
+    data = data_of(composed(*WORDS))
+    assert data.driving_log is log
+    assert (data.seed, data.val_frames, data.split_in_words) == (7, 2, "every 4th frame from 1")
+    assert data.split.held_out_indices == {1, 5, 9}
+
+
+def test_a_run_is_called_what_its_configuration_says(log):
+    cfg = composed(*WORDS)
+    identity = identity_of(cfg, "typed")
+    assert (identity.label, identity.method, identity.sparsify) == ("mine", "3dgs", "removal")
+    assert (identity.data_hash, identity.command) == ("c0ffee", "typed")
+    assert identity.config == flat_config(resolved(cfg))
+
+
+def test_a_trainer_and_a_logger(tmp_path):
+    assert trainer_of(composed(*WORDS)).keywords["log_every_n_steps"] == 4
+    assert logger_of(composed("logger=none")) is False
+    cfg = OmegaConf.merge(composed(), {"folder": str(tmp_path)})
+    assert Path(logger_of(cfg).log_dir) == tmp_path / "curves"
+
+
+def test_a_command_is_quoted():
+    assert this_command(["train", "out=a b"]) == "sparsestreet train 'out=a b'"
+
+
+@pytest.mark.parametrize(("resume", "summary"), [(None, make_summary(psnr=21.5)), ("some/run", None)])
+def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, resume, summary):
+    words = [*WORDS, *([f"resume={resume}"] if resume else [])]
+    called: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
+    order: list[str] = []
+    for name in ("keep_freed_memory", "forget_peaks", "silence_known_noise"):
+        monkeypatch.setattr(run_module, name, lambda name=name: order.append(name))
+    monkeypatch.setattr(run_module, "train", lambda *args, **how: called.append((args, how)) or summary)
+    task = OmegaConf.create({"overrides": {"task": ["seed=7", "out=a b"]}})
+    monkeypatch.setattr(HydraConfig, "get", lambda: task)
+    started = time.perf_counter() - 3
+    assert run(composed(*words), tmp_path, started) == (21.5 if summary else 0.0)
+    (((recipe, data, out), how),) = called
+    assert order == ["keep_freed_memory", "forget_peaks", "silence_known_noise"]
+    assert (recipe.seed, data.driving_log, out) == (7, log, tmp_path)
+    assert how["max_steps"] == 90
+    assert how["make_trainer"].keywords["log_every_n_steps"] == 4
+    assert Path(how["logger"].root_dir) == Path()
+    assert (how["identity"].label, how["identity"].command) == ("mine", "sparsestreet train seed=7 'out=a b'")
+    assert how["extra"] == ExtraMetrics(novel=[1.5], presets=[], timing=Timing(20, 50, 3))
+    assert how["resume"] == (Path(resume) if resume else None)
+    seconds = how["stages"].seconds()
+    assert list(seconds) == ["start", "other", "data"]
+    assert 3 <= seconds["start"] < 60
+
+
+def test_a_configuration_that_cannot_be_is_no_run(tmp_path):
+    with pytest.raises(ValueError, match=r"training runs on one device, got trainer\.devices=2"):
+        run(composed("trainer.devices=2"), tmp_path, 0.0)
+
+
+def test_a_bench_trains_without_what_a_run_leaves(log, monkeypatch, tmp_path):
+    """As its options say, with one callback more and one less."""
+    given: list[Any] = []
+    system = make_system({"background": background(1)})
+    monkeypatch.setattr(step_module, "build", lambda recipe, data: given.append((recipe, data)) or system)
+    monkeypatch.setattr(step_module, "fit", lambda *args, **how: given.append((args, how)))
+    watch = Callback()
+    assert train_with(WORDS, tmp_path)(watch) is system
+    (recipe, data), ((one, of, callbacks, make, folder), how) = given
+    assert (recipe.seed, data.driving_log, one, of) == (7, log, system, data)
+    assert (folder, how) == (tmp_path, {"max_steps": 90})
+    assert callbacks[-1] is watch
+    kinds = [type(callback) for callback in recipe.callbacks.values()]
+    assert PhaseTimes in kinds
+    assert [type(callback) for callback in callbacks[:-1]] == [kind for kind in kinds if kind is not PhaseTimes]
+    assert {DensityControl, RowLedger} <= set(kinds)
+    assert make.keywords["val_check_interval"] == NEVER
+    assert make.keywords["log_every_n_steps"] == 4
+    with pytest.raises(ValueError, match=r"got trainer\.devices=2"):
+        train_with(["trainer.devices=2"], tmp_path)
+
+
+@pytest.mark.parametrize("threads", [1, 10_000])
+def test_an_evaluation_hands_on_what_it_is_told(log, monkeypatch, tmp_path, capsys, threads):
+    """As many threads as trained, and never more than there are cores."""
+    RUN.write(tmp_path, make_run(device="cpu: other", threads=threads))
+    scene, options = object(), object()
+    opened, asked, numbers = [], [], []
+    cfg = OmegaConf.merge(composed(*WORDS), {})
+    monkeypatch.setattr(evaluate_module, "load_run_config", lambda run: opened.append(run) or cfg)
+    stored = SimpleNamespace(scene=scene, options=options)
+    monkeypatch.setattr(evaluate_module, "open_scene", lambda *place: opened.append(place) or stored)
+    monkeypatch.setattr(torch, "set_num_threads", numbers.append)
+    monkeypatch.setattr(evaluate_module, "this_machine", lambda: SimpleNamespace(cores=6))
+    summary = make_summary(psnr=21.5, training_psnr=31.25, milliseconds=7.25, gaussians={"a": 1234})
+    monkeypatch.setattr(evaluate_module, "evaluate_run", lambda *args, **how: asked.append((args, how)) or summary)
+    assert evaluate([f"run={tmp_path}", "presets=fast,fine"]) == 0
+    (((one, way, data, out), how),) = asked
+    assert (one, way, data.driving_log, out) == (scene, options, log, tmp_path)
+    assert data.split_in_words == "every 4th frame from 1"
+    extra = ExtraMetrics(novel=[1.5], presets=("fast", "fine"), timing=Timing(20, 50, 3))
+    command = f"sparsestreet evaluate run={tmp_path} novel=1.5 presets=fast,fine"
+    assert how == {"device": torch.device("cpu"), "command": command, "extra": extra, "say": print}
+    assert opened == [tmp_path, (tmp_path, "cpu")]
+    assert numbers == [min(threads, 6)]
+    assert capsys.readouterr().out.splitlines() == [
+        "held-out views: 21.50 dB",
+        "training views: 31.25 dB",
+        f"1,234 Gaussians, 7.2 ms/frame; records in {tmp_path / 'records' / 'summary.json'}",
+    ]
+
+
+def test_stages_begin_where_the_command_began():
+    assert StageRecorder(time.perf_counter() - 2).seconds()["start"] == pytest.approx(2, abs=0.5)
