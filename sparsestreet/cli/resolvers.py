@@ -31,6 +31,17 @@ def mul(factor: float, rate: float) -> float:
     return float(factor) * float(rate)
 
 
+def of_30000(step: int) -> float:
+    """Of conf/preset: a step of DriveStudio's 30,000 as a fraction of the run."""
+    return step / 30_000
+
+
+def at_scale(label: str, *, _root_: DictConfig) -> str:
+    """Of conf/preset: a label, which says so where a run is not as long and large as DriveStudio's."""
+    whole = _root_.capacity == "paper" and _root_.schedule.max_steps == 30_000
+    return label if whole else f"{label}_scaled"
+
+
 def of_preset(setting: str, *, _root_: DictConfig) -> Any:
     """Of render.settings: what ``render.preset`` says. Raises ValueError naming the presets there are."""
     from sparsestreet.ops import SplatSettings  # torch, which a report needs not
@@ -70,6 +81,8 @@ _RESOLVERS = {
     "concat": concat,
     "mul": mul,
     "min": min,
+    "of_30000": of_30000,
+    "at_scale": at_scale,
     "of_preset": of_preset,
     "gaussians_of": gaussians_of,
     "by_drive": by_drive,

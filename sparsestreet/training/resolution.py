@@ -10,6 +10,9 @@ from torch.nn.functional import interpolate
 from sparsestreet.training.schedule import ROUNDING
 from sparsestreet.types import Camera, Frame
 
+LEAST_SIDE = 11
+"""Pixels: SSIM's window. Images are not made smaller than this."""
+
 
 @dataclass(frozen=True)
 class ResolutionSchedule:
@@ -39,17 +42,20 @@ class ResolutionSchedule:
 
     def of(self, frame: Frame, step: int, max_steps: int) -> Frame:
         """Returns the frame as a step trains on it; whole, it is the same object."""
-        divisor = self.divisor(step, max_steps) if self.halvings else 1
+        if not self.halvings:
+            return frame
+        side = min(frame.camera.width, frame.camera.height)
+        divisor = min(self.divisor(step, max_steps), max(side // LEAST_SIDE, 1))
         return frame if divisor == 1 else smaller(frame, divisor)
 
 
 def smaller(frame: Frame, divisor: int) -> Frame:
-    """Returns the frame with sides of floor(1 / divisor), but at least a pixel.
+    """Returns the frame with sides of a ``divisor``-th, rounded down to whole pixels.
 
     Images are resized by an antialiased bicubic filter, masks take the nearest pixel, a depth is the mean of the
     returns in its part of the image.
     """
-    size = (max(frame.camera.height // divisor, 1), max(frame.camera.width // divisor, 1))
+    size = (frame.camera.height // divisor, frame.camera.width // divisor)
     masks = {name: getattr(frame, name) for name in ("sky", "human", "vehicle", "ego")}
     return replace(
         frame,

@@ -63,7 +63,12 @@ def test_an_odd_size_keeps_the_field_of_view():
     assert (camera.width, camera.height) == (8, 4)
     assert camera.intrinsics[0, 2].item() == pytest.approx(4)
     assert camera.intrinsics[1, 2].item() == pytest.approx(2)
-    assert smaller(frame_at(0, 3, 2), 8).camera.width == 1
+
+
+def test_images_stay_as_large_as_the_window_of_ssim():
+    schedule = ResolutionSchedule(halvings=3, double_in=0.1)
+    assert schedule.of(frame_at(0, 90, 40), 0, 100).camera.height == 13  # 40 // 3
+    assert schedule.of(frame := frame_at(0, 90, 20), 0, 100) is frame
 
 
 def test_training_steps_see_small_images_first():
@@ -79,5 +84,5 @@ def test_training_steps_see_small_images_first():
 
     system = make_system({"background": background(4)}, {"watch": Watch()})
     system.resolution = ResolutionSchedule(halvings=2, double_in=0.02)
-    StubTrainer(system, max_steps=100).train(5, frame_at())
-    assert sizes == [((4, 8, 3), 8)] * 2 + [((8, 16, 3), 16)] * 2 + [((16, 32, 3), 32)]
+    StubTrainer(system, max_steps=100).train(5, frame_at(0, 64, 48))
+    assert sizes == [((12, 16, 3), 16)] * 2 + [((24, 32, 3), 32)] * 2 + [((48, 64, 3), 64)]
