@@ -76,6 +76,15 @@ ALL = {
     "image_points": None,
     "optimizer.eps": 1e-15,
     "split.with_replacement": True,
+    "render.settings.near_plane": 0.1,
+    "render.settings.antialias": False,
+    "render.settings.eps2d": 0.3,
+    "render.settings.alpha_max": 0.999,  # of gsplat 1.3.0, as the next four
+    "render.settings.stop": "exclusive",
+    "render.settings.clamp_colors": True,
+    "render.settings.detach_directions": True,
+    "render.settings.half_colors": False,
+    "render.settings.plain_gradients": False,  # absgrad: True
     "schedule.max_steps": 30_000,
     "schedule.refine_in.every": 100,
     "schedule.refine_in.start": at(501),  # warmup_steps 500, exclusive
@@ -193,7 +202,8 @@ VIBRATING = {
     **rates("background", "velocities", 1e-3, by_radius=True),
     **rates("background", "log_life_spans", 2e-3),
     **rates("background", "life_peaks", 8e-4, 8e-6),
-    **control("background", split_scale=0.01, peak_threshold=0.002, cycle=0.2),
+    **control("background", split_scale=0.01, peak_threshold=0.002, cycle=0.2, grad_threshold=2e-4),
+    "render.settings.plain_gradients": True,
     "schedule.densify_until": at(19_999),
     "schedule.sh_interval": at(2_000),
     "schedule.resolution.halvings": 3,
