@@ -1,6 +1,7 @@
 """No loss learns the recording car: what its pixels show changes neither value nor gradient."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from sparsestreet.training.losses import (
 )
 from sparsestreet.training.losses.hood import without_hood
 from tests.training.stubs import HEIGHT, WIDTH, StubTrainer, background, frame_at, make_system, rigid
+from tests.typed import there
 
 HOOD = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
 HOOD[10:, 4:20] = True
@@ -33,7 +35,7 @@ LOSSES = (
 )
 
 
-def known(seed: int) -> dict[str, torch.Tensor]:
+def known(seed: int) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(seed)
     depth = 1 + 9 * torch.rand(HEIGHT, WIDTH, generator=generator)
     return {"depth": depth, "sky": torch.rand(HEIGHT, WIDTH, generator=generator) < 0.3}
@@ -82,6 +84,8 @@ def test_without_a_mask_nothing_is_touched():
     scene, frame = SceneGraph({"road": background(4)}), frame_at(0)
     rendering = render(scene, frame)
     assert without_hood(rendering, frame) == (rendering, frame)
+    _, recorded = without_hood(rendering, frame_at(0, **known(0), ego=HOOD))
+    assert not there(recorded.depth)[HOOD].any()
 
 
 def test_a_training_step_leaves_the_hood_out():

@@ -313,9 +313,9 @@ def test_a_floor_stops_the_value_of_the_sky_but_not_its_pull(in_the_sky):
     right = torch.tensor([0.0, 0.05, 0.1, 0.4, 1.0], dtype=torch.float64)
     alpha = (1 - right if in_the_sky else right).clone().requires_grad_()
     mask = torch.full((1, 5), in_the_sky)
-    layers = {"rgb": torch.zeros(1, 5, 3), "depth": torch.ones(1, 5)}
+    black, depth = torch.zeros(1, 5, 3), torch.ones(1, 5)
     loss = SkyMask(1.0, eps=1e-12, floor=0.1)
-    term = loss(rendering(alpha=alpha[None], **layers), frame_at(0, 5, 1, sky=mask), SCENE)
+    term = loss(rendering(black, alpha[None], depth), frame_at(0, 5, 1, sky=mask), SCENE)
     (slope,) = torch.autograd.grad(term, alpha)
     assert term.item() == pytest.approx(-right.clamp(min=0.1).log().mean().item())
     sign = 1 if in_the_sky else -1

@@ -15,9 +15,9 @@ def test_sides_double_at_drivestudios_steps():
     assert [schedule.divisor(step, 30_000) for step in (0, 249, 250, 499, 500, 29_999)] == [4, 4, 2, 2, 1, 1]
     pvg = ResolutionSchedule(halvings=3, double_in=5_000 / 30_000)
     assert [pvg.divisor(step, 30_000) for step in (4_999, 5_000, 9_999, 10_000, 15_000)] == [8, 4, 4, 2, 1]
-    for wrong in ({"halvings": -1}, {"double_in": 0.0}):
+    for halvings, double_in in ((-1, 0.1), (2, 0.0)):
         with pytest.raises(ValueError, match="halvings >= 0 and double_in > 0"):
-            ResolutionSchedule(**wrong)
+            ResolutionSchedule(halvings, double_in)
 
 
 def test_whole_images_are_the_frame_itself():
