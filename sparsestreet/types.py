@@ -212,7 +212,8 @@ class Rendering:
     screen_offsets: Float[Tensor, "n 2"]
     """A leaf of zeros. After backward its .grad holds, per row, the sum over pixels of |dLoss / d mean2d|, 1/px.
 
-    This is the absolute gradient of AbsGS, which density control thresholds."""
+    This is the absolute gradient of AbsGS, which density control thresholds; with ``SplatSettings.plain_gradients`` it
+    is the sum of dLoss / d mean2d, as in 3DGS."""
 
     @property
     def visible(self) -> Bool[Tensor, " n"]:

@@ -26,6 +26,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         optimizer=instantiate(cfg.optimizer, _convert_="all"),
         options=_render_options(cfg),
         sh_interval=cfg.schedule.sh_interval,
+        resolution=instantiate(cfg.schedule.resolution, _convert_="all"),
         seed=cfg.seed,
         image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,
     )
@@ -46,15 +47,14 @@ def data_of(cfg: DictConfig) -> StreetData:
 
 
 def with_views(cfg: DictConfig, data: StreetData) -> DictConfig:
-    """The configuration of a run that knows what training sees: its length and its limits follow from that."""
-    views = data.split.train.views
-    return with_counts(cfg, len(views), sum(view.camera.width * view.camera.height for view in views))
+    """The configuration of a run that knows what training sees: its length follows from that."""
+    return with_images(cfg, len(data.split.train))
 
 
-def with_counts(cfg: DictConfig, images: int | None, pixels: int | None) -> DictConfig:
-    """The configuration of a run whose training sees so many images and pixels."""
+def with_images(cfg: DictConfig, images: int | None) -> DictConfig:
+    """The configuration of a run whose training sees so many images."""
     known = cfg.copy()
-    known.training_views = {"images": images, "pixels": pixels}
+    known.training_views.images = images
     return known
 
 

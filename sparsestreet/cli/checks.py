@@ -16,12 +16,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from sparsestreet.cli.device import device_of
+from sparsestreet.cli.preset import preset_problem
 
 Tree = typing.Any
 
 
 def config_problem(cfg: DictConfig) -> str | None:
     """The first problem of a training's configuration in one sentence; None where there is none."""
+    if problem := preset_problem(cfg):
+        return problem
     try:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:

@@ -88,7 +88,8 @@ def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> Non
 
 
 def sweep_name(folder: Path) -> str | None:
-    """Which of conf/sweep a folder is of; None for any other sweep. ``NAME_paper`` adds rows to the folder of NAME."""
+    """Which of conf/sweep a folder is of; None for any other sweep. ``NAME_paper`` and ``NAME_others`` add rows to
+    the folder of NAME."""
     path = folder / "multirun.yaml"
     name = OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
-    return name and name.removesuffix("_paper")
+    return name and name.removesuffix("_paper").removesuffix("_others")

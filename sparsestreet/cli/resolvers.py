@@ -8,15 +8,6 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from sparsestreet.records.summary import SUMMARY
 
-DEFAULT_PIXELS = 108 * 320 * 192
-"""That training sees of the default street, for which conf/node has its numbers."""
-
-DEFAULT_GAUSSIANS = 130_000
-"""That the background of the default street may have."""
-
-MOST = 2_000_000
-"""Gaussians of a background on a CPU: parameters, gradients and moments of each take a kilobyte."""
-
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     """Of conf/node: the entry of the capacity that is chosen."""
@@ -46,14 +37,15 @@ def steps_of_log(least: int, per_image: float | int, *, _root_: DictConfig) -> i
     return least if images is None else max(least, 100 * round(per_image * images / 100))
 
 
-def of_log(count: int, *, _root_: DictConfig) -> int:
-    """Of conf/node: a number of Gaussians that is right for the default street, in proportion to the pixels that
-    training sees, in whole thousands; never less, and at most ``MOST`` in all."""
-    pixels = _root_.training_views.pixels
-    if pixels is None:
-        return count
-    factor = min(max(pixels / DEFAULT_PIXELS, 1.0), MOST / DEFAULT_GAUSSIANS)
-    return max(count, 1000 * round(count * factor / 1000))
+def of_30000(step: int) -> float:
+    """Of conf/preset: a step of DriveStudio's 30,000 as a fraction of the run."""
+    return step / 30_000
+
+
+def at_scale(label: str, *, _root_: DictConfig) -> str:
+    """Of conf/preset: a label, which says so where a run is not as long and large as DriveStudio's."""
+    whole = _root_.capacity == "paper" and _root_.schedule.max_steps == 30_000
+    return label if whole else f"{label}_scaled"
 
 
 def of_preset(setting: str, *, _root_: DictConfig) -> Any:
@@ -95,8 +87,9 @@ _RESOLVERS = {
     "concat": concat,
     "mul": mul,
     "steps_of_log": steps_of_log,
-    "of_log": of_log,
     "min": min,
+    "of_30000": of_30000,
+    "at_scale": at_scale,
     "of_preset": of_preset,
     "gaussians_of": gaussians_of,
     "by_drive": by_drive,

@@ -10,10 +10,13 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of, with_views
 from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.preset import preset_notes
 from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.evaluation.memory import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.run import train
+
+log = logging.getLogger(__name__)
 
 
 def run(cfg: DictConfig, out: Path, started: float) -> float | None:
@@ -31,6 +34,8 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     problem = config_problem(cfg)
     if problem:
         raise ValueError(problem)
+    for note in preset_notes(cfg):
+        log.info(note)
     recipe_of(cfg)  # what does not fit together is said before a log is read
     extra, logger = instantiate(cfg.evaluation, _convert_="all"), logger_of(cfg)
     stages = StageRecorder(started)

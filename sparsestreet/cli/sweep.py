@@ -98,14 +98,14 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
 
 def finished(cfg: DictConfig, out: Path) -> float | None:
     """The PSNR of a folder that holds the complete record of this very job; None where it has to be trained."""
-    from sparsestreet.cli.assemble import with_counts
+    from sparsestreet.cli.assemble import with_images
 
     try:
         summary = SUMMARY.read(out)
     except RecordError:
         return None
-    seen = only(summary.run.config, ("training_views.*",))
-    known = with_counts(cfg, **{key.rpartition(".")[2]: count for key, count in seen.items()}) if seen else cfg
+    seen = summary.run.config.get("training_views.images")
+    known = with_images(cfg, seen) if seen else cfg
     config = flat_config(resolved(known))
     same = summary.run.config_hash == config_hash(config) and only(summary.run.config, _ALIKE) == only(config, _ALIKE)
     if not same or summary.run.steps < summary.run.max_steps:

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
+from jaxtyping import Int
 from lightning import LightningDataModule
+from torch import Tensor
 
 from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames, spread
@@ -19,18 +21,27 @@ class ShuffledFrames:
     asks for ``state_dict``): a resumed training sees the frames that an uninterrupted one would have seen.
     """
 
-    def __init__(self, frames: Sequence[Frame], seed: int, finished: Callable[[], int] | None = None) -> None:
+    def __init__(
+        self,
+        frames: Sequence[Frame],
+        seed: int,
+        finished: Callable[[], int] | None = None,
+        *,
+        with_replacement: bool = False,
+    ) -> None:
         """
         Args:
             frames: of an epoch.
             seed: of the order.
             finished: with how many frames training has finished since its start. A frame that was drawn for a step
                 which was interrupted is to be drawn again, and only training knows. None: with all that were drawn.
+            with_replacement: every frame is drawn from all of them, so that an epoch has some twice and some never.
         """
         self.frames = frames
         self.seed = seed
         self._drawn = 0
         self._finished = finished
+        self._with_replacement = with_replacement
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -47,8 +58,14 @@ class ShuffledFrames:
         # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
         generator = torch.Generator().manual_seed(self.seed)
         for _ in range(epoch):
-            torch.randperm(len(self.frames), generator=generator)
-        return torch.randperm(len(self.frames), generator=generator).tolist()
+            self._draw(generator)
+        return self._draw(generator).tolist()
+
+    def _draw(self, generator: torch.Generator) -> Int[Tensor, " n"]:
+        count = len(self.frames)
+        if self._with_replacement:
+            return torch.randint(count, (count,), generator=generator)
+        return torch.randperm(count, generator=generator)
 
     def state_dict(self) -> dict[str, int]:
         return {"finished": self._drawn if self._finished is None else self._finished()}
@@ -78,7 +95,14 @@ class StreetData(LightningDataModule):
     """
 
     def __init__(
-        self, log: DrivingLog, *, stride: int = 10, offset: int = 5, seed: int = 0, val_frames: int | None = None
+        self,
+        log: DrivingLog,
+        *,
+        stride: int = 10,
+        offset: int = 5,
+        seed: int = 0,
+        val_frames: int | None = None,
+        with_replacement: bool = False,
     ) -> None:
         """
         Args:
@@ -87,6 +111,7 @@ class StreetData(LightningDataModule):
             offset: as in ``split``.
             seed: of the order of the training frames.
             val_frames: images that each validation looks at, spread over the held-out ones; None: all.
+            with_replacement: as in ``ShuffledFrames``.
         """
         super().__init__()
         if val_frames is not None and val_frames < 1:
@@ -97,11 +122,13 @@ class StreetData(LightningDataModule):
         """Which frames are held out, for records."""
         self.seed = seed
         self.val_frames = val_frames
+        self.with_replacement = with_replacement
 
     def train_dataloader(self) -> ShuffledFrames:
         """One training frame a step; an epoch is all of them in random order."""
         trainer = self.trainer
-        return ShuffledFrames(self.split.train, self.seed, None if trainer is None else lambda: trainer.global_step)
+        finished = None if trainer is None else lambda: trainer.global_step
+        return ShuffledFrames(self.split.train, self.seed, finished, with_replacement=self.with_replacement)
 
     def val_dataloader(self) -> OrderedFrames | list:
         """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out."""

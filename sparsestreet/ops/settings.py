@@ -47,6 +47,8 @@ class SplatSettings:
     """Clamp colors to [0, 1] (gradient 0 outside). Without it they are only kept from falling below 0."""
     detach_directions: bool = False
     """Means get no gradient through the direction in which their colors are seen."""
+    plain_gradients: bool = False
+    """``Rendering.screen_offsets`` gathers gradients as they are, as in 3DGS. False: their absolute values (AbsGS)."""
 
     def __post_init__(self) -> None:
         _require(0 < self.alpha_max < 1, "alpha_max must lie in (0, 1)", self.alpha_max)

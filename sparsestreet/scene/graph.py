@@ -81,7 +81,7 @@ class SceneGraph(nn.Module):
 
         ``parts`` is what the nodes answered for the view, ``drawn`` which of their rows it shows.
         """
-        terms = {name: node.regularizers(parts[name], drawn[name], state) for name, node in self.nodes.items()}
+        terms = {name: node.regularizers(view, parts[name], drawn[name], state) for name, node in self.nodes.items()}
         terms |= {name: effect.regularizers(view, state) for name, effect in self.effects.items()}
         return {f"{name}/{term}": value for name, own in terms.items() for term, value in own.items()}
 

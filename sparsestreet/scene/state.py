@@ -19,6 +19,8 @@ class SceneState:
     """Whether a training step renders the view; if so, noise and sampling of a node are on."""
     screen_gradients: bool = False
     """Whether density control is running and will read the gradients of the Gaussians' positions on screen."""
+    step: int = 0
+    """Number of optimizer steps before this one, for terms that come at some steps only."""
 
 
 FINISHED = SceneState()

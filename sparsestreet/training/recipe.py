@@ -13,6 +13,7 @@ from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
 from sparsestreet.training.losses import Loss, MaskSparsity, Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.resolution import ResolutionSchedule
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.triangulation import ImagePointSettings
 
@@ -30,6 +31,8 @@ class Recipe:
     options: RenderOptions = DEFAULT_OPTIONS
     sh_interval: float = 1 / 30
     """Fraction of the run after which one more degree of spherical harmonics is used."""
+    resolution: ResolutionSchedule = field(default_factory=ResolutionSchedule)
+    """Size of the images that steps train on; by default they are whole."""
     seed: int = 0
     image_points: ImagePointSettings | None = None
     """How points are triangulated from the training images; None: not at all."""
@@ -71,7 +74,13 @@ class Recipe:
             log, split.train, split.held_out_indices, self.nodes, self.effects, self.seed, self.image_points
         )
         return StreetSystem(
-            scene, self.losses, self.optimizer, radius=log.radius, options=self.options, sh_interval=self.sh_interval
+            scene,
+            self.losses,
+            self.optimizer,
+            radius=log.radius,
+            options=self.options,
+            sh_interval=self.sh_interval,
+            resolution=self.resolution,
         )
 
     def _has(self, kind: type[Callback]) -> bool:

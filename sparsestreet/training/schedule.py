@@ -75,17 +75,23 @@ class Interval:
     """Fraction of max_steps at which it happens last."""
     every: int = 100
     """Steps between two events."""
+    shift: int = 0
+    """Steps by which the events come after the multiples of ``every``."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.start <= self.stop <= 1:
             raise ValueError(f"an interval needs 0 <= start <= stop <= 1, got {self.start} and {self.stop}")
         if self.every < 1:
             raise ValueError(f"an interval needs every >= 1 step, got {self.every}")
+        if not 0 <= self.shift < self.every:
+            raise ValueError(f"an interval needs 0 <= shift < every, got {self.shift} and {self.every}")
 
     def due(self, step: int, course: Course) -> bool:
         """Whether the event happens after ``step`` (1 is the first)."""
         begun = step >= course.step_at(self.start) - ROUNDING
-        return begun and step <= self.last(course) and step % self.every == 0
+        # The first one comes a whole period after the shift.
+        recurs = (step - self.shift) % self.every == 0 and (step > self.shift or self.shift == 0)
+        return begun and step <= self.last(course) and recurs
 
     def closes(self, step: int, course: Course) -> bool:
         """Whether ``step`` is the last one inside the interval."""

@@ -16,7 +16,9 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.losses import Loss
+from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
+from sparsestreet.training.resolution import ResolutionSchedule
 from sparsestreet.training.schedule import Course
 from sparsestreet.types import Frame
 
@@ -38,6 +40,7 @@ class StreetSystem(LightningModule):
         radius: float,
         options: RenderOptions = DEFAULT_OPTIONS,
         sh_interval: float = 1 / 30,
+        resolution: ResolutionSchedule | None = None,
     ) -> None:
         """Make a system of its parts.
 
@@ -48,6 +51,7 @@ class StreetSystem(LightningModule):
             radius: of the scene, meters.
             options: how it is rendered.
             sh_interval: fraction of the run after which one more degree of spherical harmonics is used.
+            resolution: size of the images that steps train on; None: whole.
 
         Raises:
             ValueError: if the interval is not positive.
@@ -61,6 +65,7 @@ class StreetSystem(LightningModule):
         self.radius = radius
         self.options = options
         self.sh_interval = sh_interval
+        self.resolution = resolution or ResolutionSchedule()
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
@@ -79,19 +84,25 @@ class StreetSystem(LightningModule):
         progress = self.course.progress(self.global_step)
         # 0.6 / 0.2 is 2.9999999999999996.
         return SceneState(
-            progress, int(progress / self.sh_interval + 1e-6), training, training and self.screen_gradients
+            progress,
+            int(progress / self.sh_interval + 1e-6),
+            training,
+            training and self.screen_gradients,
+            self.global_step,
         )
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
         state = self.state(training=True)
+        frame = self.resolution.of(frame, self.global_step, self.course)
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
             self.rendering = render(self.scene, frame, state, self.options)
             applicable = {name: loss for name, loss in self.losses.items() if loss.applies(frame)}
             terms = {}
+            seen, recorded = without_hood(self.rendering, frame)
             for name, loss in applicable.items():
                 with phase(f"loss {name}"):
-                    terms[name] = loss(self.rendering, frame, self.scene)
+                    terms[name] = loss(seen, recorded, self.scene)
             with phase("regularizers"):
                 terms |= self.scene.regularizers(frame, self.rendering.parts, self.rendering.drawn, state)
         if self._logs():

@@ -154,7 +154,7 @@ def test_the_short_variant_is_the_schedules():
 
 
 def test_a_preset_reaches_the_density_of_every_node():
-    nodes = recipe_of(composed("preset=current")).nodes.values()
+    nodes = recipe_of(composed("preset=drivestudio")).nodes.values()
     assert [as_a(GradientDensity, settings.density).grad_threshold for settings in nodes] == [5e-4, 5e-4]
 
 

@@ -62,15 +62,19 @@ def test_every_job_of_a_sweep_can_be(name, counted):
 
 
 def test_the_rows_of_table_1_are_the_papers():
-    """Its two sweeps write into one folder."""
+    """Its three sweeps write into one folder."""
     labels = []
-    for name in ("table1_waymo", "table1_waymo_paper"):
+    for name in ("table1_waymo_others", "table1_waymo", "table1_waymo_paper"):
         params, out = (sweeper := composed(f"+sweep={name}").hydra).sweeper.params, sweeper.sweep.dir
         assert out == "outputs/sweeps/table1_waymo"
         rest = [f"+sweep={name}", "data.root=/drives/172", f"sparsify={params.get('sparsify', 'none')}"]
-        labels += [composed(f"method={method}", *rest).name for method in params.method.split(",")]
-    plain = ["3dgs-legacy", "deformgs-legacy", "pvg-legacy", "streetgs-legacy", "omnire-legacy"]
-    assert labels == [*plain, "streetgs-legacy+paper", "omnire-legacy+paper"]
+        configurations = [composed(f"method={method}", *rest) for method in params.method.split(",")]
+        labels += [cfg.name for cfg in configurations]
+        # DriveStudio has no points from images.
+        assert not any(cfg.image_points for cfg in configurations)
+    of_objects = ["streetgs-drivestudio_legacy", "omnire-drivestudio_legacy"]
+    others = ["3dgs-drivestudio", "deformgs-drivestudio", "pvg-drivestudio"]
+    assert labels == [*others, *of_objects, *(f"{label}+paper" for label in of_objects)]
 
 
 def test_global_pruning_of_table_3_is_global():
@@ -79,7 +83,8 @@ def test_global_pruning_of_table_3_is_global():
     arms = [
         composed(*rest, f"experiment={choice}") for choice in composed(*rest).hydra.sweeper.params.experiment.split(",")
     ]
-    assert [arm.name for arm in arms] == ["omnire-legacy+importance", "omnire-legacy+global_pruning"]
+    preset = "omnire-drivestudio_legacy"
+    assert [arm.name for arm in arms] == [f"{preset}+importance", f"{preset}+global_pruning"]
     background, everywhere = arms
     assert background.callback.pruning.rule.nodes == ["background"]
     assert background.node.background.min_gaussians == 40_000
@@ -106,8 +111,9 @@ def test_what_a_control_counts_is_many_jobs_ahead(name):
 
 
 def test_the_second_half_of_a_table_is_reported_as_the_table(tmp_path):
-    (tmp_path / "multirun.yaml").write_text("hydra: {runtime: {choices: {sweep: table1_waymo_paper}}}")
-    assert sweep_name(tmp_path) == "table1_waymo"
+    for name in ("table1_waymo", "table1_waymo_paper", "table1_waymo_others"):
+        (tmp_path / "multirun.yaml").write_text(f"hydra: {{runtime: {{choices: {{sweep: {name}}}}}}}")
+        assert sweep_name(tmp_path) == "table1_waymo"
 
 
 def test_drives_are_read_where_the_authors_read_them():

@@ -232,3 +232,19 @@ def test_a_training_interrupted_anywhere_in_a_step_goes_on_as_if_it_had_not_been
     assert len(first.seen) == (step - 1 if moment in BEFORE_UPDATE else step)
     second, _ = fit(small_street(), 12, checkpoint)
     assert first.seen + second.seen == whole.seen
+
+
+def test_with_replacement_a_frame_comes_at_any_step_and_a_resume_draws_the_same():
+    frames = make_log(9).frames
+    loader = ShuffledFrames(frames, 0, with_replacement=True)
+    drawn = [key for _ in range(40) for key in keys(loader)]
+    assert len(drawn) == 40 * len(frames)
+    epochs = [drawn[start : start + len(frames)] for start in range(0, len(drawn), len(frames))]
+    # Of n draws from n frames a share of 1 - (1 - 1/n)^n differ: 0.64 for n = 18, standard deviation 0.013 here.
+    assert sum(len(set(epoch)) for epoch in epochs) / len(drawn) == pytest.approx(0.64, abs=0.05)
+    assert set(drawn) == set(keys(frames))
+    resumed = ShuffledFrames(frames, 0, with_replacement=True)
+    resumed.load_state_dict({"finished": len(frames) + 4})
+    assert keys(resumed) == epochs[1][4:]
+    again = StreetData(make_log(9), stride=0, with_replacement=True).train_dataloader()
+    assert keys(again) == epochs[0]

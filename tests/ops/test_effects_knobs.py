@@ -14,8 +14,10 @@ from tests.ops.scenes import (
     FIELDS,
     camera,
     cast,
+    cotangents,
     every_double,
     every_precision,
+    first_interpreted,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -225,6 +227,44 @@ def test_gradients_of_clamped_colors_are_right(backend):
             return splat(Gaussians(**(values | {field: value})), view, settings=settings, backend=backend).rgb
 
         assert torch.autograd.gradcheck(image, values[field].clone().requires_grad_(), fast_mode=True)
+
+
+@every_precision
+@pytest.mark.parametrize("number", first_interpreted(3, 1))
+def test_plain_gradients_on_screen_are_those_of_a_shifted_image(backend, dtype, number):
+    """The oracle is the reference in float64: the principal point moves the splat, and nothing else, on the screen."""
+    view, places = front_camera(9, 9, 40.0), [[0.03, -0.05, 2.0], [-0.06, 0.04, 2.2], [0.0, 0.02, 1.8]][:number]
+    rows = one_gaussian(
+        means=places,
+        quaternions=[[1.0, 0.2, -0.3, 0.1]] * number,
+        scales=[[0.1, 0.05, 0.07]] * number,
+        opacities=[0.8] * number,
+        sh=[[[0.5, -0.2, 0.1]]] * number,
+    )
+    settings = SplatSettings(transmittance_min=0.0, plain_gradients=True)
+    seen, absolute = (
+        render(rows, view, backend, dtype, replace(settings, plain_gradients=plain)).gradients
+        for plain in (True, False)
+    )
+
+    def value(shift: tuple[float, float]) -> float:
+        intrinsics = view.intrinsics.clone()
+        intrinsics[:2, 2] += torch.tensor(shift)
+        images = render(rows, replace(view, intrinsics=intrinsics), "reference", settings=settings).images
+        return sum(float((image * v).sum()) for image, v in zip(images.values(), cotangents(view), strict=True))
+
+    step = 1e-6
+    slope = [
+        (value(ahead) - value(behind)) / (2 * step)
+        for ahead, behind in (((step, 0), (-step, 0)), ((0, step), (0, -step)))
+    ]
+    # Central differences of a value of size 100 are known to 1e-14 x 100 / 1e-6; float32 to the bar of the op.
+    bar = 1e-5 if dtype == torch.float64 else 1e-4
+    assert seen["screen"].sum(0).tolist() == pytest.approx(slope, rel=bar)
+    # Sums of signed numbers are at most those of their absolute values; nothing else changes.
+    assert bool((seen["screen"].abs() <= absolute["screen"] * (1 + bar)).all())
+    assert float(seen["screen"].abs().sum()) < 0.8 * float(absolute["screen"].sum())
+    assert all(torch.equal(seen[name], absolute[name]) for name in FIELDS)
 
 
 def test_what_is_off_is_not_run(monkeypatch):

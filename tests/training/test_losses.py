@@ -294,3 +294,31 @@ def test_mask_sparsity_of_a_scene_without_rows_or_masks_is_zero():
     nothing = rendering(spans={"background": slice(0, 0)})
     assert MaskSparsity()(nothing, frame(), empty).item() == 0.0
     assert MaskSparsity()(rendering(), frame(), SCENE).item() == 0.0
+
+
+def test_the_rendered_depth_has_a_limit_of_its_own():
+    """DriveStudio's: returns from 0.01 to 80 m, against all that is rendered beyond 0.1 mm."""
+    measured, rendered = torch.full((HEIGHT, WIDTH), 5.0), torch.full((HEIGHT, WIDTH), 0.00005)
+    measured[0, 0], measured[0, 1] = 0.02, 0.005
+    rendered[0, :3] = torch.tensor([0.3, 0.3, 0.0002])
+    term = Depth(1.0, inverse=False, nearest=0.01, nearest_rendered=1e-4)
+    assert term(rendering(depth=rendered), frame(depth=measured), SCENE).item() == pytest.approx((0.28 + 4.9998) / 2)
+    # One limit for both, unless said.
+    assert Depth(nearest=0.5)(rendering(depth=rendered), frame(depth=measured), SCENE).item() == 0
+
+
+@pytest.mark.parametrize("in_the_sky", [False, True])
+def test_a_floor_stops_the_value_of_the_sky_but_not_its_pull(in_the_sky):
+    """DriveStudio's safe_bce: -log max(a, 0.1), with the slope -1 / max(a, 0.1), of the alpha a that is right."""
+    right = torch.tensor([0.0, 0.05, 0.1, 0.4, 1.0], dtype=torch.float64)
+    alpha = (1 - right if in_the_sky else right).clone().requires_grad_()
+    mask = torch.full((1, 5), in_the_sky)
+    black, depth = torch.zeros(1, 5, 3), torch.ones(1, 5)
+    loss = SkyMask(1.0, eps=1e-12, floor=0.1)
+    term = loss(rendering(black, alpha[None], depth), frame_at(0, 5, 1, sky=mask), SCENE)
+    (slope,) = torch.autograd.grad(term, alpha)
+    assert term.item() == pytest.approx(-right.clamp(min=0.1).log().mean().item())
+    sign = 1 if in_the_sky else -1
+    torch.testing.assert_close(slope, sign / right.clamp(min=0.1) / 5)
+    with pytest.raises(ValueError, match="floor of a cross entropy lies between 0 and 1"):
+        SkyMask(floor=0.0)

@@ -257,6 +257,7 @@ def test_a_training_hands_on_what_it_is_given(tmp_path, monkeypatch):
     checkpoint.touch()
     identity = RunIdentity(label="mine", command="typed")
     told = {"max_steps": 9, "make_trainer": TRAINER, "logger": False, "identity": identity, "extra": extra}
+    told["minutes"] = 0.5
     assert train(parts, frames, tmp_path / "o", **told, resume=checkpoint, stages=stages) is summary
     assert called["build"] == ((parts, frames), {})
     (one, of, callbacks, make, out), how = called["fit"]
@@ -266,10 +267,11 @@ def test_a_training_hands_on_what_it_is_given(tmp_path, monkeypatch):
     assert called["evaluate"] == ((system.scene, system.options, frames, tmp_path / "o"), evaluated)
     assert called["record_costs"] == ((tmp_path / "o", stages, device), {})
     # In this order: a clock first, then those of the recipe, a signal last.
-    clock, *own, times, curve, progress, files, checkpoints, stop = callbacks
+    clock, *own, times, pace, curve, progress, files, checkpoints, stop = callbacks
     assert own == list(parts.callbacks.values())
     assert isinstance(clock, Clock)
     assert (times.recorder, curve.run, curve.clock) == (stages, tmp_path / "o", clock)
+    assert (pace.stages, pace.minutes, pace.timing) == (stages, 0.5, Timing(3, 4, 5))
     assert isinstance(progress, TrainingProgress)
     assert (files.folder, files.clock, files.description) == (
         tmp_path / "o", clock, identity.describe(parts, frames, 9),

@@ -175,6 +175,7 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
         half_colors=settings.half_colors,
         clamp_colors=settings.clamp_colors,
         detach_directions=settings.detach_directions,
+        plain_gradients=settings.plain_gradients,
         depth_bits=settings.depth_bits,
         has_lens=camera.distortion is not None,
         has_shutter=camera.shutter is not None,

@@ -123,7 +123,8 @@ def _alphas(
     pixels: Float[Tensor, "p 2"], splats: Splats, offsets: Float[Tensor, "v 2"], settings: SplatSettings
 ) -> Float[Tensor, "v p"]:
     """Clamped alpha of each splat in each pixel, 0 outside the splat's reach."""
-    shifts = _AbsoluteOffset.apply(offsets, len(pixels))
+    every = (-1, len(pixels), -1)
+    shifts = offsets[:, None].expand(every) if settings.plain_gradients else _AbsoluteOffset.apply(offsets, len(pixels))
     dx, dy = (pixels[None] - splats.means[:, None] - shifts).unbind(-1)
     l11, l21, l22 = (column[:, None] for column in splats.cholesky.unbind(-1))
     q = (l11 * dx + l21 * dy).square() + (l22 * dy).square()

@@ -116,7 +116,8 @@ class _Blend(torch.autograd.Function):
             contiguous(v_depth_sum),
         )
         ends = Ends(transmittance, ctx.lasts, ctx.parts)
-        gradients = differentiate_view(screen, view, ends, cotangents, absolute=ctx.needs_input_grad[5])
+        plain = view.settings.plain_gradients
+        gradients = differentiate_view(screen, view, ends, cotangents, absolute=ctx.needs_input_grad[5] and not plain)
         sums = transmittance.new_empty(len(fields[0]), blend_backward.SLOT_LENGTH)
         _sum_slots(gradients, lists, sums, 16, tl.float32)
         outputs = [torch.empty_like(field) for field in fields]
@@ -126,7 +127,7 @@ class _Blend(torch.autograd.Function):
             *fields, given_or(ctx.displacements, fields[0]), screen.table, screen.records, screen.tile_counts, sums,
             *outputs, v_screen, len(fields[0]),
             TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, CLAMPED=view.settings.clamp_colors,
-            DETACHED=view.settings.detach_directions, **effects(view, ctx.displacements),
+            DETACHED=view.settings.detach_directions, PLAIN=plain, **effects(view, ctx.displacements),
         )  # fmt: skip
         return *outputs, v_screen, None, None, None
 

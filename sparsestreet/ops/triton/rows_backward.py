@@ -60,7 +60,7 @@ def project_rows_backward(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
     v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr,
-    DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+    PLAIN: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -104,7 +104,7 @@ def project_rows_backward(
     store_row(v_means, row, masked(v_mean, seen, 3), given, 3)
     store_columns(v_quaternions, row, masked(v_quaternion, seen, 4), given, 4)
     store_row(v_scales, row, masked(v_size, seen, 3), given, 3)
-    store_row(v_screen, row, masked(v_absolute, seen, 2), given, 2)
+    store_row(v_screen, row, masked(v_screen_mean if PLAIN else v_absolute, seen, 2), given, 2)
     tl.store(v_opacities + row, tl.where(seen, v_opacity, 0.0), given)
 
 

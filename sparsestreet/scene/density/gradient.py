@@ -44,7 +44,7 @@ class GradientDensity(DensityStrategy):
     cull_scale_from: float = 0.1
     """Fraction of the run after which ``cull_scale`` applies: early Gaussians are large because there are few."""
     cull_screen: float = 0.15
-    """Fraction of the longer image side: rows that were larger on screen are culled."""
+    """Fraction of the longer image side: rows that were larger on screen are culled, where ``cull_scale`` applies."""
     screen_size_until: float = 0.0
     """Fraction of the run up to which ``split_screen`` and ``cull_screen`` apply; 0: never. (DriveStudio: 0.133 for
     its background, 1 for its rigid node.)"""
@@ -53,6 +53,9 @@ class GradientDensity(DensityStrategy):
     """Factor by which the scales of children (and of a parent that stays) are divided."""
     keep_parent: bool = True
     """Whether the shrunk parent stays next to its children, as in DriveStudio; the original 3DGS replaces it."""
+    clone_shrunk: bool = False
+    """Whether a parent that stays is cloned too if it has become small. DriveStudio splits first, then clones what is
+    small."""
     reset_opacity_to: float = 0.01
     """Largest opacity after a reset."""
 
@@ -61,6 +64,8 @@ class GradientDensity(DensityStrategy):
     def __post_init__(self) -> None:
         if self.split_children < 2:
             raise ValueError(f"a split needs at least 2 children, got split_children={self.split_children}")
+        if self.clone_shrunk and not self.keep_parent:
+            raise ValueError("clone_shrunk clones parents that stay: set keep_parent=True, or leave it out")
         if self.split_shrink < 1:
             raise ValueError(f"children must not be larger than their parent, got split_shrink={self.split_shrink}")
         if not 0 < self.reset_opacity_to < 1:
@@ -80,7 +85,8 @@ class GradientDensity(DensityStrategy):
 
         Let g be the mean screen gradient, s_max the largest scale, r the largest screen size and R = ``radius`` the
         scene radius in meters. A row with g > grad_threshold (``urgency`` > 1) is split if s_max > split_scale R (or,
-        up to ``screen_size_until``, r > split_screen), else cloned. A clone is an exact copy. Children of a split are
+        up to ``screen_size_until``, r > split_screen), else cloned. (With ``clone_shrunk`` a row is cloned where its
+        scale, after the split, is at most split_scale R.) A clone is an exact copy. Children of a split are
         drawn from their parent: at mu + R(q) (s * z) with z ~ N(0, I), with scales s / split_shrink. Copies inherit all
         other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep theirs.
 
@@ -90,10 +96,13 @@ class GradientDensity(DensityStrategy):
         _check_same_rows(rows, statistics)
         urgency = self.urgency(statistics)
         wanted = urgency > 1
-        large = _largest_scale(rows) > self.split_size(rows, radius)
+        scale, limit = _largest_scale(rows), self.split_size(rows, radius)
+        large = scale > limit
         if progress <= self.screen_size_until:
             large = large | (statistics.largest_screen > self.split_screen)
         split, clone = self.decisions(rows, statistics, large)
+        if self.clone_shrunk:
+            clone = clone | (split & (scale / self.split_shrink <= limit))
         wanted = wanted & _within_cap(urgency, wanted, split, clone, self, max_gaussians)
         return self.grow(rows, wanted & split, wanted & clone, generator)
 
@@ -138,16 +147,16 @@ class GradientDensity(DensityStrategy):
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
         """Drops rows that are faint (opacity < cull_opacity) or too large.
 
-        After ``cull_scale_from`` it drops rows whose largest scale exceeds cull_scale * ``radius``, meters. Up to
-        ``screen_size_until`` it drops rows that were larger than ``cull_screen`` on screen. Raises ValueError if the
-        statistics do not belong to the rows.
+        After ``cull_scale_from`` it drops rows whose largest scale exceeds cull_scale * ``radius``, meters, and, up to
+        ``screen_size_until``, rows that were larger than ``cull_screen`` on screen. Raises ValueError if the statistics
+        do not belong to the rows.
         """
         _check_same_rows(rows, statistics)
         drop = torch.sigmoid(rows.opacity_logits.detach()) < self.cull_opacity
         if progress > self.cull_scale_from:
             drop = drop | (_largest_scale(rows) > self.cull_size(rows, radius))
-        if progress <= self.screen_size_until:
-            drop = drop | (statistics.largest_screen > self.cull_screen)
+            if progress <= self.screen_size_until:
+                drop = drop | (statistics.largest_screen > self.cull_screen)
         return RowPlan.keep(~drop)
 
     def reset(self, rows: Rows) -> RowPlan:

@@ -28,11 +28,22 @@ class DensityStatistics:
     watched: dict[str, Float[Tensor, " n"]]
     """Name of a column with one number a row -> sum of its absolute gradient over the visits."""
 
-    def __init__(self, rows: int, device: torch.device | str = "cpu", watched: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        rows: int,
+        device: torch.device | str = "cpu",
+        watched: Collection[str] = (),
+        *,
+        first_counts_all: bool = False,
+    ) -> None:
+        """``first_counts_all``: whether the first view counts as a visit of rows that it does not draw, as DriveStudio
+        has it."""
         self.gradient_sum = torch.zeros(rows, device=device)
         self.visits = torch.zeros(rows, dtype=torch.int64, device=device)
         self.largest_screen = torch.zeros(rows, device=device)
         self.watched = {name: torch.zeros(rows, device=device) for name in watched}
+        self.first_counts_all = first_counts_all
+        self.is_empty = True
 
     def __len__(self) -> int:
         return self.visits.shape[0]
@@ -61,7 +72,8 @@ class DensityStatistics:
         drawn = radii > 0
         norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
         self.gradient_sum += torch.where(drawn, norm, 0.0)
-        self.visits += drawn
+        self.visits += 1 if self.is_empty and self.first_counts_all else drawn
+        self.is_empty = False
         self.largest_screen = torch.maximum(self.largest_screen, radii / max(width, height))
         for name, total in self.watched.items():
             total += torch.where(drawn, (gradients or {})[name].abs(), 0.0)
@@ -87,6 +99,7 @@ class DensityStatistics:
     def reset(self) -> None:
         """Clears all accumulators (after each refinement)."""
         self._each(torch.zeros_like)
+        self.is_empty = True
 
     def to(self, device: torch.device) -> None:
         """Moves the accumulators to the device of the rows."""

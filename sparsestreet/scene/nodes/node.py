@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,7 +19,7 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of, usual_rates
 from sparsestreet.scene.masks import Mask, MaskScope, MaskSettings
-from sparsestreet.scene.nodes.regularizers import sharp_shape
+from sparsestreet.scene.nodes.regularizers import sharp_shape, sharp_shape_ratio
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Gaussians, Track, View
 
@@ -62,6 +62,10 @@ class NodeSettings(ABC):
     """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: the term is not computed."""
     max_axis_ratio: float = 10.0
     """Ratio of a Gaussian's longest to its shortest axis above which that term counts."""
+    sharp_shape_form: Literal["log", "ratio"] = "log"
+    """``ratio``: DriveStudio's term, linear in the ratio (see ``regularizers.sharp_shape_ratio``)."""
+    sharp_shape_every: int = 1
+    """Steps from one that has the term to the next."""
     learning_rates: Rates = field(default_factory=usual_rates)
     """Column, parameter or module of the node -> its rate; the longest name that matches wins. A mapping of a rate's
     fields becomes a rate."""
@@ -79,6 +83,8 @@ class NodeSettings(ABC):
                 f"sharp_shape is a weight >= 0 and max_axis_ratio a ratio >= 1, got {self.sharp_shape} and "
                 f"{self.max_axis_ratio}"
             )
+        if self.sharp_shape_every < 1:
+            raise ValueError(f"sharp_shape_every counts steps and must be >= 1, got {self.sharp_shape_every}")
         if self.densify_until is not None and not 0 <= self.densify_until <= 1:
             raise ValueError(f"densify_until is a fraction of the run in [0, 1], got {self.densify_until}")
         if self.max_gaussians is not None and self.max_gaussians < max(self.min_gaussians, 1):
@@ -204,14 +210,15 @@ class Node(nn.Module, ABC):
         return {}
 
     def regularizers(
-        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+        self, view: View, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
         """Returns the node's own terms, those of its density strategy, and those that have a weight in the settings."""
         settings = self.settings
         shape = {}
-        if settings.sharp_shape > 0:
+        if settings.sharp_shape > 0 and state.step % settings.sharp_shape_every == 0:
+            term = sharp_shape if settings.sharp_shape_form == "log" else sharp_shape_ratio
             # Activation applies the mask, so hidden Gaussians still have their shape here.
-            shape["sharp_shape"] = settings.sharp_shape * sharp_shape(self.rows.log_scales, settings.max_axis_ratio)
+            shape["sharp_shape"] = settings.sharp_shape * term(self.rows.log_scales, settings.max_axis_ratio)
         if settings.density is not None:
             shape |= settings.density.regularizers(self.rows)
         return shape | self.own_regularizers(raw, drawn, state)

@@ -9,18 +9,80 @@ from torch import Tensor
 REACH = 5
 """Most keyframes between a pose and those it is compared with (DriveStudio draws one distance of 1 ... 5 a step)."""
 
+SAME_TIME = 1e-5
+"""Times in [0, 1] that differ by less are those of one frame."""
+
 
 def sharp_shape(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -> Float[Tensor, ""]:
     """Returns the mean of relu(log s_max - log s_min - log r), above 0 if axes differ by more than a factor r.
 
-    DriveStudio's term is linear in the ratio. The ratio is not a number for a masked Gaussian (scale 0) and overflows
-    for a needle; the logarithm of the unmasked scales does neither.
+    DriveStudio's term, ``sharp_shape_ratio``, is linear in the ratio. The ratio overflows for a needle, and its
+    gradient grows with it; the logarithm does neither.
 
     >>> sharp_shape(torch.tensor([[0.0, 0.0, 0.0]]), max_axis_ratio=10.0).item()
     0.0
     """
     ratio = log_scales.amax(1) - log_scales.amin(1)
     return (ratio - math.log(max_axis_ratio)).relu().sum() / max(len(log_scales), 1)
+
+
+def sharp_shape_ratio(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -> Float[Tensor, ""]:
+    """Returns the mean of max(s_max / s_min, r) - r, DriveStudio's term against needles.
+
+    >>> sharp_shape_ratio(torch.tensor([[12.0, 1.0, 1.0], [2.0, 1.0, 1.0]]).log(), max_axis_ratio=10.0).item()
+    1.0
+    """
+    ratio = (log_scales.amax(1) - log_scales.amin(1)).exp()
+    return (ratio - max_axis_ratio).relu().sum() / max(len(log_scales), 1)
+
+
+def excess_volume(log_scales: Float[Tensor, "n 3"], quantile: float) -> Float[Tensor, ""]:
+    """Returns the mean of relu(v - p) of the products v of the scales, cubic meters, and p their quantile.
+
+    p is the floor(quantile n)-th smallest of them, and is differentiated too, as in DriveStudio.
+
+    >>> excess_volume(torch.tensor([[1.0], [2.0], [3.0], [6.0]]).log().expand(4, 3) / 3, quantile=0.75).item()
+    0.75
+    """
+    volumes = log_scales.sum(1).exp()
+    rank = int(len(volumes) * quantile)
+    if rank < 1:
+        return volumes.new_zeros(())
+    return (volumes - torch.kthvalue(volumes, rank).values).relu().mean()
+
+
+def temporal_smoothness_at(
+    times: Float[Tensor, "i k"],
+    translations: Float[Tensor, "i k 3"],
+    valid: Bool[Tensor, "i k"],
+    time: float,
+    distance: int,
+) -> Float[Tensor, ""]:
+    """Returns the part of ``temporal_smoothness`` of the keyframes at one time and their neighbors at one distance.
+
+    The mean is over the objects that have all three keyframes. DriveStudio's term of a step: the time is that of its
+    frame, the distance is drawn. 0 if no object has them.
+
+    >>> jerk = torch.tensor([[[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+    >>> whole = torch.ones(1, 3, dtype=torch.bool)
+    >>> temporal_smoothness_at(torch.tensor([[0.0, 0.5, 1.0]]), jerk, whole, time=0.5, distance=1).item()
+    2.0
+    """
+    count = times.shape[1]
+    here = (times - time).abs().masked_fill(~valid, torch.inf)
+    each, middle = torch.arange(len(times), device=times.device), here.argmin(1)
+    before, after = middle - distance, middle + distance
+    # A time is that of a keyframe up to rounding; frames lie at least 1e-4 of a log apart.
+    whole = (here.amin(1) < SAME_TIME) & (before >= 0) & (after < count)
+    before, after = before.clamp(min=0), after.clamp(max=count - 1)
+    # Valid keyframes come first, so the last of three decides.
+    whole = whole & valid[each, after]
+    span = torch.where(whole, times[each, after] - times[each, before], 1.0)
+    fraction = (times[each, middle] - times[each, before]) / span
+    fixed = translations.detach()
+    line = torch.lerp(fixed[each, before], fixed[each, after], fraction[:, None])
+    bends = 2 * (translations[each, middle] - line).abs().mean(-1)
+    return torch.where(whole, bends, 0.0).sum() / whole.sum().clamp(min=1)
 
 
 def temporal_smoothness(

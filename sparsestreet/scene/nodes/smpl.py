@@ -24,6 +24,7 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
+from sparsestreet.scene.nodes.regularizers import excess_volume
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, stored_keyframes
 from sparsestreet.scene.state import SceneState
 from sparsestreet.triangulation import TriangulatedPoints
@@ -54,6 +55,11 @@ class SmplSettings(TrackedSettings):
     """Weight of the mean spread among neighbors, for each of rotations, scales, opacities and harmonics."""
     scale_weight: float = 0.05
     """Weight of the mean squared longest axis, square meters."""
+    volume_weight: float = 0.0
+    """Weight of ``regularizers.excess_volume`` above ``volume_quantile`` (DriveStudio's scaling_reg); 0: none."""
+    volume_quantile: float = 0.99
+    volume_from: float = 0.2
+    """Fraction of the run at which that term starts."""
     smoothness_weight: float = 0.0
     """Weight of the distance of joints, as unit quaternions, from the middle of the keyframes before and after."""
 
@@ -62,6 +68,11 @@ class SmplSettings(TrackedSettings):
         if not self.has_body_pose:
             raise ValueError(
                 f"a node of bodies takes only tracks with body poses, got has_body_pose={self.has_body_pose}: say true"
+            )
+        if not (self.volume_weight >= 0 and 0 < self.volume_quantile <= 1):
+            raise ValueError(
+                "volume_weight is a weight >= 0 and volume_quantile lies in (0, 1], got "
+                f"{self.volume_weight} and {self.volume_quantile}"
             )
         if self.neighbors < 2:
             raise ValueError(f"neighbors counts the Gaussian itself, so it must be at least 2, got {self.neighbors}")
@@ -232,12 +243,14 @@ class Smpl(Tracked):
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns those of ``neighbors``, ``scale`` and ``smoothness`` that have a weight."""
+        """Returns those of ``neighbors``, ``scale``, ``volume`` and ``smoothness`` that have a weight."""
         terms, settings = {}, self.settings
         if len(self.rows) and settings.neighbor_weight > 0:
             terms["neighbors"] = settings.neighbor_weight * self._spread(raw, drawn)
         if len(self.rows) and settings.scale_weight > 0:
             terms["scale"] = settings.scale_weight * _mean_of(raw.log_scales.exp().amax(1).square(), drawn)
+        if len(self.rows) and settings.volume_weight > 0 and state.progress >= settings.volume_from:
+            terms["volume"] = settings.volume_weight * excess_volume(raw.log_scales, settings.volume_quantile)
         if settings.smoothness_weight > 0:
             terms["smoothness"] = settings.smoothness_weight * self._unevenness()
         return terms

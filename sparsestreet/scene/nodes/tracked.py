@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,13 +13,14 @@ from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_boxes
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
-from sparsestreet.scene.nodes.regularizers import temporal_smoothness
+from sparsestreet.scene.nodes.regularizers import REACH, temporal_smoothness, temporal_smoothness_at
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Track, View
 
@@ -39,6 +40,9 @@ class TrackedSettings(NodeSettings):
     temporal_smooth: float = 0.0
     """Weight of the term that keeps learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: the term is
     not computed."""
+    temporal_smooth_of: Literal["all", "frame"] = "all"
+    """``all``: the mean over all frames and distances at every step; ``frame``: that of the step's frame and one drawn
+    distance, as in DriveStudio."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -197,12 +201,20 @@ class Tracked(Node):
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
     def regularizers(
-        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
+        self, view: View, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        terms, weight = super().regularizers(raw, drawn, state), self.settings.temporal_smooth
+        terms, weight = super().regularizers(view, raw, drawn, state), self.settings.temporal_smooth
         if weight > 0:
             learned = self.keyframe_translations + self.translation_deltas
-            terms["temporal_smooth"] = weight * temporal_smoothness(self.keyframe_times, learned, self.keyframe_valid)
+            table = self.keyframe_times, learned, self.keyframe_valid
+            if self.settings.temporal_smooth_of == "all":
+                smooth = temporal_smoothness(*table)
+            else:
+                # It depends on the step alone, so a resumed run draws the same as an uninterrupted one.
+                generator = named_generator(0, f"temporal smooth {state.step}")
+                distance = int(torch.randint(1, REACH + 1, (), generator=generator))
+                smooth = temporal_smoothness_at(*table, view.time, distance)
+            terms["temporal_smooth"] = weight * smooth
         return terms
 
     @property

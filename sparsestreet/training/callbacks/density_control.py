@@ -12,6 +12,7 @@ from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.training.callbacks.resizing import RowListener, resize_rows
+from sparsestreet.training.lightning import data_of
 from sparsestreet.training.schedule import Interval, last_step
 from sparsestreet.training.system import StreetSystem
 
@@ -23,8 +24,13 @@ class DensityControl(Callback, RowListener):
         refine_in: when rows that are of no use are culled and, up to ``densify_until``, others split and cloned before.
         densify_until: fraction of the run after which no rows are added any more, unless a node's settings say another.
         reset_in: when opacities are pulled down, so that what is not needed can be culled.
-        pause_after_reset: steps after a reset without refinement: opacities must recover first.
+        pause_after_reset: steps after a reset without refinement: opacities must recover first. None, as in
+            DriveStudio: no refinement in the first steps of each period of ``reset_in``, as many as there are training
+            images and at least ``refine_in.every``; statistics start anew at each refinement that falls out.
+        first_counts_all: as in ``DensityStatistics``.
         seed: of the positions of split children, of rows drawn and of noise.
+
+    Raises ValueError at the start of a training whose periods are shorter than the pause.
     """
 
     def __init__(
@@ -33,7 +39,8 @@ class DensityControl(Callback, RowListener):
         densify_until: float,
         reset_in: Interval,
         *,
-        pause_after_reset: int = 100,
+        pause_after_reset: int | None = 100,
+        first_counts_all: bool = False,
         seed: int = 0,
     ) -> None:
         if not refine_in.start <= densify_until <= refine_in.stop:
@@ -43,6 +50,8 @@ class DensityControl(Callback, RowListener):
             )
         self.refine_in, self.densify_until, self.reset_in = refine_in, densify_until, reset_in
         self.pause_after_reset = pause_after_reset
+        self.first_counts_all = first_counts_all
+        self.closed_steps = 0
         self.seed, self.generator = seed, torch.Generator().manual_seed(seed)
         self.statistics: dict[str, DensityStatistics] = {}
         self.last_reset: int | None = None
@@ -50,12 +59,23 @@ class DensityControl(Callback, RowListener):
     def setup(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         for name, node in pl_module.scene.nodes.items():
             if (strategy := node.settings.density) is not None:
-                self.statistics.setdefault(name, DensityStatistics(len(node.rows), watched=strategy.watched))
+                empty = DensityStatistics(
+                    len(node.rows), watched=strategy.watched, first_counts_all=self.first_counts_all
+                )
+                self.statistics.setdefault(name, empty)
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         # Only now are rows on their device, and statistics of a checkpoint restored.
         for statistics in self.statistics.values():
             statistics.to(pl_module.device)
+        if self.pause_after_reset is None:
+            images = len(data_of(trainer).split.train)
+            self.closed_steps = max(images, self.refine_in.every)
+            if self.closed_steps >= self.reset_in.every:
+                raise ValueError(
+                    f"the {images} training images fill the {self.reset_in.every} steps between two opacity resets, so "
+                    "nothing would ever be refined: set schedule.pause_after_reset, or raise schedule.reset_in.every"
+                )
 
     def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         """Keep statistics beside the rows, whoever changed them."""
@@ -83,9 +103,13 @@ class DensityControl(Callback, RowListener):
         step = trainer.global_step
         for name in self.statistics:
             self._shake(trainer, pl_module, name)
-        if self.refine_in.due(step, pl_module.course) and not self._recovering(step):
-            for name in self.statistics:
+        if not self.refine_in.due(step, pl_module.course):
+            return
+        for name, statistics in self.statistics.items():
+            if not self._recovering(step):
                 self._refine(trainer, pl_module, name)
+            elif self.pause_after_reset is None:
+                statistics.reset()
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: object, batch_idx: int) -> None:
         last = self.refine_in.last(pl_module.course)
@@ -110,6 +134,8 @@ class DensityControl(Callback, RowListener):
             means += noise
 
     def _recovering(self, step: int) -> bool:
+        if self.pause_after_reset is None:
+            return step % self.reset_in.every <= self.closed_steps
         return self.last_reset is not None and step - self.last_reset <= self.pause_after_reset
 
     def _refine(self, trainer: Trainer, system: StreetSystem, name: str) -> None:

@@ -1,4 +1,4 @@
-"""What shows moving objects weighs more towards the end of a run (DriveStudio's legacy presets)."""
+"""What shows moving objects weighs more towards the end of a run (DriveStudio's paper_legacy configurations)."""
 
 from dataclasses import dataclass
 
@@ -41,6 +41,8 @@ class DynamicRegion:
             camera = scene.seen(frame, rendering.state).camera
             alone = splat(gaussians, camera, settings=options.settings, backend=options.backend)
         region = alone.alpha > self.threshold
+        if frame.ego is not None:
+            region = region & ~frame.ego
         error = (rendering.rgb - frame.image.to(rendering.rgb.dtype) / 255).abs().mean(-1)
         # Over all pixels, because picking those of the region would wait for a device.
         return self.weight * (torch.where(region, error, 0.0).sum() / region.sum().clamp(min=1))

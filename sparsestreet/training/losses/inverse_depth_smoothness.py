@@ -1,4 +1,4 @@
-"""Inverse depth is smooth where the recorded image is (Godard et al. 2017, as DriveStudio's legacy presets have it)."""
+"""Inverse depth is smooth where the recorded image is (Godard et al. 2017, as in DriveStudio's paper_legacy)."""
 
 from dataclasses import dataclass
 

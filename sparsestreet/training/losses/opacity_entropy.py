@@ -1,4 +1,4 @@
-"""Pixels are covered or they are not: the entropy of alpha, as DriveStudio's legacy presets have it."""
+"""Pixels are covered or they are not: the entropy of alpha, as DriveStudio's paper_legacy configurations have it."""
 
 from dataclasses import dataclass
 

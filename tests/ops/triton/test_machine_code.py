@@ -50,6 +50,7 @@ OTHERS = [
     (1, "plain", False, SplatSettings(stop="exclusive", antialias=True), "depth"),
     (9, "plain", False, SplatSettings(half_colors=True), "rgb"),
     (16, "plain", False, SplatSettings.preset("drivestudio"), "rgb"),
+    (4, "plain", False, SplatSettings(plain_gradients=True), "rgb"),
     (1, "lens", False, SplatSettings(), "depth"),
     (4, "shutter", True, SplatSettings.preset("exact"), "depth"),
     (16, "both", True, SplatSettings(antialias=True), "rgb"),

@@ -160,7 +160,8 @@ def test_cull_drops_faint_huge_and_close_rows():
 
     assert kept(False, False) == [1, 2, 3, 4]
     assert kept(True, False) == [1, 3, 4]
-    assert kept(False, True) == [1, 2, 4]
+    # What is large on screen goes only once what is large in the world does, as in DriveStudio.
+    assert kept(False, True) == [1, 2, 3, 4]
     assert kept(True, True) == [1, 4]
 
 
@@ -233,3 +234,25 @@ def test_impossible_settings_are_refused():
         GradientDensity(split_children=1)
     with pytest.raises(ValueError, match="split_shrink"):
         GradientDensity(split_shrink=0.5)
+
+
+def test_a_parent_that_became_small_is_cloned_too():
+    """DriveStudio splits before it clones: 0.03 < 0.04 <= 0.048, but 0.06 / 1.6 = 0.0375 stays large."""
+    rows = rows_of_scales([0.02, 0.04, 0.06])
+    plan = densified(GradientDensity(clone_shrunk=True), rows, with_statistics([HIGH] * 3))
+    assert plan.source.tolist() == [0, 1, 2, 0, 1, 1, 1, 2, 2]
+    scales = plan.edits["log_scales"].amax(1).exp()
+    expected = torch.tensor([0.02, 0.025, 0.0375, 0.02, 0.025, 0.025, 0.025, 0.0375, 0.0375])
+    torch.testing.assert_close(scales, expected)
+    assert torch.equal(plan.edits["means"][[1, 4]], rows.means.detach()[[1, 1]])
+    # Four rows come of row 1: with room for three, it does not grow.
+    capped = densified(GradientDensity(clone_shrunk=True), rows, with_statistics([LOW, HIGH, LOW]), max_gaussians=5)
+    assert capped.source.tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match="clones parents that stay"):
+        GradientDensity(clone_shrunk=True, keep_parent=False)
+
+
+def test_a_row_that_is_small_but_large_on_screen_is_split_and_cloned():
+    density = GradientDensity(clone_shrunk=True, screen_size_until=0.5)
+    plan = densified(density, rows_of_scales([0.02]), with_statistics([HIGH], [0.06]))
+    assert plan.source.tolist() == [0, 0, 0, 0]

@@ -106,3 +106,17 @@ def test_watched_columns_follow_the_rows_are_forgotten_and_survive_a_checkpoint(
     assert resumed.mean_gradients("life_peaks").tolist() == [3.0, 0.0, 0.5]
     resumed.reset()
     assert resumed.mean_gradients("life_peaks").tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_first_view_may_count_for_rows_that_it_does_not_draw():
+    """As in DriveStudio, after every refinement."""
+    statistics = DensityStatistics(2, first_counts_all=True)
+    for _ in range(2):
+        statistics.reset()
+        statistics.add(torch.tensor([[3.0, 0.0], [9.0, 0.0]]), torch.tensor([1.0, 0.0]), 2, 2)
+        statistics.add(torch.tensor([[9.0, 0.0], [3.0, 0.0]]), torch.tensor([0.0, 1.0]), 2, 2)
+        assert statistics.visits.tolist() == [1, 2]
+        assert statistics.mean_gradients().tolist() == [3.0, 1.5]
+    restored = DensityStatistics.from_state(statistics.state_dict())
+    restored.add(torch.ones(2, 2), torch.zeros(2), 2, 2)
+    assert restored.visits.tolist() == [1, 2]

@@ -162,10 +162,11 @@ def test_a_masked_gaussian_keeps_its_shape_in_the_term():
     rows = random_rows(4, 0, mask=mask)
     node = background(rows, mask, sharp_shape=1.0, max_axis_ratio=1.5)
     state, drawn = SceneState(), torch.ones(4, dtype=torch.bool)
-    before = node.regularizers(node.raw_at(view_at(0.0), state), drawn, state)["sharp_shape"].item()
+    view = view_at(0.0)
+    before = node.regularizers(view, node.raw_at(view, state), drawn, state)["sharp_shape"].item()
     with torch.no_grad():
         rows.mask_logits.fill_(-20.0)
-    term = node.regularizers(node.raw_at(view_at(0.0), state), drawn, state)["sharp_shape"]
+    term = node.regularizers(view, node.raw_at(view, state), drawn, state)["sharp_shape"]
     term.backward()
     assert term.item() == before > 0
     assert bool(rows.log_scales.grad.isfinite().all())

@@ -277,3 +277,45 @@ def test_noise_is_added_after_every_step_and_follows_from_the_step():
     # Sums of float32 numbers up to a thousand.
     torch.testing.assert_close(means[False], torch.full((3, 3), sum(added)), rtol=1e-6, atol=1e-3)
     torch.testing.assert_close(means[True], torch.full((3, 3), added[2]), rtol=1e-6, atol=1e-3)
+
+
+def drivestudio(every: int = 30) -> DensityControl:
+    """Resets at 32, 62 and 92, if every 30 steps; refines at 5, 10 ... 100 of 100 steps."""
+    return DensityControl(
+        Interval(0.0, 1.0, every=5), 1.0, Interval(0.0, 1.0, every=every, shift=2), pause_after_reset=None
+    )
+
+
+def test_after_a_reset_every_training_image_comes_first():
+    """DriveStudio's gate: 12 images close the first 12 steps of each 30; nothing is reset at step 2."""
+    strategy, listener = AskedStrategy(), Listener()
+    system = make_system({"background": background(4, density=strategy)})
+    trainer = StubTrainer(system, [control := drivestudio(), listener], train=tuple(map(frame_at, range(12))))
+    trainer.start()
+    trainer.walk(10)
+    control.statistics["background"].visits += 1
+    trainer.walk(15)
+    trainer.walk(100)
+    assert asked_at(strategy, "cull") == [15, 20, 25, 45, 50, 55, 75, 80, 85]
+    assert [step for step, _, reason in listener.reasons if reason == "opacity reset"] == [32, 62, 92]
+    # What falls out forgets what was seen since, as a refinement does.
+    control.statistics["background"].visits += 1
+    trainer.walk(101)
+    assert control.statistics["background"].visits.tolist() == [1] * 4
+    trainer.global_step = 94
+    trainer.walk(95)
+    assert control.statistics["background"].visits.tolist() == [0] * 4
+
+
+def test_few_images_close_as_many_steps_as_lie_between_two_refinements():
+    strategy = AskedStrategy()
+    trainer, _, _ = started(drivestudio(), background=background(4, density=strategy))
+    trainer.walk(45)
+    assert asked_at(strategy, "cull") == [10, 15, 20, 25, 30 + 10, 30 + 15]
+
+
+def test_images_that_leave_no_time_to_refine_are_refused():
+    system = make_system({"background": background(4, density=AskedStrategy())})
+    trainer = StubTrainer(system, [drivestudio(every=10)], train=tuple(map(frame_at, range(12))))
+    with pytest.raises(ValueError, match="the 12 training images fill the 10 steps between two opacity resets"):
+        trainer.start()

@@ -54,7 +54,7 @@ def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_t
         assert scene is system.scene
         assert [frame.frame_index for frame in frames] == [0, 2, 3, 5, 6]
         assert frames == data.split.train
-    states = [SceneState(0.2, 0), SceneState(0.55, 1), SceneState(1.0, 3)]
+    states = [SceneState(0.2, 0, step=4), SceneState(0.55, 1, step=11), SceneState(1.0, 3, step=20)]
     contexts = [RenderContext(state, options, passes=3, passed=passed) for passed, state in enumerate(states)]
     assert [context for _, _, context in rule.asked] == contexts
 

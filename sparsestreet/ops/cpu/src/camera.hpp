@@ -22,7 +22,7 @@ struct Camera {
   Vector<T> shutter_translation, shutter_rotation;
   T alpha_min, log2_alpha_min, eps2d, near_plane, width, height;
   T max_sigma_squared;  // the largest |L d|^2 that is drawn
-  bool antialias, half_colors, clamp_colors, detach_directions, every_tile;
+  bool antialias, half_colors, clamp_colors, detach_directions, plain_gradients, every_tile;
   int depth_bits;
 
   explicit Camera(const View& v)
@@ -33,7 +33,8 @@ struct Camera {
         alpha_min(v.alpha_min), log2_alpha_min(std::fmax(std::log2(v.alpha_min), LEAST_EXPONENT)), eps2d(v.eps2d),
         near_plane(v.near_plane), width(v.width), height(v.height), max_sigma_squared(T(v.max_sigma) * T(v.max_sigma)),
         antialias(v.antialias), half_colors(v.half_colors), clamp_colors(v.clamp_colors),
-        detach_directions(v.detach_directions), every_tile(v.every_tile), depth_bits(int(v.depth_bits)) {
+        detach_directions(v.detach_directions), plain_gradients(v.plain_gradients), every_tile(v.every_tile),
+        depth_bits(int(v.depth_bits)) {
     for (int i = 0; i < 3; ++i) rotation.rows[i] = vector(v.rotation + 3 * i);
     const T margin_x = T(0.3) * width / (2 * fx), margin_y = T(0.3) * height / (2 * fy);
     slope_min[0] = -cx / fx - margin_x, slope_max[0] = (width - cx) / fx + margin_x;

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 11;
+constexpr int32_t INTERFACE_VERSION = 12;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -22,7 +22,7 @@ struct View {
   double fold;            // r^2 past which the lens does not see
   double shutter_translation[3], shutter_rotation[3];  // over the readout, camera frame
   int64_t width, height;
-  int64_t exclusive_stop, antialias, half_colors, clamp_colors, detach_directions, depth_bits;
+  int64_t exclusive_stop, antialias, half_colors, clamp_colors, detach_directions, plain_gradients, depth_bits;
   int64_t has_lens, has_shutter;
   int64_t every_tile;  // lists each splat in every tile and looks at all their rows: to check the lists against
   int64_t pair_limit;  // (splat, tile) pairs that may be held
@@ -41,7 +41,8 @@ struct Layers {
   void *rgb, *transmittance, *depth_sum;
 };
 
-// Gradients of the rows; screen: sum over pixels of |dLoss / d mean on the screen| [n,2].
+// Gradients of the rows; screen: sum over pixels of |dLoss / d mean on the screen|, of plain_gradients without the bars,
+// [n,2].
 struct RowGradients {
   void *means, *quaternions, *scales, *opacities, *sh, *screen;
 };

@@ -164,7 +164,7 @@ void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Input
   store_columns<T>(&v.scales.x, 3, [&](int r) { return out.scales + 3 * row(r); });
   store_columns<T>(&v.opacity, 1, [&](int r) { return out.opacities + row(r); });
   store_columns<T>(v_sh, coefficients, [&](int r) { return out.sh + 3 * in.terms * row(r); });
-  store_columns<T>(&g.abs_x, 2, [&](int r) { return out.screen + 2 * row(r); });
+  store_columns<T>(camera.plain_gradients ? &g.x : &g.abs_x, 2, [&](int r) { return out.screen + 2 * row(r); });
 }
 
 // Rows `range` of the input: culled ones get zeros, the others are gathered until they fill a register. In which lane
