@@ -44,6 +44,7 @@ class TrainSchema:
     data: Tree = MISSING
     schedule: Tree = MISSING
     assignment: Tree = MISSING
+    moving: Tree = MISSING
     method: Tree = MISSING
     preset: Tree = MISSING
     sparsify: Tree = MISSING

@@ -10,6 +10,7 @@ from rich.table import Table
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
+from sparsestreet.geometry.displacement import displacement
 
 
 def report_check(reader: LogReader, console: Console | None = None) -> int:
@@ -53,9 +54,9 @@ def _summary(log: DrivingLog) -> Table:
 
 
 def _track_table(log: DrivingLog) -> Table:
-    table = Table("class", "objects", "boxes", "longest travel (m)", title="Objects")
+    table = Table("class", "objects", "boxes", "largest displacement (m)", title="Objects")
     for name in sorted({track.class_name for track in log.tracks}):
         tracks = [track for track in log.tracks if track.class_name == name]
         boxes = sum(len(track.frames) for track in tracks)
-        table.add_row(escape(name), str(len(tracks)), str(boxes), f"{max(track.path_length for track in tracks):.1f}")
+        table.add_row(escape(name), str(len(tracks)), str(boxes), f"{max(map(displacement, tracks)):.1f}")
     return table

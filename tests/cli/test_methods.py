@@ -218,6 +218,26 @@ def test_a_density_strategy_is_a_choice():
     assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
 
 
+@pytest.mark.parametrize(
+    ("overrides", "asked"),
+    [
+        ([], {"rigid": (1.0, 0.0), "deformable": (0.5, 0.0), "smpl": (None, 0.0)}),
+        (["moving=path_length"], {"rigid": (None, 1.0), "deformable": (None, 0.5), "smpl": (None, 0.5)}),
+        (["preset=drivestudio_legacy"], {"rigid": (None, 1.0), "deformable": (None, 0.5), "smpl": (None, 0.5)}),
+        (["preset=drivestudio"], {"rigid": (None, 1.0), "deformable": (None, 0.5), "smpl": (None, 0.5)}),
+        (
+            ["preset=drivestudio", "moving=displacement"],
+            {"rigid": (1.0, 0.0), "deformable": (0.5, 0.0), "smpl": (None, 0.0)},
+        ),
+        (["moving.rigid.min_displacement=2.0"], {"rigid": (2.0, 0.0), "deformable": (0.5, 0.0), "smpl": (None, 0.0)}),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_moves_is_one_choice_and_upstreams_presets_make_it(overrides, asked):
+    nodes = recipe_of(composed("method=omnire", *overrides)).nodes
+    assert {name: (nodes[name].min_displacement, nodes[name].min_path_length) for name in asked} == asked
+
+
 def test_pvg_grows_by_upstreams_numbers_at_the_papers_length():
     """But for the screen gradients, which are absolute ones here, and so have a threshold of their own."""
     node = recipe_of(composed("method=pvg", "schedule=paper", "capacity=paper")).nodes["background"]

@@ -83,8 +83,10 @@ def test_global_pruning_of_table_3_is_global():
     arms = [
         composed(*rest, f"experiment={choice}") for choice in composed(*rest).hydra.sweeper.params.experiment.split(",")
     ]
-    preset = "omnire-drivestudio_legacy"
-    assert [arm.name for arm in arms] == [f"{preset}+importance", f"{preset}+global_pruning"]
+    assert [arm.name for arm in arms] == [
+        "omnire-drivestudio_legacy+importance",
+        "omnire-drivestudio_legacy+global_pruning",
+    ]
     background, everywhere = arms
     assert background.callback.pruning.rule.nodes == ["background"]
     assert background.node.background.min_gaussians == 40_000

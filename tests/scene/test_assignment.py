@@ -1,6 +1,7 @@
 """Who takes which object of a log."""
 
 import pytest
+import torch
 
 from sparsestreet.scene.assignment import Assignment, assign_tracks
 from sparsestreet.types import Track
@@ -43,6 +44,22 @@ def test_a_path_must_be_longer_than_the_shortest():
     exactly = moving("x", "Car", 1.0)
     assert names(assign_tracks([exactly], {"cars": CARS}).unclaimed) == ["x"]
     assert names(assign_tracks([moving("y", "Car", 1.001)], {"cars": CARS}).claimed) == ["y"]
+
+
+def test_a_parked_car_trembles_a_mover_gets_somewhere():
+    generator = torch.Generator().manual_seed(0)
+    noise = 0.01 * torch.randn(2, 150, 3, generator=generator).double()
+    x = torch.linspace(0, 2.0, 150)
+    parked = track("parked", range(150), [pose(0.0, tuple(error.tolist())) for error in noise[0]])
+    slow = track(
+        "slow", range(150), [pose(0.0, (float(at), *error.tolist()[1:])) for at, error in zip(x, noise[1], strict=True)]
+    )
+    assert parked.path_length > 3.0
+    by_path, by_displacement = rigid_settings(), rigid_settings(min_displacement=1.0, min_path_length=0.0)
+    assert names(assign_tracks([parked, slow], {"cars": by_path}).claimed) == ["parked", "slow"]
+    assert names(assign_tracks([parked, slow], {"cars": by_displacement}).claimed) == ["slow"]
+    both = rigid_settings(min_displacement=1.0, min_path_length=100.0)
+    assert assign_tracks([parked, slow], {"cars": both}).claimed == ()
 
 
 def test_two_claimers_are_named_with_their_track():

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from sparsestreet.geometry.displacement import displacement
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.density import DensityStrategy
@@ -36,8 +37,11 @@ class NodeSettings(ABC):
 
     classes: Sequence[str] = ()
     """Class names of the log whose tracks the node takes."""
+    min_displacement: float | None = None
+    """Meters; tracks whose boxes are nowhere farther apart than this, or than their noise explains, are left to the
+    static nodes (``geometry.displacement``). None: it is not asked."""
     min_path_length: float = 0.0
-    """Meters; tracks that travel no farther are left to the static nodes."""
+    """Meters; so are tracks whose steps from box to box, noise included, add up to no more (DriveStudio's rule)."""
     has_body_pose: bool | None = None
     """True: the node takes only tracks with body poses; False: only tracks without; None: both."""
     min_gaussians: int = 0
@@ -96,7 +100,11 @@ class NodeSettings(ABC):
     def takes(self, track: Track) -> bool:
         """Whether the node claims a track of the log."""
         fits = self.has_body_pose is None or self.has_body_pose == (track.body is not None)
-        return fits and track.class_name in self.classes and track.path_length > self.min_path_length
+        return fits and track.class_name in self.classes and self._moves(track)
+
+    def _moves(self, track: Track) -> bool:
+        far = self.min_displacement is None or displacement(track) > self.min_displacement
+        return far and track.path_length > self.min_path_length
 
     @property
     def mask_settings(self) -> MaskSettings | None:
