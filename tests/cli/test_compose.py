@@ -29,7 +29,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["trainer.fast_dev_runx=true"], "did you mean 'trainer.fast_dev_run'"),
         (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
         (["nod.background.num_points=5"], "did you mean 'node.background.num_points'"),
-        (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of capped, importance, masks, none"),
+        (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of capped, importance, masks, mcmc"),
         (["experimant=capped"], "did you mean 'experiment'"),
         (["data/lidar=hdl65"], "no option 'hdl65' in conf/data/lidar: choose one of hdl32, hdl64, ideal, waymo_top"),
         (["data/lidr=hdl64"], "did you mean 'data/lidar'"),
@@ -46,7 +46,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["node.background.sources.nera.part=0.1"], "did you mean 'node.background.sources.near.part'"),
         (["logger=null"], "choose one of csv, none"),
         (["methd=3dgs"], "did you mean 'method'? Its options are 3dgs, deformgs, omnire, pvg, streetgs"),
-        (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of strong_masks"),
+        (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of one_schedule"),
         (
             ["sparsify=paper", "pruning@callback.pruning.rule=foo"],
             "in conf/pruning: choose one of importance",
