@@ -21,6 +21,11 @@ def as_published(published: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
     return published if _root_.sparsify.get("published", False) else otherwise
 
 
+def limit(most: int | None, *, _root_: DictConfig) -> int | None:
+    """Of conf/node: the most Gaussians of a node, or none (null) if the sparsification says ``unlimited``."""
+    return None if _root_.sparsify.get("unlimited", False) else most
+
+
 def concat(*lists: Iterable[Any]) -> ListConfig:
     """Of conf/assignment: all lists as one."""
     return ListConfig([entry for entries in lists for entry in entries])  # ``--resolve`` takes no list of Python's
@@ -76,6 +81,11 @@ def by_drive(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -
     return values.get(int(name), otherwise) if name.isdigit() else otherwise
 
 
+def dashed(values: Iterable[Any]) -> str:
+    """Of conf/experiment: a list in a name."""
+    return "-".join(map(str, values))
+
+
 def last_part(path: str) -> str:
     """Of conf/sweep: the name of a folder."""
     return Path(path).name
@@ -84,6 +94,7 @@ def last_part(path: str) -> str:
 _RESOLVERS = {
     "by_capacity": by_capacity,
     "as_published": as_published,
+    "limit": limit,
     "concat": concat,
     "mul": mul,
     "steps_of_log": steps_of_log,
@@ -93,6 +104,7 @@ _RESOLVERS = {
     "of_preset": of_preset,
     "gaussians_of": gaussians_of,
     "by_drive": by_drive,
+    "dashed": dashed,
     "last_part": last_part,
 }
 

@@ -9,6 +9,7 @@ from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
 from sparsestreet.report.grid import Cell, Grid
 from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
+from sparsestreet.report.notes import CAPPED
 
 LOSSES = (0.1, 0.3, 0.5)
 """Losses of full-image held-out PSNR, dB, that a smaller arm may have."""
@@ -85,7 +86,7 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
         found = [paired(arm, plain, one.value, one.relative) for one in shown]
         n = max((interval.n for interval in found if interval), default=0)
         cells = [difference_cell(interval, one.text, n, runs) for interval, one in zip(found, shown, strict=True)]
-        rows.append((Cell(f"{arm.title} - {plain.name}", runs=runs), Cell(str(n), runs=runs), *cells))
+        rows.append((Cell(f"{arm.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
     notes = [
         f"differences paired by scene and seed, mean [{100 * CONFIDENCE:.0f} % t interval]; n: scenes, each the mean "
         "of its seeds, or the seeds of a single scene; bold where the interval excludes 0, never with n = 1",
@@ -94,7 +95,23 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
     if alone:
         notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
     header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
-    return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
+    return Grid("differences", "Differences to the plain method", header, tuple(rows), (*notes, *_caps(arms)))
+
+
+def _capped(plain: Arm) -> bool:
+    return any(record.summary.run.caps for record in plain.records)
+
+
+def _named(plain: Arm) -> str:
+    """Returns the name of a plain arm, marked where its count is a limit's."""
+    return f"{plain.name} {CAPPED}" if _capped(plain) else plain.name
+
+
+def _caps(arms: Sequence[Arm]) -> tuple[str, ...]:
+    """Says what a share of a marked arm's Gaussians is a share of."""
+    held = [arm.name for arm in arms if arm.sparsify == "none" and _capped(arm)]
+    said = "held down by max_gaussians, so that a share of its Gaussians is a share of that limit"
+    return (f"{CAPPED} {', '.join(held)}: {said}",) if held else ()
 
 
 def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
@@ -139,9 +156,9 @@ def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
         for most in LOSSES:
             allowed = [one for one in _candidates(plain, arms, protocol) if one.loss <= most]
             best = min(allowed, key=lambda one: one.share, default=None)
-            rows.append((Cell(f"{plain.name}, at most {most:g} dB"), *_chosen(best)))
+            rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
     notes = ("of the arms of this sweep as they were run: nothing is interpolated; plain counts as its own candidate",)
-    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), notes)
+    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), notes + _caps(arms))
 
 
 def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
@@ -151,9 +168,9 @@ def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
         for share in SHARES:
             allowed = [one for one in _candidates(plain, arms, protocol) if one.share <= share]
             best = min(allowed, key=lambda one: one.loss, default=None)
-            rows.append((Cell(f"{plain.name}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
+            rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
     notes = ("of the arms of this sweep as they were run: nothing is interpolated",)
-    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), notes)
+    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), notes + _caps(arms))
 
 
 _CHOSEN = tuple(

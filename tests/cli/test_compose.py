@@ -46,7 +46,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["node.background.sources.nera.part=0.1"], "did you mean 'node.background.sources.near.part'"),
         (["logger=null"], "choose one of csv, none"),
         (["methd=3dgs"], "did you mean 'method'? Its options are 3dgs, deformgs, omnire, pvg, streetgs"),
-        (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of strong_masks"),
+        (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of one_schedule"),
         (
             ["sparsify=paper", "pruning@callback.pruning.rule=foo"],
             "in conf/pruning: choose one of importance",

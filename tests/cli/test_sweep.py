@@ -4,6 +4,7 @@ import importlib
 import math
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli import sweep
@@ -36,9 +37,14 @@ def problem_of(cfg: DictConfig) -> str | None:
 def jobs(name: str) -> list[list[str]]:
     """One job for each value of the sweep's first option."""
     params = composed(f"+sweep={name}").hydra.sweeper.params
-    first, *others = ((key, str(value).replace("[background]", "null").split(",")) for key, value in params.items())
-    rest = [f"{key}={values[-1]}" for key, values in others]
-    return [[f"{first[0]}={value}", *rest, f"+sweep={name}"] for value in first[1]]
+    asked = OverridesParser.create().parse_overrides([f"{key}={value}" for key, value in params.items()])
+    first, *others = (
+        [f"{one.key_or_group}={value}" for value in one.sweep_string_iterator()]
+        if one.is_sweep_override()
+        else [one.input_line]
+        for one in asked
+    )
+    return [[value, *(values[-1] for values in others), f"+sweep={name}"] for value in first]
 
 
 @pytest.fixture(scope="module")

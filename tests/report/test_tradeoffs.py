@@ -62,6 +62,21 @@ def test_one_pair_is_never_bold():
     assert (cell["PSNR full"].text, cell["PSNR full"].bold, cell["n"].text) == ("-5.00", False, "1")
 
 
+def test_a_share_of_a_capped_run_is_marked_as_one():
+    runs = [make_summary("plain", 0, 25.0, caps={"road": 900}), make_summary("plain+removal", 0, 24.9)]
+    found = arms([record(run) for run in runs])
+    for make, named in (
+        (differences, "plain+removal - plain †"),
+        (matched_quality, "plain †, at most 0.1 dB"),
+        (matched_budget, "plain †, at most 25 % of its Gaussians"),
+    ):
+        grid = make(found, DRIVESTUDIO)
+        assert grid.rows[0][0].text == named
+        assert "a share of its Gaussians is a share of that limit" in grid.notes[-1]
+        free = make(arms([record(make_summary(run.run.label, 0, 25.0)) for run in runs]), DRIVESTUDIO)
+        assert not any("†" in text for text in (free.rows[0][0].text, *free.notes))
+
+
 def test_an_arm_without_its_plain_run_is_named():
     grid = differences(arms([record(make_summary("plain+removal"))]), DRIVESTUDIO)
     assert not grid.rows
