@@ -27,6 +27,9 @@ def train(arguments: list[str]) -> int:
     global _started
     _started = time.perf_counter()
     if "--help" not in arguments:
+        if {"-m", "--multirun"} & set(arguments) and {"--cfg", "-c", "--info", "-i"} & set(arguments):
+            print("sparsestreet train: --cfg and --info show one configuration: leave out -m", file=sys.stderr)
+            return 2
         try:
             arguments = _shown(as_sweep(resumed_overrides(arguments)))
             problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)

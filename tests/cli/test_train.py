@@ -344,7 +344,7 @@ def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     [
         (["schedule.max_step=5"], "schedule.max_steps"),
         (["data=drivestudio"], "data.root has no value"),
-        (["schedule.max_steps=abc"], "must be int"),
+        (["schedule.max_steps=abc"], "must be a whole number, 1 or more, got 'abc'"),
         (["resume=/nowhere/at/all"], "there is nothing"),
     ],
 )
