@@ -50,6 +50,7 @@ class TrainSchema:
     capacity: str = MISSING
     split: Tree = MISSING
     resume: str | None = None
+    overwrite: bool = False
     count_of: str | None = None
     data: Tree = MISSING
     schedule: Tree = MISSING

@@ -40,7 +40,7 @@ def demo(arguments: list[str]) -> int:
     started = time.perf_counter()
     for sparsify in SPARSIFY:
         print(f"\n== sparsify={sparsify} ==", flush=True)
-        chosen = [f"sparsify={sparsify}", f"assignment={ASSIGNMENT}", f"schedule.max_steps={STEPS}"]
+        chosen = [f"sparsify={sparsify}", f"assignment={ASSIGNMENT}", f"schedule.max_steps={STEPS}", "overwrite=true"]
         overrides = [*chosen, f"out={_quoted(out / sparsify)}", *arguments]
         # A process each: what one training leaves in memory does not slow the next.
         status = subprocess.run([sys.executable, "-m", "sparsestreet", "train", *overrides], check=False).returncode

@@ -43,8 +43,8 @@ def test_three_runs_one_table_and_pictures(asked, capsys):
     out, start = Path("outputs/demo"), [sys.executable, "-m", "sparsestreet", "train"]
     names = ("none", "paper_short", "removal")
     assert commands == [
-        [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1200", f"out={out / name}",
-         "seed=1", "schedule.max_steps=20"]
+        [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1200", "overwrite=true",
+         f"out={out / name}", "seed=1", "schedule.max_steps=20"]
         for name in names
     ]  # fmt: skip
     runs = [out / name for name in names]
@@ -70,13 +70,13 @@ def test_help(capsys):
 
 @pytest.fixture
 def trained(monkeypatch):
-    """Words of each training; each leaves a record and a picture in the folder that it was given, of PSNR 21, 22, 23."""
+    """Words of each training; each leaves a record (21, 22, 23 dB) and a picture in the folder that it was given."""
     words = []
 
     def train(command, check):
         words.append(command[4:])
         (place,) = (one for one in OverridesParser.create().parse_overrides(words[-1]) if one.key_or_group == "out")
-        run, label = Path(place.value()), f"plain+{len(words)}" if len(words) > 1 else "plain"
+        run, label = Path(str(place.value())), f"plain+{len(words)}" if len(words) > 1 else "plain"
         SUMMARY.write(run, make_summary(label, 0, 20.0 + len(words)))
         QUALITY[HELD_OUT].write(run, [make_image(5)])
         for kind in KINDS:

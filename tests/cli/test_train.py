@@ -365,6 +365,7 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
     assert "/nowhere/at/all" in written
     assert "Traceback" not in written
     assert "Error in call" not in written
+    assert not (tmp_path / "run").exists()
 
 
 def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):
