@@ -82,6 +82,17 @@ def test_training_improves_and_leaves_records(finished, brief):
         assert (finished / picture).is_file()
 
 
+def test_training_ends_with_its_result(finished):
+    """What the record says, in the last lines that one sees."""
+    summary = SUMMARY.read(finished)
+    quality, _, size, places = (finished / "train.log").read_text().splitlines()[-4:]
+    assert f"held-out views: PSNR {summary.mean('psnr_full'):.2f} dB, vehicles " in quality
+    assert f"{summary.gaussians_total:,} Gaussians, {summary.bytes_total / 1e6:.2f} MB, " in size
+    assert places.endswith(
+        f"pictures: {finished}/pictures/sheet.png; curves: {finished}/curves; numbers: {finished}/records"
+    )
+
+
 def test_phases_are_the_wall_clock_of_the_command(brief):
     """By a clock outside: each second belongs to one phase."""
     out, wall = brief
