@@ -9,6 +9,7 @@ from hydra import compose
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+import sparsestreet.training.run  # noqa: F401 - its import takes seconds, which are of no test
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import composed, configuration, load_run_config, override_problem
 from sparsestreet.cli.limits import LOGGER_PACKAGES
@@ -67,7 +68,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["lr=0.1"], "no key 'lr'; did you mean 'schedule.rates'?"),
         (["llr=0.1"], "no key 'llr'; sparsestreet train --cfg job prints all"),
         (["device=cuda"], "did you mean 'trainer'? Its options are cpu, gpu"),
-        (["weight=1"], "did you mean loss.photometric.weight, loss.sky.weight or loss.depth.weight?"),
+        (["weight=1"], "loss.photometric.weight, loss.sky.weight or loss.depth.weight?"),
         (["cutoff=1"], "no key 'cutoff'; "),
         (["seed=0,1"], "seed=0,1 asks for several runs: add -m, or choose one"),
     ],
