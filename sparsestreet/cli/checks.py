@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from sparsestreet.cli.device import device_of
+from sparsestreet.cli.limits import limit_problem
 from sparsestreet.cli.preset import preset_problem
 
 Tree = typing.Any
@@ -29,7 +30,12 @@ def config_problem(cfg: DictConfig) -> str | None:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         return _in_one_line(error)
-    return next(_parts_without_keys(tree), None) or next(_wrong_types(tree), None) or _device_problem(cfg)
+    return (
+        limit_problem(cfg)
+        or next(_parts_without_keys(tree), None)
+        or next(_wrong_types(tree), None)
+        or _device_problem(cfg)
+    )
 
 
 def unresolvable(cfg: DictConfig) -> str | None:

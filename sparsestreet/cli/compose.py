@@ -1,5 +1,6 @@
 """Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
 
+import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,11 +17,22 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
-from sparsestreet.cli.options import unknown_key
+from sparsestreet.cli.limits import limit_problem
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.
 CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
+
+WORDS = {
+    **dict.fromkeys(("steps", "iterations", "iters", "num_iterations", "epochs"), "schedule.max_steps"),
+    **dict.fromkeys(("lr", "learning_rate", "learning_rates"), "schedule.rates"),
+    **dict.fromkeys(("device", "gpu", "accelerator"), "trainer"),
+}
+"""Words of the field -> our key."""
+SHORT = 4
+"""Letters of a word below which another word is like it by chance (lr, logger)."""
+FEW_PLACES = 6
+"""Keys that a slip still names."""
 
 ADDABLE = ("++", "+hydra", "+sweep")
 """What may be added: keys that are meant to be new, and sweeps."""
@@ -34,12 +46,13 @@ class TrainSchema:
     """Every root key of conf/train.yaml: any other is an error, with ``+`` as well."""
 
     name: str = MISSING
-    seed: int = MISSING
+    seed: Any = MISSING
     capacity: str = MISSING
     split: Tree = MISSING
     training_views: Tree = MISSING
     budget: Tree = MISSING
     resume: str | None = None
+    overwrite: bool = False
     count_of: str | None = None
     data: Tree = MISSING
     schedule: Tree = MISSING
@@ -109,7 +122,7 @@ def override_problem(overrides: list[str]) -> str | None:
         key = getattr(cause, "full_key", None)
         reason = str(cause)
         return _explain(f"{key}: {reason}" if key and key not in reason.splitlines()[0] else reason, single)
-    return _masks_that_are_off(single, cfg)
+    return limit_problem(cfg) or _masks_that_are_off(single, cfg)
 
 
 def without_flags(overrides: Sequence[str]) -> list[str]:
@@ -163,7 +176,7 @@ def _explain(reason: str, overrides: list[str]) -> str:
     key = next((name for name in given if part in name.split(".") or name == part), part)
     if places := re.search(r"Did you mean to override (?:one of )?(.+)\?", reason):
         return f"no key {key!r}; did you mean {places[1].replace(', ', ' or ')}?{_options_of(key)}"
-    if key in _known() or (CONF / _group(key)).is_dir():
+    if key in _known()[0] or (CONF / _group(key)).is_dir():
         return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
     return _unknown_key(key)
 
@@ -192,8 +205,34 @@ def _group(key: str) -> str:
 
 
 def _unknown_key(key: str) -> str:
-    """One line with the key that was probably meant, and the options where that is a group."""
-    return unknown_key(key, _known(), _options_of)
+    """One line with the key that was probably meant, or the few that it may be, and the options where it is a group."""
+    meant = _meant(key)
+    if not meant:
+        return f"no key {key!r}; sparsestreet train --cfg job prints all"
+    if len(meant) == 1:
+        return f"no key {key!r}; did you mean {meant[0]!r}?{_options_of(meant[0])}"
+    return f"no key {key!r}; did you mean {', '.join(meant[:-1])} or {meant[-1]}?"
+
+
+def _meant(key: str) -> list[str]:
+    """Keys by another word of the field's, by their last name, else the one that is most like it."""
+    if key in WORDS:
+        return [WORDS[key]]
+    known, leaders = _known()
+    alike = 0.5 if len(key) >= SHORT else 0.8
+    found = [] if "." in key else _by_last_name(key, known)
+    found = found or difflib.get_close_matches(key, known, n=1, cutoff=alike)
+    return list(dict.fromkeys(leaders.get(one, one) for one in found))
+
+
+def _by_last_name(word: str, known: Sequence[str]) -> list[str]:
+    """The few keys that end in a word, or in the one that is most like it; none where they are many."""
+    last: dict[str, list[str]] = {}
+    for key in known:
+        last.setdefault(key.rpartition(".")[2], []).append(key)
+    like = difflib.get_close_matches(word, last, n=1, cutoff=0.6 if len(word) >= SHORT else 1.0)
+    found = last[like[0]] if like else []
+    return found if len(found) <= FEW_PLACES else []
 
 
 def _options_of(key: str) -> str:
@@ -202,23 +241,29 @@ def _options_of(key: str) -> str:
 
 
 @cache
-def _known() -> tuple[str, ...]:
-    """Every key of the configuration as it stands without overrides, every group, and every place of one."""
+def _known() -> tuple[tuple[str, ...], dict[str, str]]:
+    """Every key of the configuration as it stands without overrides, every group, and every place of one.
+
+    Then the keys that follow another of the same last name, which is to be set instead (``trainer.max_steps``).
+    """
     with configuration():
         cfg = compose("train", return_hydra_config=True)
     groups = [str(path.relative_to(CONF)) for path in CONF.rglob("*") if path.is_dir()]
     places = [key for key in cfg.hydra.runtime.choices if "@" in key]
-    keys = _keys(OmegaConf.to_container(composed(()), resolve=False))
-    return (*keys, *groups, *places)
+    values = _keys(OmegaConf.to_container(composed(()), resolve=False))
+    follows = {key: re.fullmatch(r"\$\{([\w.]+)\}", str(value)) for key, value in values.items()}
+    last = {key: key.rpartition(".")[2] for key in values}
+    leaders = {key: found[1] for key, found in follows.items() if found and found[1].endswith(f".{last[key]}")}
+    return (*values, *groups, *places), leaders
 
 
-def _keys(tree: object, prefix: str = "") -> list[str]:
-    if not isinstance(tree, dict):
-        return []
-    keys = []
-    for name, value in tree.items():
-        keys.append(f"{prefix}{name}")
-        keys += _keys(value, f"{prefix}{name}.")
+def _keys(tree: object, prefix: str = "") -> dict[str, object]:
+    """Dotted key -> its value as it is written; what begins with an underscore is Hydra's."""
+    keys: dict[str, object] = {}
+    for name, value in tree.items() if isinstance(tree, dict) else ():
+        if not name.startswith("_"):
+            keys[f"{prefix}{name}"] = value
+            keys |= _keys(value, f"{prefix}{name}.")
     return keys
 
 

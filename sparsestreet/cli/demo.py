@@ -1,8 +1,10 @@
 """``sparsestreet demo``: a street, trained plain, with the paper's method and with ours; one table and pictures."""
 
+import re
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from sparsestreet.cli.report import report
@@ -11,12 +13,13 @@ from sparsestreet.report.side_by_side import compare_runs
 from sparsestreet.scene.centers import node_legend
 
 USAGE = """\
-sparsestreet demo [key=value ...]
+sparsestreet demo [out=DIR] [key=value ...]
 
-Trains the embedded street three times, in outputs/demo: plain, sparsify=paper_short (both stages of the paper,
-with numbers for short runs) and sparsify=removal (the paper's masks, then our rule). The overrides go to all three:
-seed=1, schedule.max_steps=2000 ...
+Trains the embedded street three times, in folders of outputs/demo (or of DIR): plain, sparsify=paper_short (both stages
+of the paper, with numbers for short runs) and sparsify=removal (the paper's masks, then our rule). What is there of an
+earlier demo is replaced. All other overrides go to all three: seed=1, schedule.max_steps=2000 ...
 """
+OUT = Path("outputs/demo")
 SPARSIFY = ("none", "paper_short", "removal")
 ASSIGNMENT = "all_rigid"
 """Whoever walks or rides is on a track too, as a figure that keeps its shape: method=omnire takes longer."""
@@ -29,12 +32,16 @@ def demo(arguments: list[str]) -> int:
     if "--help" in arguments:
         print(USAGE)
         return 0
+    try:
+        out, arguments = _folder(arguments)
+    except ValueError as error:
+        print(f"sparsestreet demo: {error}", file=sys.stderr)
+        return 2
     started = time.perf_counter()
-    out = Path("outputs/demo")
     for sparsify in SPARSIFY:
         print(f"\n== sparsify={sparsify} ==", flush=True)
-        chosen = [f"sparsify={sparsify}", f"assignment={ASSIGNMENT}", f"schedule.max_steps={STEPS}"]
-        overrides = [*chosen, f"out={out / sparsify}", *arguments]
+        chosen = [f"sparsify={sparsify}", f"assignment={ASSIGNMENT}", f"schedule.max_steps={STEPS}", "overwrite=true"]
+        overrides = [*chosen, f"out={_quoted(out / sparsify)}", *arguments]
         # A process each: what one training leaves in memory does not slow the next.
         status = subprocess.run([sys.executable, "-m", "sparsestreet", "train", *overrides], check=False).returncode
         if status:
@@ -48,3 +55,24 @@ def demo(arguments: list[str]) -> int:
     )
     print(f"a video of it: sparsestreet render scene={runs[-1]} path=shifted offset=1.5 out=drive.mp4")
     return status
+
+
+def _folder(arguments: Sequence[str]) -> tuple[Path, list[str]]:
+    """The demo's folder, and the overrides of all three runs.
+
+    Raises ValueError for what would make one run of the three, or lead them into one folder.
+    """
+    for text in arguments:
+        key = text.partition("=")[0].lstrip("+")
+        if key in ("sparsify", "folder", "resume", "hydra.run.dir") or text in ("-m", "--multirun"):
+            raise ValueError(f"{text}: the demo trains plain, paper and removal, in folders of out=DIR: leave it out")
+    places = [text.partition("=")[2].strip("'\"") for text in arguments if text.startswith("out=")]
+    if len(places) > 1 or "" in places:
+        raise ValueError("out=DIR names one folder, or is left out")
+    return Path(places[0]) if places else OUT, [text for text in arguments if not text.startswith("out=")]
+
+
+def _quoted(path: Path) -> str:
+    """As Hydra's grammar takes it, whatever characters a folder's name has."""
+    text = str(path)
+    return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", "\\'") + "'"

@@ -15,7 +15,7 @@ from sparsestreet.cli.scene import open_scene
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.records.provenance import this_machine
 from sparsestreet.records.run import RUN, RunDescription
-from sparsestreet.records.summary import SUMMARY
+from sparsestreet.report.result import result_lines
 from sparsestreet.training.run import evaluate as evaluate_run
 
 USAGE = """\
@@ -79,11 +79,7 @@ def _evaluate(options: Options) -> None:
         extra=extra,
         say=print,
     )
-    for split, quality in summary.quality.items():
-        print(f"{split.replace('_', '-')} views: {quality['psnr_full'].mean:.2f} dB")
-    latency = summary.latency
-    steady = "" if latency.noise.quiet else " on a machine that was not quiet"
-    print(f"{summary.gaussians_total:,} Gaussians, {latency.p50:.1f} ms/frame{steady}; records in {SUMMARY.path(run)}")
+    print("\n".join(result_lines(summary, run)))
 
 
 def extra_words(extra: ExtraMetrics) -> list[str]:

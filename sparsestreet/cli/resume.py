@@ -23,7 +23,7 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
     run = run_of(Path(given))
     load_run_config(run)  # says what a run's folder is, where this is none
     overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
-    kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out="))]
+    kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out=", "overwrite="))]
     folder = [] if any(text.startswith("out=") for text in arguments) else [f"out={run}"]
     return [*kept, *arguments, *folder]
 

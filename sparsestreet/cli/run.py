@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of, with_views
 from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.folder import take_folder
 from sparsestreet.cli.preset import preset_notes
 from sparsestreet.cli.process import keep_freed_memory
 from sparsestreet.evaluation.memory import forget_peaks
@@ -44,6 +45,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         cfg = with_views(cfg, data)
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(cfg, this_command(["train", *HydraConfig.get().overrides.task]))
+    take_folder(cfg, out)
     summary = train(
         recipe_of(cfg),
         data,

@@ -14,7 +14,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from sparsestreet.cli.compose import resolved
-from sparsestreet.records.configuration import config_hash, flat_config, only
+from sparsestreet.cli.folder import folder_problem, holds_same_run, same_run
+from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
@@ -23,9 +24,6 @@ log = logging.getLogger(__name__)
 
 OF_DRIVES = ("table", "drives")
 """What the names of sweeps over recorded drives start with."""
-
-_ALIKE = ("seed", "data.root", "data.log.root")
-"""Beside the hash: what tells the jobs of a sweep apart and is part of no configuration's identity."""
 
 
 class SweepFolder(Callback):
@@ -74,12 +72,16 @@ def sweep_status() -> int:
 def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> float | None:
     """One job of a sweep: skipped where its folder holds its record, and written down where it fails.
 
-    Answers with the PSNR that ``train`` answered with or the record holds, NaN for a job that failed.
+    Answers with the PSNR that ``train`` answered with or the record holds, NaN for a job that failed. Where the folder
+    holds another run, the whole sweep ends with status 2, so that nothing is written into that one.
     """
     from sparsestreet.cli.assemble import this_command
 
     try:
         done = finished(cfg, out)
+        if done is None and not holds_same_run(cfg, out) and (problem := folder_problem(cfg, out)):
+            print(f"sparsestreet train: {problem}", file=sys.stderr)
+            sys.exit(2)
         if done is None:
             done = train()
         else:
@@ -105,10 +107,8 @@ def finished(cfg: DictConfig, out: Path) -> float | None:
     except RecordError:
         return None
     seen = summary.run.config.get("training_views.images")
-    known = with_images(cfg, seen) if seen else cfg
-    config = flat_config(resolved(known))
-    same = summary.run.config_hash == config_hash(config) and only(summary.run.config, _ALIKE) == only(config, _ALIKE)
-    if not same or summary.run.steps < summary.run.max_steps:
+    config = flat_config(resolved(with_images(cfg, seen) if seen else cfg))
+    if not same_run(summary.run.config, config) or summary.run.steps < summary.run.max_steps:
         return None
     return summary.mean("psnr_full")
 

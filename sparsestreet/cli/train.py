@@ -12,6 +12,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
+from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, run_job, sentence, sweep_problem, sweep_status
 
@@ -27,6 +28,9 @@ def train(arguments: list[str]) -> int:
     global _started
     _started = time.perf_counter()
     if "--help" not in arguments:
+        if {"-m", "--multirun"} & set(arguments) and {"--cfg", "-c", "--info", "-i"} & set(arguments):
+            print("sparsestreet train: --cfg and --info show one configuration: leave out -m", file=sys.stderr)
+            return 2
         try:
             arguments = _shown(as_sweep(resumed_overrides(arguments)))
             problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
@@ -59,7 +63,7 @@ def _problem_of_values(arguments: list[str]) -> str | None:
     if any(text.startswith("-") for text in arguments):
         return None
     cfg = composed(arguments)
-    problem = config_problem(cfg)
+    problem = folder_problem(cfg, Path(cfg.out)) or config_problem(cfg)
     if problem is None and cfg.resume:
         # Before Hydra writes the configuration of this start over that of the run.
         check_resumed(resolved(cfg), run_of(Path(cfg.resume)))
@@ -71,19 +75,28 @@ def app(cfg: DictConfig) -> float | None:
     """One training with its evaluation; returns a full-image PSNR for sweepers (held out, else of training views)."""
     # The jobs of a sweep begin here.
     started = time.perf_counter() if HydraConfig.get().mode == RunMode.MULTIRUN else _started
-    from sparsestreet.cli.run import run
-
     # Lightning starts further processes with what stands here, behind this program (``python -m sparsestreet`` or the
     # installed script): they need the command's name, which Hydra does not know, and the overrides of this job alone.
     sys.argv = [sys.argv[0], "train", *HydraConfig.get().overrides.task]
     out = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        return run_job(cfg, out, lambda: run(cfg, out, started))
+        return run_job(cfg, out, lambda: _run(cfg, out, started))
     try:
-        return run(cfg, out, started)
+        # Again, because hydra.run.dir may lead elsewhere than out.
+        if problem := folder_problem(cfg, out):
+            raise ValueError(problem)
+        return _run(cfg, out, started)
     except (InstantiationException, ValueError, OSError, ImportError) as error:
         # Where somebody looks for a fault, Hydra's own report with the whole trace is better.
         if "HYDRA_FULL_ERROR" in os.environ:
             raise
         print(f"sparsestreet train: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
+    finally:
+        leave_folder(out, f"{HydraConfig.get().job.name}.log")
+
+
+def _run(cfg: DictConfig, out: Path, started: float) -> float | None:
+    from sparsestreet.cli.run import run  # torch and Lightning: seconds, which a refused start does not wait for
+
+    return run(cfg, out, started)

@@ -19,6 +19,7 @@ IDENTITY_KEYS = (
     "name",
     "label",
     "resume",  # a resumed run is the same run
+    "overwrite",
     "out",
     "folder",
     "count_of",  # the run whose counts a control copies; the counts are options of their own

@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sparsestreet.records.configuration import config_hash, differing_options, only, without
 from sparsestreet.records.summary import RunSummary
@@ -13,6 +13,9 @@ Value = Callable[[RunSummary], float | None]
 RecordValue = Callable[[RunRecord], float | None]
 Unit = tuple[tuple[str, str], int]
 """A scene with the part of its log, and a seed."""
+
+INCOMPLETE = "‡"
+"""Marks an arm that lacks runs which others at its place have: its means compare with none of theirs."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class Arm:
     """Device, threads and commit. Also the data of a scene, options of the log and split if the sweep has several."""
     records: tuple[RunRecord, ...]
     """Runs of both kinds: trained without the held-out views, and trained on all views."""
+    lacks: tuple[str, ...] = ()
+    """Scenes and seeds, in words, that another arm at its place has and this one has not."""
 
     @property
     def control(self) -> str | None:
@@ -35,8 +40,12 @@ class Arm:
 
     @property
     def title(self) -> str:
-        """The name in a table."""
-        return f"control: {self.name}" if self.control else self.name
+        """The name in a table, with the number of runs if others have more."""
+        name = f"control: {self.name}" if self.control else self.name
+        if not self.lacks:
+            return name
+        own = len(_units_of(self))
+        return f"{name} ({own} of {own + len(self.lacks)} runs {INCOMPLETE})"
 
     @property
     def plain_label(self) -> str:
@@ -116,7 +125,34 @@ def arms(records: Sequence[RunRecord]) -> list[Arm]:
             run = group[0].summary.run
             name = f"{variant.name} ({words})" if words else variant.name
             found.append(Arm(name, variant.label, run.method, run.sparsify, place, tuple(group)))
+    found = [replace(arm, lacks=_lacks(arm, found)) for arm in found]
     return sorted(found, key=lambda arm: (arm.plain_label, arm.control is not None, arm.sparsify != "none", arm.name))
+
+
+def _units_of(arm: Arm) -> set[tuple[bool, Unit]]:
+    return {(whole, unit) for whole in (False, True) for unit in arm.runs(whole)}
+
+
+def _lacks(arm: Arm, among: Sequence[Arm]) -> tuple[str, ...]:
+    own = _units_of(arm)
+    others = {unit for other in among if other.place == arm.place for unit in _units_of(other)}
+    words = ((scene, seed, ", all views" if whole else "") for whole, ((scene, _), seed) in sorted(others - own))
+    return tuple(f"{scene} seed {seed}{kind}" for scene, seed, kind in words)
+
+
+def incomplete(found: Sequence[Arm]) -> list[str]:
+    """Returns a note on the arms that lack runs which others have, or nothing."""
+    lacking = [f"{arm.name} lacks {_few(arm.lacks)}" for arm in found if arm.lacks]
+    if not lacking:
+        return []
+    return [
+        f"{INCOMPLETE} fewer runs than other arms have, so that its means compare with none of theirs: read the "
+        f"differences and the arrows, which are of scenes and seeds that both arms have. {'; '.join(lacking)}"
+    ]
+
+
+def _few(words: Sequence[str], most: int = 3) -> str:
+    return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
 
 
 def plain_of(arm: Arm, among: Iterable[Arm]) -> Arm | None:

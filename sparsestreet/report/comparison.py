@@ -22,19 +22,23 @@ VIEWS = 2
 def comparison_data(arms: Sequence[Arm]) -> str | None:
     """Returns JSON of the views with their images as data URLs, truth first; None if there is no view to compare.
 
-    Each scene shows its lowest seed and the first ``VIEWS`` views that evaluation drew.
+    Each scene shows one seed, which most of the arms have (the lowest of several), and the first ``VIEWS`` views that
+    evaluation drew.
     """
     views = []
     scenes = sorted({record.summary.run.scene for arm in arms for record in arm.records})
     for scene in scenes:
-        seed = min(
-            record.summary.run.seed for arm in arms for record in arm.records if record.summary.run.scene == scene
-        )
+        seed = _seed_of_most(arms, scene)
         shown = [(arm, record) for arm in arms if (record := _record(arm, scene, seed)) is not None]
         keys = drawn_views(shown[0][1].folder / "pictures")[:VIEWS] if shown else []
         views += [view for key in keys if (view := _view(scene, seed, key, shown)) is not None]
     # A tag inside the text would end the script element.
     return json.dumps(views).replace("</", "<\\/") if views else None
+
+
+def _seed_of_most(arms: Sequence[Arm], scene: str) -> int:
+    seeds = sorted({record.summary.run.seed for arm in arms for record in arm.records})
+    return max(seeds, key=lambda seed: sum(_record(arm, scene, seed) is not None for arm in arms))
 
 
 def _record(arm: Arm, scene: str, seed: int) -> RunRecord | None:

@@ -2,7 +2,8 @@
 
 import io
 import re
-from collections.abc import Callable, Sequence
+import statistics
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Value, plain_of
+from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
 
 # Okabe and Ito's palette with a slightly lighter blue: distinguishable with any color vision, on white and on black.
 COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -146,29 +147,59 @@ def _pareto_panel(axes: Axes, arms: Sequence[Arm], cost: Value, quality: Value) 
     means: dict[str, tuple[float, float]] = {}
     for arm in arms:
         paint = GREY if arm.control else color[arm.plain_label]
-        costs, qualities = arm.units(cost), arm.units(quality)
-        shared = sorted(costs.keys() & qualities.keys())
-        axes.scatter(
-            [costs[unit] for unit in shared], [qualities[unit] for unit in shared], s=9, alpha=0.45, color=paint,
-            marker=marker(arm), linewidths=0.8,
-        )  # fmt: skip
-        x, y = arm.mean(cost), arm.mean(quality)
-        if x is None or y is None:
+        points = _points(arm, cost, quality)
+        if not points:
             continue
-        means[arm.name] = x, y
-        axes.scatter([x], [y], s=48, color=paint, marker=marker(arm), zorder=3, linewidths=1.6)
+        axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker(arm),
+                     linewidths=0.8)  # fmt: skip
+        means[arm.name] = _mean_point(points)
+        # A marker of lines has no inside to leave empty: it is drawn thin.
+        hollow = {"facecolors": "none", "edgecolors": paint} if marker(arm) not in "x+" else {"color": paint}
+        shape = {**hollow, "linewidths": 0.8} if arm.lacks else {"color": paint, "linewidths": 1.6}
+        axes.scatter(*means[arm.name], s=48, marker=marker(arm), zorder=3, **shape)
     for arm in arms:
-        plain = plain_of(arm, arms)
-        if plain is not None and plain is not arm and not arm.control and {arm.name, plain.name} <= means.keys():
+        ends = None if arm.control else paired_means(arm, plain_of(arm, arms), cost, quality)
+        if ends is not None:
             arrow = {"arrowstyle": "->", "color": color[arm.plain_label], "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
-            axes.annotate("", means[arm.name], means[plain.name], arrowprops=arrow)
-    best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control])
-    axes.plot(*zip(*best, strict=True), color=_INK, linewidth=0.9, linestyle="--", zorder=1)
+            axes.annotate("", ends[1], ends[0], arrowprops=arrow)
+    best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control and not arm.lacks])
+    if best:
+        axes.plot(*zip(*best, strict=True), color=_INK, linewidth=0.9, linestyle="--", zorder=1)
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 10 * low else MaxNLocator(4))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def paired_means(
+    arm: Arm, plain: Arm | None, cost: Value, quality: Value
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Returns where an arrow starts and ends: the means of the plain arm and of an arm over the units of both.
+
+    None for the plain arm itself, without one, and without a common unit.
+    """
+    if plain is None or plain is arm:
+        return None
+    ours, theirs = _points(arm, cost, quality), _points(plain, cost, quality)
+    shared = ours.keys() & theirs.keys()
+    if not shared:
+        return None
+    start, end = (_mean_point({unit: points[unit] for unit in shared}) for points in (theirs, ours))
+    return start, end
+
+
+def _points(arm: Arm, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
+    """Returns scene and seed -> cost and quality, where both are known."""
+    costs, qualities = arm.units(cost), arm.units(quality)
+    return {unit: (costs[unit], qualities[unit]) for unit in sorted(costs.keys() & qualities.keys())}
+
+
+def _mean_point(points: Mapping[Unit, tuple[float, float]]) -> tuple[float, float]:
+    """Returns the mean over scenes of the mean over each scene's seeds."""
+    scenes = (by_scene({unit: point[axis] for unit, point in points.items()}) for axis in (0, 1))
+    x, y = (statistics.fmean(means.values()) for means in scenes)
+    return x, y
 
 
 def _legend(arms: Sequence[Arm]) -> list[Line2D]:

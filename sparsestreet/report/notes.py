@@ -23,6 +23,7 @@ def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) ->
         *_timing(runs),
         *_training(runs),
         *(_scenes(variants) if over_scenes else ()),
+        *_lacking_seeds(variants),
         *_long_names(variants),
         *_repeated_seeds(variants),
         *_unfinished(variants),
@@ -132,6 +133,22 @@ def _repeated_seeds(variants: Sequence[Variant]) -> list[str]:
         twice = [f"seed {seed} {count} times" for (_, seed), count in sorted(times.items()) if count > 1]
         if twice:
             said.append(f"{variant.name}: {', '.join(twice)}; equal runs of one seed are no independent repeats")
+    return said
+
+
+def _lacking_seeds(variants: Sequence[Variant]) -> list[str]:
+    """Names variants that lack seeds which others have of a scene: seeds can differ by more than methods do."""
+    every = sorted({(run.run.scene, run.run.seed) for variant in variants for run in variant.runs})
+    said = []
+    for variant in variants:
+        own = {(run.run.scene, run.run.seed) for run in variant.runs}
+        lacking: dict[str, list[str]] = {}
+        for scene, seed in every:
+            if (scene, seed) not in own and scene in {scene for scene, _ in own}:
+                lacking.setdefault(scene, []).append(str(seed))
+        if lacking:
+            words = ", ".join(f"{scene} with seed {', '.join(seeds)}" for scene, seeds in lacking.items())
+            said.append(f"{variant.name} has no run of {words}: compare differences, not means")
     return said
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import write_atomically
-from sparsestreet.report.arms import Arm, arms, why_apart
+from sparsestreet.report.arms import Arm, arms, incomplete, why_apart
 from sparsestreet.report.beside import beside_the_path
 from sparsestreet.report.collect import RunRecord, check_definitions, collect
 from sparsestreet.report.comparison import comparison_data
@@ -48,7 +48,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     grids = _grids(found, failures, protocol, name)
     folder = sweep / "report"
     figures, absent = _figures(found, protocol, folder / "figures")
-    notes = [*why_apart(found), *_caps(found), *_unfinished(records), *absent]
+    notes = [*incomplete(found), *why_apart(found), *_caps(found), *_unfinished(records), *absent]
     write_atomically(folder / "tables.md", markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes))
     write_atomically(folder / "tables.tex", latex(grids))
     write_atomically(folder / "tables.csv", comma_separated(grids))
@@ -107,8 +107,9 @@ def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[li
         take(
             pareto(found, protocol, cost, folder / f"{name}.svg"),
             name,
-            f"Held-out PSNR against {cost[1]}: every run small, every arm's mean large, arrows from plain to pruned, "
-            "the front of the means dashed, controls grey.",
+            f"Held-out PSNR against {cost[1]}: every run small, every arm's mean large, arrows from plain to pruned "
+            "over the scenes and seeds that both have, the front of the means dashed, controls grey. Hollow: the mean "
+            "of an arm that lacks runs, which is in no front.",
             f"no figure of quality against {cost[1]}: no run has both",
         )
     take(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
-from sparsestreet.report.grid import Cell, Grid
+from sparsestreet.report.arms import Arm, Unit, Value, by_scene, mean_over_scenes, plain_of
+from sparsestreet.report.grid import ABSENT, Cell, Grid
 from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
 from sparsestreet.report.notes import CAPPED
 
@@ -131,6 +131,7 @@ def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs
 @dataclass(frozen=True)
 class _Candidate:
     arm: Arm
+    plain: Arm
     loss: float
     """dB; positive if it is worse."""
     share: float
@@ -145,52 +146,74 @@ def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Ca
         loss = paired(arm, plain, _held_out(protocol.psnr))
         share = paired(arm, plain, lambda run: float(run.gaussians_total), relative=True)
         if loss is not None and share is not None:
-            found.append(_Candidate(arm, -loss.mean, 1 + share.mean / 100))
+            found.append(_Candidate(arm, plain, -loss.mean, 1 + share.mean / 100))
     return found
 
 
 def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """Returns the table of the arms with the fewest Gaussians for each loss of ``LOSSES``."""
-    rows = []
+    """Returns the arms with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
+    rows, notes = [], [f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS]
     for plain in (arm for arm in arms if arm.sparsify == "none"):
         for most in LOSSES:
             allowed = [one for one in _candidates(plain, arms, protocol) if one.loss <= most]
-            best = min(allowed, key=lambda one: one.share, default=None)
+            best, control = (min(some, key=lambda one: one.share, default=None) for some in _parted(allowed))
             rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
-    notes = ("of the arms of this sweep as they were run: nothing is interpolated; plain counts as its own candidate",)
-    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), notes + _caps(arms))
+            if control is not None and (best is None or control.share < best.share):
+                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is smaller")
+    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), (*notes, *_caps(arms)))
 
 
 def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """Returns the table of the arms with the best held-out PSNR for each share of ``SHARES``."""
-    rows = []
+    """Returns the arms with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
+    rows, notes = [], [_OF_THIS_SWEEP, _NO_CONTROLS]
     for plain in (arm for arm in arms if arm.sparsify == "none"):
         for share in SHARES:
             allowed = [one for one in _candidates(plain, arms, protocol) if one.share <= share]
-            best = min(allowed, key=lambda one: one.loss, default=None)
+            best, control = (min(some, key=lambda one: one.loss, default=None) for some in _parted(allowed))
             rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
-    notes = ("of the arms of this sweep as they were run: nothing is interpolated",)
-    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), notes + _caps(arms))
+            if control is not None and (best is None or control.loss < best.loss):
+                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is better")
+    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), (*notes, *_caps(arms)))
 
 
+_OF_THIS_SWEEP = "of the arms of this sweep as they were run: nothing is interpolated"
+_NO_CONTROLS = (
+    "a control has the size of another arm and is no way to get small, so that none is chosen; one that would have "
+    "been is named here. Numbers are of the scenes and seeds that the arm shares with the plain one"
+)
 _CHOSEN = tuple(
     ("", heading)
     for heading in ("allowed", "arm", "PSNR full, dB", "share, %", "Gaussians", "MB", "ms/frame", "train minutes")
 )
 
 
+def _parted(candidates: Sequence[_Candidate]) -> tuple[list[_Candidate], list[_Candidate]]:
+    """Returns those that are no controls, and the controls."""
+    controls = [one for one in candidates if one.arm.control]
+    return [one for one in candidates if not one.arm.control], controls
+
+
+def _in_words(one: _Candidate) -> str:
+    return f"{one.arm.title}, {-one.loss:+.2f} dB at {100 * one.share:.0f} % of the Gaussians,"
+
+
 def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
     if best is None:
         return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
     runs = tuple(record.folder.name for record in best.arm.records)
-    minutes = best.arm.mean(_minutes)
+
+    def mean(value: Value, form: str) -> str:
+        ours, theirs = best.arm.units(value), best.plain.units(value)
+        found = mean_over_scenes({unit: ours[unit] for unit in ours.keys() & theirs.keys()})
+        return ABSENT if found is None else form.format(found)
+
     numbers = (
         f"{-best.loss:+.2f}",
         f"{100 * best.share:.0f}",
-        f"{best.arm.mean(lambda run: float(run.gaussians_total)):,.0f}",
-        f"{best.arm.mean(lambda run: run.bytes_total / 1e6):.2f}",
-        f"{best.arm.mean(lambda run: run.latency.p50):.2f}",
-        "-" if minutes is None else f"{minutes:.2f}",
+        mean(lambda run: float(run.gaussians_total), "{:,.0f}"),
+        mean(lambda run: run.bytes_total / 1e6, "{:.2f}"),
+        mean(lambda run: run.latency.p50, "{:.2f}"),
+        mean(_minutes, "{:.2f}"),
     )
     return (Cell(best.arm.title, runs=runs), *(Cell(number, runs=runs) for number in numbers))
 

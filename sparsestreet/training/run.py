@@ -22,6 +22,7 @@ from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import RunSummary
+from sparsestreet.report.result import result_lines
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks import (
@@ -132,7 +133,8 @@ def train(
             system.scene, system.options, data, out, device=device, command=identity.command, extra=extra
         )
         record_costs(out, stages, device)  # the last file: a run with costs is a whole one
-    log.info("records and pictures in %s", out)
+    for line in result_lines(summary, out):
+        log.info(line)
     return summary
 
 
@@ -181,6 +183,8 @@ def fit(
         return trainer
     # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
     step = torch.load(start, map_location="cpu", weights_only=False)["global_step"]
+    if step >= max_steps:
+        log.info("%s was finished: all %d steps are done, it is measured again", out, step)
     with kept_curves(out, step if trainer.is_global_zero else None):
         trainer.fit(system, datamodule=data, ckpt_path=start, weights_only=False)
     return trainer

@@ -1,5 +1,7 @@
 """What the command line makes of overrides before Hydra sees them."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -7,8 +9,10 @@ from hydra import compose
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+import sparsestreet.training.run  # noqa: F401 - its import takes seconds, which are of no test
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import composed, configuration, load_run_config, override_problem
+from sparsestreet.cli.limits import LOGGER_PACKAGES
 from sparsestreet.cli.train import train
 from tests.typed import there
 
@@ -58,6 +62,14 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["render=fast"], "set one of render.backend, render.preset, render.settings"),
         (["optimizer=visible_adam"], "set one of optimizer.eps, optimizer.visible_only"),
         (["render=null"], "render is no choice but has keys of its own"),
+        (["trainer.max_step=5"], "did you mean 'schedule.max_steps'?"),  # which that one follows
+        (["max_steps=60"], "did you mean 'schedule.max_steps'?"),
+        (["steps=60"], "did you mean 'schedule.max_steps'?"),
+        (["lr=0.1"], "no key 'lr'; did you mean 'schedule.rates'?"),
+        (["llr=0.1"], "no key 'llr'; sparsestreet train --cfg job prints all"),
+        (["device=cuda"], "did you mean 'trainer'? Its options are cpu, gpu"),
+        (["weight=1"], "loss.photometric.weight, loss.sky.weight or loss.depth.weight?"),
+        (["cutoff=1"], "no key 'cutoff'; "),
         (["seed=0,1"], "seed=0,1 asks for several runs: add -m, or choose one"),
     ],
 )
@@ -70,7 +82,44 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("schedule.max_steps=abc", "must be int, got 'abc'"),
+        ("schedule.max_steps=0", "schedule.max_steps must be a whole number, 1 or more, got 0"),
+        ("schedule.max_steps=-5", "schedule.max_steps must be a whole number, 1 or more, got -5"),
+        ("schedule.max_steps=abc", "schedule.max_steps must be a whole number, 1 or more, got 'abc'"),
+        ("schedule.max_steps=1e3", "schedule.max_steps must be a whole number, 1 or more, got 1000.0"),
+        ("schedule.max_steps=true", "schedule.max_steps must be a whole number, 1 or more, got True"),
+        ("seed=-1", "seed must be a whole number, 0 to 4294967295, got -1"),
+        ("seed=4294967296", "seed must be a whole number, 0 to 4294967295, got 4294967296"),
+        ("seed=abc", "seed must be a whole number, 0 to 4294967295, got 'abc'"),
+        ("split.stride=-1", "split.stride must be a whole number, 0 or more, got -1"),
+        ("trainer.max_steps=60", "of 2,000 steps says: give schedule.max_steps=60, or trainer.fast_dev_run=60 to try"),
+        ("logger=nosuch", "pip install 'sparsestreet[nosuch]', or choose logger=csv"),
+    ],
+)
+def test_numbers_out_of_their_limits_are_found_before_torch_is_imported(override, said, monkeypatch):
+    monkeypatch.setitem(LOGGER_PACKAGES, "TensorBoardLogger", ("nosuch",))  # here, whatever is installed
+    override = override.replace("logger=nosuch", "logger=tensorboard")
+    problem = there(override_problem([override]))
+    assert said in problem
+    assert len(problem.splitlines()) == 1
+    assert config_problem(composed([override])) == problem  # of a job of a sweep
+
+
+def test_the_first_checks_import_no_torch():
+    code = (
+        "import sys; from sparsestreet.cli.train import train; status = train(['schedule.max_steps=0'])\n"
+        "assert status == 2 and not {'torch', 'lightning'} & set(sys.modules), status"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_a_question_to_hydra_is_of_one_configuration(capsys):
+    assert train(["-m", "seed=0,1", "--cfg", "job"]) == 2
+    assert capsys.readouterr().err == "sparsestreet train: --cfg and --info show one configuration: leave out -m\n"
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
         ("node.background.num_points=many", "node.background.num_points must be int, got 'many'"),
         ("node.background.sources.images.order=any", "sources.images.order must be Literal"),
         ("node.background.learning_rates.means.initial=[1]", "learning_rates.means.initial must be float"),

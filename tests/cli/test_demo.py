@@ -6,13 +6,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from sparsestreet.cli import demo as module
 from sparsestreet.cli.demo import demo
+from sparsestreet.pictures.images import KINDS, picture_path, write_png
+from sparsestreet.records.quality import HELD_OUT, QUALITY
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.centers import node_legend
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import make_image, make_summary
 
 
 @pytest.fixture
@@ -37,10 +41,10 @@ def test_three_runs_one_table_and_pictures(asked, capsys):
     assert demo(["seed=1", "schedule.max_steps=20"]) == 3
     *commands, (given, named), words = asked
     out, start = Path("outputs/demo"), [sys.executable, "-m", "sparsestreet", "train"]
-    names = ("none", "paper", "removal")
+    names = ("none", "paper_short", "removal")
     assert commands == [
-        [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1200", f"out={out / name}",
-         "seed=1", "schedule.max_steps=20"]
+        [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1200", "overwrite=true",
+         f"out={out / name}", "seed=1", "schedule.max_steps=20"]
         for name in names
     ]  # fmt: skip
     runs = [out / name for name in names]
@@ -61,4 +65,55 @@ def test_the_first_failure_ends_it(asked, monkeypatch):
 
 def test_help(capsys):
     assert demo(["--help"]) == 0
-    assert "sparsestreet demo [key=value ...]" in capsys.readouterr().out
+    assert "sparsestreet demo [out=DIR] [key=value ...]" in capsys.readouterr().out
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Words of each training; each leaves a record (21, 22, 23 dB) and a picture in the folder that it was given."""
+    words = []
+
+    def train(command, check):
+        words.append(command[4:])
+        (place,) = (one for one in OverridesParser.create().parse_overrides(words[-1]) if one.key_or_group == "out")
+        run, label = Path(str(place.value())), f"plain+{len(words)}" if len(words) > 1 else "plain"
+        SUMMARY.write(run, make_summary(label, 0, 20.0 + len(words)))
+        QUALITY[HELD_OUT].write(run, [make_image(5)])
+        for kind in KINDS:
+            write_png(picture_path(run / "pictures", 5, 0, kind), np.zeros((30, 48, 3), dtype=np.uint8))
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(module.subprocess, "run", train)
+    monkeypatch.setattr(module, "compare_runs", lambda runs, sheet, legend: sheet.parent.mkdir(exist_ok=True))
+    return words
+
+
+@pytest.mark.parametrize("name", ["demo2", "a b = ü"])
+def test_the_demo_writes_where_it_is_told(name, trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    SUMMARY.write(tmp_path / "outputs/demo/none", make_summary("plain", 0, 99.0))  # of an earlier demo
+    assert demo([f"out={tmp_path / name}", "seed=1"]) == 0
+    assert sorted(path.name for path in (tmp_path / name).iterdir()) == ["none", "paper_short", "removal", "table.md"]
+    assert [[word for word in words if word.startswith("sparsify=")] for words in trained] == [
+        ["sparsify=none"], ["sparsify=paper_short"], ["sparsify=removal"]
+    ]  # fmt: skip
+    assert all("seed=1" in words and sum(word.startswith("out=") for word in words) == 1 for words in trained)
+    said = capsys.readouterr().out
+    assert "21.00" in said
+    assert "99.00" not in said
+    assert str(tmp_path / name / "removal") in said
+
+
+def test_the_demo_has_a_folder_of_its_own(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert demo([]) == 0
+    assert sorted(path.name for path in (tmp_path / "outputs/demo").iterdir()) == [
+        "none", "paper_short", "removal", "table.md"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("word", ["sparsify=paper", "folder=x", "hydra.run.dir=x", "resume=x", "-m", "out="])
+def test_what_would_make_one_run_of_three_is_refused(word, trained, capsys):
+    assert demo([word]) == 2
+    assert not trained
+    assert capsys.readouterr().err.count("\n") == 1

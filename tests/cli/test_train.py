@@ -82,6 +82,17 @@ def test_training_improves_and_leaves_records(finished, brief):
         assert (finished / picture).is_file()
 
 
+def test_training_ends_with_its_result(finished):
+    """What the record says, in the last lines that one sees."""
+    summary = SUMMARY.read(finished)
+    quality, _, size, places = (finished / "train.log").read_text().splitlines()[-4:]
+    assert f"held-out views: PSNR {summary.mean('psnr_full'):.2f} dB, vehicles " in quality
+    assert f"{summary.gaussians_total:,} Gaussians, {summary.bytes_total / 1e6:.2f} MB, " in size
+    assert places.endswith(
+        f"pictures: {finished}/pictures/sheet.png; curves: {finished}/curves; numbers: {finished}/records"
+    )
+
+
 def test_phases_are_the_wall_clock_of_the_command(brief):
     """By a clock outside: each second belongs to one phase."""
     out, wall = brief
@@ -344,7 +355,7 @@ def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     [
         (["schedule.max_step=5"], "schedule.max_steps"),
         (["data=drivestudio"], "data.root has no value"),
-        (["schedule.max_steps=abc"], "must be int"),
+        (["schedule.max_steps=abc"], "must be a whole number, 1 or more, got 'abc'"),
         (["resume=/nowhere/at/all"], "there is nothing"),
     ],
 )
@@ -365,6 +376,7 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
     assert "/nowhere/at/all" in written
     assert "Traceback" not in written
     assert "Error in call" not in written
+    assert not (tmp_path / "run").exists()
 
 
 def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from sparsestreet.records.run import CodeVersion
-from sparsestreet.report.arms import arms, plain_of, why_apart
+from sparsestreet.report.arms import arms, incomplete, plain_of, why_apart
 from sparsestreet.report.tradeoffs import paired
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, street_runs
@@ -132,3 +132,17 @@ def test_data_that_differ_under_one_name_stand_apart():
     found = arms([record(run) for run in runs])
     assert [arm.name for arm in found] == ["plain (data aaaaaa)", "plain (data bbbbbb)"]
     assert why_apart(found)[0].startswith("runs differ in data of one name (data aaaaaa, data bbbbbb)")
+
+
+def test_an_arm_that_lacks_seeds_is_marked_everywhere():
+    """Of three seeds the masks have one; other places and arms with all seeds say nothing."""
+    runs = [make_summary("plain", seed) for seed in (0, 1, 2)] + [make_summary("plain+masks", 1)]
+    found = arms([record(run) for run in (*runs, make_summary("plain+masks", 5, threads=1))])
+    assert [(arm.label, arm.title.removeprefix(arm.name)) for arm in found] == [
+        ("plain", ""),
+        ("plain+masks", ""),
+        ("plain+masks", " (1 of 3 runs ‡)"),
+    ]
+    (note,) = incomplete(found)
+    assert note.endswith("both arms have. plain+masks (2 threads) lacks street seed 0, street seed 2")
+    assert incomplete(arms([record(run) for run in runs[:3]])) == []

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from sparsestreet.pictures.images import picture_path, write_png
 from sparsestreet.records.quality import HELD_OUT, QUALITY
@@ -13,17 +14,26 @@ from tests.report.sweep_folder import record
 from tests.typed import there
 
 
-def test_pictures_are_of_one_seed(tmp_path):
-    """Seed 0 is the lowest; an arm that has seed 1 alone is not shown beside it."""
+@pytest.mark.parametrize(
+    ("had", "seed", "shown"),
+    [
+        # Seed 0 is the lowest, and half of the arms lack it.
+        ([("plain", 0), ("plain", 1), ("plain+removal", 1)], 1, ["plain", "plain+removal"]),
+        # No seed is in two arms: the lowest, and no picture of another seed beside it.
+        ([("plain", 0), ("plain+removal", 1)], 0, ["plain"]),
+        ([("plain", 1), ("plain", 2), ("plain+removal", 2), ("plain+removal", 1)], 1, ["plain", "plain+removal"]),
+    ],
+)
+def test_pictures_are_of_one_seed_that_most_arms_have(tmp_path, had, seed, shown):
     runs = []
-    for label, seed in (("plain", 0), ("plain", 1), ("plain+removal", 1)):
-        folder = tmp_path / f"{label}_{seed}"
+    for label, number in had:
+        folder = tmp_path / f"{label}_{number}"
         for kind in ("truth", "render"):
             write_png(picture_path(folder / "pictures", 5, 0, kind), np.zeros((3, 4, 3), dtype=np.uint8))
-        runs.append(record(make_summary(label, seed), str(folder)))
+        runs.append(record(make_summary(label, number), str(folder)))
     (view,) = json.loads(there(comparison_data(arms(runs))))
-    assert view["name"] == "street, seed 0, frame 5, camera 0"
-    assert [image["name"] for image in view["images"]] == ["truth", "plain"]
+    assert view["name"] == f"street, seed {seed}, frame 5, camera 0"
+    assert [image["name"].partition(" (")[0] for image in view["images"]] == ["truth", *shown]
 
 
 def test_the_psnr_below_a_picture_is_of_its_view(tmp_path):

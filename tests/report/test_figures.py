@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+import matplotlib.axes
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -53,6 +54,36 @@ def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
     assert len(re.findall(r"<use [^>]*fill: #1f86c9", text)) == 2 * 2 * 4 + 1
     assert len(re.findall(rf"<use [^>]*stroke: {GREY}", text)) >= 2 * 4
     assert "control: random" in text
+
+
+UNEQUAL = {
+    ("plain", 0): (20.0, 1000), ("plain", 1): (22.0, 3000),
+    ("plain+masks", 1): (21.5, 1500), ("plain+removal", 0): (19.0, 500), ("plain+removal", 1): (21.0, 700),
+}  # fmt: skip
+"""Label and seed -> PSNR and Gaussians; the masks lose 0.5 dB in the one seed that they have."""
+
+
+@pytest.mark.lengthy
+def test_an_arrow_is_of_the_seeds_that_both_arms_have(tmp_path, monkeypatch):
+    """The mean of masks, 21.5, lies above that of the plain runs, 21, and they gain nothing: seed 0 is harder."""
+    found = arms(
+        [record(make_summary(name, seed, psnr, {"background": n})) for (name, seed), (psnr, n) in UNEQUAL.items()]
+    )
+    arrows, fronts, hollow = [], [], []
+    axes = matplotlib.axes.Axes
+    monkeypatch.setattr(axes, "annotate", lambda self, text, end, start, **_: arrows.append((start, end)))
+    monkeypatch.setattr(axes, "plot", lambda self, x, y, **_: fronts.append(list(zip(x, y, strict=True))))
+    scatter = axes.scatter
+
+    def scattered(self, x, y, **style):
+        hollow.extend([(x, y)] if style.get("facecolors") == "none" else [])
+        return scatter(self, x, y, **style)
+
+    monkeypatch.setattr(axes, "scatter", scattered)
+    pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "pareto.svg")
+    assert arrows[:2] == [((3000.0, 22.0), (1500.0, 21.5)), ((2000.0, 21.0), (600.0, 20.0))]
+    assert hollow[0] == (1500.0, 21.5)
+    assert fronts[0] == [(600.0, 20.0), (2000.0, 21.0)]  # without the masks
 
 
 @pytest.mark.lengthy

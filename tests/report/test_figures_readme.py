@@ -53,7 +53,7 @@ def test_without_curves_runs_and_means_are_points(tmp_path, monkeypatch):
         for seed, psnr, scene, ms, seconds in
         ((0, 23.0, "x", 20.0, 200.0), (1, 25.0, "x", 40.0, 400.0), (0, 20.0, "y", 60.0, 100.0))
     ]  # fmt: skip
-    control = record(make_summary("m+random", 0, 1.0, milliseconds=1.0))
+    control = record(make_summary("m+random", 0, 1.0, milliseconds=1.0, scene="x"))
     figure, training, frame = figure_of([*runs, control], tmp_path, monkeypatch)
     assert (training.get_xlabel(), frame.get_xlabel()) == ("training seconds", "milliseconds a frame")
     assert training.get_ylabel() == "held-out PSNR, dB"

@@ -109,6 +109,13 @@ def test_a_mean_over_scenes_says_which():
     assert said[-1] == "differences are to plain, paired by scene and seed; per cent is what remains of it"
 
 
+def test_seeds_that_a_variant_lacks_are_named():
+    runs = [make_summary("plain", 0), make_summary("plain", 1), make_summary("ours", 1)]
+    assert "ours has no run of street with seed 0: compare differences, not means" in notes(*runs)
+    lacking = [street(name, seed, 20.0, 100) for name in ("plain", "ours") for seed in (0, 1)]
+    assert not [said for said in notes(*lacking) if "with seed" in said]
+
+
 def test_near_and_beyond_are_explained_where_there_is_lidar():
     blind = make_summary()
     assert not [said for said in notes(blind) if said.startswith("near")]

@@ -109,6 +109,28 @@ def test_a_larger_arm_within_the_budget_is_better():
     assert chosen["plain, at most 50 % of its Gaussians"] == "plain+larger"
 
 
+def test_a_control_is_never_chosen_but_named():
+    """The capped method is smaller and better than what it controls: the tables choose the arm and say so."""
+    runs = {"plain": (25.0, 1000), "plain+removal": (24.8, 400), "plain+capped": (24.9, 300)}
+    made = arms([record(make_summary(name, 0, psnr, {"background": n})) for name, (psnr, n) in runs.items()])
+    quality, budget = matched_quality(made, DRIVESTUDIO), matched_budget(made, DRIVESTUDIO)
+    control = "control: plain+capped, -0.10 dB at 30 % of the Gaussians, is"
+    assert [row[1].text for row in quality.rows] == ["plain", "plain+removal", "plain+removal"]
+    assert [note for note in quality.notes if note.startswith("plain, at most 0.3 dB")] == [
+        f"plain, at most 0.3 dB: {control} smaller"
+    ]
+    assert [row[1].text for row in budget.rows] == ["none of this sweep", "plain+removal", "plain+removal"]
+    assert f"plain, at most 50 % of its Gaussians: {control} better" in budget.notes
+
+
+def test_a_chosen_arm_has_the_numbers_of_the_seeds_it_shares():
+    """Seed 1, which the plain arm lacks, has 900 Gaussians and is in no number of the row."""
+    runs = [("plain", 0, 25.0, 1000), ("plain+removal", 0, 24.9, 300), ("plain+removal", 1, 20.0, 900)]
+    made = arms([record(make_summary(name, seed, psnr, {"background": n})) for name, seed, psnr, n in runs])
+    chosen = by_heading(matched_quality(made, DRIVESTUDIO), matched_quality(made, DRIVESTUDIO).rows[-1])
+    assert (chosen["arm"].text, chosen["share, %"].text, chosen["Gaussians"].text) == ("plain+removal", "30", "300")
+
+
 def test_a_gain_is_no_loss():
     """An arm that is smaller and better by 0.6 dB is within every limit."""
     runs = [make_summary("plain", 0, 25.0), make_summary("plain+removal", 0, 25.6, {"background": 300})]

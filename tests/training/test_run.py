@@ -1,5 +1,7 @@
 """A training from Python, without a configuration: what it leaves, how it goes on, and who writes."""
 
+import logging
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -131,6 +133,16 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(whole, tmp_path):
         assert torch.equal(value, got[name]), name
     ledger = Path("records") / "counts.csv"
     assert (tmp_path / ledger).read_text() == (whole / ledger).read_text()
+
+
+def test_a_run_that_was_finished_says_so(whole, tmp_path, caplog):
+    """And is measured again, without a step."""
+    shutil.copytree(whole, out := tmp_path / "run")
+    with caplog.at_level(logging.INFO), pytest.warns(UserWarning, match="is not empty"):
+        train(recipe(out, steps := Steps()), data(), out, max_steps=STEPS, make_trainer=TRAINER, resume=out)
+    assert steps.begun == []
+    assert f"{out} was finished: all {STEPS} steps are done, it is measured again" in caplog.messages
+    assert any(line.startswith("held-out views: PSNR ") for line in caplog.messages)
 
 
 def test_a_run_that_is_not_there_is_an_error_before_anything_is_built(tmp_path):

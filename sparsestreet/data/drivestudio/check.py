@@ -59,7 +59,7 @@ def _check_poses(layout: Layout) -> list[Problem]:
         pose = attempt(problems, partial(read_pose, path))
         if pose is not None:
             placed.append((path, pose[:3, 3]))
-    if layout.waymo:  # there the extrinsics are relative to the vehicle
+    if layout.flavor.mounted:  # there the extrinsics are relative to the vehicle
         placed = [(path, position) for path, position in placed if path.parent.name == "ego_pose"]
     if layout.instances.is_file():
         tracks = attempt(problems, partial(read_instances, layout)) or []

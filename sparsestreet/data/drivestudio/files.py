@@ -21,7 +21,7 @@ def pose_files(layout: Layout) -> list[Path]:
     """Every pose that is read, once, among them the front camera's that the world is re-centered on."""
     cameras = sorted({*layout.cameras, layout.front})
     poses = [layout.extrinsics(frame, camera) for frame in layout.frames for camera in cameras]
-    if layout.waymo or layout.has_lidar:
+    if layout.flavor.mounted or layout.has_lidar:
         poses += [layout.sweep_pose(frame) for frame in layout.frames]
     return list(dict.fromkeys(poses))
 

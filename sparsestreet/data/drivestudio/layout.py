@@ -1,10 +1,11 @@
-"""Where DriveStudio's processed layout keeps what, in its Waymo and its nuScenes flavor."""
+"""Where DriveStudio's processed layout keeps what, in each of its flavors."""
 
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sparsestreet.data.drivestudio.flavors import FLAVORS, Flavor, FlavorName, flavor_of
 from sparsestreet.data.formats import published_format
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.window import chosen_cameras, frame_window
@@ -19,8 +20,7 @@ class Layout:
     """A log's folder and the part of it that is read: file names of every kind."""
 
     root: Path
-    waymo: bool
-    """True: poses of the vehicle and static camera mounts; False (nuScenes): a pose for each image."""
+    flavor: Flavor
     frames: range
     """Frames of the window, in the folder's own numbers."""
     cameras: tuple[int, ...]
@@ -44,25 +44,15 @@ class Layout:
         return self.root / "intrinsics" / f"{camera}.txt"
 
     def extrinsics(self, frame: int, camera: int) -> Path:
-        """Waymo: camera -> vehicle, the same at all frames. nuScenes: camera -> world."""
-        return self.root / "extrinsics" / (f"{camera}.txt" if self.waymo else f"{frame:03d}_{camera}.txt")
+        """Of a mounted camera: camera -> vehicle, the same at all frames. Of others: camera -> world."""
+        return self.root / "extrinsics" / (f"{camera}.txt" if self.flavor.mounted else f"{frame:03d}_{camera}.txt")
 
     def sweep_pose(self, frame: int) -> Path:
-        """Frame of the lidar points -> world: the vehicle for Waymo, the sensor for nuScenes."""
-        return self.root / ("ego_pose" if self.waymo else "lidar_pose") / f"{frame:03d}.txt"
+        """Frame of the lidar points -> world: that of the vehicle, if cameras are mounted, else of the sensor."""
+        return self.root / self.flavor.sweep_poses / f"{frame:03d}.txt"
 
     def sweep(self, frame: int) -> Path:
         return self.root / "lidar" / f"{frame:03d}.bin"
-
-    @property
-    def sweep_columns(self) -> int:
-        """float32 columns of a lidar row."""
-        return 14 if self.waymo else 4
-
-    @property
-    def sweep_xyz(self) -> slice:
-        """Columns of a lidar row that hold the point (a Waymo row starts with the ray's origin)."""
-        return slice(3, 6) if self.waymo else slice(0, 3)
 
     @property
     def instances(self) -> Path:
@@ -124,8 +114,9 @@ def find_layout(
     last_frame: int = -1,
     lidar: bool = True,
     bodies: bool = True,
+    flavor: FlavorName | None = None,
 ) -> Layout:
-    """Recognize the flavor by its files and choose cameras and frames (last_frame is included; -1: to the end).
+    """Choose cameras and frames (last_frame is included; -1: to the end); without ``flavor`` the files tell it.
 
     Without ``lidar`` or ``bodies`` the folder is looked at as if it had none.
 
@@ -133,20 +124,17 @@ def find_layout(
     """
     if not (root / "images").is_dir():
         raise _no_log(root)
-    waymo = (root / "ego_pose").is_dir()
-    if not waymo and not _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA):
-        remedy = "add ego_pose/TTT.txt (Waymo flavor) or extrinsics/TTT_C.txt (nuScenes flavor)"
-        raise fault(root / "extrinsics", "the folder holds no poses of either flavor", remedy)
+    found = FLAVORS[flavor] if flavor else flavor_of(root, lidar=lidar)
     images = _numbers(root / "images", ".jpg", _FRAME_CAMERA)
     on_disk = sorted({camera for _, camera in images} | {n for (n,) in _numbers(root / "intrinsics", ".txt", _CAMERA)})
     if not images or not on_disk:
         raise fault(root / "images", "the folder holds no TTT_C.jpg", "write the images as frame_camera, as 000_0.jpg")
-    count = _count_frames(root, waymo, lidar)
+    count = _count_frames(root, found, lidar)
     frames = frame_window(count, first_frame, last_frame, root)
     chosen = chosen_cameras(on_disk, cameras, root)
     has_lidar = lidar and (root / "lidar").is_dir()
     has_bodies = bodies and (root / "humanpose").is_dir()
-    return Layout(root, waymo, frames, chosen, on_disk[0], count, has_lidar, has_bodies)
+    return Layout(root, found, frames, chosen, on_disk[0], count, has_lidar, has_bodies)
 
 
 def _no_log(root: Path) -> LogError:
@@ -164,14 +152,14 @@ def _no_log(root: Path) -> LogError:
     return fault(root, "the folder has no images/", f"name {wanted}")
 
 
-def _count_frames(root: Path, waymo: bool, lidar: bool) -> int:
+def _count_frames(root: Path, flavor: Flavor, lidar: bool) -> int:
     """One more than the highest frame number of any kind of file: where one kind stops early, its files are missing."""
     found = [(frame,) for frame, _ in _numbers(root / "images", ".jpg", _FRAME_CAMERA)]
     if lidar:
         found += _numbers(root / "lidar", ".bin", _FRAME)
-    if lidar or waymo:
-        found += _numbers(root / ("ego_pose" if waymo else "lidar_pose"), ".txt", _FRAME)
-    if not waymo:
+    if lidar or flavor.mounted:
+        found += _numbers(root / flavor.sweep_poses, ".txt", _FRAME)
+    if not flavor.mounted:
         found += [(frame,) for frame, _ in _numbers(root / "extrinsics", ".txt", _FRAME_CAMERA)]
     return 1 + max(frame for (frame,) in found)
 

@@ -40,19 +40,19 @@ def read_intrinsics(path: Path) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor,
 
 def world_from_camera(layout: Layout, frame: int, camera: int) -> Float64[Tensor, "4 4"]:
     """Pose of a camera (OpenCV axes) in the data set's world; raises LogError."""
-    extrinsics = read_pose(layout.extrinsics(frame, camera))
-    if not layout.waymo:
-        return extrinsics
-    return read_pose(layout.sweep_pose(frame)) @ extrinsics @ WAYMO_FROM_OPENCV
+    pose = read_pose(layout.extrinsics(frame, camera))
+    if layout.flavor.mounted:
+        pose = read_pose(layout.sweep_pose(frame)) @ pose
+    return pose if layout.flavor.opencv else pose @ WAYMO_FROM_OPENCV
 
 
 def first_pose(layout: Layout) -> Float64[Tensor, "4 4"]:
-    """Pose of the vehicle (Waymo) or the front camera (nuScenes) in the data set's world at the first frame read.
+    """Pose of the vehicle, if cameras are mounted on it, else of the front camera, in the data set's world.
 
-    The log is re-centered on its position; the axes are kept.
+    It is that of the first frame read. The log is re-centered on its position; the axes are kept.
     """
     first = layout.frames[0]
-    return read_pose(layout.sweep_pose(first) if layout.waymo else layout.extrinsics(first, layout.front))
+    return read_pose(layout.sweep_pose(first) if layout.flavor.mounted else layout.extrinsics(first, layout.front))
 
 
 def read_clock(layout: Layout) -> LogClock:

@@ -12,6 +12,7 @@ from torch import Tensor
 from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
 from sparsestreet.data.drivestudio.files import hashed_files
+from sparsestreet.data.drivestudio.flavors import Flavor, FlavorName
 from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
@@ -32,8 +33,8 @@ from sparsestreet.types import Track
 class DriveStudioReader(LogReader):
     """Frames first_frame .. last_frame (included) of some cameras, of the folder of one scene.
 
-    Both flavors are recognized by their files. The world keeps the data set's axes and is shifted, in float64, so
-    that the vehicle (Waymo) or the front camera (nuScenes) starts at the origin. Frames are counted from the window's
+    The world keeps the data set's axes and is shifted, in float64, so that the vehicle (flavors of mounted cameras) or
+    the front camera (nuScenes, PandaSet) starts at the origin. Frames are counted from the window's
     start, cameras by their place in ``cameras``. Time is frame / (frames - 1), 0 in a log of one frame.
 
     A file ``timestamps.txt`` beside the folders is the clock: the seconds of each frame, one a line, by any zero. All
@@ -63,6 +64,8 @@ class DriveStudioReader(LogReader):
     flavor only. None: all."""
     extent: SceneExtent = "world"
     """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
+    flavor: FlavorName | None = None
+    """The data set that the layout was made of; None: what the files tell, an error where they leave it open."""
     cache_mb: int = 512
     """Decoded frames kept in memory, MB (1e6 bytes); a frame takes about 10 bytes a pixel."""
 
@@ -126,6 +129,7 @@ class DriveStudioReader(LogReader):
             last_frame=self.last_frame,
             lidar=self.lidar,
             bodies=self.bodies,
+            flavor=self.flavor,
         )
 
 
@@ -140,7 +144,7 @@ def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Tr
 
 def _notes(layout: Layout) -> tuple[str, ...]:
     sky, human, vehicle = (layout.mask_folder(kind) is not None for kind in ("sky", "human", "vehicle"))
-    return absence_notes(
+    absent = absence_notes(
         sky=sky,
         human=human,
         vehicle=vehicle,
@@ -148,3 +152,12 @@ def _notes(layout: Layout) -> tuple[str, ...]:
         boxes=layout.has_instances,
         clock=layout.has_clock,
     )
+    return (*_note_of_flavor(layout.flavor), *absent)
+
+
+def _note_of_flavor(flavor: Flavor) -> list[str]:
+    """How a folder is read that is of neither data set which DriveStudio began with."""
+    if flavor.name in ("waymo", "nuscenes"):
+        return []
+    mounts = "mounted cameras" if flavor.mounted else "a pose for each image"
+    return [f"read as data.log.flavor={flavor.name}: {mounts}, OpenCV's axes, lidar rows of {flavor.columns} numbers"]

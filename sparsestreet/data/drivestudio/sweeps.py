@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.data.drivestudio.flavors import NAME_IT
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import read_pose
 from sparsestreet.data.lidar import check_points
@@ -18,12 +19,10 @@ _REMEDY = "drop these returns, and make sure that the rows have the flavor's col
 
 def check_sweep_size(layout: Layout, frame: int) -> None:
     """Raises LogError unless the file holds whole rows."""
-    path, row = layout.sweep(frame), 4 * layout.sweep_columns
-    if path.stat().st_size % row:
-        message = f"{path.stat().st_size} bytes are no whole number of rows of {layout.sweep_columns} float32"
-        remedy = (
-            f"write float32 rows of {layout.sweep_columns} columns ({'Waymo' if layout.waymo else 'nuScenes'} flavor)"
-        )
+    path, columns = layout.sweep(frame), layout.flavor.columns
+    if path.stat().st_size % (4 * columns):
+        message = f"{path.stat().st_size} bytes are no whole number of rows of {columns} float32"
+        remedy = f"write float32 rows of {columns} columns ({layout.flavor.name} flavor), or {NAME_IT}"
         raise fault(path, message, remedy)
 
 
@@ -41,9 +40,10 @@ def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None =
     """
     check_sweep_size(layout, frame)
     path = layout.sweep(frame)
-    rows = np.fromfile(path, dtype="<f4").reshape(-1, layout.sweep_columns)
-    points = torch.from_numpy(rows[:, layout.sweep_xyz].astype(np.float64))
+    rows = np.fromfile(path, dtype="<f4").reshape(-1, layout.flavor.columns)
+    first = layout.flavor.x_column
+    points = torch.from_numpy(rows[:, first : first + 3].astype(np.float64))
     check_points(points, path, remedy=_REMEDY)
-    if ahead is not None and layout.waymo:
+    if ahead is not None and layout.flavor.name == "waymo":
         points = points[(points[:, 0] > ahead[0]) & (points[:, 0] < ahead[1])]
     return transform_points(read_pose(layout.sweep_pose(frame)), points)

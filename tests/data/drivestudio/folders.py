@@ -62,6 +62,29 @@ def make_waymo(root: Path, *, frames: int = 3, cameras: int = 2, offset: np.ndar
     return root
 
 
+def make_mounted_opencv(root: Path, *, columns: int = 4, frames: int = 3, cameras: int = 2) -> Path:
+    """DriveStudio's layouts of KITTI, Argoverse (4 columns) and nuPlan (6): Waymo's street, OpenCV's axes."""
+    make_waymo(root, frames=frames, cameras=cameras)
+    for camera in range(cameras):
+        write_matrix(root / f"extrinsics/{camera}.txt", pose(WORLD_FROM_OPENCV, np.array([0, 0.5 * camera, 1.5])))
+    for frame in range(frames):
+        write_rows(root / f"lidar/{frame:03d}.bin", rows_of(POINTS_IN_WORLD - (frame, 0, 0), columns))
+    return root
+
+
+def make_pandaset(root: Path, *, frames: int = 3, cameras: int = 2) -> Path:
+    """As nuScenes, but sweeps have 5 columns, and their poses lie in ego_pose."""
+    make_nuscenes(root, frames=frames, cameras=cameras)
+    (root / "lidar_pose").rename(root / "ego_pose")
+    for path in (root / "lidar").iterdir():
+        write_rows(path, rows_of(np.fromfile(path, dtype="<f4").reshape(-1, 4)[:, :3], 5))
+    return root
+
+
+def rows_of(points: np.ndarray, columns: int) -> np.ndarray:
+    return np.concatenate([points, np.full((len(points), columns - 3), -1.0)], axis=1)
+
+
 def write_common(root: Path, frames: int, cameras: int, offset: np.ndarray) -> None:
     for camera in range(cameras):
         write_lines(root / f"intrinsics/{camera}.txt", [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, 0, 0, 0, 0, 0])

@@ -1,0 +1,37 @@
+"""What a run came to, in the few lines that a command ends with."""
+
+from pathlib import Path
+
+from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.records.quality import HELD_OUT, TRAINING
+from sparsestreet.records.summary import RunSummary
+
+_VIEWS = {HELD_OUT: "held-out views", TRAINING: "training views"}
+
+
+def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDIO) -> list[str]:
+    """Returns quality of each split, size and time, and where the pictures are; absent numbers are left out.
+
+    Args:
+        summary: the record of the run.
+        out: the run's folder.
+        protocol: the definitions of PSNR and SSIM.
+    """
+    run, latency = summary.run, summary.latency
+    trained = [] if run.training_seconds is None else [f"{run.training_seconds:.0f} s of training"]
+    steady = "" if latency.noise.quiet else " (on a machine that was not quiet)"
+    size = [f"{summary.gaussians_total:,} Gaussians", f"{summary.bytes_total / 1e6:.2f} MB", *trained]
+    return [
+        *(_quality(summary, split, protocol) for split in (HELD_OUT, TRAINING) if split in summary.quality),
+        ", ".join([*size, f"{latency.p50:.1f} ms a frame{steady}"]),
+        f"pictures: {out / 'pictures' / 'sheet.png'}; curves: {out / 'curves'}; numbers: {out / 'records'}",
+    ]
+
+
+def _quality(summary: RunSummary, split: str, protocol: Protocol) -> str:
+    columns = (("PSNR", protocol.psnr), ("vehicles", protocol.vehicle[0]), ("people", protocol.human[0]))
+    means = [(name, summary.mean(metric, split)) for name, metric in columns]
+    said = [f"{name} {mean:.2f} dB" for name, mean in means if mean is not None]
+    ssim = summary.mean(protocol.ssim, split)
+    said += [] if ssim is None else [f"SSIM {ssim:.3f}"]
+    return f"{_VIEWS[split]}: {', '.join(said)}"

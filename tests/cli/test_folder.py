@@ -1,0 +1,160 @@
+"""Whose folder a run writes into: nobody else's unless asked, and none for a start that fails."""
+
+import os
+from pathlib import Path
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from sparsestreet.cli import folder
+from sparsestreet.cli.compose import composed, resolved
+from sparsestreet.cli.folder import OF_A_RUN, folder_problem, leave_folder, take_folder
+from sparsestreet.cli.resume import resumed_overrides
+from sparsestreet.cli.sweep import run_job
+from sparsestreet.cli.train import train
+from sparsestreet.records.configuration import flat_config
+from sparsestreet.records.run import RUN
+from tests.evaluation.frames import make_summary
+from tests.typed import there
+
+
+def a_run(out: Path, *overrides: str, steps: int | None = 60) -> Path:
+    """A folder as training leaves it, after so many of 60 steps; None: killed before it could say how many."""
+    cfg = composed(overrides)
+    (out / "checkpoints").mkdir(parents=True)
+    (out / "checkpoints/last.ckpt").touch()
+    (out / ".hydra").mkdir()
+    OmegaConf.save(cfg, out / ".hydra/config.yaml")
+    OmegaConf.save(list(overrides), out / ".hydra/overrides.yaml")
+    if steps is not None:
+        config = flat_config(resolved(cfg))
+        RUN.write(out, make_summary(cfg.name, cfg.seed, config=config, steps=steps).run)
+    return out
+
+
+def contents(out: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("words", "steps", "said"),
+    [
+        ((), 60, "holds this very run, finished: sparsestreet evaluate run={out}, or replace it: overwrite=true"),
+        ((), 23, "holds this very run, unfinished: go on with resume={out}, or begin again: overwrite=true"),
+        ((), None, "holds this very run, unfinished: go on with resume={out}, or begin again: overwrite=true"),
+        (("seed=1",), 60, "holds another run (streetgs, seed 0): name another place with out=..., or replace it: over"),
+        (("sparsify=paper",), 23, "holds another run (streetgs, seed 0)"),
+        (("data=drivestudio", "data.root=/drives/1"), None, "holds another run: name"),
+        (("overwrite=true", "sparsify=paper"), 60, None),
+    ],
+)
+def test_a_folder_with_a_run_is_refused_unless_asked(words, steps, said, tmp_path):
+    out = a_run(tmp_path / "run", steps=steps)
+    problem = folder_problem(composed(words), out)
+    assert problem == said if said is None else said.format(out=out) in there(problem)
+
+
+def test_a_run_goes_on_in_its_own_folder_and_in_no_other_runs(tmp_path):
+    run, other = a_run(tmp_path / "run", steps=23), a_run(tmp_path / "other", "seed=1")
+    for text in (run, run / "checkpoints/last.ckpt"):
+        cfg = composed([f"resume={text}"])
+        assert folder_problem(cfg, run) is None
+        assert "holds another run" in there(folder_problem(cfg, other))
+    a_run(tmp_path / "asked", "overwrite=true", steps=23)
+    assert "overwrite=true" not in resumed_overrides([f"resume={tmp_path / 'asked'}"])  # it would lose its checkpoints
+
+
+def test_what_is_no_run_is_no_obstacle(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / ".hydra").mkdir()  # of a start that failed
+    (tmp_path / "train.log").touch()
+    assert folder_problem(composed(()), tmp_path) is None
+    assert folder_problem(composed(()), tmp_path / "new/folder") is None
+
+
+def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file/run"):
+        assert folder_problem(composed(()), out) == f"{out} cannot be written: name another place with out=..."
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # root may write anywhere
+    assert "cannot be written" in there(folder_problem(composed(()), tmp_path / "deep/run"))
+
+
+def test_a_refused_run_is_left_as_it_is(tmp_path, capsys):
+    out = a_run(tmp_path / "run")
+    before = contents(out)
+    assert train(["sparsify=paper", f"out={out}"]) == 2
+    written = capsys.readouterr().err
+    assert "holds another run (streetgs, seed 0)" in written
+    assert written.count("\n") == 1
+    assert contents(out) == before
+
+
+def test_hydra_leads_nowhere_else(tmp_path, capsys, monkeypatch):
+    """``hydra.run.dir`` names the folder behind the back of ``out``."""
+    out = a_run(tmp_path / "run")
+    monkeypatch.setattr("sparsestreet.cli.train._problem_of_values", lambda words: None)  # half of the test's time
+    with pytest.raises(SystemExit):
+        train(["sparsify=paper", f"hydra.run.dir={out}"])
+    assert "holds another run" in capsys.readouterr().err
+    assert (out / ".hydra/overrides.yaml").read_text() == "[]\n"
+
+
+def test_a_job_of_a_sweep_replaces_itself_alone(tmp_path, capsys):
+    out = a_run(tmp_path / "run", steps=23)
+    assert run_job(composed(()), out, lambda: 25.0) == 25.0  # unfinished: the same command runs it again
+    before = contents(out)
+    with pytest.raises(SystemExit) as ended:
+        run_job(composed(["sparsify=paper"]), out, lambda: pytest.fail("it trained"))
+    assert ended.value.code == 2
+    assert "holds another run (streetgs, seed 0)" in capsys.readouterr().err
+    assert contents(out) == before  # no failed.json either, which would take the record out of reports
+    assert run_job(composed(["sparsify=paper", "overwrite=true"]), out, lambda: 26.0) == 26.0
+
+
+@pytest.fixture
+def within_hydra(monkeypatch):
+    """As within its app."""
+    cfg = OmegaConf.create({"hydra": {"overrides": {"task": ["seed=1"]}, "runtime": {"cwd": "/here"}}})
+    monkeypatch.setattr(folder.HydraConfig, "instance", lambda: type("Hydra", (), {"cfg": cfg}))
+    monkeypatch.setattr(folder.HydraConfig, "get", lambda: cfg.hydra)
+
+
+@pytest.mark.usefixtures("within_hydra")
+def test_nothing_of_a_replaced_run_stays_beside_the_new_one(tmp_path):
+    out = a_run(tmp_path / "run")
+    for name in ("records", "pictures", "curves", "predictions"):
+        (out / name).mkdir()
+        (out / name / "old").touch()
+    (out / "notes.txt").touch()
+    take_folder(composed(["overwrite=true", "seed=1"]), out)
+    assert not [name for name in OF_A_RUN if (out / name).exists()]
+    assert (out / "notes.txt").is_file()
+    config, hydra, overrides = (
+        OmegaConf.load(out / f".hydra/{name}.yaml") for name in ("config", "hydra", "overrides")
+    )
+    assert isinstance(config, DictConfig)
+    assert config.seed == 1
+    assert "out: outputs/${now:" in (out / ".hydra/config.yaml").read_text()  # as it was composed
+    assert hydra.hydra.runtime.cwd == "/here"
+    assert overrides == ["seed=1"]
+
+
+@pytest.mark.usefixtures("within_hydra")
+def test_a_run_that_goes_on_keeps_its_files(tmp_path):
+    out = a_run(tmp_path / "run", steps=23)
+    take_folder(composed([f"resume={out}"]), out)
+    assert (out / "checkpoints/last.ckpt").is_file()
+    assert RUN.read(out).steps == 23
+
+
+def test_a_start_that_failed_leaves_nothing_and_a_run_everything(tmp_path):
+    failed, run = tmp_path / "failed", a_run(tmp_path / "run")
+    (failed / ".hydra").mkdir(parents=True)
+    (failed / "train.log").touch()
+    (run / "train.log").touch()
+    before = contents(run)
+    for out in (failed, run, tmp_path / "absent"):
+        leave_folder(out, "train.log")
+    assert not failed.exists()
+    assert contents(run) == before

@@ -1,0 +1,30 @@
+"""The last lines of a command against numbers that the record was given."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from sparsestreet.records.quality import HELD_OUT, MetricSummary
+from sparsestreet.report.result import result_lines
+from tests.evaluation.frames import make_summary
+
+
+def test_what_a_run_came_to():
+    summary = make_summary("plain", 0, 24.35, {"background": 15_000, "rigid": 613}, training_psnr=26.0)
+    people = {"psnr_human": MetricSummary(19.8, None, 3, 0), "ssim_uniform7_full": MetricSummary(0.8124, None, 6, 0)}
+    summary = dataclasses.replace(summary, quality=summary.quality | {HELD_OUT: summary.quality[HELD_OUT] | people})
+    held_out, training, size, places = result_lines(summary, Path("outputs/a"))
+    assert held_out == "held-out views: PSNR 24.35 dB, vehicles 22.00 dB, people 19.80 dB, SSIM 0.812"
+    assert training == "training views: PSNR 26.00 dB, vehicles 22.00 dB, SSIM 0.800"
+    # 59 float32 a Gaussian, and 100 seconds of training, says make_summary.
+    assert size.startswith("15,613 Gaussians, 3.68 MB, 100 s of training, 40.0 ms a frame")
+    assert places == "pictures: outputs/a/pictures/sheet.png; curves: outputs/a/curves; numbers: outputs/a/records"
+
+
+@pytest.mark.parametrize(("psnr", "training"), [(None, 26.0), (25.0, None)])
+def test_only_what_was_measured_is_said(psnr, training):
+    lines = result_lines(make_summary("plain", 0, psnr, training_psnr=training), Path("a"))
+    assert len(lines) == 3
+    assert lines[0].startswith("training views: PSNR 26.00" if psnr is None else "held-out views: PSNR 25.00")
+    assert "people" not in lines[0]
