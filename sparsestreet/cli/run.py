@@ -42,17 +42,17 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     stages = StageRecorder(started)
     with stages, stage("data"):
         data = data_of(cfg)
-        cfg = with_views(cfg, data)
+        known = with_views(cfg, data)
         # The job's own overrides: in a sweep they are not what was typed.
-        identity = identity_of(cfg, this_command(["train", *HydraConfig.get().overrides.task]))
+        identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
     take_folder(cfg, out)
     summary = train(
-        recipe_of(cfg),
+        recipe_of(known),
         data,
         out,
-        max_steps=cfg.trainer.max_steps,
+        max_steps=known.trainer.max_steps,
         minutes=cfg.budget.minutes,
-        make_trainer=trainer_of(cfg),
+        make_trainer=trainer_of(known),
         logger=logger,
         identity=identity,
         extra=extra,
