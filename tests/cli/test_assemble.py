@@ -22,7 +22,6 @@ from sparsestreet.cli.step import NEVER, train_with
 from sparsestreet.data.synthetic.reader import StreetReader
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
-from sparsestreet.phases import StageRecorder
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.run import RUN
 from sparsestreet.training.callbacks import DensityControl, PhaseTimes, RowLedger
@@ -184,7 +183,3 @@ def test_an_evaluation_hands_on_what_it_is_told(log, monkeypatch, tmp_path, caps
         "training views: 31.25 dB",
         f"1,234 Gaussians, 7.2 ms/frame; records in {tmp_path / 'records' / 'summary.json'}",
     ]
-
-
-def test_stages_begin_where_the_command_began():
-    assert StageRecorder(time.perf_counter() - 2).seconds()["start"] == pytest.approx(2, abs=0.5)

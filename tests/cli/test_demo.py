@@ -59,6 +59,6 @@ def test_the_first_failure_ends_it(asked, monkeypatch):
     assert asked == []
 
 
-def test_help(capsys):
+def test_help(asked, capsys):
     assert demo(["--help"]) == 0
     assert "sparsestreet demo [key=value ...]" in capsys.readouterr().out
