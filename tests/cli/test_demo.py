@@ -37,7 +37,7 @@ def test_three_runs_one_table_and_pictures(asked, capsys):
     assert demo(["seed=1", "schedule.max_steps=20"]) == 3
     *commands, (given, named), words = asked
     out, start = Path("outputs/demo"), [sys.executable, "-m", "sparsestreet", "train"]
-    names = ("none", "paper", "removal")
+    names = ("none", "paper_short", "removal")
     assert commands == [
         [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1200", f"out={out / name}",
          "seed=1", "schedule.max_steps=20"]
