@@ -8,6 +8,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 
 from sparsestreet.bench import figures
 from sparsestreet.bench.figures import (
@@ -22,6 +23,7 @@ from sparsestreet.bench.figures import (
     whole_time,
 )
 from sparsestreet.bench.fit import Line
+from tests.typed import as_a
 
 
 def record(
@@ -174,7 +176,7 @@ def test_a_figure_is_saved_twice_and_the_same_again(tmp_path):
 def extents(axes: Axes) -> list[tuple[str, float, float, float]]:
     """Text, left, right and middle of the names beside points, in pixels, by the widths that placed them."""
     found = []
-    for text in axes.texts:
+    for text in (as_a(Annotation, one) for one in axes.texts):
         x, y = axes.transData.transform(text.xy).tolist()
         right, up = (part * axes.figure.dpi / 72 for part in text.get_position())
         width = 4.9 * len(text.get_text()) * axes.figure.dpi / 72

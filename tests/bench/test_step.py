@@ -8,6 +8,8 @@ import pytest
 import torch
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.text import Annotation
 
 from sparsestreet.bench import step, step_figure
 from sparsestreet.bench.floors import Floor, StepWork, floors
@@ -18,6 +20,7 @@ from sparsestreet.bench.timing import TimeSpread
 from sparsestreet.phases import PhaseRecorder, WallClock, phase
 from tests.bench.test_records import PROVENANCE
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
+from tests.typed import as_a
 
 WINDOW = StepWindow(first=2, timed=3, counted=2)
 WORK = StepWork(rows=10, visible=4, terms=4, samples=100, parameters=50, size=(2, 3), sky_pixels=5)
@@ -161,7 +164,8 @@ def test_the_picture_of_a_step(monkeypatch, tmp_path):
     ((figure, folder, name),) = drawn
     assert (folder, name) == (tmp_path, "step")
     (axes,) = figure.axes
-    bars = [(bar.get_y() + bar.get_height() / 2, bar.get_width(), to_hex(bar.get_facecolor())) for bar in axes.patches]
+    drawn_bars = [as_a(Rectangle, bar) for bar in axes.patches]
+    bars = [(bar.get_y() + bar.get_height() / 2, bar.get_width(), to_hex(bar.get_facecolor())) for bar in drawn_bars]
     op, rest, floor = "#0072b2", "#e69f00", "#333333"
     expected = [(0, 10.0, op), (0, 2.5, floor), (1, 20.0, rest), (2, 6.0, op), (2, 3.0, floor)]
     assert [(pytest.approx(place), width, color) for place, width, color in expected] == bars
@@ -171,7 +175,7 @@ def test_the_picture_of_a_step(monkeypatch, tmp_path):
         " 20.0 ms, 60 operations",
         " 6.0 ms, 4 operations, 2.0 x its floor",
     ]
-    assert [text.xy for text in axes.texts] == [(10.0, 0), (20.0, 1), (6.0, 2)]
+    assert [as_a(Annotation, text).xy for text in axes.texts] == [(10.0, 0), (20.0, 1), (6.0, 2)]
     assert axes.get_xlim()[1] == pytest.approx(31.0)
     assert axes.get_ylim()[0] > axes.get_ylim()[1]
     assert axes.get_title() == "train x: 40.0 ms a step, 2.50 x its op, 70 operations"

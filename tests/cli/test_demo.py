@@ -63,7 +63,7 @@ def test_the_first_failure_ends_it(asked, monkeypatch):
     assert asked == []
 
 
-def test_help(capsys):
+def test_help(asked, capsys):
     assert demo(["--help"]) == 0
     assert "sparsestreet demo [out=DIR] [key=value ...]" in capsys.readouterr().out
 

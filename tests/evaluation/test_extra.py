@@ -1,5 +1,7 @@
 """Over which views a run is measured beyond its quality."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -111,10 +113,11 @@ def test_what_is_said_of_presets():
 
 
 def test_metrics_that_cannot_be_are_refused():
-    for asked, said in (
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"novel": (1.0, 0.0)}, r"above 0, got \[1.0, 0.0\]"),
         ({"ramp": True}, "say novel=1,2,3 too"),
         ({"presets": ("fast", "quick")}, "no settings preset 'quick'"),
-    ):
+    )
+    for asked, said in cases:
         with pytest.raises(ValueError, match=said):
             ExtraMetrics(**asked)

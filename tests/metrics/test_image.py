@@ -83,13 +83,15 @@ def test_every_id_has_a_definition_that_names_its_region():
 
 def test_a_definition_says_over_what_it_is_averaged():
     """Windows leave the full image at its border; in a region they do not, and its pixels are averaged."""
-    whole = {
+    whole: dict[str, str] = {
         "ssim_uniform7": "less its 3 pixel border",
         "ssim_gauss11": "less its 5 pixel border",
         "lpips_alex": "each layer averaged over the image",
         "lpips_vgg": "each layer averaged over the image",
     }
-    of_map = dict.fromkeys(("ssim_uniform7", "ssim_gauss11"), "the map of the full image, borders by reflection")
+    of_map: dict[str, str] = dict.fromkeys(
+        ("ssim_uniform7", "ssim_gauss11"), "the map of the full image, borders by reflection"
+    )
     of_map |= dict.fromkeys(("lpips_alex", "lpips_vgg"), "each layer's map of the full image")
     for region in REGIONS:
         for quantity in quantities_of(region):

@@ -1,11 +1,14 @@
 """Every file of a run holds what was written, value by value, under its own name and header."""
 
 from dataclasses import astuple
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
+from sparsestreet.records.file import JsonFile
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.latency import LATENCY, ClockRow, Latency, Percentiles, clock_rows
 from sparsestreet.records.ledger import LEDGER, CountChange
@@ -91,6 +94,12 @@ def test_clocks_are_of_all_gaussians_or_of_masked_and_removed_ones():
 SHIFT = NovelShift(offset=-1.5, views=6, distances={"fid": 42.5}, truth={"psnr_human": 20.5}, true_views=5)
 
 
+def check_written(run: Path, file: JsonFile[Any], name: str, record: Any) -> None:
+    file.write(run, record)
+    assert (run / name).is_file()
+    assert file.read(run) == record
+
+
 def test_records_beside_the_summary_are_read_as_they_were_written(tmp_path):
     novel = NovelRecord(command="n", ramp=True, real_views=7, absent="no weights", shifts=(SHIFT,))
     way = RenderedAs(
@@ -98,14 +107,9 @@ def test_records_beside_the_summary_are_read_as_they_were_written(tmp_path):
     )
     presets = PresetRecord(command="p", device="d", threads=3, views=4, noise=NOISE, rendered=(way,))
     failed = FailedRun(label="a+b", seed=4, command="c", error="e", trace="t")
-    for file, name, record in (
-        (NOVEL, "records/novel.json", novel),
-        (PRESETS, "records/presets.json", presets),
-        (FAILURE, "failed.json", failed),
-    ):
-        file.write(tmp_path / "run", record)
-        assert (tmp_path / "run" / name).is_file()
-        assert file.read(tmp_path / "run") == record
+    check_written(tmp_path / "run", NOVEL, "records/novel.json", novel)
+    check_written(tmp_path / "run", PRESETS, "records/presets.json", presets)
+    check_written(tmp_path / "run", FAILURE, "failed.json", failed)
     assert read_failures(tmp_path) == [(tmp_path / "run", failed)]
 
 

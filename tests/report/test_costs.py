@@ -1,6 +1,7 @@
 """What each arm costs, in absolute numbers."""
 
 from dataclasses import replace
+from typing import Any
 
 from sparsestreet.records.costs import update_costs
 from sparsestreet.report import RunRecord, collect
@@ -33,7 +34,7 @@ def test_every_column_has_a_number_of_its_own(tmp_path):
     for seed in (0, 1):
         folder = tmp_path / f"run{seed}"
         gaussians = {"background": 1000, "rigid": 500 + 1000 * seed}
-        numbers = {"milliseconds": 7.0 + seed, "training_seconds": 50.0 + 4 * seed}
+        numbers: dict[str, Any] = {"milliseconds": 7.0 + seed, "training_seconds": 50.0 + 4 * seed}
         runs.append(RunRecord(folder, make_summary("m", seed, gaussians=gaussians, **numbers)))
         parts = {"scene": 1.0, "splat": 2.0, "lens": 4.0, "losses": 8.0, "regularizers": 16.0, "loop": 500.0}
         parts |= {"backward": 32.0, "optimizer": 64.0, "density": 250.0, "sky": 125.0}  # no effect of this scene

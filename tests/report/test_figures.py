@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import matplotlib.axes
 import numpy as np
@@ -179,7 +180,7 @@ def two_methods():
     }  # fmt: skip
     found = []
     for label, (psnr, rows, ms, seconds) in runs.items():
-        numbers = {"vehicle_psnr": psnr - 7, "milliseconds": ms, "training_seconds": seconds}
+        numbers: dict[str, Any] = {"vehicle_psnr": psnr - 7, "milliseconds": ms, "training_seconds": seconds}
         found.append(record(make_summary(label, 0, psnr, {"x": rows}, **numbers), label))
     return arms(found)
 
@@ -335,9 +336,10 @@ def test_figures_are_named_and_what_is_absent_is_said(tmp_path):
 
 
 def test_panels_are_as_large_as_they_are_asked_to_be(canvas, tmp_path):
-    sizes = [panels(*given)[0].get_size_inches().tolist() for given in ((1,), (3,), (2, 4.6, 4.0))]
+    drawn = panels(1), panels(3), panels(2, 4.6, 4.0)
+    sizes = [figure.get_size_inches().tolist() for figure, _ in drawn]
     assert sizes == [pytest.approx(size) for size in ((3.2, 3.4), (9.6, 3.4), (9.2, 4.0))]
-    assert [len(panels(count)[1]) for count in (1, 3)] == [1, 3]
+    assert [len(axes) for _, axes in drawn] == [1, 3, 2]
     for name in ("a", "b"):
         update_costs(tmp_path / name, nodes={"road": NodeCost(10, 0.1, 4.0, 3.0)})
     frame_waterfall(arms([record(make_summary(name), str(tmp_path / name)) for name in "ab"]), tmp_path / "w.svg")

@@ -196,7 +196,7 @@ class Finished(Trainer):
 
     is_global_zero: bool = True
     fast_dev_run: bool = False
-    strategy = SimpleNamespace(root_device=torch.device("cpu", 0))
+    strategy: Any = SimpleNamespace(root_device=torch.device("cpu", 0))
 
     def __init__(self) -> None: ...
 
