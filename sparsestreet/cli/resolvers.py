@@ -8,6 +8,9 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from sparsestreet.records.summary import SUMMARY
 
+PER_IMAGE = 56.0
+"""Steps for each training image of a recorded drive (docs/length.md)."""
+
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     """Of conf/node: the entry of the capacity that is chosen."""
@@ -36,9 +39,11 @@ def mul(factor: float, rate: float) -> float:
     return float(factor) * float(rate)
 
 
-def steps_of_log(least: int, per_image: float | int, *, _root_: DictConfig) -> int:
-    """Of conf/schedule: steps of a run, in whole hundreds; before the log is read, the least."""
+def steps_of_log(least: int, *, _root_: DictConfig) -> int:
+    """Of conf/schedule: steps of a run, in whole hundreds, ``data.steps_per_image`` for each training image (without
+    such a key ``PER_IMAGE``); before the log is read, the least."""
     images = _root_.training_views.images
+    per_image = float(_root_.data.get("steps_per_image", PER_IMAGE))
     return least if images is None else max(least, 100 * round(per_image * images / 100))
 
 

@@ -107,7 +107,7 @@ def finished(cfg: DictConfig, out: Path) -> float | None:
     except RecordError:
         return None
     seen = summary.run.config.get("training_views.images")
-    config = flat_config(resolved(with_images(cfg, seen) if seen else cfg))
+    config = flat_config(resolved(with_images(cfg, seen) if isinstance(seen, int) else cfg))
     if not same_run(summary.run.config, config) or summary.run.steps < summary.run.max_steps:
         return None
     return summary.mean("psnr_full")

@@ -113,12 +113,13 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
     for name in ("keep_freed_memory", "forget_peaks", "silence_known_noise"):
         monkeypatch.setattr(run_module, name, lambda name=name: order.append(name))
     monkeypatch.setattr(run_module, "train", lambda *args, **how: called.append((args, how)) or summary)
+    monkeypatch.setattr(run_module, "take_folder", lambda cfg, out: order.append(f"take {out.name}"))
     task = OmegaConf.create({"overrides": {"task": ["seed=7", "out=a b"]}})
     monkeypatch.setattr(HydraConfig, "get", lambda: task)
     started = time.perf_counter() - 3
     assert run(composed(*words), tmp_path, started) == (21.5 if summary else 0.0)
     (((recipe, data, out), how),) = called
-    assert order == ["keep_freed_memory", "forget_peaks", "silence_known_noise"]
+    assert order == ["keep_freed_memory", "forget_peaks", "silence_known_noise", f"take {tmp_path.name}"]
     assert (recipe.seed, data.driving_log, out) == (7, log, tmp_path)
     assert how["max_steps"] == 90
     assert how["make_trainer"].keywords["log_every_n_steps"] == 4
@@ -182,7 +183,5 @@ def test_an_evaluation_hands_on_what_it_is_told(log, monkeypatch, tmp_path, caps
     assert opened == [tmp_path, (tmp_path, "cpu")]
     assert numbers == [min(threads, 6)]
     assert capsys.readouterr().out.splitlines() == [
-        "held-out views: 21.50 dB",
-        "training views: 31.25 dB",
-        f"1,234 Gaussians, 7.2 ms/frame; records in {tmp_path / 'records' / 'summary.json'}",
+        "held-out views: PSNR 21.50 dB, vehicles 22.00 dB, SSIM 0.800",
     ]

@@ -10,8 +10,10 @@ from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, resolved
 from sparsestreet.cli.preset import preset_notes
 from sparsestreet.records.configuration import flat_config
+from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.schedule import Course, Interval
 from tests.cli.configurations import composed
+from tests.typed import as_a
 
 FULL = ("schedule=paper", "capacity=paper")
 METHODS = {
@@ -326,7 +328,8 @@ def test_a_short_run_has_the_same_shape():
 
 
 def test_resets_come_at_the_steps_of_upstream():
-    interval = recipe_of(composed("preset=drivestudio", "method=streetgs", *FULL)).callbacks["density_control"].reset_in
+    callbacks = recipe_of(composed("preset=drivestudio", "method=streetgs", *FULL)).callbacks
+    interval = as_a(DensityControl, callbacks["density_control"]).reset_in
     assert isinstance(interval, Interval)
     resets = [step for step in range(30_001) if interval.due(step, Course(30_000))]
     assert resets == [3_100, 6_100, 9_100, 12_100, 15_100, 18_100, 21_100, 24_100, 27_100]

@@ -50,9 +50,11 @@ def test_a_parked_car_trembles_a_mover_gets_somewhere():
     generator = torch.Generator().manual_seed(0)
     noise = 0.01 * torch.randn(2, 150, 3, generator=generator).double()
     x = torch.linspace(0, 2.0, 150)
-    parked = track("parked", range(150), [pose(0.0, tuple(error.tolist())) for error in noise[0]])
+    parked = track("parked", list(range(150)), [pose(0.0, tuple(error.tolist())) for error in noise[0]])
     slow = track(
-        "slow", range(150), [pose(0.0, (float(at), *error.tolist()[1:])) for at, error in zip(x, noise[1], strict=True)]
+        "slow",
+        list(range(150)),
+        [pose(0.0, (float(at), *error.tolist()[1:])) for at, error in zip(x, noise[1], strict=True)],
     )
     assert parked.path_length > 3.0
     by_path, by_displacement = rigid_settings(), rigid_settings(min_displacement=1.0, min_path_length=0.0)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -160,7 +161,7 @@ def test_its_terms_are_the_mean_opacity_and_the_mean_scale():
 
 
 @pytest.mark.parametrize("wrong", [{"growth": -0.1}, {"unit": 0.0}, {"noise_rate": -1.0}, {"scale_weight": -1.0}])
-def test_options_out_of_range_are_refused(wrong: dict[str, float]):
+def test_options_out_of_range_are_refused(wrong: dict[str, Any]):
     with pytest.raises(ValueError, match="must be >= 0 and unit > 0"):
         McmcDensity(**wrong)
 
@@ -168,7 +169,7 @@ def test_options_out_of_range_are_refused(wrong: dict[str, float]):
 def test_a_node_adds_the_terms_of_its_strategy_to_the_loss():
     node = background(random_rows(5, 0), density=McmcDensity())
     drawn = torch.ones(5, dtype=torch.bool)
-    terms = node.regularizers(node.raw_at(view_at(0.0), degree(1)), drawn, degree(1))
+    terms = node.regularizers(view_at(0.0), node.raw_at(view_at(0.0), degree(1)), drawn, degree(1))
     assert terms.keys() == {"mcmc_opacity", "mcmc_scale"}
-    sum(terms.values()).backward()
+    torch.stack(tuple(terms.values())).sum().backward()
     assert bool((node.rows.opacity_logits.grad > 0).all() and (node.rows.log_scales.grad > 0).all())
