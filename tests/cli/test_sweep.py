@@ -41,7 +41,7 @@ def jobs(name: str) -> list[list[str]]:
     first, *others = (
         [f"{one.key_or_group}={value}" for value in one.sweep_string_iterator()]
         if one.is_sweep_override()
-        else [one.input_line]
+        else [there(one.input_line)]
         for one in asked
     )
     return [[value, *(values[-1] for values in others), f"+sweep={name}"] for value in first]
