@@ -73,9 +73,27 @@ def control(node: str, **differs: Any) -> dict:
     return {f"node.{node}.density.{key}": value for key, value in (found | differs).items()}
 
 
+def start(lidar: int, near: int, far: int) -> dict:
+    """model.Background.init: from_lidar.num_samples, near_randoms, far_randoms."""
+    found = {
+        "images.number": 0,
+        "lidar.number": lidar,
+        "lidar.box_enlargement": None,
+        "lidar.voxel": None,
+        "lidar.initial_opacity": 0.1,
+    }
+    for name, number in (("near", near), ("far", far)):
+        guesses = {"number": number, "blind": True, "largest_scale": None, "initial_opacity": 0.1}
+        found |= {f"{name}.{key}": value for key, value in guesses.items()}
+    return {f"node.background.sources.{key}": value for key, value in found.items()}
+
+
 ALL = {
     "seed": 0,
     "image_points": None,
+    "data.log.undistort": True,
+    "data.log.lidar_ahead": [-2, 80],  # truncated_min_range, truncated_max_range
+    "data.log.extent": "first_pose",
     "optimizer.eps": 1e-15,
     "split.with_replacement": True,
     "render.settings.near_plane": 0.1,
@@ -108,6 +126,8 @@ ALL = {
     "loss.depth.nearest": 0.01,
     "loss.depth.nearest_rendered": 1e-4,
     "loss.depth.farthest": 80.0,
+    "effects.sky.when": "on",
+    "effects.shutter.when": "off",
     "effects.sky.resolution": 1024,
     "effects.sky.learning_rates.texels.initial": 0.01,
     **needles("background"),
@@ -118,8 +138,18 @@ ALL = {
     "node.background.sh_degree": 3,
     "node.background.max_gaussians": None,
 }
-CURRENT = {"loss.depth.weight": 0.01, "loss.depth.inverse": False}
+CURRENT = {
+    "loss.depth.weight": 0.01,
+    "loss.depth.inverse": False,
+    "effects.affine.when": "on",
+    "effects.affine.weight": 1e-5,
+    "effects.affine.decay": 1e-6,
+    "effects.affine.learning_rates.deltas.initial": 1e-5,
+    **start(800_000, 100_000, 100_000),
+}
 LEGACY = {
+    "effects.affine.when": "off",
+    **start(600_000, 200_000, 200_000),
     "loss.depth.weight": 0.1,
     "loss.depth.inverse": True,
     "loss.opacity_entropy.weight": 0.05,
@@ -130,6 +160,9 @@ LEGACY = {
 }
 OBJECTS = {"screen_size_until": at(30_000), "cull_scale": 0.1}
 RIGID = {
+    "node.background.clear_swept_boxes": True,
+    "node.rigid.min_path_length": 1.0,
+    "node.rigid.box_points": 0,
     **needles("rigid"),
     **general("rigid"),
     **rates("rigid", "means", 1.6e-4, 1.6e-6, by_radius=True),
@@ -153,6 +186,8 @@ PEOPLE = {
     **rates("smpl", "translation_deltas", 5e-4, 1e-4),
     **rates("smpl", "joint_deltas", 2 * 5e-5, 2 * 1e-5),
     "node.smpl.density": None,
+    "node.smpl.min_path_length": 0.5,
+    "node.smpl.random_colors": True,
     "node.smpl.temporal_smooth": 0.01,
     "node.smpl.temporal_smooth_of": "frame",
     "node.smpl.neighbors": 3,
@@ -170,6 +205,8 @@ DEFORMABLE = {
     **rates("deformable", "embeddings", 1e-3, 1e-4),
     **rates("deformable", "network", 5 * 1.6e-3, 5 * 1.6e-4),
     **control("deformable", **OBJECTS, reset_opacity_to=0.1),
+    "node.deformable.min_path_length": 0.5,
+    "node.deformable.box_points": 0,
     "node.deformable.refine_boxes": False,
     "node.deformable.densify_until": at(19_999),
     "node.deformable.deform_from": at(3_001),  # use_deformgs_after 3000, exclusive
@@ -199,12 +236,15 @@ FIELD = {
     "node.background.network.time_octaves": 10,
     "node.background.network.scales": True,
 }
+SINGLE = {"node.background.clear_swept_boxes": False}
 VIBRATING = {
+    "effects.affine.weight": 0.0,  # trainer.losses has no affine
+    "node.background.random_life_peaks": False,
     **rates("background", "opacity_logits", 5e-3),
     **rates("background", "velocities", 1e-3, by_radius=True),
     **rates("background", "log_life_spans", 2e-3),
     **rates("background", "life_peaks", 8e-4, 8e-6),
-    **control("background", split_scale=0.01, peak_threshold=0.002, cycle=0.2, grad_threshold=2e-4),
+    **control("background", split_scale=0.01, peak_threshold=0.002, cycle=0.2, grad_threshold=2e-4, split_span=0.01),
     "render.settings.plain_gradients": True,
     "schedule.densify_until": at(19_999),
     "schedule.sh_interval": at(2_000),
@@ -232,7 +272,7 @@ def threshold(value: float, *nodes: str) -> dict:
 
 
 UPSTREAM = {
-    ("drivestudio", "3dgs"): ALL | CURRENT | threshold(5e-4, "background"),
+    ("drivestudio", "3dgs"): ALL | CURRENT | SINGLE | threshold(5e-4, "background"),
     ("drivestudio", "streetgs"): ALL | CURRENT | RIGID | threshold(5e-4, "background", "rigid"),
     ("drivestudio", "omnire"): ALL
     | CURRENT
@@ -241,8 +281,8 @@ UPSTREAM = {
     | DEFORMABLE
     | {"node.smpl.volume_weight": 0.0}
     | threshold(5e-4, "background", "rigid", "deformable"),
-    ("drivestudio", "deformgs"): ALL | CURRENT | FIELD,
-    ("drivestudio", "pvg"): ALL | CURRENT | VIBRATING,
+    ("drivestudio", "deformgs"): ALL | CURRENT | SINGLE | FIELD,
+    ("drivestudio", "pvg"): ALL | CURRENT | SINGLE | VIBRATING,
     ("drivestudio_legacy", "streetgs"): ALL | LEGACY | RIGID | threshold(3e-4, "background", "rigid"),
     ("drivestudio_legacy", "omnire"): ALL
     | LEGACY
@@ -346,3 +386,24 @@ def test_what_is_lacking_is_said_in_plain_words():
     assert list(preset_notes(composed())) == []
     # The configuration of a run has it.
     assert any(key.startswith("preset.absent.") for key in flat("drivestudio", "pvg"))
+
+
+@pytest.mark.lengthy
+@pytest.mark.parametrize(("preset", "method"), [("drivestudio_legacy", "omnire"), ("drivestudio", "pvg")])
+def test_a_preset_trains_and_says_what_it_is(preset: str, method: str, run_train, tmp_path, capsys):
+    """Every part of it: smaller images first, density control, all terms."""
+    few = [f"node.background.sources.{name}.number={number}" for name, number in (("lidar", 600), ("near", 100))]
+    run_train(
+        tmp_path,
+        f"preset={preset}",
+        f"method={method}",
+        "image_points=none",  # as the preset has it; said for the street of the tests
+        "trainer.fast_dev_run=12",
+        "schedule.refine_in.every=5",
+        "schedule.pause_after_reset=0",
+        *few,
+        "node.background.sources.far.number=100",
+    )
+    said = capsys.readouterr().out
+    assert said.count(f"preset {preset} is scaled: ") == 1
+    assert said.count(f"preset {preset} lacks of DriveStudio: ") == 1

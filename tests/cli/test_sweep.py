@@ -67,6 +67,7 @@ def test_every_job_of_a_sweep_can_be(name, counted):
         assert problem_of(cfg) is None, cfg.name
 
 
+@pytest.mark.lengthy
 def test_the_rows_of_table_1_are_the_papers():
     """Its three sweeps write into one folder."""
     labels = []
