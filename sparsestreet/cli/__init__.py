@@ -1,6 +1,7 @@
 """The command line; the only place that sees a config."""
 
 import importlib
+import os
 import sys
 
 from sparsestreet.cli.process import prepare_process
@@ -15,10 +16,10 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet train -m sparsify=none,paper_short,removal seed=0,1,2                a sweep
   sparsestreet train +sweep=streets                   a sweep of conf/sweep; sparsestreet report sweep=DIR shows it
   sparsestreet train resume=RUN                       go on after an interruption
-  sparsestreet evaluate run=RUN                       measure a trained run again, without training
+  sparsestreet evaluate RUN                           measure a trained run again, without training
   sparsestreet report DIR [DIR ...]                   tables from the records of runs
-  sparsestreet render scene=RUN out=drive.mp4         a video of a trained street, along its log or beside it
-  sparsestreet export scene=RUN out=street.ply        its Gaussians for viewers, at a time, or one object of it
+  sparsestreet render RUN drive.mp4                   a video of a trained street, along its log or beside it
+  sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
   sparsestreet data check DIR                         everything that is wrong with a log, at once
   sparsestreet data make seed=1                       write a synthetic street to disk
   sparsestreet bench                                  what the splat op costs in time, memory and accuracy
@@ -29,18 +30,29 @@ Every command takes --help. Options of train are Hydra overrides; `sparsestreet 
 COMMANDS = ("demo", "train", "evaluate", "report", "render", "export", "data", "bench")
 
 
+READER_GONE = 128 + 13
+"""Status of a program that SIGPIPE ended, as a shell counts."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Hand the arguments to the command; exit with its status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
-    if command in ("-h", "--help", "help"):
-        print(USAGE)
-        sys.exit(0)
-    prepare_process()
-    sys.exit(_run(command, rest))
+    try:
+        status = _run(command, rest)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output has enough (``| head -1``); Python would flush it once more at its end, and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = READER_GONE
+    sys.exit(status)
 
 
 def _run(command: str, rest: list[str]) -> int:
+    if command in ("-h", "--help", "help"):
+        print(USAGE)
+        return 0
+    prepare_process()
     if command in COMMANDS:
         # Each command is the function of its name in the module of its name, and imported only when it is called:
         # lightning alone takes seconds to import, and a report needs none of it.

@@ -19,7 +19,7 @@ from sparsestreet.report.result import result_lines
 from sparsestreet.training.run import evaluate as evaluate_run
 
 USAGE = """\
-sparsestreet evaluate run=RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true] [presets=fast,default,exact]
+sparsestreet evaluate RUN [device=cpu|cuda] [novel=1,2,3] [ramp=true] [presets=fast,default,exact]
 
 RUN is a folder that train wrote, also of a run that was interrupted. Its scene is measured against the views of its
 log, on the kind of device that it was trained on unless another is named, with as many threads as trained it; records
@@ -57,7 +57,7 @@ class Options:
 
 def evaluate(arguments: list[str]) -> int:
     """Open the run's scene and its log, write records and pictures; statuses as in ``run_command``."""
-    return run_command("evaluate", USAGE, arguments, Options, _evaluate)
+    return run_command("evaluate", USAGE, arguments, Options, _evaluate, positional=("run",))
 
 
 def _evaluate(options: Options) -> None:

@@ -6,15 +6,15 @@ from pathlib import Path
 from sparsestreet.cli.options import run_command
 
 USAGE = """\
-sparsestreet export scene=RUN out=FILE.ply [key=value ...]     Gaussians of a trained street, as viewers read them
+sparsestreet export RUN FILE.ply [key=value ...]     Gaussians of a trained street, as viewers read them
 
-  sparsestreet export scene=outputs/RUN out=street.ply                     the whole street, at the start of its log
-  sparsestreet export scene=outputs/RUN out=street.ply time=0.5            half way through the log
-  sparsestreet export scene=outputs/RUN out=empty.ply nodes=background     without what moves
-  sparsestreet export scene=outputs/RUN out=car.ply time=0.5 instance=12   one object, where it is at that time
+  sparsestreet export outputs/RUN street.ply                     the whole street, at the start of its log
+  sparsestreet export outputs/RUN street.ply time=0.5            half way through the log
+  sparsestreet export outputs/RUN empty.ply nodes=background     without what moves
+  sparsestreet export outputs/RUN car.ply time=0.5 instance=12   one object, where it is at that time
 
-  scene      a run's folder, or a scene.safetensors
-  out        a .ply in the layout of 3DGS (binary; opens in SuperSplat and others)
+  scene      a run's folder, or a scene.safetensors; the first word without a key
+  out        (the second) a .ply in the layout of 3DGS (binary; opens in SuperSplat and others)
   time       0 to 1: first to last frame of the log (default: 0)
   nodes      [background,rigid]: only these nodes of the scene
   instance   only this object, by the name of its track; a name that does not exist lists those that do
@@ -40,7 +40,7 @@ class ExportRequest:
 
 def export(arguments: list[str]) -> int:
     """Write the file; 2 on wrong usage, 1 if something is missing."""
-    return run_command("export", USAGE, arguments, ExportRequest, _export)
+    return run_command("export", USAGE, arguments, ExportRequest, _export, positional=("scene", "out"))
 
 
 def _export(request: ExportRequest) -> None:

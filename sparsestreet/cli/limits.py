@@ -8,6 +8,7 @@ WHOLE_NUMBERS: dict[str, tuple[int, int | None]] = {
     # What numpy's and Lightning's generators take.
     "seed": (0, 2**32 - 1),
     "schedule.max_steps": (1, None),
+    "checkpoint_every": (1, None),
     "split.stride": (0, None),
     "split.offset": (0, None),
 }

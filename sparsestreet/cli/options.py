@@ -28,7 +28,7 @@ def run_command(
     words: Sequence[str],
     kind: type[Options],
     action: Callable[[Options], None],
-    positional: str | None = None,
+    positional: str | Sequence[str] = (),
 ) -> int:
     """Parse the words of ``sparsestreet NAME`` and act on them.
 
@@ -45,6 +45,8 @@ def run_command(
         print(f"sparsestreet {name}: {error}", file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:
+        if isinstance(error, BrokenPipeError):
+            sys.stdout.flush()  # breaks again where it is our output that nobody reads any more: ``main`` ends quietly
         print(f"sparsestreet {name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -53,26 +55,28 @@ def run_command(
     return 0
 
 
-def parse_options(words: Sequence[str], kind: type[Options], positional: str | None = None) -> Options:
+def parse_options(words: Sequence[str], kind: type[Options], positional: str | Sequence[str] = ()) -> Options:
     """The dataclass that the words describe; a field without default must be given.
 
     Args:
         words: ``key=value``, each key once.
         kind: a dataclass; its fields are str, int, float, bool, Path, slice (``0:40``), a Literal, ``tuple[X, ...]``
             (``[a,b]`` or ``a,b``) or one of them or None.
-        positional: a field, tuple[X, ...], that takes the words without a key; None: there are no such words.
+        positional: the field, tuple[X, ...], that takes all words without a key; or the fields that take one each, in
+            this order, if they are not given by their keys.
 
     Raises OptionError.
     """
     hints = typing.get_type_hints(kind)
     declared = fields(cast(Any, kind))  # no annotation says that it is a dataclass
     names = [field.name for field in declared if field.name != positional]
+    paths = bool(positional)
     given: dict[str, Any] = {}
     loose = []
     for word in words:
         key, equals, text = word.partition("=")
         # A folder may have an equals sign in its name: those of sweeps do.
-        if not equals or not key.isidentifier() or (positional is not None and Path(word).exists()):
+        if not equals or not key.isidentifier() or (paths and Path(word).exists()):
             loose.append(word)
         elif key not in names:
             raise OptionError(unknown_key(key, names))
@@ -80,10 +84,14 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | N
             raise OptionError(f"{key} is given twice: choose one")
         else:
             given[key] = _value(key, text, hints[key])
-    if loose and positional is None:
-        raise OptionError(f"{loose[0]!r} is no option: write key=value, with one of {', '.join(names)}")
-    if positional is not None:
+    if isinstance(positional, str):
         given[positional] = tuple(_value(positional, word, typing.get_args(hints[positional])[0]) for word in loose)
+    else:
+        places = [name for name in positional if name not in given]
+        unfit = [word for word in loose if word.startswith("-")] or loose[len(places) :]
+        if unfit:
+            raise OptionError(f"{unfit[0]!r} is no option: write key=value, with one of {', '.join(names)}")
+        given |= {name: _value(name, word, hints[name]) for name, word in zip(places, loose, strict=False)}
     for field in declared:
         if field.default is MISSING and field.name not in given:
             raise OptionError(f"{field.name}=... is missing")

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from sparsestreet.types import View
 
 USAGE = """\
-sparsestreet render scene=RUN out=FILE [key=value ...]     a video of a trained street; the log is not needed
+sparsestreet render RUN FILE [key=value ...]     a video of a trained street; the log is not needed
 
-  sparsestreet render scene=outputs/RUN out=drive.mp4                     what the log's cameras saw, side by side
-  sparsestreet render scene=outputs/RUN out=drive.mp4 cameras=0 fps=30    the front camera, smooth
-  sparsestreet render scene=outputs/RUN out=right.mp4 path=shifted offset=1.5       from 1.5 m farther to the right
-  sparsestreet render scene=outputs/RUN out=still frames=40:60 width=640            single PNGs in the folder still/
+  sparsestreet render outputs/RUN drive.mp4                     what the log's cameras saw, side by side
+  sparsestreet render outputs/RUN drive.mp4 cameras=0 fps=30    the front camera, smooth
+  sparsestreet render outputs/RUN right.mp4 path=shifted offset=1.5       from 1.5 m farther to the right
+  sparsestreet render outputs/RUN still frames=40:60 width=640            single PNGs in the folder still/
 
-  scene     a run's folder, or a scene.safetensors
-  out       a .mp4, or a folder for PNGs (a name without an ending)
+  scene     a run's folder, or a scene.safetensors; the first word without a key
+  out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
   path      recorded (as the log was driven) or shifted (beside it)
   offset    meters to the right that path=shifted moves the car; negative: to the left
   cameras   [1,0,2]: these of the log, shown in this order (default: all, the leftmost first)
@@ -68,7 +68,7 @@ class RenderRequest:
 
 def render(arguments: list[str]) -> int:
     """Write the video; 2 on wrong usage, 1 if something is missing."""
-    return run_command("render", USAGE, arguments, RenderRequest, _render)
+    return run_command("render", USAGE, arguments, RenderRequest, _render, positional=("scene", "out"))
 
 
 def _render(request: RenderRequest) -> None:

@@ -34,6 +34,11 @@ def concat(*lists: Iterable[Any]) -> ListConfig:
     return ListConfig([entry for entries in lists for entry in entries])  # ``--resolve`` takes no list of Python's
 
 
+def beside(folder: str, name: str) -> str:
+    """Of conf/image_points: a folder next to another one, so that runs in one place share it."""
+    return str(Path(folder).parent / name)
+
+
 def mul(factor: float, rate: float) -> float:
     """Of conf/node: a rate of the schedule times a number."""
     return float(factor) * float(rate)
@@ -101,6 +106,7 @@ _RESOLVERS = {
     "as_published": as_published,
     "limit": limit,
     "concat": concat,
+    "beside": beside,
     "mul": mul,
     "steps_of_log": steps_of_log,
     "min": min,

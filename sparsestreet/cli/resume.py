@@ -22,6 +22,11 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
         raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
     run = run_of(Path(given))
     load_run_config(run)  # says what a run's folder is, where this is none
+    if not any((run / "checkpoints").glob("[!.]*.ckpt")):
+        raise FileNotFoundError(
+            f"resume={given}: it was ended before its first checkpoint (checkpoint_every=...): start it again, into "
+            f"the same folder with out={run} overwrite=true"
+        )
     overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
     kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out=", "overwrite="))]
     folder = [] if any(text.startswith("out=") for text in arguments) else [f"out={run}"]

@@ -57,6 +57,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         identity=identity,
         extra=extra,
         resume=Path(cfg.resume) if cfg.resume else None,
+        checkpoint_every=cfg.checkpoint_every,
         stages=stages,
     )
     return 0.0 if summary is None else summary.mean("psnr_full")

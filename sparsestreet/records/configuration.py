@@ -20,6 +20,7 @@ IDENTITY_KEYS = (
     "label",
     "resume",  # a resumed run is the same run
     "overwrite",
+    "checkpoint_every",
     "out",
     "folder",
     "count_of",  # the run whose counts a control copies; the counts are options of their own

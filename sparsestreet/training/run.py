@@ -69,6 +69,7 @@ def train(
     identity: RunIdentity | None = None,
     extra: ExtraMetrics | None = None,
     resume: Path | None = None,
+    checkpoint_every: int = 1000,
     stages: StageRecorder | None = None,
 ) -> RunSummary | None:
     """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
@@ -87,6 +88,7 @@ def train(
         identity: what the run is called in its records; None: as its folder.
         extra: what is measured beside the record of every run; None: nothing.
         resume: a run's folder, or one of its checkpoints, to go on from.
+        checkpoint_every: steps between two checkpoints, besides the one at the end.
         stages: counts the seconds of the command that trains; None: they begin here.
 
     Returns:
@@ -112,7 +114,7 @@ def train(
             HeldOutCurve(out, clock),
             TrainingProgress(),
             RunFiles(out, identity.describe(recipe, data, max_steps), clock),
-            Checkpoints(out / "checkpoints"),
+            Checkpoints(out / "checkpoints", checkpoint_every),
             stop,  # the last: a signal ends training when the others are done with the step
         ]
         logger = CSVLogger(out, name="", version="curves") if logger is None else logger

@@ -43,6 +43,7 @@ WORDS = (
     "split.val_frames=2",
     "schedule.max_steps=90",
     "schedule.sh_interval=0.17",
+    "checkpoint_every=30",
     "optimizer.eps=1e-9",
     "optimizer.visible_only=true",
     "render.backend=reference",
@@ -121,7 +122,7 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
     (((recipe, data, out), how),) = called
     assert order == ["keep_freed_memory", "forget_peaks", "silence_known_noise", f"take {tmp_path.name}"]
     assert (recipe.seed, data.driving_log, out) == (7, log, tmp_path)
-    assert how["max_steps"] == 90
+    assert (how["max_steps"], how["checkpoint_every"]) == (90, 30)
     assert how["make_trainer"].keywords["log_every_n_steps"] == 4
     assert Path(how["logger"].root_dir) == Path()
     assert (how["identity"].label, how["identity"].command) == ("mine", "sparsestreet train seed=7 'out=a b'")
@@ -184,4 +185,7 @@ def test_an_evaluation_hands_on_what_it_is_told(log, monkeypatch, tmp_path, caps
     assert numbers == [min(threads, 6)]
     assert capsys.readouterr().out.splitlines() == [
         "held-out views: PSNR 21.50 dB, vehicles 22.00 dB, SSIM 0.800",
+        "training views: PSNR 31.25 dB, vehicles 22.00 dB, SSIM 0.800",
+        "1,234 Gaussians, 0.29 MB, 100 s of training, 7.2 ms a frame",
+        f"pictures: {tmp_path}/pictures/sheet.png; curves: {tmp_path}/curves; numbers: {tmp_path}/records",
     ]

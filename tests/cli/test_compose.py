@@ -21,6 +21,14 @@ def test_the_same_overrides_are_composed_once():
     assert composed(["seed=1"]) is composed(("seed=1",)) is not composed(["seed=2"])
 
 
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [((), "outputs/points"), (("out=/there/run",), "/there/points"), (("image_points.cache=/mine",), "/mine")],
+)
+def test_points_of_images_lie_beside_the_folders_of_runs(words, place):
+    assert composed(words).image_points.cache == place
+
+
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "hydra"], ["--info", "defaults"], ["-m"]])
 def test_flags_of_hydra_and_their_words_pass(flags):
     assert override_problem([*flags, "seed=1"]) is None
@@ -90,6 +98,7 @@ def test_a_slip_is_one_line_that_says_what_was_meant(overrides, said):
         ("seed=-1", "seed must be a whole number, 0 to 4294967295, got -1"),
         ("seed=4294967296", "seed must be a whole number, 0 to 4294967295, got 4294967296"),
         ("seed=abc", "seed must be a whole number, 0 to 4294967295, got 'abc'"),
+        ("checkpoint_every=0", "checkpoint_every must be a whole number, 1 or more, got 0"),
         ("split.stride=-1", "split.stride must be a whole number, 0 or more, got -1"),
         ("trainer.max_steps=60", "of 2,000 steps says: give schedule.max_steps=60, or trainer.fast_dev_run=60 to try"),
         ("logger=nosuch", "pip install 'sparsestreet[nosuch]', or choose logger=csv"),

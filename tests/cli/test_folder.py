@@ -64,6 +64,13 @@ def test_a_run_goes_on_in_its_own_folder_and_in_no_other_runs(tmp_path):
     assert "overwrite=true" not in resumed_overrides([f"resume={tmp_path / 'asked'}"])  # it would lose its checkpoints
 
 
+def test_a_run_without_a_checkpoint_is_said_at_once(tmp_path, capsys):
+    out = a_run(tmp_path / "run", steps=None)
+    (out / "checkpoints/last.ckpt").rename(out / "checkpoints/.last.99.tmp.ckpt")  # killed while it wrote the first
+    assert train([f"resume={out}"]) == 2
+    assert f"start it again, into the same folder with out={out} overwrite=true" in capsys.readouterr().err
+
+
 def test_what_is_no_run_is_no_obstacle(tmp_path):
     (tmp_path / "notes.txt").touch()
     (tmp_path / ".hydra").mkdir()  # of a start that failed

@@ -87,6 +87,22 @@ def test_words_without_a_key_go_to_the_field_that_takes_them(tmp_path, monkeypat
         parse_options(["outputs", "baselin=plain"], Folders, positional="folders")
 
 
+@pytest.mark.parametrize(
+    "words", [["a=b/run", "two words"], ["title=two words", "a=b/run"], ["two words", "scene=a=b/run"]]
+)
+def test_a_few_fields_take_a_word_each(words, tmp_path, monkeypatch):
+    """In their order, those left out that have their key; a folder may have an equals sign in its name."""
+    monkeypatch.chdir(tmp_path)
+    Path("a=b/run").mkdir(parents=True)
+    assert parse_options(words, Wishes, positional=("scene", "title")) == Wishes(Path("a=b/run"), title="two words")
+
+
+@pytest.mark.parametrize("words", [["r", "t", "more"], ["r", "scene=q", "t"], ["r", "--width=5"]])
+def test_a_word_too_many_is_no_option(words):
+    with pytest.raises(OptionError, match="is no option: write key=value, with one of scene, width"):
+        parse_options(words, Wishes, positional=("scene", "title"))
+
+
 def test_very_many_keys_are_not_listed():
     assert unknown_key("zz", ["width", "height"]) == "no key 'zz'; there are width, height"
     assert unknown_key("zz", [f"key_{number}" for number in range(100)]) == "no key 'zz'"

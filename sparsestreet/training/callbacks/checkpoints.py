@@ -28,6 +28,11 @@ class Checkpoints(Callback):
         self.folder = Path(folder)
         self.every = every
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remove what a process left that was killed while it wrote one: its name has the number of that process."""
+        for half_written in self.folder.glob(".*.tmp.ckpt") if trainer.is_global_zero else ():
+            half_written.unlink(missing_ok=True)
+
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:

@@ -66,6 +66,14 @@ def test_an_exception_leaves_the_step_that_was_done_and_a_finished_run_takes_it_
     assert contents(folder) == {"last.ckpt": "5"}
 
 
+def test_a_half_written_one_of_a_killed_process_goes(tmp_path):
+    for name in (".last.99999.tmp.ckpt", "last.ckpt", "mine.tmp.ckpt"):
+        (tmp_path / name).write_text("half")
+    trainer = trainer_in(tmp_path)
+    trainer.callbacks[0].on_train_start(trainer, trainer.system)
+    assert contents(tmp_path) == {"last.ckpt": "half", "mine.tmp.ckpt": "half"}
+
+
 @pytest.mark.parametrize(("step", "exception"), [(3, TornStop()), (0, RuntimeError("no data"))])
 def test_half_a_step_and_no_step_leave_no_checkpoint(tmp_path, step, exception):
     trainer = trainer_in(tmp_path)
