@@ -42,12 +42,14 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     stages = StageRecorder(started)
     with stages, stage("data"):
         data = data_of(cfg)
+    with stages, stage("start"):
         known = with_views(cfg, data)
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
-    take_folder(cfg, out)
+        recipe = recipe_of(known)
+        take_folder(cfg, out)
     summary = train(
-        recipe_of(known),
+        recipe,
         data,
         out,
         max_steps=known.trainer.max_steps,
