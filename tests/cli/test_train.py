@@ -83,7 +83,7 @@ def test_training_improves_and_leaves_records(finished, brief):
 
 
 def test_training_ends_with_its_result(finished):
-    """What the record says, in lines that follow each other. Later runs of this process may have written behind them."""
+    """What the record says, in lines that follow each other; later runs of this process may have written behind."""
     summary = SUMMARY.read(finished)
     lines = (finished / "train.log").read_text().splitlines()
     first = next(index for index, line in enumerate(lines) if "held-out views: PSNR" in line)
