@@ -32,8 +32,9 @@ def test_rules_differ_in_their_rule_alone(moments: str):
 
 
 def test_every_rule_takes_from_all_nodes_and_leaves_the_same_number():
+    cfgs = {name: composed(f"experiment=rule/{name}", f"schedule.removal_at={MOMENTS[0]}") for name in RULES}
     rules: dict[str, Any] = {
-        name: as_a(Pruning, recipe_of(composed(f"experiment=rule/{name}")).callbacks["pruning"]).rule for name in RULES
+        name: as_a(Pruning, recipe_of(cfg).callbacks["pruning"]).rule for name, cfg in cfgs.items()
     }
     assert {(rule.nodes, rule.keep) for rule in rules.values()} == {(None, 0.5)}
     kinds = {"importance": ImportanceRule, "removal": LeaveOneOutRule}
