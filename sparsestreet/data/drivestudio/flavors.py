@@ -57,7 +57,7 @@ def flavor_of(root: Path, *, lidar: bool) -> Flavor:
     Raises LogError where the files leave more than one flavor, or none.
     """
     extrinsics = root / "extrinsics"
-    mounts = sorted(path for path in _texts(extrinsics) if re.fullmatch(r"\d+", path.stem))
+    mounts = _mounts(extrinsics)
     if any(re.fullmatch(r"\d+_\d+", path.stem) for path in _texts(extrinsics)):
         moving = [flavor for flavor in FLAVORS.values() if not flavor.mounted]
         found = [flavor for flavor in moving if (root / flavor.sweep_poses).is_dir()]
@@ -73,12 +73,40 @@ def flavor_of(root: Path, *, lidar: bool) -> Flavor:
     return _by_columns(root / "lidar") if lidar and (root / "lidar").is_dir() else FLAVORS["kitti"]
 
 
+def named_flavor(root: Path, name: FlavorName) -> Flavor:
+    """The flavor of a name. Raises LogError where all mounted cameras stand upright by the other axes than its own.
+
+    They would be turned on their sides, and without lidar no file would be of a wrong size.
+    """
+    flavor, extrinsics = FLAVORS[name], root / "extrinsics"
+    told = _axes(_mounts(extrinsics)) if flavor.mounted else set()
+    if told == {"waymo" if flavor.opencv else "opencv"}:
+        others = [other.name for other in FLAVORS.values() if other.mounted and other.opencv != flavor.opencv]
+        message = f"data.log.flavor={name}, but all cameras are upright by the axes of {', '.join(others)}"
+        raise fault(extrinsics, message, f"{NAME_IT}, or leave it out")
+    return flavor
+
+
+def _mounts(extrinsics: Path) -> list[Path]:
+    """The files of mounted cameras."""
+    return sorted(path for path in _texts(extrinsics) if re.fullmatch(r"\d+", path.stem))
+
+
 def _texts(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.suffix == ".txt"] if folder.is_dir() else []
 
 
 def _opencv_axes(extrinsics: Path, mounts: Sequence[Path]) -> bool:
-    """Whether y of the mounted cameras points down in the vehicle, whose z is up; False: their z points up.
+    """Whether y of the mounted cameras points down in the vehicle, whose z is up; False: their z points up."""
+    found = _axes(mounts)
+    if len(found) > 1 or "neither" in found:
+        message = "neither y (down, OpenCV) nor z (up, Waymo) of all cameras is upright in the vehicle"
+        raise fault(extrinsics, message, NAME_IT)
+    return found == {"opencv"}
+
+
+def _axes(mounts: Sequence[Path]) -> set[str]:
+    """Whose axes stand upright in the vehicle: "opencv", "waymo" or "neither", of each camera.
 
     Files that hold no pose are left to the check of the log, which names them.
     """
@@ -90,10 +118,7 @@ def _opencv_axes(extrinsics: Path, mounts: Sequence[Path]) -> bool:
             continue
         if pose.shape == (4, 4):
             found.add("opencv" if pose[2, 1] < -UPRIGHT else "waymo" if pose[2, 2] > UPRIGHT else "neither")
-    if len(found) > 1 or "neither" in found:
-        message = "neither y (down, OpenCV) nor z (up, Waymo) of all cameras is upright in the vehicle"
-        raise fault(extrinsics, message, NAME_IT)
-    return found == {"opencv"}
+    return found
 
 
 def _by_columns(sweeps: Path) -> Flavor:

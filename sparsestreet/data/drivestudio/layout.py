@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.data.drivestudio.flavors import FLAVORS, Flavor, FlavorName, flavor_of
+from sparsestreet.data.drivestudio.flavors import Flavor, FlavorName, flavor_of, named_flavor
 from sparsestreet.data.formats import published_format
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.window import chosen_cameras, frame_window
@@ -124,7 +124,7 @@ def find_layout(
     """
     if not (root / "images").is_dir():
         raise _no_log(root)
-    found = FLAVORS[flavor] if flavor else flavor_of(root, lidar=lidar)
+    found = named_flavor(root, flavor) if flavor else flavor_of(root, lidar=lidar)
     images = _numbers(root / "images", ".jpg", _FRAME_CAMERA)
     on_disk = sorted({camera for _, camera in images} | {n for (n,) in _numbers(root / "intrinsics", ".txt", _CAMERA)})
     if not images or not on_disk:

@@ -12,7 +12,7 @@ from torch import Tensor
 from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
 from sparsestreet.data.drivestudio.files import hashed_files
-from sparsestreet.data.drivestudio.flavors import Flavor, FlavorName
+from sparsestreet.data.drivestudio.flavors import FlavorName
 from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
@@ -152,12 +152,14 @@ def _notes(layout: Layout) -> tuple[str, ...]:
         boxes=layout.has_instances,
         clock=layout.has_clock,
     )
-    return (*_note_of_flavor(layout.flavor), *absent)
+    return (*_note_of_flavor(layout), *absent)
 
 
-def _note_of_flavor(flavor: Flavor) -> list[str]:
+def _note_of_flavor(layout: Layout) -> list[str]:
     """How a folder is read that is of neither data set which DriveStudio began with."""
+    flavor = layout.flavor
     if flavor.name in ("waymo", "nuscenes"):
         return []
     mounts = "mounted cameras" if flavor.mounted else "a pose for each image"
-    return [f"read as data.log.flavor={flavor.name}: {mounts}, OpenCV's axes, lidar rows of {flavor.columns} numbers"]
+    rows = f", lidar rows of {flavor.columns} numbers" if layout.has_lidar else ""
+    return [f"read as data.log.flavor={flavor.name}: {mounts}, OpenCV's axes{rows}"]

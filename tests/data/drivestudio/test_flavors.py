@@ -37,7 +37,8 @@ def test_mounted_cameras_with_opencv_axes_are_told_by_their_mounts(columns, lida
     log = DriveStudioReader(make_mounted_opencv(tmp_path / "a", columns=columns), lidar=lidar).read()
     assert_same_street(log, DriveStudioReader(make_waymo(tmp_path / "b"), lidar=lidar).read())
     name = "nuplan" if lidar and columns == 6 else "kitti"
-    assert log.notes[0].startswith(f"read as data.log.flavor={name}: mounted cameras, OpenCV's axes")
+    rows = f", lidar rows of {columns} numbers" if lidar else ""
+    assert log.notes[0] == f"read as data.log.flavor={name}: mounted cameras, OpenCV's axes{rows}"
 
 
 def test_poses_of_images_beside_poses_of_the_vehicle_are_pandasets(tmp_path):
@@ -62,6 +63,21 @@ def test_a_flavor_may_be_named(make, name, tmp_path):
     log = DriveStudioReader(make(tmp_path), flavor=name).read()
     assert_same_street(log, DriveStudioReader(tmp_path).read())
     assert not [note for note in log.notes if "data.log.flavor" in note and name in ("waymo", "nuscenes")]
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "told"),
+    [
+        (make_waymo, "kitti", "waymo"),
+        (make_waymo, "nuplan", "waymo"),
+        (make_mounted_opencv, "waymo", "kitti, argoverse, nuplan"),
+    ],
+)
+@pytest.mark.parametrize("lidar", [True, False])
+def test_a_name_that_would_turn_all_cameras_is_refused(make, name, told, lidar, tmp_path):
+    """With lidar the rows did not fit; without it the cameras lay on their sides in silence."""
+    (problem,) = DriveStudioReader(make(tmp_path), flavor=name, lidar=lidar).check()
+    assert f"data.log.flavor={name}, but all cameras are upright by the axes of {told}" in str(problem)
 
 
 def tilt(degrees: float) -> np.ndarray:
