@@ -8,12 +8,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.compose import configuration, resolved, without_flags
+from sparsestreet.cli.flags import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.folder import folder_problem, holds_same_run, same_run
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
@@ -37,8 +39,19 @@ class SweepFolder(Callback):
 
 def as_sweep(arguments: list[str]) -> list[str]:
     """The arguments, with Hydra's flag where a sweep is named."""
-    flagged = {"-m", "--multirun", "--cfg", "-c", "--info", "-i"} & set(arguments)
+    flagged = (SHOWS | SWEEPS) & flags_of(arguments)
     return arguments if flagged or not _named(arguments) else ["-m", *arguments]
+
+
+def note_of_sweep(arguments: list[str]) -> str | None:
+    """Where the configuration of a named sweep is shown: the keys whose values are not yet those of its jobs."""
+    name = _named(arguments)
+    if name is None or not SHOWS & flags_of(arguments):
+        return None
+    with configuration():
+        cfg = compose("train", without_flags(arguments), return_hydra_config=True)
+    keys = ", ".join(cfg.hydra.sweeper.params or ())
+    return f"one configuration is shown; the jobs of the sweep differ in {keys} (conf/sweep/{name}.yaml)"
 
 
 def sweep_problem(arguments: list[str]) -> str | None:

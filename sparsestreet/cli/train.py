@@ -12,9 +12,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
+from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
-from sparsestreet.cli.sweep import SweepFolder, as_sweep, run_job, sentence, sweep_problem, sweep_status
+from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -28,17 +29,18 @@ def train(arguments: list[str]) -> int:
     global _started
     _started = time.perf_counter()
     if "--help" not in arguments:
-        if {"-m", "--multirun"} & set(arguments) and {"--cfg", "-c", "--info", "-i"} & set(arguments):
-            print("sparsestreet train: --cfg and --info show one configuration: leave out -m", file=sys.stderr)
-            return 2
         try:
-            arguments = _shown(as_sweep(resumed_overrides(arguments)))
-            problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
+            problem = flag_problem(arguments)
+            if problem is None:
+                arguments = _shown(as_sweep(resumed_overrides(arguments)))
+                problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:
             print(f"sparsestreet train: {problem}", file=sys.stderr)
             return 2
+        if note := note_of_sweep(arguments):
+            print(f"sparsestreet train: {note}", file=sys.stderr)
     sys.argv = [sys.argv[0], *arguments]  # which Hydra reads
     SweepFolder.folder = None  # of an earlier command of this process
     app()

@@ -121,9 +121,24 @@ def test_the_first_checks_import_no_torch():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-def test_a_question_to_hydra_is_of_one_configuration(capsys):
-    assert train(["-m", "seed=0,1", "--cfg", "job"]) == 2
-    assert capsys.readouterr().err == "sparsestreet train: --cfg and --info show one configuration: leave out -m\n"
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("-m seed=0,1 --cfg job", "--cfg and --info show one configuration: leave out -m"),
+        ("--multirun --info=all", "--cfg and --info show one configuration: leave out -m"),
+        ("--resolve", "--resolve changes what --cfg prints: write --cfg job --resolve"),
+        ("--resolve --info", "--resolve changes what --cfg prints: write --cfg job --resolve"),
+        ("-p loss", "-p changes what --cfg prints: write --cfg job -p loss"),
+        ("--max_steps 60", "no flag, and there is no key 'max_steps'; did you mean 'schedule.max_steps'?"),
+        ("--seed=3", "--seed is no flag: write seed=VALUE"),
+    ],
+)
+def test_flags_that_cannot_be_are_one_line(arguments, said, capsys):
+    """Those of Hydra were a traceback, a page of usage, or a training of two thousand steps (-p)."""
+    assert train(arguments.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("sparsestreet train: ")
+    assert line.endswith(said)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from sparsestreet.cli import sweep
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, override_problem
 from sparsestreet.cli.report import sweep_name
-from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, run_job, sweep_problem, sweep_status
+from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, note_of_sweep, run_job, sweep_problem, sweep_status
 from sparsestreet.cli.train import train
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY
@@ -152,8 +152,16 @@ def test_drives_must_be_named_and_there(tmp_path):
 
 def test_a_named_sweep_is_one_without_its_flag():
     assert as_sweep(["+sweep=tiny"]) == ["-m", "+sweep=tiny"]
-    for asked in (["seed=1"], ["-m", "+sweep=tiny"], ["+sweep=tiny", "--cfg", "job"]):
+    for asked in (["seed=1"], ["-m", "+sweep=tiny"], ["+sweep=tiny", "--cfg", "job"], ["+sweep=tiny", "--cfg=job"]):
         assert as_sweep(asked) == asked
+
+
+def test_a_shown_sweep_says_what_its_jobs_differ_in():
+    assert note_of_sweep(["+sweep=rules", "--cfg", "job"]) == (
+        "one configuration is shown; the jobs of the sweep differ in experiment, schedule.removal_at, seed "
+        "(conf/sweep/rules.yaml)"
+    )
+    assert note_of_sweep(["+sweep=rules"]) is note_of_sweep(["--cfg", "job"]) is None
 
 
 def test_launchers_compose_or_say_how_they_are_installed():
