@@ -1,12 +1,35 @@
 """What the frozen values that rooms hand to each other refuse to answer."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from sparsestreet.types import Rendering
+import sparsestreet
+from sparsestreet.types import Camera, Rendering
 from tests.scene.street import view_at
+
+CHANGING = {"BodyWriter", "StreetWriter", "TrainSchema", "_Made", "_Named"}
+"""Dataclasses whose fields are filled as they go."""
+
+
+def test_values_are_frozen():
+    """Of all rooms: nobody changes what another one holds too."""
+    sources = [path.read_text() for path in Path(sparsestreet.__file__).parent.rglob("*.py")]
+    dataclass = re.compile(r"^ *@dataclass(.*)\n(?: *@.*\n)* *class (\w+)", re.M)
+    found = [match for text in sources for match in dataclass.findall(text)]
+    assert len(found) > 200
+    assert {name for options, name in found if "frozen=True" not in options} == CHANGING
+
+
+def test_a_camera_stands_where_its_axes_meet():
+    """It looks along world x from (3, -1, 2): its own x is world -y, its y is world -z."""
+    rotation = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    pose = torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, torch.tensor([-1.0, 2.0, -3.0])
+    assert Camera(pose, torch.eye(3), 2, 2).position.tolist() == [3.0, -1.0, 2.0]
 
 
 def test_only_a_recorded_view_has_both_indices():
