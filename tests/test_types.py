@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import sparsestreet
-from sparsestreet.types import Camera, Rendering
+from sparsestreet.types import Camera, Rendering, Track
 from tests.scene.street import view_at
 
 CHANGING = {"BodyWriter", "StreetWriter", "TrainSchema", "_Made", "_Named"}
@@ -39,6 +39,14 @@ def test_only_a_recorded_view_has_both_indices():
     for beside in (replace(recorded, frame_index=None), replace(recorded, camera_index=None)):
         with pytest.raises(ValueError, match="take the views of a log"):
             _ = beside.indices
+
+
+def test_the_path_of_an_object_is_as_long_as_its_steps():
+    """3, 4 and 0 m along the axes, then 5 m across two of them; turning is no way."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    poses[:, :3, 3] = torch.tensor([[7.0, 1, 1], [10, 1, 1], [10, 5, 1], [10, 5, 1], [10, 2, 5]])
+    poses[1, :2, :2] = torch.tensor([[0.0, -1], [1, 0]])
+    assert Track("0", "Vehicle", torch.arange(5), poses, torch.ones(3)).path_length == 12.0
 
 
 def test_screen_gradients_are_there_after_a_backward_pass_only():

@@ -109,6 +109,16 @@ def test_tiles_with_bent_sides_are_bounded_on_all_of_them(k1):
     assert heights.min((1, 2)).max() < 1e-6
 
 
+@pytest.mark.parametrize(("beyond", "planes"), [(0.0, 4), (0.5e-6, 4), (1.5e-6, 3)])
+def test_a_plane_of_a_wide_tile_goes_if_it_cuts_off_more_than_rounding(beyond, planes):
+    """Columns at -80 and 80 degrees, most of them at 80: from the middle a ray points back, and no plane is turned."""
+    x, y, z = np.cos(np.radians(80)), np.sin(np.radians(80)), 0.3
+    outwards = np.array([-z, 0, x]) / np.hypot(x, z)
+    top = np.array([x, 0, z]) + beyond * outwards
+    rows = [[(x, -y, z), tuple(top), *[(x, y, z)] * 3], [(x, -y, -z), (1, 0, 0), *[(x, y, -z)] * 3]]
+    assert len(_bounding_planes(np.array(rows, np.float32).transpose(2, 0, 1))) == planes
+
+
 @pytest.mark.parametrize(
     "lens",
     [
