@@ -1,5 +1,6 @@
 """A street behind a lens: every pixel shows what a pinhole sees in the direction that the lens bends there."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -138,6 +139,18 @@ def test_a_lens_that_does_not_reach_the_corners_is_refused(lens):
 
 def test_a_lens_is_refused_for_the_image_it_has():
     assert replace(SETTINGS, lens=(-0.6, 0.0, 0.0, 0.0, 0.0), field_of_view=30.0).lens[0] == -0.6
+
+
+@pytest.mark.parametrize(("excess", "reaches"), [(-2e-8, True), (2e-8, False)])
+def test_the_largest_lens_is_found_in_float64(excess, reaches):
+    """r (1 + k r^2) is largest, 2/3 r, at r^2 = -1 / 3k: the corner c of an image is reached up to k = -4 / 27 c^2.
+
+    Coefficients rounded to float32 are off by up to 6e-8 of their size.
+    """
+    corner_squared = np.tan(np.radians(30)) ** 2 * (1 + 0.75**2)
+    lens = (-4 / 27 / corner_squared * (1 + excess), 0.0, 0.0, 0.0, 0.0)
+    with nullcontext() if reaches else pytest.raises(ValueError, match="in the whole image"):
+        replace(SETTINGS, width=80, height=60, field_of_view=60.0, lens=lens)
 
 
 def test_equal_lenses_are_equal_settings():
