@@ -54,6 +54,38 @@ def test_parts_are_where_they_were(parts):
     assert found == {kind: pytest.approx(numbers, rel=0, abs=1e-6) for kind, numbers in PLACES.items()}
 
 
+SHAPES = {
+    "Asphalt": [1.0, 3.091373],
+    "Footway": [1.0, 3.0349867],
+    "Facade": [1.0, 2.1450735],
+    "Plain": [0.9792473, 2.808603],
+    "Grainy": [0.9022876, 2.3916891],
+    "BodyPaint": [0.9973684, 2.6922105],
+    "Cabin": [0.8315789, 2.756082],
+    "Wheel": [0.968125, 2.4639672],
+}
+
+
+def test_shapes_are_what_they_were(parts):
+    """Share of rays towards the inside of each part's box that hit it, and how far they come."""
+    rng = np.random.default_rng(0)
+    found = {}
+    for kind, members in parts.items():
+        distances = []
+        for part in members:
+            half = part.shape.half_extent.astype(np.float64)
+            starts = rng.standard_normal((3, 60))
+            starts *= 3 * half.max() / np.linalg.norm(starts, axis=0)
+            towards = rng.uniform(-0.9, 0.9, (3, 60)) * half[:, None] - starts
+            directions = towards / np.linalg.norm(towards, axis=0)
+            distances.append(part.shape.enter(starts.astype(np.float32), directions.astype(np.float32)) / half.max())
+        values = np.concatenate(distances).astype(np.float64)
+        hit = np.isfinite(values)
+        found[kind] = [hit.mean(), values[hit].mean()]
+    # Float32 distances, whose errors even out; a ray may meet an edge in another way.
+    assert found == {kind: pytest.approx(numbers, rel=2e-6) for kind, numbers in SHAPES.items()}
+
+
 LOOKS = {
     "Asphalt": [0.129871, 0.167372, 0.099082, 0.0, 0.111338, 0.104878, 0.118715, 0.0],
     "Footway": [0.271543, 0.265023, 0.247042, 0.0, 0.072215, 0.070513, 0.069096, 0.0],
