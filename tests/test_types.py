@@ -1,12 +1,35 @@
 """What the frozen values that rooms hand to each other refuse to answer."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from sparsestreet.types import Rendering
+import sparsestreet
+from sparsestreet.types import Camera, Rendering, Track
 from tests.scene.street import view_at
+
+CHANGING = {"BodyWriter", "StreetWriter", "TrainSchema", "_Made", "_Named"}
+"""Dataclasses whose fields are filled as they go."""
+
+
+def test_values_are_frozen():
+    """Of all rooms: nobody changes what another one holds too."""
+    sources = [path.read_text() for path in Path(sparsestreet.__file__).parent.rglob("*.py")]
+    dataclass = re.compile(r"^ *@dataclass(.*)\n(?: *@.*\n)* *class (\w+)", re.M)
+    found = [match for text in sources for match in dataclass.findall(text)]
+    assert len(found) > 200
+    assert {name for options, name in found if "frozen=True" not in options} == CHANGING
+
+
+def test_a_camera_stands_where_its_axes_meet():
+    """It looks along world x from (3, -1, 2): its own x is world -y, its y is world -z."""
+    rotation = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    pose = torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, torch.tensor([-1.0, 2.0, -3.0])
+    assert Camera(pose, torch.eye(3), 2, 2).position.tolist() == [3.0, -1.0, 2.0]
 
 
 def test_only_a_recorded_view_has_both_indices():
@@ -16,6 +39,14 @@ def test_only_a_recorded_view_has_both_indices():
     for beside in (replace(recorded, frame_index=None), replace(recorded, camera_index=None)):
         with pytest.raises(ValueError, match="take the views of a log"):
             _ = beside.indices
+
+
+def test_the_path_of_an_object_is_as_long_as_its_steps():
+    """3, 4 and 0 m along the axes, then 5 m across two of them; turning is no way."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    poses[:, :3, 3] = torch.tensor([[7.0, 1, 1], [10, 1, 1], [10, 5, 1], [10, 5, 1], [10, 2, 5]])
+    poses[1, :2, :2] = torch.tensor([[0.0, -1], [1, 0]])
+    assert Track("0", "Vehicle", torch.arange(5), poses, torch.ones(3)).path_length == 12.0
 
 
 def test_screen_gradients_are_there_after_a_backward_pass_only():

@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from sparsestreet.triangulation.rays import (
     Observations,
     _reprojection,
+    _solved,
     meet,
     relative_depth_error,
     reprojection_errors,
@@ -125,3 +126,10 @@ def test_a_point_that_nothing_shows_is_at_the_origin_and_nothing_is_known_of_it(
 def test_a_point_behind_a_camera_has_a_negative_depth():
     observations = Observations(np.zeros(1, int), pose()[None], np.zeros((1, 2)), np.array([FOCAL]))
     assert reprojection_errors(observations, np.array([[0.0, 0.0, -5.0]]))[1] == -5
+
+
+def test_a_direction_that_nothing_determines_is_damped_by_a_billionth_of_the_trace():
+    """1e-9 times the trace 2: what pulls as strongly moves a point by 1, what is determined is not changed."""
+    solved = _solved(np.diag([1.0, 1.0, 0.0])[None], np.array([[3.0, -4.0, 2e-9]]))
+    # Another 1e-12 stands beside the 2e-9.
+    np.testing.assert_allclose(solved, [[3.0, -4.0, 1.0]], rtol=1e-3)

@@ -12,7 +12,8 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.synthetic.parts import BACKGROUND
 from sparsestreet.geometry.distortion import distort
 from sparsestreet.triangulation import ImagePointSettings, street_points
-from sparsestreet.triangulation.street import _rays
+from sparsestreet.triangulation.features import Features
+from sparsestreet.triangulation.street import _pixel, _rays
 from sparsestreet.types import Camera
 from tests.triangulation.conftest import traced
 
@@ -180,6 +181,14 @@ def test_rays_are_those_of_a_lens_without_distortion():
     imaged = distort(rays, lens.double()) @ intrinsics[:2, :2].double().T + intrinsics[:2, 2].double()
     np.testing.assert_allclose(_rays(imaged.numpy(), camera), rays.numpy(), atol=1e-9)
     assert np.abs(_rays(imaged.numpy(), replace(camera, distortion=None)) - rays.numpy()).max() > 0.01
+
+
+def test_a_feature_takes_the_pixel_that_it_lies_in():
+    """Of 5 x 3 pixels; a feature on the far border, or interpolated to beyond it, takes the last one."""
+    camera = Camera(torch.eye(4), torch.eye(3), 5, 3)
+    places = np.array([[3.7, 2.2], [0.0, 0.9], [5.0, 3.0], [-0.1, 3.2]])
+    row, column = _pixel(Features(places, np.zeros((4, 128), np.float32)), camera)
+    assert (row.tolist(), column.tolist()) == ([2, 0, 2, 2], [3, 0, 4, 0])
 
 
 def test_frames_are_read_one_at_a_time_and_their_pixels_let_go(street):

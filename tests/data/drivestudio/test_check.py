@@ -59,6 +59,10 @@ def truncate(name: str, size: int) -> Callable[[Path], object]:
     return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size])
 
 
+def empty(folder: str) -> Callable[[Path], object]:
+    return lambda root: [path.unlink() for path in (root / folder).iterdir()]
+
+
 def image(name: str, height: int, width: int) -> Callable[[Path], None]:
     shape = (height, width, 3) if name.endswith("jpg") else (height, width)
     return lambda root: write_image(root / name, np.zeros(shape, np.uint8))
@@ -81,6 +85,7 @@ def boxes(**columns: object) -> Callable[[Path], None]:
 
 CORRUPTIONS = {
     "missing image": (remove("images/001_1.jpg"), "images/001_1.jpg", "missing"),
+    "no images": (empty("images"), "images", "no TTT_C.jpg"),
     "missing pose": (remove("extrinsics/002_0.txt"), "extrinsics/002_0.txt", "missing"),
     "missing lidar pose": (remove("lidar_pose/001.txt"), "lidar_pose/001.txt", "missing"),
     "missing sweep": (remove("lidar/001.bin"), "lidar/001.bin", "missing"),

@@ -1,5 +1,6 @@
 """A street behind a lens: every pixel shows what a pinhole sees in the direction that the lens bends there."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -109,6 +110,16 @@ def test_tiles_with_bent_sides_are_bounded_on_all_of_them(k1):
     assert heights.min((1, 2)).max() < 1e-6
 
 
+@pytest.mark.parametrize(("beyond", "planes"), [(0.0, 4), (0.5e-6, 4), (1.5e-6, 3)])
+def test_a_plane_of_a_wide_tile_goes_if_it_cuts_off_more_than_rounding(beyond, planes):
+    """Columns at -80 and 80 degrees, most of them at 80: from the middle a ray points back, and no plane is turned."""
+    x, y, z = np.cos(np.radians(80)), np.sin(np.radians(80)), 0.3
+    outwards = np.array([-z, 0, x]) / np.hypot(x, z)
+    top = np.array([x, 0, z]) + beyond * outwards
+    rows = [[(x, -y, z), tuple(top), *[(x, y, z)] * 3], [(x, -y, -z), (1, 0, 0), *[(x, y, -z)] * 3]]
+    assert len(_bounding_planes(np.array(rows, np.float32).transpose(2, 0, 1))) == planes
+
+
 @pytest.mark.parametrize(
     "lens",
     [
@@ -128,6 +139,18 @@ def test_a_lens_that_does_not_reach_the_corners_is_refused(lens):
 
 def test_a_lens_is_refused_for_the_image_it_has():
     assert replace(SETTINGS, lens=(-0.6, 0.0, 0.0, 0.0, 0.0), field_of_view=30.0).lens[0] == -0.6
+
+
+@pytest.mark.parametrize(("excess", "reaches"), [(-2e-8, True), (2e-8, False)])
+def test_the_largest_lens_is_found_in_float64(excess, reaches):
+    """r (1 + k r^2) is largest, 2/3 r, at r^2 = -1 / 3k: the corner c of an image is reached up to k = -4 / 27 c^2.
+
+    Coefficients rounded to float32 are off by up to 6e-8 of their size.
+    """
+    corner_squared = np.tan(np.radians(30)) ** 2 * (1 + 0.75**2)
+    lens = (-4 / 27 / corner_squared * (1 + excess), 0.0, 0.0, 0.0, 0.0)
+    with nullcontext() if reaches else pytest.raises(ValueError, match="in the whole image"):
+        replace(SETTINGS, width=80, height=60, field_of_view=60.0, lens=lens)
 
 
 def test_equal_lenses_are_equal_settings():

@@ -7,6 +7,7 @@ from sparsestreet.data.synthetic.coverage import beyond, strip, stripes
 from sparsestreet.data.synthetic.noise import cell_random, smooth_noise, stream
 from sparsestreet.data.synthetic.parts import Part
 from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.textures.plain import Grainy
 from sparsestreet.data.synthetic.world import build_world
 
 
@@ -60,6 +61,16 @@ def test_streams_differ_by_seed_and_name():
     draws = [stream(seed, name).random() for seed in (0, 1) for name in ("a", "b")]
     assert len(set(draws)) == 4
     assert stream(0, "a").random() == draws[0]
+
+
+def test_grain_neither_blackens_nor_glows():
+    """A standard deviation of twice the color is cut off at 0.15 of it and at a reflectance of 0.95."""
+    points = np.random.default_rng(3).uniform(-20, 20, (3, 500)).astype(np.float32)
+    up = np.zeros_like(points)
+    up[2] = 1
+    albedo = Grainy((0.4, 0.5, 0.6), 0.5, 2.0).appearance(points, up, np.zeros_like(points)).albedo
+    np.testing.assert_allclose(albedo.min(1), [0.06, 0.075, 0.09], rtol=1e-6)
+    np.testing.assert_allclose(albedo.max(1), 0.95, rtol=1e-6)
 
 
 def surfaces() -> dict[str, Part]:

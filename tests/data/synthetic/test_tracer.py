@@ -5,7 +5,7 @@ import pytest
 
 from sparsestreet.data.synthetic.parts import Part, at, limb
 from sparsestreet.data.synthetic.scene import Scene, SunView
-from sparsestreet.data.synthetic.shading import radiance
+from sparsestreet.data.synthetic.shading import radiance, to_srgb
 from sparsestreet.data.synthetic.shapes import Capsule, Cylinder, Ellipsoid, box
 from sparsestreet.data.synthetic.sky import random_weather
 from sparsestreet.data.synthetic.textures.plain import Plain
@@ -142,6 +142,14 @@ def test_a_point_behind_a_box_is_darker():
     (shaded, open_1), (unshaded, open_2) = brightness
     assert (shaded < 0.5 * unshaded).all()
     np.testing.assert_allclose(open_1, open_2)
+
+
+def test_srgb_by_hand():
+    """Exposure 0.62, then e (1 + e / 4) / (1 + e) * 1.45, then the curve of sRGB: its line, its power, and white."""
+    linear = np.array([-0.5, 0.001, 0.5, 0.8, 4.0], np.float32)
+    # 0.00062 -> 0.000899 on the line; 0.31 -> 0.369722; 0.496 -> 0.540361; 2.48 -> 1.67, which is cut off.
+    expected = [0, 3, 164, 194, 255]
+    assert to_srgb(np.tile(linear, (3, 2, 1))).tolist() == [[[value] * 3 for value in expected]] * 2
 
 
 def test_limb_runs_from_start_to_end():

@@ -2,13 +2,20 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.render import render_frame
+from sparsestreet.data.synthetic.cameras import StreetCamera
+from sparsestreet.data.synthetic.parts import Part, at
+from sparsestreet.data.synthetic.render import Instant, render_frame
+from sparsestreet.data.synthetic.scene import Scene, SunView
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.shapes import box
+from sparsestreet.data.synthetic.sky import random_weather
+from sparsestreet.data.synthetic.textures.plain import Plain
 from sparsestreet.data.synthetic.world import build_world
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import View
@@ -70,3 +77,13 @@ def test_nobody_looks_out_of_a_car(log):
     front = log.views[0]
     camera = replace(front.camera, camera_from_world=inverse(inside).float())
     assert log.truth(View(camera, 0.0)) is None
+
+
+@pytest.mark.parametrize(("x", "inside"), [(0.0, True), (2.2, True), (2.4, False), (-2.4, False)])
+def test_a_camera_is_in_a_box_of_30_cm_more(x, inside):
+    """A box of 4 m along x that stands at (10, 5) and faces y: the camera lies at x of its own axes."""
+    scene = Scene.of([Part(box(1.0, 1.0, 1.0), Plain((0.5, 0.5, 0.5)), at(0.0, 0.0, 0.0))])
+    weather = random_weather(0)
+    actors = ((at(10.0, 5.0, 0.0, yaw=np.pi / 2), (4.0, 2.0, 1.5)),)
+    camera = StreetCamera(at(10.0, 5.0 + x, 0.0), np.eye(3), 1, 1)
+    assert Instant(scene, SunView.of(scene, weather.sun), weather, actors).inside_an_actor(camera) == inside
