@@ -4,6 +4,7 @@ from collections import Counter
 from types import SimpleNamespace
 
 import pytest
+from triton.compiler import CompiledKernel
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.triton import launch
@@ -169,3 +170,29 @@ def test_a_kernel_runs_on_the_device_of_its_tensors(monkeypatch, current, entere
     launch.launch(Kernel(), 33, 16, tensor, 5, options={"num_warps": 1}, DEPTH=True)
     assert devices == entered
     assert started == [((3, 1, 1), (tensor, 5), {"DEPTH": True, "BLOCK": 16, "num_warps": 1})]
+
+
+@pytest.mark.parametrize(
+    ("hooked", "called"), [(None, "run"), ("launch_enter_hook", "item"), ("launch_exit_hook", "item")]
+)
+def test_a_launch_that_a_hook_waits_for_is_tritons_own(monkeypatch, hooked, called):
+    # A profiler may set either of the two hooks alone.
+    started = []
+
+    class Compiled(CompiledKernel):
+        function = packed_metadata = None
+
+        def __init__(self):
+            pass
+
+        def __getitem__(self, grid):
+            return lambda *arguments: started.append(("item", grid, arguments))
+
+        def run(self, *arguments):
+            started.append(("run", arguments[:3], arguments[9:]))
+
+    if hooked:
+        monkeypatch.setattr(getattr(launch.triton.knobs.runtime, hooked), "calls", [print])
+    monkeypatch.setattr(launch, "driver", SimpleNamespace(active=SimpleNamespace(get_current_stream=lambda device: 7)))
+    launch._start(Compiled(), 0, (3, 1, 1), (5, 6))
+    assert started == [(called, (3, 1, 1), (5, 6))]
