@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.ops.cpu import workspace
+from sparsestreet.ops.cpu import library, workspace
 from sparsestreet.ops.cpu.library import LIBRARY_VARIABLE, find_library, load_library, tile_size
 
 find = find_library.__wrapped__  # without its cache
@@ -20,6 +20,15 @@ def test_a_variable_that_names_no_file(monkeypatch, tmp_path):
     monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path))
     with pytest.raises(RuntimeError, match=f"{LIBRARY_VARIABLE} names no file: .*unset it"):
         find()
+
+
+@pytest.mark.parametrize("files", [None, []])
+def test_no_library_is_built(monkeypatch, files):
+    # None: a package without a record of its files.
+    monkeypatch.delenv(LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(library, "LIBRARY_NAME", "no_such_library.so")
+    monkeypatch.setattr(library.importlib.metadata, "files", lambda name: files)
+    assert find() is None
 
 
 def test_the_library_reports_its_tiles():

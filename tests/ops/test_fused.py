@@ -5,8 +5,32 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops import fused
+from sparsestreet.ops.activate import activate
 from sparsestreet.ops.fused import fused_backend
+from sparsestreet.ops.poses import poses_at
+from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.ops.sky import over_sky
+from sparsestreet.ops.ssim import ssim
+from sparsestreet.types import Camera
+
+ROWS = RawGaussians(*(torch.zeros(1, *shape) for shape in ((3,), (3,), (4,), (), (1, 3), (0, 3))))
+TRACKS = Trajectories(
+    torch.zeros(1, 1), torch.zeros(1, 1, 4), torch.zeros(1, 1, 3), torch.ones(1, 1).bool(), torch.zeros(1, 2)
+)
+IMAGE = torch.zeros(11, 11, 3)
+CAMERA = Camera(torch.eye(4), torch.eye(3), width=11, height=11)
+STEPS = {
+    "activate.activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
+    "poses.poses_at": lambda backend: poses_at(
+        TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend
+    ),
+    "sky.over_sky": lambda backend: over_sky(
+        IMAGE, IMAGE[..., 0], torch.zeros(6, 1, 1, 3), CAMERA, transmittance_min=0.1, backend=backend
+    ),
+    "ssim.mean_ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
+}
 
 
 @pytest.fixture
@@ -50,3 +74,26 @@ def test_triton_that_cannot_run(monkeypatch):
     monkeypatch.setattr(fused, "has_triton", lambda: False)
     with pytest.raises(RuntimeError, match="'triton' needs the package triton: pip install"):
         fused_backend("triton", torch.zeros(3))
+
+
+@pytest.mark.parametrize("backend", ["cpu", "triton"])
+@pytest.mark.parametrize("step", STEPS)
+def test_the_named_implementation_runs(monkeypatch, step, backend):
+    # Torch's numbers would be as good.
+    ran = RuntimeError(f"{backend} ran")
+
+    def run(*_):
+        raise ran
+
+    monkeypatch.setattr(f"sparsestreet.ops.{backend}.{step}", run)
+    with pytest.raises(RuntimeError, match=str(ran)):
+        STEPS[step](backend)
+
+
+def test_a_named_implementation_refuses_what_it_does_not_take(on_gpu):
+    for other in (on_gpu.T, on_gpu.double()):
+        with pytest.raises(ValueError, match="'triton' takes contiguous float32 tensors, got .*: use backend='torch'"):
+            fused_backend("triton", on_gpu, other)
+    for other in (on_gpu, torch.zeros(3).double()):
+        with pytest.raises(ValueError, match="'cpu' takes float32 or float64 tensors on the CPU, got .*: use backend"):
+            fused_backend("cpu", torch.zeros(3), other)
