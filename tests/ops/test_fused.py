@@ -92,8 +92,8 @@ def test_the_named_implementation_runs(monkeypatch, step, backend):
 
 def test_a_named_implementation_refuses_what_it_does_not_take(on_gpu):
     for other in (on_gpu.T, on_gpu.double()):
-        with pytest.raises(ValueError, match="'triton' takes contiguous float32 tensors, got .*: use backend='torch'"):
+        with pytest.raises(ValueError, match=r"'triton' takes contiguous float32 tensors, got .*: use backend='torch'"):
             fused_backend("triton", on_gpu, other)
     for other in (on_gpu, torch.zeros(3).double()):
-        with pytest.raises(ValueError, match="'cpu' takes float32 or float64 tensors on the CPU, got .*: use backend"):
+        with pytest.raises(ValueError, match=r"'cpu' takes float32 or float64 tensors on the CPU, got .*: use backend"):
             fused_backend("cpu", torch.zeros(3), other)
