@@ -1,7 +1,9 @@
 """What ``import sparsestreet`` gives, and what it does not cost."""
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -26,3 +28,22 @@ def test_the_help_of_a_command_is_light(command):
     code = f"import sys; from sparsestreet.cli.{command} import {command} as run; run(['--help']); "
     code += "sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
+
+
+MUTABLE = {"BodyWriter", "StreetWriter", "TrainSchema", "_Made", "_Named"}
+
+
+def test_values_are_frozen_and_options_are_named():
+    """All dataclasses but a few are frozen; settings that inherit, and what they inherit from, take keywords only."""
+    classes: dict[str, tuple[str, list[str]]] = {}
+    for path in Path(sparsestreet.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            said = " ".join(map(ast.unparse, node.decorator_list)) if isinstance(node, ast.ClassDef) else ""
+            if isinstance(node, ast.ClassDef) and "dataclass" in said:
+                classes[node.name] = said, [ast.unparse(base) for base in node.bases]
+    assert {name for name, (said, _) in classes.items() if "frozen=True" not in said} == MUTABLE
+    named = {name for name, (said, _) in classes.items() if "kw_only=True" in said}
+    settings = ("Settings", "Source", "Guesses")
+    families = [(name, base) for name, (_, bases) in classes.items() for base in bases if base.endswith(settings)]
+    assert len(families) > 10
+    assert [pair for pair in families if len(named.intersection(pair)) == 1] == []

@@ -56,6 +56,19 @@ def test_fields_and_shapes():
     assert masks == {"road": (9,), "cars": (5,)}
 
 
+def test_gradients_on_screen_are_kept_where_the_state_asks_for_them():
+    options = RenderOptions(backend="reference")
+    asked, plain = (
+        render(scene_of(), view_at(0.5, CAMERA), SceneState(screen_gradients=wanted), options)
+        for wanted in (True, False)
+    )
+    for result in (asked, plain):
+        result.rgb.sum().backward()
+    assert float(asked.splats.screen_gradients.abs().sum()) > 0
+    with pytest.raises(ValueError, match="screen_gradients=True"):
+        _ = plain.splats.screen_gradients
+
+
 def test_a_novel_view_needs_no_frame_and_no_camera_of_the_log():
     scene, blank = scene_of(), torch.zeros(11, 17, 3, dtype=torch.uint8)
     novel = View(CAMERA, 0.5)

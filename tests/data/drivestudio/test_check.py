@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.drivestudio.layout import find_layout
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
 from tests.data.drivestudio.folders import (
@@ -157,6 +158,26 @@ CORRUPTIONS = {
 @pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
 def test_a_sound_log_has_no_problems(make, tmp_path):
     assert DriveStudioReader(make(tmp_path)).check() == []
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+@pytest.mark.parametrize(
+    ("make", "name", "of_lidar"),
+    [
+        (make_nuscenes, "images/004_1.jpg", False),
+        (make_nuscenes, "extrinsics/004_1.txt", False),
+        (make_nuscenes, "lidar_pose/004.txt", True),
+        (make_nuscenes, "lidar/004.bin", True),
+        (make_waymo, "images/004_1.jpg", False),
+        (make_waymo, "ego_pose/004.txt", False),
+        (make_waymo, "lidar/004.bin", True),
+    ],
+)
+def test_a_log_has_as_many_frames_as_its_longest_kind_of_file(make, name, of_lidar, lidar, tmp_path):
+    root = make(tmp_path)
+    (root / name).touch()
+    layout = find_layout(root, lidar=lidar)
+    assert layout.num_frames_on_disk == len(layout.frames) == (3 if of_lidar and not lidar else 5)
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)

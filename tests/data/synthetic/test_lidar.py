@@ -134,6 +134,10 @@ def reader(*overrides: str) -> StreetReader:
         return instantiate(compose("train", list(overrides)).data.log, _convert_="all")
 
 
+def test_the_usual_street_and_sensor_are_those_of_conf():
+    assert reader().settings == StreetSettings()
+
+
 @pytest.mark.lengthy
 @pytest.mark.parametrize("name", ["hdl32", "hdl64", "ideal", "waymo_top"])
 def test_a_sensor_is_chosen_and_changed_from_the_command_line(name):

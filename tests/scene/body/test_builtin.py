@@ -3,6 +3,7 @@ import torch
 
 from sparsestreet.geometry.skeleton import JOINTS, rest_joints
 from sparsestreet.scene.body import BodyTemplate, BuiltinBody, surface
+from tests.weighed import weighed
 
 NUM_VERTICES = pytest.mark.parametrize("num_vertices", [700, pytest.param(6000, marks=pytest.mark.lengthy)])
 
@@ -40,6 +41,15 @@ def test_it_has_the_size_of_a_person(num_vertices):
     assert float(normals[soles, 1]) < -0.9
     assert torch.equal(template.joints, rest_joints())
     assert float(template.vertices[:, 2].amax()) > 0.15  # the toes point forward
+
+
+def test_it_stays_as_it_is():
+    """People of a scene file stand on it: their vertices are not in the file."""
+    template = BuiltinBody().load()
+    assert template.vertices.dtype == template.joints.dtype == template.weights.dtype == torch.float32
+    found = (weighed(template.vertices), weighed(template.faces), weighed(template.joints), weighed(template.weights))
+    # Slopes are taken over 0.1 mm: of 2,000 coordinates few are off by more than a micrometer.
+    assert found == pytest.approx((316.7012, 681586.197, 11.5779, 339.624), abs=2e-3)
 
 
 @NUM_VERTICES

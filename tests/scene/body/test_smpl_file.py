@@ -54,6 +54,8 @@ def test_a_person_has_the_shape_of_the_coefficients(name, tmp_path):
     np.testing.assert_allclose(joints.numpy(), expected_joints - expected_joints[0], atol=2e-5)
     np.testing.assert_array_equal(template.faces.numpy(), stored["f"])
     np.testing.assert_allclose(template.weights.numpy(), stored["weights"], atol=1e-7)
+    numbers = [value for value in vars(template).values() if value.is_floating_point()]
+    assert [value.dtype for value in numbers] == [torch.float32] * 5
 
 
 @FORMATS
