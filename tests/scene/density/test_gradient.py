@@ -73,6 +73,12 @@ def test_small_rows_are_cloned_and_large_ones_split(keep_parent, use_screen_size
     assert plan.fresh.tolist() == [row >= num_survivors for row in range(len(source))]
 
 
+def test_a_row_of_just_the_split_scale_is_cloned():
+    """3DGS: split above, clone up to it."""
+    plan = densified(GradientDensity(split_scale=1 / RADIUS), rows_of_scales([1.0]), with_statistics([HIGH]))
+    assert plan.edits["log_scales"].amax(1).tolist() == [0.0, 0.0]
+
+
 def test_columns_of_survivors_clones_and_children():
     rows = rows_of_scales(SCALES)
     before = {name: column.detach().clone() for name, column in rows.columns().items()}
