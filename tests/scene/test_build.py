@@ -43,6 +43,12 @@ def test_a_node_does_not_depend_on_its_neighbors():
     assert not torch.equal(first.nodes["background"].rows.means, other.nodes["background"].rows.means)
 
 
+def test_a_start_draws_by_its_own_seed_only():
+    before = torch.get_rng_state()
+    build({"background": BACKGROUND, "cars": CARS})
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_what_no_node_takes_stays_in_the_background():
     lidar = background_settings(lidar=10_000)
     with_cars, without = build({"background": lidar}), build({"background": lidar, "cars": CARS})
