@@ -218,6 +218,9 @@ def test_between_two_frames_a_row_shows_that_shows_at_either():
     assert torch.equal(shown(node, 0.3), at[0.25] | at[0.5])
     assert torch.equal(shown(node, 0.25 + 1e-6), at[0.25])
     assert torch.equal(shown(node, 0.7), at[0.5] | at[1.0])
+    # Beyond the frames the nearest one counts.
+    assert torch.equal(shown(node, TIMES[0] - 0.2), at[TIMES[0]])
+    assert torch.equal(shown(node, 1.2), at[1.0])
     assert (at[0.5] & ~at[1.0]).any()
     assert (at[0.5] & ~at[0.25]).any()
 
