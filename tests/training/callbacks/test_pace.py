@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from lightning import Callback, Trainer
@@ -12,7 +13,9 @@ from sparsestreet.records.run import RUN
 from sparsestreet.training.callbacks import Pace, pace
 from sparsestreet.training.forecast import CLOSING_SECONDS
 from sparsestreet.training.run import train
+from sparsestreet.training.schedule import Course
 from sparsestreet.training.system import StreetSystem
+from tests.training.stubs import background, make_system
 from tests.training.test_run import TRAINER, data, recipe
 
 BEFORE = 5.0
@@ -84,6 +87,31 @@ def test_without_a_budget_the_steps_are_those_of_the_schedule(tmp_path, clocked,
 
 def test_a_budget_that_is_over_takes_two_steps(tmp_path, clocked):
     assert trained(tmp_path, clocked, max_steps=12, minutes=0.01).run.steps == 2
+
+
+def test_a_trial_of_a_few_steps_is_not_forecast(tmp_path, clocked, monkeypatch, caplog):
+    def measured(*_):
+        raise AssertionError("nothing to forecast")
+
+    monkeypatch.setattr(pace, "measured_step", measured)
+    still = replace(recipe(tmp_path), callbacks={})
+    with caplog.at_level(logging.INFO):
+        train(still, data(), tmp_path, max_steps=12, make_trainer=partial(TRAINER, fast_dev_run=1))
+    assert "a step takes" not in caplog.text
+
+
+def test_a_resumed_run_ends_where_its_budget_said():
+    course = Course(12)
+    course.change(4, 20)
+    resumed, trainer, system = (
+        Pace(StageRecorder()),
+        TRAINER(max_steps=12, logger=False),
+        make_system({"road": background()}),
+    )
+    resumed.load_state_dict({"course": course.state_dict()})
+    resumed.on_fit_start(trainer, system)
+    assert trainer.max_steps == system.course.steps == 20
+    assert system.course.state_dict() == course.state_dict()
 
 
 def test_a_budget_is_some_time():
