@@ -108,6 +108,7 @@ def test_a_resumed_run_ends_where_its_budget_said():
         TRAINER(max_steps=12, logger=False),
         make_system({"road": background()}),
     )
+    system.trainer = trainer
     resumed.load_state_dict({"course": course.state_dict()})
     resumed.on_fit_start(trainer, system)
     assert trainer.max_steps == system.course.steps == 20
