@@ -37,3 +37,12 @@ def test_faint_rows_are_not_drawn():
     scene = SceneGraph({"a": node_at([[10.0, 0.0, 1.5]], opacity_logit=-6.0)})
     assert (project_centers(scene, view_at(0.0)) == BACKGROUND_COLOR).all()
     assert (project_centers(scene, view_at(0.0), min_opacity=0.001) != BACKGROUND_COLOR).any()
+
+
+def test_colors_are_told_apart():
+    colors = torch.tensor([(BACKGROUND_COLOR,) * 3, *NODE_COLORS])
+    assert float(colors.min()) >= 0
+    assert float(colors.max()) <= 1
+    # A sixth of the range in some channel is seen at once.
+    apart = (colors[:, None] - colors).abs().amax(-1) + torch.eye(len(colors))
+    assert float(apart.min()) > 1 / 6

@@ -133,3 +133,10 @@ def test_names_of_the_parameters():
     names = {name for name, _ in scene.named_parameters()}
     assert {"effects.sky.texels", "nodes.road.rows.means", "nodes.cars.rotation_deltas"} <= names
     assert len(names) == 1 + 6 + 8
+
+
+def test_a_lone_node_left_out_has_no_rows_and_no_mask():
+    scene = SceneGraph({"road": background(random_rows(4, 0, mask=MASK), MASK)})
+    left = scene.without("road").nodes["road"]
+    assert (len(left.rows), left.mask) == (0, None)
+    assert (len(scene.nodes["road"].rows), scene.nodes["road"].mask) == (4, MASK)

@@ -45,6 +45,8 @@ def check(case: dict, found: dict) -> None:
         sizes = expected(kernel["name"], case["width"], case["height"])
         assert kernel["spilled"] == kernel["tensor_core"] == kernel["atomics"] == 0, kernel
         assert kernel["shared"] <= 48 << 10, kernel
+        # One number for each row, which fits 32 bits.
+        assert kernel["types"].get("places", "*i32") == "*i32"
         for name, known in kernel["known"].items():
             kind = kernel["types"][name]
             wanted = "16" if kind.startswith("*") else "" if kind.startswith("fp") else sizes.get(name, "")

@@ -56,7 +56,10 @@ def test_rows_of_points():
     torch.testing.assert_close(rows.log_scales.exp(), torch.full((2, 3), 5.0))
     torch.testing.assert_close(rows.quaternions.norm(dim=1), torch.ones(2))
     assert "mask_logits" not in rows.columns()
-    exact = seeded(torch.rand(3, 3).double(), torch.rand(3, 3).double(), opacity=0.1)
+    one = torch.full((2,), 0.5).double()
+    exact = init_gaussians(
+        colors.double(), colors.double(), one, opacities=one, sh_degree=1, generator=torch.Generator()
+    )
     assert {column.dtype for column in exact.columns().values()} == {torch.float32}
 
 
