@@ -65,6 +65,7 @@ def pairs() -> list[tuple[str, str]]:
     return [cast(tuple[str, str], tuple(name.split("/"))) for name in _keys()["columns"]]
 
 
+@cache
 def compare(preset: str, method: str) -> Comparison:
     """The preset as ``schedule=paper capacity=paper`` compose it, beside upstream's settings.
 
