@@ -118,7 +118,7 @@ def _value(key: str, text: str, kind: Any) -> Any:
     if not text:
         raise OptionError(f"{key} has no value: write {key}=..., or leave it out")
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin is types.UnionType:
+    if origin in (types.UnionType, typing.Union):  # ``X | None``; Python 3.11 has the second of a Literal
         (inner,) = (argument for argument in arguments if argument is not types.NoneType)
         return _value(key, text, inner)
     if origin is tuple:

@@ -20,6 +20,7 @@ class Wishes:
     frames: slice | None = None
     path: Literal["recorded", "shifted"] = "recorded"
     title: str = ""
+    device: Literal["cpu", "cuda"] | None = None
 
     def __post_init__(self) -> None:
         if self.width > 9000:
@@ -34,8 +35,10 @@ class Folders:
 
 def test_every_kind_of_value_is_read():
     words = ["scene=a=b/run", "width=12", "fps=29.97", "smooth=true", "cameras=[0,2]", "nodes=background"]
-    words += ["frames=3:40", "path=shifted", "title=two words"]
-    expected = Wishes(Path("a=b/run"), 12, 29.97, True, (0, 2), ("background",), slice(3, 40), "shifted", "two words")
+    words += ["frames=3:40", "path=shifted", "title=two words", "device=cuda"]
+    expected = Wishes(
+        Path("a=b/run"), 12, 29.97, True, (0, 2), ("background",), slice(3, 40), "shifted", "two words", "cuda"
+    )
     assert parse_options(words, Wishes) == expected
 
 
@@ -60,6 +63,7 @@ def test_brackets_may_be_left_out_and_ranges_are_open():
         (["scene=r", "fps=nan"], "fps must be a number, got 'nan'"),
         (["scene=r", "smooth=yes"], "smooth must be one of true, false, got 'yes'"),
         (["scene=r", "path=straight"], "path must be one of recorded, shifted, got 'straight'"),
+        (["scene=r", "device=tpu"], "device must be one of cpu, cuda, got 'tpu'"),
         (["scene=r", "cameras=[0,left]"], "cameras must be a whole number, got 'left'"),
         (["scene=r", "cameras=[]"], "cameras has no value: write cameras=..., or leave it out"),
         (["scene=r", "frames=7"], "frames must be a range like 0:40, got '7'"),
