@@ -17,6 +17,13 @@ class OptimizerSettings:
     """Adam's epsilon. At torch's default of 1e-8 mask logits whose only gradient is lambda_n / K never move."""
     visible_only: bool = False
     """True: rows whose gradient is exactly zero keep their values and moments (VisibleAdam)."""
+    largest_radius: float | None = None
+    """Meters: rates that are scaled by the scene's radius count no more of it. Detail does not grow with the length of
+    a drive. None: all of it (3DGS, DriveStudio)."""
+
+    def __post_init__(self) -> None:
+        if self.largest_radius is not None and not self.largest_radius > 0:
+            raise ValueError(f"largest_radius must be > 0 m, got {self.largest_radius}: null for no limit")
 
     def build(self, scene: SceneGraph, radius: float) -> torch.optim.Optimizer:
         """Adam with one group per rate, in which parameters of all nodes are stepped together.
@@ -26,6 +33,7 @@ class OptimizerSettings:
         Raises ValueError for a parameter without a rate.
         """
         rates, groups = scene.learning_rates(), {}
+        radius = radius if self.largest_radius is None else min(radius, self.largest_radius)
         for name, parameter in scene.named_parameters():
             rate = rates[name]
             initial = rate.initial * (radius if rate.scale_by_scene_radius else 1.0)

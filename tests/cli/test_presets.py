@@ -45,6 +45,7 @@ REFINED = {
     "density__split_shrink": 1.6,
     "density__keep_parent": True,
     "density__clone_shrunk": True,
+    "density__steady_means": False,  # dup_in_optim: zeros for exp_avg and exp_avg_sq
 }
 """What its code does with every node that it refines, and no key says."""
 OBJECTS = REFINED | {"box_points": 0, "density__screen_size_until": at(30_000), "densify_until": at(19_999)}
@@ -53,6 +54,7 @@ ALL = {
     "data.log.lidar_ahead": [-2, 80],  # truncated_min_range, truncated_max_range
     "data.log.extent": "first_pose",
     "optimizer.eps": 1e-15,
+    "optimizer.largest_radius": None,
     "split.with_replacement": True,
     "render.settings.eps2d": 0.3,
     "render.settings.alpha_max": 0.999,  # of gsplat 1.3.0, as the next four

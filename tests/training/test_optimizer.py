@@ -43,6 +43,19 @@ def test_rates_scale_with_the_scene_and_decay_log_linearly():
         assert rate(optimizer, street, "effects.sky.texels") == pytest.approx(1e-2)
 
 
+@pytest.mark.parametrize(("largest", "means"), [(None, 1.6e-3), (20.0, 1.6e-3), (4.0, 6.4e-4)])
+def test_no_more_of_the_radius_than_the_largest_counts_for_rates(largest, means):
+    street = scene()
+    optimizer = OptimizerSettings(largest_radius=largest).build(street, radius=10.0)
+    assert rate(optimizer, street, "nodes.background.rows.means") == pytest.approx(means)  # 1.6e-4 a meter
+    assert rate(optimizer, street, "nodes.rigid.rows.means") == 3e-3  # which is not scaled
+
+
+def test_a_largest_radius_is_positive():
+    with pytest.raises(ValueError, match="must be > 0 m, got 0.0: null for no limit"):
+        OptimizerSettings(largest_radius=0.0)
+
+
 def test_every_node_has_rates_of_its_own():
     street = scene()
     optimizer = OptimizerSettings().build(street, radius=10.0)

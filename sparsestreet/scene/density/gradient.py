@@ -56,6 +56,9 @@ class GradientDensity(DensityStrategy):
     clone_shrunk: bool = False
     """Whether a parent that stays is cloned too if it has become small. DriveStudio splits first, then clones what is
     small."""
+    steady_means: bool = True
+    """Whether the means of clones and children begin with their parent's second moments, so that Adam does not throw
+    them from where they were put (``RowPlan.inherited_second_moments``). False: 3DGS and DriveStudio."""
     reset_opacity_to: float = 0.01
     """Largest opacity after a reset."""
 
@@ -88,7 +91,8 @@ class GradientDensity(DensityStrategy):
         up to ``screen_size_until``, r > split_screen), else cloned. (With ``clone_shrunk`` a row is cloned where its
         scale, after the split, is at most split_scale R.) A clone is an exact copy. Children of a split are
         drawn from their parent: at mu + R(q) (s * z) with z ~ N(0, I), with scales s / split_shrink. Copies inherit all
-        other columns (mask logits, instances ...) and start with zero optimizer moments; parents keep theirs.
+        other columns (mask logits, instances ...) and start with zero optimizer moments, but for ``steady_means``;
+        parents keep theirs.
 
         The new order is: the surviving rows in their old order, then clones, then children, siblings side by side.
         Raises ValueError if the statistics do not belong to the rows or hold a gradient that is not finite.
@@ -142,7 +146,9 @@ class GradientDensity(DensityStrategy):
         means[first_child:] += _offsets(rows, children, generator)
         log_scales = rows.log_scales.detach()[source]
         log_scales[split[source]] -= math.log(self.split_shrink)
-        return RowPlan(len(rows), source, fresh, edits={"means": means, "log_scales": log_scales})
+        inherited = frozenset({"means"} if self.steady_means else ())
+        edits = {"means": means, "log_scales": log_scales}
+        return RowPlan(len(rows), source, fresh, edits, inherited_second_moments=inherited)
 
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
         """Drops rows that are faint (opacity < cull_opacity) or too large.

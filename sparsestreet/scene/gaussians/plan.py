@@ -27,6 +27,10 @@ class RowPlan:
     """Name of a parameter or buffer -> values [new, ...] that replace its column, for rows that are not copies."""
     reset_moments: frozenset[str] = frozenset()
     """Names of parameters whose moments start at zero in every row (an opacity reset)."""
+    inherited_second_moments: frozenset[str] = frozenset()
+    """Names of parameters of which fresh rows begin with their source's second moments. With zeros, which Adam takes
+    for true after its first thousand steps, one gradient moves a parameter by 0.1 / sqrt(0.001) = 3.2 rates at once,
+    and by 32 until its first moment has died away."""
 
     def __post_init__(self) -> None:
         if len(self.source) != len(self.fresh):

@@ -71,7 +71,8 @@ class Rows(nn.Module):
             setattr(self, name, parameter)
             if optimizer is not None and column.requires_grad:
                 zero = torch.ones_like(plan.fresh) if name in plan.reset_moments else plan.fresh
-                _replace_in_optimizer(optimizer, column, parameter, plan.source, zero)
+                inherited = {"exp_avg_sq"} if name in plan.inherited_second_moments - plan.reset_moments else set()
+                _replace_in_optimizer(optimizer, column, parameter, plan.source, zero, inherited)
 
     @torch.no_grad()
     def drop_column(self, name: str, optimizer: Optimizer | None = None) -> None:
@@ -86,7 +87,7 @@ class Rows(nn.Module):
         if plan.rows != len(self):
             raise ValueError(f"the plan was made for {plan.rows} rows, the table has {len(self)}: plan again")
         parameters = {name for name, column in columns.items() if isinstance(column, nn.Parameter)}
-        unknown = (set(plan.edits) - set(columns)) | (plan.reset_moments - parameters)
+        unknown = (set(plan.edits) - set(columns)) | ((plan.reset_moments | plan.inherited_second_moments) - parameters)
         if unknown:
             raise KeyError(f"the plan edits {sorted(unknown)}, but the rows have only {sorted(columns)}")
         for name, value in plan.edits.items():
@@ -124,8 +125,11 @@ def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
     optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
-def _replace_in_optimizer(optimizer: Optimizer, old: Tensor, new: nn.Parameter, source: Tensor, zero: Tensor) -> None:
-    """Puts ``new`` in the place of ``old`` and carries every per-row moment along, set to 0 where ``zero`` is true."""
+def _replace_in_optimizer(
+    optimizer: Optimizer, old: Tensor, new: nn.Parameter, source: Tensor, zero: Tensor, inherited: Collection[str]
+) -> None:
+    """Puts ``new`` in the place of ``old`` and carries every per-row moment along, set to 0 where ``zero`` is true,
+    except for those that are ``inherited``."""
     for group in optimizer.param_groups:
         group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
     state = optimizer.state.pop(old, None)
@@ -134,6 +138,7 @@ def _replace_in_optimizer(optimizer: Optimizer, old: Tensor, new: nn.Parameter, 
     for key, moment in state.items():
         if torch.is_tensor(moment) and moment.shape == old.shape:
             moved = moment[source]
-            moved[zero] = 0
+            if key not in inherited:
+                moved[zero] = 0
             state[key] = moved
     optimizer.state[new] = state

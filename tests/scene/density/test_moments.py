@@ -6,6 +6,7 @@ The oracle keeps each row as its own little object, with Adam written out, and k
 import copy
 from dataclasses import dataclass
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -36,10 +37,10 @@ class SimulatedRow:
             self.values[name] = self.values[name] - LEARNING_RATE * self.first[name] / (1 - 0.9**number) / denominator
 
     def twin(self) -> "SimulatedRow":
-        """A copy without history."""
+        """A copy without history, but for how large the gradients of its mean were."""
         twin = copy.deepcopy(self)
         twin.first = {name: torch.zeros_like(moment) for name, moment in self.first.items()}
-        twin.second = copy.deepcopy(twin.first)
+        twin.second = copy.deepcopy(twin.first) | {"means": twin.second["means"]}
         return twin
 
 
@@ -162,3 +163,33 @@ def test_replaced_parents_leave_no_moments_behind():
         assert not moments[2:].any(), name
         expected = torch.stack([run.simulated[row].first[name] for row in (0, 2)])
         torch.testing.assert_close(moments[:2], expected, rtol=1e-12, atol=1e-15)  # float64 round-off
+
+
+@pytest.mark.parametrize(("steady", "rates"), [(True, 1.0), (False, 31.6)])
+def test_how_far_one_gradient_throws_a_clone(steady, rates):
+    """The steps after a gradient g are rate * 0.1 * 0.9^k g / sqrt(v), and sum up to rate * g / sqrt(v). The parent's v
+    is g^2 if it has seen nothing else; without it v is 0.001 g^2."""
+    rows = make_rows(1, torch.Generator().manual_seed(3))
+    rows.log_scales.data.fill_(-9.0)  # small: cloned
+    adam = torch.optim.Adam(rows.parameters(), lr=LEARNING_RATE, eps=EPSILON)
+
+    def step(size: float) -> None:
+        for parameter in rows.parameters():
+            parameter.grad = torch.full_like(parameter, size)
+        adam.step()
+
+    step(1e-3)
+    for state in adam.state.values():  # as after 10,000 such steps, when Adam corrects no bias any more
+        state["step"].fill_(10_000)
+        state["exp_avg_sq"].fill_(1e-6)
+    plan = GradientDensity(steady_means=steady).grow(
+        rows, torch.tensor([False]), torch.tensor([True]), torch.Generator()
+    )
+    rows.resize(plan, adam)
+    before = rows.means.detach().clone()
+    step(1e-3)
+    for _ in range(60):  # not seen: 0.9^60 = 0.2 % of the way is left
+        step(0.0)
+    thrown = float((rows.means.detach() - before)[1].abs().max())
+    # v decays by 0.1 % a step while the first moment dies away: 0.5 % of the way over its 10 steps.
+    assert thrown == pytest.approx(rates * LEARNING_RATE, rel=0.02)

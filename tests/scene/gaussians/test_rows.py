@@ -33,7 +33,8 @@ def test_values_moments_and_buffers_follow_their_rows():
     source = torch.tensor([5, 0, 0, 3])
     fresh = torch.tensor([False, False, True, False])
     new_means = torch.full((4, 3), 7.0)
-    rows.resize(RowPlan(6, source, fresh, {"means": new_means}, frozenset({"opacity_logits"})), optimizer)
+    plan = RowPlan(6, source, fresh, {"means": new_means}, frozenset({"opacity_logits"}), frozenset({"sh_dc"}))
+    rows.resize(plan, optimizer)
     assert len(rows) == 4
     for name, column in rows.columns().items():
         for new, old in enumerate(source.tolist()):
@@ -44,7 +45,8 @@ def test_values_moments_and_buffers_follow_their_rows():
         for new, old in enumerate(source.tolist()):
             zeroed = fresh[new] or name == "opacity_logits"
             for key, before in (("exp_avg", first), ("exp_avg_sq", second)):
-                expected = torch.zeros_like(before[name][old]) if zeroed else before[name][old]
+                inherited = (name, key) == ("sh_dc", "exp_avg_sq")
+                expected = torch.zeros_like(before[name][old]) if zeroed and not inherited else before[name][old]
                 assert torch.equal(state[key][new], expected), (name, key)
         assert float(state["step"]) == 3
     assert len(optimizer.state) == sum(1 for _ in rows.parameters())
@@ -115,9 +117,11 @@ def test_the_children_inherit_mask_and_instance():
 def test_an_unknown_edit_changes_nothing():
     rows, optimizer = trained()
     before = snapshot(rows, optimizer)[0]
-    plan = RowPlan(6, torch.tensor([0]), torch.tensor([False]), {"mean": torch.zeros(1, 3)})
-    with pytest.raises(KeyError, match="mean"):
-        rows.resize(plan, optimizer)
+    source, fresh = torch.tensor([0]), torch.tensor([False])
+    edit = RowPlan(6, source, fresh, {"mean": torch.zeros(1, 3)})
+    for plan in (edit, RowPlan(6, source, fresh, inherited_second_moments=frozenset({"mean"}))):
+        with pytest.raises(KeyError, match="mean"):
+            rows.resize(plan, optimizer)
     assert all(torch.equal(column, before[name]) for name, column in rows.columns().items())
 
 
