@@ -10,6 +10,8 @@ from sparsestreet.records.summary import SUMMARY
 
 PER_IMAGE = 56.0
 """Steps for each training image of a recorded drive (docs/length.md)."""
+IMAGES_PER_CAPACITY = 54.0
+"""Training images of a recorded drive that the numbers of ``capacity=small`` are made for (docs/length.md)."""
 
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
@@ -50,6 +52,15 @@ def steps_of_log(least: int, *, _root_: DictConfig) -> int:
     images = _root_.training_views.images
     per_image = float(_root_.data.get("steps_per_image", PER_IMAGE))
     return least if images is None else max(least, 100 * round(per_image * images / 100))
+
+
+def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:
+    """Of conf/node: a number of Gaussians, in whole hundreds, that grows with the training images where these are more
+    than ``data.images_per_capacity`` (without such a key ``IMAGES_PER_CAPACITY``); before the log is read, the least.
+    """
+    images = _root_.training_views.images
+    enough = float(_root_.data.get("images_per_capacity", IMAGES_PER_CAPACITY))
+    return least if images is None else max(least, 100 * round(least * images / enough / 100))
 
 
 def of_30000(step: int) -> float:
@@ -109,6 +120,7 @@ _RESOLVERS = {
     "beside": beside,
     "mul": mul,
     "steps_of_log": steps_of_log,
+    "gaussians_of_log": gaussians_of_log,
     "min": min,
     "of_30000": of_30000,
     "at_scale": at_scale,
