@@ -68,7 +68,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
         (["mask@node.rigd.mask=temporal"], "mask@node.rigid.mask? Its options are static, temporal"),
         (["render=fast"], "set one of render.backend, render.preset, render.settings"),
-        (["optimizer=visible_adam"], "set one of optimizer.eps, optimizer.visible_only"),
+        (["optimizer=visible_adam"], "set one of optimizer.eps, optimizer.largest_radius, optimizer.visible_only"),
         (["render=null"], "render is no choice but has keys of its own"),
         (["trainer.max_step=5"], "did you mean 'schedule.max_steps'?"),  # which that one follows
         (["max_steps=60"], "did you mean 'schedule.max_steps'?"),

@@ -52,7 +52,7 @@ def test_no_more_of_the_radius_than_the_largest_counts_for_rates(largest, means)
 
 
 def test_a_largest_radius_is_positive():
-    with pytest.raises(ValueError, match="must be > 0 m, got 0.0: null for no limit"):
+    with pytest.raises(ValueError, match=r"must be > 0 m, got 0\.0: null"):
         OptimizerSettings(largest_radius=0.0)
 
 
