@@ -39,7 +39,7 @@ def rendering(
     depth = torch.ones(HEIGHT, WIDTH) if depth is None else depth
     radii = torch.zeros(0) if radii is None else radii
     splats = Rendering(rgb, alpha, depth, radii, torch.zeros(len(radii), 2))
-    return SceneRendering(rgb, alpha, depth, splats, spans or {}, {})
+    return SceneRendering(rgb, alpha, depth, splats, spans or {}, {}, no_gaussians())
 
 
 def check_gradient(term: Callable[[Tensor], Tensor], values: Tensor, generator: torch.Generator) -> None:

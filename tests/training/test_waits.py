@@ -53,7 +53,7 @@ def given() -> tuple[SceneRendering, Frame, SceneGraph]:
     state = SceneState(0.9, 3, training=True)
     parts = {name: node.raw_at(frame, state) for name, node in placed.nodes.items()}
     drawn = splats(10)
-    rendering = SceneRendering(drawn.rgb, drawn.alpha, drawn.depth, drawn, spans, parts, state)
+    rendering = SceneRendering(drawn.rgb, drawn.alpha, drawn.depth, drawn, spans, parts, no_gaussians(), state)
     return rendering, replace(frame, **known), placed
 
 
