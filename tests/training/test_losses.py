@@ -15,7 +15,7 @@ from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.losses import Depth, Loss, MaskSparsity, Photometric, SkyMask
 from sparsestreet.types import Frame, Rendering
-from tests.training.stubs import background, frame_at, rigid, set_rows
+from tests.training.stubs import background, frame_at, no_gaussians, rigid, set_rows
 from tests.typed import there
 
 HEIGHT, WIDTH = 13, 17

@@ -21,7 +21,7 @@ from sparsestreet.scene.state import SceneState
 from sparsestreet.training import losses
 from sparsestreet.training.losses import Loss, dynamic_region
 from sparsestreet.types import Frame, Rendering
-from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
+from tests.training.stubs import StubTrainer, background, frame_at, make_system, no_gaussians, rigid
 
 META = torch.device("meta")
 SIZE = (16, 32)

@@ -15,6 +15,7 @@ from tests.training.stubs import (
     AskedStrategy,
     background,
     frame_at,
+    no_gaussians,
 )
 
 
