@@ -35,5 +35,6 @@ def test_weights_fall_with_the_least_difference():
 
 def test_nothing_to_color():
     colors, seen = seen_colors(torch.zeros(0, 3), [frame(1)])
-    assert colors.shape == (0, 3) and seen.shape == (0,)
+    assert colors.shape == (0, 3)
+    assert seen.shape == (0,)
     assert seen_colors(torch.ones(2, 3), [])[1].tolist() == [False, False]

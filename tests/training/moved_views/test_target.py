@@ -31,8 +31,10 @@ def test_a_pixel_takes_its_nearest_return():
     street = returns(at_pixel(2.5, 1.5, 5.0), at_pixel(2.6, 1.4, 4.9), at_pixel(6.5, 4.5, 7.0), weight=0.5)
     found = target(camera(), street, NONE, [])
     assert torch.nonzero(found.weight).tolist() == [[1, 2], [4, 6]]
-    assert found.depth[1, 2] == pytest.approx(4.9) and found.depth[4, 6] == pytest.approx(7.0)
-    assert torch.equal(found.color[1, 2], street.colors[1]) and torch.equal(found.color[4, 6], street.colors[2])
+    assert found.depth[1, 2] == pytest.approx(4.9)
+    assert found.depth[4, 6] == pytest.approx(7.0)
+    assert torch.equal(found.color[1, 2], street.colors[1])
+    assert torch.equal(found.color[4, 6], street.colors[2])
     assert set(found.weight.unique().tolist()) == {0.0, 0.5}
 
 
@@ -106,7 +108,8 @@ def test_unhidden_against_a_slow_definition():
         beside = inside & ((cells - cells[row]).abs() <= 1).all(1)
         if z[row] <= 1.15 * z[beside].min() + 0.3:
             expected.append(row)
-    assert rows.tolist() == expected and 20 < len(expected) < int(inside.sum())
+    assert rows.tolist() == expected
+    assert 20 < len(expected) < int(inside.sum())
     torch.testing.assert_close(positions, pixels[rows])
     assert torch.equal(depths, z[rows])
 
@@ -114,5 +117,7 @@ def test_unhidden_against_a_slow_definition():
 @pytest.mark.parametrize("street", [NONE, returns(at_pixel(20.0, 1.0, 5.0))])
 def test_without_a_return_nothing_is_known(street):
     found = target(camera(), street, NONE, [])
-    assert found.weight.shape == (HEIGHT, WIDTH) and not found.weight.any()
-    assert torch.isfinite(found.depth).all() and (found.depth > 0).all()
+    assert found.weight.shape == (HEIGHT, WIDTH)
+    assert not found.weight.any()
+    assert torch.isfinite(found.depth).all()
+    assert (found.depth > 0).all()

@@ -10,8 +10,8 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, from_another_camera, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
-from sparsestreet.training.moved_views.returns import StreetReturns
 from sparsestreet.training.moved_views import term as term_module
+from sparsestreet.training.moved_views.returns import StreetReturns
 from sparsestreet.training.moved_views.target import Returns, target
 from sparsestreet.training.moved_views.term import free_range
 from sparsestreet.types import Camera, Frame, Track, View
@@ -46,7 +46,8 @@ def test_the_same_gaussians_from_elsewhere_are_those_of_a_view_there():
     there = View(replace(frame.camera, camera_from_world=pose), frame.time, frame.frame_index, frame.camera_index)
     rendering = seen(one, frame)
     again, anew = from_another_camera(one, rendering, there, rendering.options), render(one, there, rendering.state)
-    assert torch.equal(again.rgb, anew.rgb) and torch.equal(again.depth, anew.depth)
+    assert torch.equal(again.rgb, anew.rgb)
+    assert torch.equal(again.depth, anew.depth)
     assert not torch.equal(again.rgb, rendering.rgb)
 
 
@@ -99,7 +100,8 @@ def test_gradients_reach_the_nodes_and_draws_depend_on_the_step_alone():
     assert values[3][0] == values[3][1] != values[6][0]
     torch.stack(tuple(term(one, seen(one, frame), frame).values())).sum().backward()
     for node in one.nodes.values():
-        assert node.rows.means.grad is not None and node.rows.means.grad.abs().max() > 0
+        assert node.rows.means.grad is not None
+        assert node.rows.means.grad.abs().max() > 0
 
 
 def test_what_a_view_is_compared_with(monkeypatch):
@@ -121,7 +123,10 @@ def test_what_a_view_is_compared_with(monkeypatch):
         term(one, seen(one, frame), frame)
     street, objects, boxes, reach = asked[0][1:]
     assert (street.weights * 5).round().tolist() == [2.0, 3.0]
-    assert objects is car and len(boxes) == 1 and torch.equal(boxes[0][0], poses[0]) and reach == 0.25
+    assert objects is car
+    assert len(boxes) == 1
+    assert torch.equal(boxes[0][0], poses[0])
+    assert reach == 0.25
     assert len(asked[1][1]) == 1
     view = drawn[0]
     assert (view.time, view.indices, view.seconds, view.stamp) == (frame.time, frame.indices, 3.5, 7)
@@ -137,7 +142,8 @@ def test_floaters_before_the_camera_are_left_to_the_recorded_views():
     means[:, 2] = 0.35
     floaters = replace(rendering.gaussians, means=means)
     blocked = term(one, replace(rendering, gaussians=floaters), frame)["moved_depth"].item()
-    assert usual > 0 and blocked < usual / 10
+    assert usual > 0
+    assert blocked < usual / 10
 
 
 def test_which_steps_have_a_moved_view():
