@@ -28,7 +28,7 @@ class MovedViews:
     """How many frames before and after its own a view sees returns of."""
     returns_per_sweep: int = 30_000
     """A sweep keeps at most this number of returns, drawn at random: memory."""
-    returns_per_view: int = 40_000
+    returns_per_view: int = 30_000
     """A view looks at no more returns, drawn at random in each step: time."""
     tolerance: float = 0.1
     """Difference between the color of a return and an image of another instant at which the return weighs 1/e."""
