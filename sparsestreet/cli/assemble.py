@@ -29,6 +29,7 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         resolution=instantiate(cfg.schedule.resolution, _convert_="all"),
         seed=cfg.seed,
         image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,
+        moved_views=instantiate(cfg.moved_views, _convert_="all") if cfg.moved_views else None,
     )
     recipe.check()
     return recipe

@@ -65,6 +65,7 @@ class TrainSchema:
     node: Tree = MISSING
     effects: Tree | None = None
     image_points: Any = None
+    moved_views: Any = None
     loss: Tree = MISSING
     callback: Tree = MISSING
     optimizer: Tree = MISSING

@@ -42,6 +42,17 @@ def moved(camera: Camera, vector: Float64[Tensor, "3"]) -> Camera:
     return replace(camera, camera_from_world=pose.to(camera.camera_from_world.dtype))
 
 
+def resized(camera: Camera, height: int, width: int) -> Camera:
+    """The camera with an image of another size that shows the same.
+
+    >>> intrinsics = torch.tensor([[10.0, 0.0, 2.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])
+    >>> resized(Camera(torch.eye(4), intrinsics, width=4, height=4), 2, 2).intrinsics[0].tolist()
+    [5.0, 0.0, 1.0]
+    """
+    scale = torch.tensor([[width / camera.width], [height / camera.height], [1.0]]).to(camera.intrinsics)
+    return replace(camera, intrinsics=scale * camera.intrinsics, width=width, height=height)
+
+
 def project(
     camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:

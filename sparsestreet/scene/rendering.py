@@ -1,6 +1,6 @@
 """From a scene and a view to an image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,10 +9,10 @@ from torch import Tensor
 from sparsestreet.ops import splat
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.phases import phase
-from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.graph import SceneGaussians, SceneGraph
 from sparsestreet.scene.options import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.scene.state import FINISHED, SceneState
-from sparsestreet.types import Rendering, View
+from sparsestreet.types import Gaussians, Rendering, View
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class SceneRendering:
     """Name of a node -> its rows in ``splats``."""
     parts: dict[str, RawGaussians]
     """Name of a node -> what it answered for the view, before activation."""
+    gaussians: Gaussians
+    """What was drawn, activated."""
 
     @property
     def drawn(self) -> dict[str, Bool[Tensor, " _"]]:
@@ -50,17 +52,38 @@ def render(
     with torch.autocast(scene.device.type, enabled=False):
         with phase("scene"):
             placed = scene.gaussians_at(view, state)
-        with phase("splat"):
-            splats = splat(
-                placed.gaussians,
-                placed.view.camera,
-                settings=options.settings,
-                backend=options.backend,
-                screen_gradients=state.screen_gradients,
-            )
-        rgb = splats.rgb
-        for name, effect in scene.effects.items():
-            if effect.has_image:
-                with phase(name):
-                    rgb = effect.image(rgb, splats, placed.view, options)
-        return SceneRendering(rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts, state, options)
+        return _drawn(scene, placed, state, options)
+
+
+def from_another_camera(
+    scene: SceneGraph, rendering: SceneRendering, view: View, options: RenderOptions
+) -> SceneRendering:
+    """Draw the Gaussians of a rendering once more, from another camera at the same instant.
+
+    Nodes are not asked again, which saves their time, and gradients of both images reach them together. The image
+    gathers no screen gradients.
+    """
+    state = replace(rendering.state, screen_gradients=False)
+    with torch.autocast(scene.device.type, enabled=False):
+        seen = scene.seen(view, state)
+        placed = SceneGaussians(rendering.gaussians, rendering.spans, rendering.parts, seen)
+        return _drawn(scene, placed, state, options)
+
+
+def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options: RenderOptions) -> SceneRendering:
+    with phase("splat"):
+        splats = splat(
+            placed.gaussians,
+            placed.view.camera,
+            settings=options.settings,
+            backend=options.backend,
+            screen_gradients=state.screen_gradients,
+        )
+    rgb = splats.rgb
+    for name, effect in scene.effects.items():
+        if effect.has_image:
+            with phase(name):
+                rgb = effect.image(rgb, splats, placed.view, options)
+    return SceneRendering(
+        rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts, placed.gaussians, state, options
+    )

@@ -12,6 +12,7 @@ from sparsestreet.scene.nodes import NodeSettings
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
 from sparsestreet.training.losses import Loss, MaskSparsity, Photometric
+from sparsestreet.training.moved_views import MovedViews, moved_view_term
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.resolution import ResolutionSchedule
 from sparsestreet.training.system import StreetSystem
@@ -36,6 +37,8 @@ class Recipe:
     seed: int = 0
     image_points: ImagePointSettings | None = None
     """How points are triangulated from the training images; None: not at all."""
+    moved_views: MovedViews | None = None
+    """How views beside the recorded path are trained on; None: not at all."""
 
     def problems(self) -> list[str]:
         """Parts that lack their counterpart, one sentence each; an empty list where all fits together."""
@@ -81,6 +84,9 @@ class Recipe:
             options=self.options,
             sh_interval=self.sh_interval,
             resolution=self.resolution,
+            moved_views=None
+            if self.moved_views is None
+            else moved_view_term(self.moved_views, data, self.nodes, self.seed),
         )
 
     def _has(self, kind: type[Callback]) -> bool:

@@ -7,8 +7,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from sparsestreet.geometry.cameras import resized
 from sparsestreet.training.schedule import ROUNDING, Course
-from sparsestreet.types import Camera, Frame
+from sparsestreet.types import Frame
 
 LEAST_SIDE = 11
 """Pixels: SSIM's window. Images are not made smaller than this."""
@@ -59,17 +60,11 @@ def smaller(frame: Frame, divisor: int) -> Frame:
     masks = {name: getattr(frame, name) for name in ("sky", "human", "vehicle", "ego")}
     return replace(
         frame,
-        camera=_camera(frame.camera, size),
+        camera=resized(frame.camera, *size),
         image=_image(frame.image, size),
         depth=None if frame.depth is None else _depth(frame.depth, size),
         **{name: None if mask is None else _mask(mask, size) for name, mask in masks.items()},
     )
-
-
-def _camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    height, width = size
-    shrink = torch.tensor([[width / camera.width], [height / camera.height], [1.0]]).to(camera.intrinsics)
-    return replace(camera, intrinsics=shrink * camera.intrinsics, width=width, height=height)
 
 
 def _image(image: UInt8[Tensor, "h w 3"], size: tuple[int, int]) -> UInt8[Tensor, "_ _ 3"]:

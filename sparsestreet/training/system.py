@@ -17,6 +17,7 @@ from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRe
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
+from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.resolution import ResolutionSchedule
 from sparsestreet.training.schedule import Course
@@ -41,6 +42,7 @@ class StreetSystem(LightningModule):
         options: RenderOptions = DEFAULT_OPTIONS,
         sh_interval: float = 1 / 30,
         resolution: ResolutionSchedule | None = None,
+        moved_views: MovedViewTerm | None = None,
     ) -> None:
         """Make a system of its parts.
 
@@ -52,6 +54,7 @@ class StreetSystem(LightningModule):
             options: how it is rendered.
             sh_interval: fraction of the run after which one more degree of spherical harmonics is used.
             resolution: size of the images that steps train on; None: whole.
+            moved_views: the terms of views beside the path; None: there are none.
 
         Raises:
             ValueError: if the interval is not positive.
@@ -66,6 +69,7 @@ class StreetSystem(LightningModule):
         self.options = options
         self.sh_interval = sh_interval
         self.resolution = resolution or ResolutionSchedule()
+        self.moved_views = moved_views
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
@@ -105,6 +109,9 @@ class StreetSystem(LightningModule):
                     terms[name] = loss(seen, recorded, self.scene)
             with phase("regularizers"):
                 terms |= self.scene.regularizers(frame, self.rendering.parts, self.rendering.drawn, state)
+            if self.moved_views is not None and self.moved_views.applies(state.step, state.progress):
+                with phase("moved view"):
+                    terms |= self.moved_views(self.scene, self.rendering, frame)
         if self._logs():
             with phase("logging"):
                 self._log_training(self.rendering, terms, frame)

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from sparsestreet.cli.assemble import recipe_of, trainer_of
 from sparsestreet.cli.compose import configuration
 from sparsestreet.scene.nodes import BackgroundSettings, RigidSettings
+from sparsestreet.training.moved_views import MovedViews
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.run import CPU_TRAINER
 from tests.typed import as_a
@@ -39,6 +40,10 @@ def test_learning_rates_and_sources(cfg):
     assert usual.sources == configured.sources
     assert usual.num_points == configured.num_points
     assert (usual.prunable, usual.masked) == (configured.prunable, configured.masked)
+
+
+def test_moved_views(cfg):
+    assert recipe_of(cfg).moved_views == MovedViews()
 
 
 def test_the_rest_of_a_recipe(cfg):

@@ -215,7 +215,8 @@ def test_its_parts_fit_together_and_are_no_others(preset: str, method: str):
     plain = composed(f"method={method}", *FULL)
     assert list(cfg.node) == list(plain.node)
     assert list(cfg.callback) == list(plain.callback)
-    new = set(flat(preset, method)) - set(flat_config(resolved(plain)))
+    assert cfg.moved_views is None
+    new = set(flat(preset, method)) - set(flat_config(resolved(plain))) - {"moved_views"}
     assert all(key.startswith(("preset.", "loss.")) for key in new)
 
 

@@ -25,9 +25,10 @@ from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks.resizing import RowListener
 from sparsestreet.training.losses import Loss, Photometric
+from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
-from sparsestreet.types import Camera, Frame
+from sparsestreet.types import Camera, Frame, Gaussians
 
 WIDTH, HEIGHT = 32, 16
 NUM_FRAMES = 5
@@ -91,6 +92,11 @@ def rigid(count: int = 10, *, seed: int = 1, mask: StaticMaskSettings | None = N
     return Rigid(settings, rows, still, sizes, names=("truck", "person"), max_gap=1.0, mask=trained)
 
 
+def no_gaussians() -> Gaussians:
+    """What a rendering that is made by hand has drawn."""
+    return Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3))))
+
+
 def labels(node: Node) -> list[int]:
     """Which of the first rows a node still has."""
     return node.rows.label.tolist()
@@ -123,6 +129,7 @@ def make_system(
     radius: float = 10.0,
     options: RenderOptions | None = None,
     sh_interval: float = 0.1,
+    moved_views: MovedViewTerm | None = None,
 ) -> StreetSystem:
     return StreetSystem(
         SceneGraph(nodes, effects),
@@ -131,6 +138,7 @@ def make_system(
         radius=radius,
         options=RenderOptions() if options is None else options,
         sh_interval=sh_interval,
+        moved_views=moved_views,
     )
 
 

@@ -15,7 +15,7 @@ from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.losses import Depth, Loss, MaskSparsity, Photometric, SkyMask
 from sparsestreet.types import Frame, Rendering
-from tests.training.stubs import background, frame_at, rigid, set_rows
+from tests.training.stubs import background, frame_at, no_gaussians, rigid, set_rows
 from tests.typed import there
 
 HEIGHT, WIDTH = 13, 17
@@ -39,7 +39,7 @@ def rendering(
     depth = torch.ones(HEIGHT, WIDTH) if depth is None else depth
     radii = torch.zeros(0) if radii is None else radii
     splats = Rendering(rgb, alpha, depth, radii, torch.zeros(len(radii), 2))
-    return SceneRendering(rgb, alpha, depth, splats, spans or {}, {})
+    return SceneRendering(rgb, alpha, depth, splats, spans or {}, {}, no_gaussians())
 
 
 def check_gradient(term: Callable[[Tensor], Tensor], values: Tensor, generator: torch.Generator) -> None:

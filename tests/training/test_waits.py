@@ -21,7 +21,7 @@ from sparsestreet.scene.state import SceneState
 from sparsestreet.training import losses
 from sparsestreet.training.losses import Loss, dynamic_region
 from sparsestreet.types import Frame, Rendering
-from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
+from tests.training.stubs import StubTrainer, background, frame_at, make_system, no_gaussians, rigid
 
 META = torch.device("meta")
 SIZE = (16, 32)
@@ -53,7 +53,7 @@ def given() -> tuple[SceneRendering, Frame, SceneGraph]:
     state = SceneState(0.9, 3, training=True)
     parts = {name: node.raw_at(frame, state) for name, node in placed.nodes.items()}
     drawn = splats(10)
-    rendering = SceneRendering(drawn.rgb, drawn.alpha, drawn.depth, drawn, spans, parts, state)
+    rendering = SceneRendering(drawn.rgb, drawn.alpha, drawn.depth, drawn, spans, parts, no_gaussians(), state)
     return rendering, replace(frame, **known), placed
 
 

@@ -15,6 +15,7 @@ from tests.training.stubs import (
     AskedStrategy,
     background,
     frame_at,
+    no_gaussians,
 )
 
 
@@ -28,7 +29,9 @@ def seen(system: StreetSystem, gradient: Tensor, radii: Tensor, width: int, heig
     for name, count in system.scene.counts().items():
         spans[name] = slice(start, start + count)
         start += count
-    system.rendering = SceneRendering(image, plane, plane, Rendering(image, plane, plane, radii, offsets), spans, {})
+    system.rendering = SceneRendering(
+        image, plane, plane, Rendering(image, plane, plane, radii, offsets), spans, {}, no_gaussians()
+    )
 
 
 def test_statistics_of_a_wide_image_by_hand():

@@ -1,0 +1,20 @@
+"""Views beside the recorded path, compared with what lidar returned from there.
+
+A recorded view is rendered once more from a camera that stands sideways of the recorded one. Nobody recorded an image
+there, but the returns of this sweep and of those before and after it, in the colors of the recorded images, say what
+many of its pixels show. Fused lidar as a target beside the path follows LiDAR-EVS (arXiv 2603.14763) and FlexDrive
+(arXiv 2502.21093) in idea; the form is ours.
+
+    settings    how often, how far, and how much the terms weigh
+    returns     the street's returns, and those of cars in the frames of their boxes
+    coloring    the color of a return, and how far images of other instants agree with it
+    target      what returns say of the pixels of a camera
+    term        the terms of a step
+    build       from a log to its terms
+"""
+
+from sparsestreet.training.moved_views.build import moved_view_term
+from sparsestreet.training.moved_views.settings import MovedViews
+from sparsestreet.training.moved_views.term import MovedViewTerm
+
+__all__ = ["MovedViewTerm", "MovedViews", "moved_view_term"]

@@ -1,0 +1,109 @@
+"""The terms of a step that renders its view once more from beside the path."""
+
+import logging
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sparsestreet.geometry.cameras import distance_to_view, moved, resized
+from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.scene.generators import named_generator
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import SceneRendering, from_another_camera
+from sparsestreet.training.moved_views.returns import StreetReturns
+from sparsestreet.training.moved_views.settings import MovedViews
+from sparsestreet.training.moved_views.target import NEAREST, Returns, target
+from sparsestreet.types import Camera, Frame, View
+
+_log = logging.getLogger(__name__)
+
+CLEARANCE = 0.5
+"""Meters that stay between a moved camera and what the lidar saw."""
+_MARGIN = 0.1
+"""Of the image on each side: what a lens shows beyond the pinhole's image."""
+
+
+class MovedViewTerm:
+    """Renders a step's Gaussians from a camera beside the recorded one, and compares them with the returns."""
+
+    def __init__(self, settings: MovedViews, returns: StreetReturns, seed: int) -> None:
+        self.settings = settings
+        self.returns = returns
+        self.seed = seed
+        self._near: dict[tuple[int, int], tuple[Int[Tensor, " n"], tuple[float, float]]] = {}
+
+    def applies(self, step: int, progress: float) -> bool:
+        """Whether a step has a moved view."""
+        settings = self.settings
+        return (
+            step % settings.every == 0 and settings.start <= progress < settings.stop and len(self.returns.street) > 0
+        )
+
+    def __call__(self, scene: SceneGraph, rendering: SceneRendering, frame: Frame) -> dict[str, Float[Tensor, ""]]:
+        """The weighted terms. ``rendering`` is of the same instant: its Gaussians are drawn again.
+
+        A draw depends on seed and step alone, so a resumed run draws the same as an uninterrupted one.
+        """
+        settings = self.settings
+        generator = named_generator(self.seed, f"moved view {rendering.state.step}")
+        rows, (left, right) = self._around(frame)
+        distance = left + (right - left) * float(torch.rand((), generator=generator))
+        camera = self._camera(frame.camera, distance)
+        if len(rows) > settings.returns_per_view:
+            rows = rows[torch.randint(len(rows), (settings.returns_per_view,), generator=generator)]
+        index, _ = frame.indices
+        none = Returns.concatenate([])
+        found = target(
+            camera,
+            self.returns.street.at(rows),
+            self.returns.objects.get(index, none),
+            self.returns.boxes(index),
+            0.5 / settings.divisor,
+        )
+        view = View(camera, frame.time, frame.frame_index, frame.camera_index, frame.seconds, frame.stamp)
+        # The low-pass of the recorded image, in pixels of the smaller one: its pixels are samples of the recorded size.
+        sampled = replace(rendering.options.settings, eps2d=rendering.options.settings.eps2d / settings.divisor**2)
+        seen = from_another_camera(scene, rendering, view, replace(rendering.options, settings=sampled))
+        device = seen.depth.device
+        depth, color, weight = (each.to(device) for each in (found.depth, found.color, found.weight))
+        known = (weight > 0) & (seen.depth.detach() > NEAREST)
+        weight = torch.where(known, weight, 0.0) / weight.numel()
+        inverse = 1 / torch.where(known, seen.depth, 1.0) - 1 / torch.where(known, depth, 1.0)
+        return {
+            "moved_depth": settings.depth_weight * (weight * inverse.abs()).sum(),
+            "moved_color": settings.color_weight * (weight * (seen.rgb - color).abs().mean(-1)).sum(),
+        }
+
+    def _camera(self, camera: Camera, distance: float) -> Camera:
+        """The camera meters to its right, with a smaller image."""
+        divisor = self.settings.divisor
+        beside = moved(camera, distance * camera.camera_from_world[0, :3].double())
+        return resized(beside, max(camera.height // divisor, 1), max(camera.width // divisor, 1))
+
+    def _around(self, frame: Frame) -> tuple[Int[Tensor, " n"], tuple[float, float]]:
+        """Rows of the street that cameras beside this one may see, and how far they may move: meters to the right."""
+        if frame.indices not in self._near:
+            rows = self.returns.around(frame.indices[0], self.settings.sweeps)
+            points = self.returns.street.points[rows]
+            inside = distance_to_view(frame.camera, points, _MARGIN) < self.settings.sideways
+            limits = free_range(frame.camera, points, self.settings.sideways)
+            self._near[frame.indices] = torch.nonzero(inside).squeeze(-1) + rows.start, limits
+        return self._near[frame.indices]
+
+
+def free_range(camera: Camera, points: Float[Tensor, "n 3"], sideways: float) -> tuple[float, float]:
+    """How far a camera may move along its own x axis, from the leftmost to the rightmost place, meters.
+
+    It keeps CLEARANCE to all points.
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=4, height=4)
+    >>> free_range(camera, torch.tensor([[1.5, 0.0, 0.1], [-9.0, 0.0, 0.0]]), sideways=3.0)
+    (-3.0, 1.0)
+    """
+    x, y, z = transform_points(camera.camera_from_world.to(points), points).unbind(1)
+    level = (y.abs() < CLEARANCE) & (z.abs() < CLEARANCE)
+    right, left = x[level & (x > 0)], -x[level & (x <= 0)]
+    free = [min(sideways, max(float(side.min()) - CLEARANCE, 0.0)) if len(side) else sideways for side in (left, right)]
+    return -free[0], free[1]
