@@ -192,7 +192,8 @@ def test_the_short_variant_is_the_schedules():
     at_length = ("method=omnire", "schedule=paper", "capacity=paper")
     short, exact = (resolved(composed(*at_length, f"sparsify={one}")) for one in ("paper_short", "paper"))
     for one in (short, exact):
-        one.pop("sparsify"), one.pop("name"), one.pop("out", None)
+        for key in ("sparsify", "name", "out"):
+            one.pop(key, None)
     assert short == exact
 
 

@@ -50,7 +50,8 @@ def test_the_library_reports_its_tiles():
 
 def activated() -> Gaussians:
     shapes = ((3,), (3,), (4,), (), (1, 3), (0, 3))
-    raw = RawGaussians(*(torch.ones(2, *shape, requires_grad=True) for shape in shapes))
+    means, scales, turns, opacities, dc, rest = (torch.ones(2, *shape, requires_grad=True) for shape in shapes)
+    raw = RawGaussians(means, scales, turns, opacities, dc, rest)
     return activate([raw], sh_degree=0, backend="cpu")
 
 

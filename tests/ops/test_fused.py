@@ -15,7 +15,8 @@ from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
 from sparsestreet.types import Camera
 
-ROWS = RawGaussians(*(torch.zeros(1, *shape) for shape in ((3,), (3,), (4,), (), (1, 3), (0, 3))))
+MEANS, SCALES, TURNS, OPACITIES, DC, REST = (torch.zeros(1, *shape) for shape in ((3,), (3,), (4,), (), (1, 3), (0, 3)))
+ROWS = RawGaussians(MEANS, SCALES, TURNS, OPACITIES, DC, REST)
 TRACKS = Trajectories(
     torch.zeros(1, 1), torch.zeros(1, 1, 4), torch.zeros(1, 1, 3), torch.ones(1, 1).bool(), torch.zeros(1, 2)
 )

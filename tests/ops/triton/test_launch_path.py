@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from triton.compiler import CompiledKernel
+from triton import knobs
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.triton import launch
@@ -194,7 +195,7 @@ def test_a_launch_that_a_hook_waits_for_is_tritons_own(monkeypatch, hooked, call
             started.append(("run", arguments[:3], arguments[9:]))
 
     if hooked:
-        monkeypatch.setattr(getattr(launch.triton.knobs.runtime, hooked), "calls", [print])
+        monkeypatch.setattr(getattr(knobs.runtime, hooked), "calls", [print])
     monkeypatch.setattr(launch, "driver", SimpleNamespace(active=SimpleNamespace(get_current_stream=lambda device: 7)))
     launch._start(Compiled(), 0, (3, 1, 1), (5, 6))
     assert started == [(called, (3, 1, 1), (5, 6))]
