@@ -29,6 +29,9 @@ GROWS_TO = 3.0
 OPTIMIZER = 1.3
 """A step with its optimizer and statistics takes so many times as long as without (docs/length.md)."""
 
+MOVED_VIEW = 0.5
+"""A moved view takes so much of a step (docs/moved_views.md)."""
+
 CLOSING_SECONDS = 3.0
 """For files and plots at the end."""
 
@@ -94,7 +97,9 @@ def measured_step(system: StreetSystem, data: StreetData) -> float:
     afterwards stays the same to the bit."""
     frames = data.split.train
     sample = [to_device(frame, system.device) for frame in frames.at(spread(len(frames), TRIALS))]
-    return OPTIMIZER * median(_seconds(lambda frame=frame: _step(system, frame), system.device) for frame in sample)
+    moved = 0.0 if system.moved_views is None else MOVED_VIEW * system.moved_views.frequency
+    bare = median(_seconds(lambda frame=frame: _step(system, frame), system.device) for frame in sample)
+    return (OPTIMIZER + moved) * bare
 
 
 def measured_evaluation(system: StreetSystem, data: StreetData) -> tuple[float, float]:

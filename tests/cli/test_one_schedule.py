@@ -23,6 +23,7 @@ def without(parts: tuple[str, ...], *overrides: str) -> dict[str, Any]:
     return {key: value for key, value in config.items() if not key.startswith(parts)}
 
 
+@pytest.mark.lengthy
 @pytest.mark.parametrize("moments", MOMENTS)
 def test_rules_differ_in_their_rule_alone(moments: str):
     chosen = [(f"experiment=rule/{rule}", f"schedule.removal_at={moments}") for rule in RULES]

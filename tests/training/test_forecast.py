@@ -5,10 +5,13 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Split
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.scene.density import GradientDensity
+from sparsestreet.training import forecast as forecast_module
 from sparsestreet.training.forecast import (
     CLOSING_SECONDS,
     GROWS_TO,
     GROWTH,
+    MOVED_VIEW,
+    OPTIMIZER,
     Forecast,
     growth_of,
     largest,
@@ -16,6 +19,9 @@ from sparsestreet.training.forecast import (
     measured_step,
     renders_of,
 )
+from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
+from sparsestreet.training.moved_views.returns import StreetReturns
+from sparsestreet.training.moved_views.target import Returns
 from tests.training.stubs import SplitFrames, StubTrainer, background, frame_at, make_system, rigid
 
 
@@ -52,6 +58,20 @@ def test_a_node_grows_to_its_limit_or_to_a_few_times_its_start():
     most = 20 + 50 + GROWS_TO * 30 + 40
     assert largest(system) == most
     assert growth_of(system) == pytest.approx((most / 100) ** GROWTH)
+
+
+def test_moved_views_take_their_part_of_the_steps(monkeypatch):
+    frames = Frames.of([frame_at(index) for index in range(3)])
+    system, data = make_system({"background": background(20)}), SplitFrames(Split(frames, Frames.of(())))
+    monkeypatch.setattr(forecast_module, "_seconds", lambda work, device: 2.0)
+    assert measured_step(system, data) == 2.0 * OPTIMIZER
+    one = Returns(torch.ones(1, 3), torch.ones(1, 3), torch.ones(1))
+    settings = MovedViews(every=4, start=0.1, stop=0.9)
+    system.moved_views = MovedViewTerm(settings, StreetReturns(one, (0,), (0, 1), {}, ()), seed=0)
+    # 0.8 of the run, every fourth step.
+    assert measured_step(system, data) == pytest.approx(2.0 * (OPTIMIZER + 0.2 * MOVED_VIEW))
+    system.moved_views = MovedViewTerm(settings, StreetReturns(Returns.concatenate([]), (), (0,), {}, ()), seed=0)
+    assert measured_step(system, data) == 2.0 * OPTIMIZER
 
 
 def test_trials_leave_no_trace():

@@ -34,6 +34,12 @@ class MovedViewTerm:
         self.seed = seed
         self._near: dict[tuple[int, int], tuple[Int[Tensor, " n"], tuple[float, float]]] = {}
 
+    @property
+    def frequency(self) -> float:
+        """Moved views per step, over the whole run."""
+        settings = self.settings
+        return (settings.stop - settings.start) / settings.every if len(self.returns.street) else 0.0
+
     def applies(self, step: int, progress: float) -> bool:
         """Whether a step has a moved view."""
         settings = self.settings

@@ -4,8 +4,8 @@ from collections import Counter
 from types import SimpleNamespace
 
 import pytest
-from triton.compiler import CompiledKernel
 from triton import knobs
+from triton.compiler import CompiledKernel
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.triton import launch
