@@ -60,8 +60,8 @@ def from_another_camera(
 ) -> SceneRendering:
     """Draw the Gaussians of a rendering once more, from another camera at the same instant.
 
-    Nodes are not asked again, which saves their time, and gradients of both images reach them together. The image
-    gathers no screen gradients.
+    Nodes are not asked again, which saves their time, and gradients of both images reach them together. A field has
+    deformed only what the first view could see. The image gathers no screen gradients.
     """
     state = replace(rendering.state, screen_gradients=False)
     with torch.autocast(scene.device.type, enabled=False):
