@@ -13,7 +13,7 @@ def test_a_simulators_preset_differs_in_its_moved_views_alone():
     assert {key for key in apart if not key.startswith(("moved_views.", "preset."))} == {"name", "out"}
     assert usual.keys() == simulation.keys()
     settings = recipe_of(composed("preset=simulation")).moved_views
-    assert settings == MovedViews(every=1, stop=1.0, depth_weight=4.0, color_weight=4.0)
+    assert settings == MovedViews(every=2, depth_weight=8.0, color_weight=8.0)
 
 
 def test_they_can_be_left_out():
