@@ -20,9 +20,9 @@ class MovedViews:
     """Meters; a camera moves by a uniformly drawn distance up to this to the left or right, but into no wall."""
     divisor: int = 2
     """Sides of a moved view are those of the recorded one divided by this."""
-    depth_weight: float = 6.0
+    depth_weight: float = 4.0
     """Of the absolute error of the inverse depth, 1/m."""
-    color_weight: float = 6.0
+    color_weight: float = 4.0
     """Of the absolute error of the color, mean over its channels."""
     sweeps: int = 10
     """How many frames before and after its own a view sees returns of."""
