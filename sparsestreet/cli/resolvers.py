@@ -54,6 +54,13 @@ def steps_of_log(least: int, *, _root_: DictConfig) -> int:
     return least if images is None else max(least, 100 * round(per_image * images / 100))
 
 
+def epoch_of_log(least: int, *, _root_: DictConfig) -> int:
+    """Of conf/schedule: the steps of an epoch in whole hundreds, and so many at least; before the log is read, the
+    least."""
+    images = _root_.training_views.images
+    return least if images is None else max(least, 100 * round(images / 100))
+
+
 def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:
     """Of conf/node: a number of Gaussians, in whole hundreds, that grows with the training images where these are more
     than ``data.images_per_capacity`` (without such a key ``IMAGES_PER_CAPACITY``); before the log is read, the least.
@@ -120,6 +127,7 @@ _RESOLVERS = {
     "beside": beside,
     "mul": mul,
     "steps_of_log": steps_of_log,
+    "epoch_of_log": epoch_of_log,
     "gaussians_of_log": gaussians_of_log,
     "min": min,
     "of_30000": of_30000,

@@ -121,6 +121,14 @@ def test_steps_and_gaussians_follow_the_training_images(words, images, expected)
 
 
 @pytest.mark.parametrize(
+    ("words", "images", "every"),
+    [((), None, 100), ((), 108, 100), ((), 40, 100), ((), 432, 400), ((), 560, 600), (("schedule=paper",), 432, 100)],
+)
+def test_a_refinement_has_heard_all_training_images(words, images, every):
+    assert with_images(composed(*words), images).callback.density_control.refine_in.every == every
+
+
+@pytest.mark.parametrize(
     ("words", "largest"), [((), 40.0), (("schedule=paper",), None), (("preset=drivestudio",), None)]
 )
 def test_a_short_run_counts_no_more_of_the_radius_than_a_street_has(words, largest):
