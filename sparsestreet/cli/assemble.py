@@ -18,6 +18,7 @@ from sparsestreet.training.recipe import Recipe
 
 def recipe_of(cfg: DictConfig) -> Recipe:
     """The parts of a training, before any data is read. Raises ValueError where they do not fit together."""
+    cfg = cfg.copy()  # instantiate writes values in the place of what follows from the log
     recipe = Recipe(
         nodes=instantiate(cfg.node, _convert_="all"),
         effects=instantiate(cfg.effects, _convert_="all") if cfg.effects else {},

@@ -125,7 +125,10 @@ def test_steps_and_gaussians_follow_the_training_images(words, images, expected)
     [((), None, 100), ((), 108, 100), ((), 40, 100), ((), 432, 400), ((), 560, 600), (("schedule=paper",), 432, 100)],
 )
 def test_a_refinement_has_heard_all_training_images(words, images, every):
-    assert with_images(composed(*words), images).callback.density_control.refine_in.every == every
+    cfg = composed(*words)
+    recipe_of(cfg)  # as train has it before it reads the log
+    control = as_a(DensityControl, recipe_of(with_images(cfg, images)).callbacks["density_control"])
+    assert control.refine_in.every == every
 
 
 @pytest.mark.parametrize(
