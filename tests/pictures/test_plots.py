@@ -66,6 +66,7 @@ def test_runs_are_points_in_the_color_of_their_name(tmp_path, drawn):
     assert legend_of(drawn[0]) == ["plain (n=2)", "ours (n=1)"]
 
 
+@pytest.mark.lengthy
 def test_colors_and_marks_begin_anew_behind_the_last(tmp_path, drawn):
     """Eight of each: the ninth looks as the first, and no two of the first eight alike."""
     names = [f"m{index}" for index in range(9)]

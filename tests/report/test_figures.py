@@ -320,6 +320,7 @@ def test_a_curve_is_the_runs_own(canvas, tmp_path):
         assert legends == [["plain", "paper", "control: capped"], ["plain"]]
 
 
+@pytest.mark.lengthy
 def test_figures_are_named_and_what_is_absent_is_said(tmp_path):
     found = two_methods()
     drawn, absent = _figures(found, DRIVESTUDIO, tmp_path)

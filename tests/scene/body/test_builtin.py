@@ -76,6 +76,7 @@ def test_every_part_follows_its_own_bones(num_vertices):
             assert joint == "head"
 
 
+@pytest.mark.lengthy
 def test_weights_change_little_between_neighbors():
     template = BuiltinBody(6000).load()
     first, second = template.weights[edges_of(template)].unbind(1)

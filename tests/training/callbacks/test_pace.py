@@ -62,6 +62,7 @@ def trained(out, steps: Steps, **settings):
     return train(still, data(), out, make_trainer=TRAINER, stages=Clocked(steps), **settings)
 
 
+@pytest.mark.lengthy
 def test_a_run_ends_in_the_minutes_it_is_given(tmp_path, clocked, caplog):
     with caplog.at_level(logging.INFO):
         summary = trained(tmp_path, clocked, max_steps=12, minutes=0.5)
@@ -77,6 +78,7 @@ def test_a_run_ends_in_the_minutes_it_is_given(tmp_path, clocked, caplog):
     assert f"{round((30 - BEFORE - evaluation) / 0.1)} steps" in caplog.text
 
 
+@pytest.mark.lengthy
 def test_without_a_budget_the_steps_are_those_of_the_schedule(tmp_path, clocked, caplog):
     with caplog.at_level(logging.INFO):
         summary = trained(tmp_path, clocked, max_steps=12)
@@ -85,6 +87,7 @@ def test_without_a_budget_the_steps_are_those_of_the_schedule(tmp_path, clocked,
     assert "12 steps, at most 180 Gaussians, about 0.0 minutes and 0.1 for evaluation" in caplog.text
 
 
+@pytest.mark.lengthy
 def test_a_budget_that_is_over_takes_two_steps(tmp_path, clocked):
     assert trained(tmp_path, clocked, max_steps=12, minutes=0.01).run.steps == 2
 
