@@ -12,6 +12,8 @@ from sparsestreet.geometry.displacement import displacement, position_noise
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.types import Track
 
+pytestmark = pytest.mark.lengthy
+
 SEEDS = st.integers(0, 2**31 - 1)
 NOISE = st.floats(1e-3, 0.5)  # meters, of an axis
 COUNTS = st.integers(20, 200)  # below some 20 boxes the estimate of the noise is rough

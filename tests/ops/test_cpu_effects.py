@@ -12,6 +12,8 @@ from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.types import Camera, Gaussians, Shutter
 from tests.ops.scenes import FIELDS, camera, cast, cotangents, random_gaussians, relative_error, render, with_threads
 
+pytestmark = pytest.mark.lengthy
+
 
 def vector(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)

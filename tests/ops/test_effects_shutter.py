@@ -23,6 +23,8 @@ from tests.ops.scenes import (
     render,
 )
 
+pytestmark = pytest.mark.lengthy
+
 # The low-pass belongs to the sensor and does not move with the splat, so the moving-Gaussian identity is exact without.
 SHARP = SplatSettings(eps2d=0.0)
 FITTED = SplatSettings(eps2d=0.0, alpha_min=0.0, transmittance_min=0.0)

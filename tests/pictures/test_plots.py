@@ -5,6 +5,8 @@ from matplotlib.figure import Figure
 
 from sparsestreet.pictures.plots import plot_counts, plot_psnr, plot_runs
 
+pytestmark = pytest.mark.lengthy
+
 
 @pytest.fixture
 def drawn(monkeypatch) -> list[Figure]:

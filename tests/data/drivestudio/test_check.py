@@ -24,6 +24,8 @@ from tests.data.drivestudio.folders import (
     write_rows,
 )
 
+pytestmark = pytest.mark.lengthy
+
 INFO = "instances/instances_info.json"
 
 

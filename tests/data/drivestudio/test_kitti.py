@@ -13,6 +13,8 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import Frame
 
+pytestmark = pytest.mark.lengthy
+
 
 @pytest.fixture(scope="module")
 def log(kitti: Path) -> DrivingLog:
