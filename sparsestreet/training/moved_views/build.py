@@ -38,9 +38,9 @@ def moved_view_term(
     with stage("points"):
         returns = collect(sweeps, data.split.train, moving, rigid, settings, seed)
     _log.info(
-        "views beside the path: %s returns of the street; %.0f %% of their weight is left where images of other "
-        "instants disagree",
+        "views beside the path: %s returns of the street, of mean weight %.2f (1: an image before or after shows the "
+        "same color)",
         f"{len(returns.street):,}",
-        100 * returns.agreement(),
+        returns.agreement(),
     )
     return MovedViewTerm(settings, returns, seed)

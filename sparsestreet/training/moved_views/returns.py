@@ -4,6 +4,7 @@ from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -74,14 +75,21 @@ def collect(
         settings: how many returns are kept, and how their weights fall.
         seed: of the choice of the returns that are kept.
     """
-    images = _by_instant(frames)
+    places = _by_instant(frames)
+    instants = sorted(places)
+
+    # Sweeps come in order: each image is decoded once, and few are in memory.
+    @lru_cache(maxsize=3)
+    def images(instant: int) -> list[Frame]:
+        return [frames[place] for place in places.get(instant, [])]
+
     generator = named_generator(seed, "moved views")
     street, starts, objects = [], [0], {}
     for sweep in sweeps:
-        colors, seen = seen_colors(sweep.points, images.get(sweep.index, []))
+        colors, seen = seen_colors(sweep.points, images(sweep.index))
         still = seen & outside_boxes(moving, sweep.index, sweep.points, ENLARGEMENT)
         rows = at_most(settings.returns_per_sweep, torch.nonzero(still).squeeze(-1), generator)
-        others = [frame for near in _beside(sweep.index, sorted(images)) for frame in images[near]]
+        others = [frame for near in _beside(sweep.index, instants) for frame in images(near)]
         weights = agreement(sweep.points[rows], colors[rows], others, settings.tolerance)
         street.append(Returns(sweep.points[rows], colors[rows], weights))
         starts.append(starts[-1] + len(rows))
@@ -90,10 +98,11 @@ def collect(
     return StreetReturns(Returns.concatenate(street), sweeps.indices, tuple(starts), objects, tuple(moving))
 
 
-def _by_instant(frames: Frames) -> dict[int, list[Frame]]:
+def _by_instant(frames: Frames) -> dict[int, list[int]]:
+    """Integer frame -> places of its views; no pixel is read."""
     found = defaultdict(list)
-    for frame in frames:
-        found[frame.indices[0]].append(frame)
+    for place, view in enumerate(frames.views):
+        found[view.indices[0]].append(place)
     return found
 
 

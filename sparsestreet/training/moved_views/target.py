@@ -40,9 +40,6 @@ class Returns:
     def at(self, rows: Int[Tensor, " k"]) -> "Returns":
         return Returns(self.points[rows], self.colors[rows], self.weights[rows])
 
-    def to(self, device: torch.device) -> "Returns":
-        return Returns(self.points.to(device), self.colors.to(device), self.weights.to(device))
-
     @staticmethod
     def concatenate(parts: "Sequence[Returns]") -> "Returns":
         """The rows of all parts in order."""
@@ -81,6 +78,9 @@ def target(camera: Camera, street: Returns, objects: Returns, boxes: Sequence[Bo
             smaller part compares a point with what is rendered at that very point.
     """
     returns = Returns.concatenate([street, objects])
+    if not len(returns):
+        shape = (camera.height, camera.width)
+        return Target(torch.ones(shape), torch.zeros(*shape, 3), torch.zeros(shape))
     rows, positions, depths = unhidden(camera, returns.points)
     counts = ((positions % 1 - 0.5).abs() <= reach).all(1) & (depths > NEAREST) & (depths < FARTHEST)
     rows, positions, depths = rows[counts], positions[counts], depths[counts]
@@ -94,8 +94,6 @@ def target(camera: Camera, street: Returns, objects: Returns, boxes: Sequence[Bo
     )
     found = (first != _NO_RETURN).view(camera.height, camera.width)
     row = torch.where(found.flatten(), first & 0xFFFFFFFF, 0)
-    if not len(returns):
-        return Target(torch.ones(found.shape), torch.zeros(*found.shape, 3), torch.zeros(found.shape))
     return Target(
         torch.where(found, (first >> 32).to(torch.int32).view(torch.float32).view(found.shape), 1.0),
         returns.colors[row].view(*found.shape, 3),

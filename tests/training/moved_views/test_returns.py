@@ -1,6 +1,7 @@
 """Which returns are the street's, which an object's, and which a frame sees."""
 
 import math
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.training.moved_views import MovedViews
 from sparsestreet.training.moved_views.returns import StreetReturns, collect
-from sparsestreet.types import Sweep, Track
+from sparsestreet.types import Frame, Sweep, Track
 from tests.training.stubs import frame_at
 
 SETTINGS = MovedViews(tolerance=0.1)
@@ -95,6 +96,25 @@ def test_images_of_the_nearest_instants_weigh():
         frames = [replace(frame_at(0), frame_index=i, image=gray if i in (4, agreeing) else black) for i in range(2, 8)]
         found = collect(Sweeps.of((point,)), Frames.of(frames), [], [], SETTINGS, 0)
         assert found.street.weights.tolist() == [pytest.approx(weight, rel=1e-5)]
+
+
+def test_each_image_is_read_once_and_few_are_in_memory():
+    """Of three instants: its own, and those before and after."""
+    read, alive, most = [], weakref.WeakSet(), []
+
+    def load(index: int) -> Frame:
+        frame = frame_at(index % 5)
+        read.append(index)
+        alive.add(frame.image)
+        most.append(len(alive))
+        return replace(frame, frame_index=index)
+
+    frames = Frames(
+        [replace(frame_at(0), frame_index=index) for index in range(9)], lambda view: load(view.frame_index)
+    )
+    collect(Sweeps.of(tuple(sweep(index) for index in range(9))), frames, [], [], SETTINGS, 0)
+    assert sorted(read) == list(range(9))
+    assert max(most) <= 4  # the one that makes way goes when the next is there
 
 
 def test_a_sweep_keeps_no_more_than_it_may():
