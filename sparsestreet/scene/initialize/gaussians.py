@@ -18,6 +18,12 @@ SH_CONSTANT = 0.5 / math.sqrt(math.pi)
 MINIMUM_SCALE = 1e-3
 """Meters; coincident points have distance 0, but a scale needs a logarithm."""
 
+DARKEST = 1 / 510
+"""Half a gray level. The op cuts colors off at 0, where they have no gradient: a black one would stay black."""
+
+FLAT = 0.01
+"""Meters, largest start of a scale across a surface. From 3 mm to 30 mm nothing changes (docs/moved_views.md)."""
+
 
 def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Returns the mean distance to the three nearest other points (or fewer if there are fewer), at least 1 mm.
@@ -72,8 +78,21 @@ def init_gaussians(
         "log_scales": scales.float().log()[:, None].expand(-1, 3),
         "quaternions": normalized(torch.randn(num_rows, 4, generator=generator)),
         "opacity_logits": torch.logit(opacities.float()),
-        "sh_dc": ((colors.float() - 0.5) / SH_CONSTANT)[:, None, :],
+        "sh_dc": ((colors.float().clamp(min=DARKEST) - 0.5) / SH_CONSTANT)[:, None, :],
         "sh_rest": torch.zeros(num_rows, (sh_degree + 1) ** 2 - 1, 3),
     }
     masks = dict(mask_columns or {})
     return Rows(parameters | dict(columns or {}) | masks, buffers, transient=masks.keys())
+
+
+@torch.no_grad()
+def lie_flat(rows: Rows, normals: Float[Tensor, "n 3"]) -> None:
+    """Turns the third axis of each Gaussian into its normal and makes it thin there; NaN: it stays as it is.
+
+    The rotation is the shortest one from (0, 0, 1), so normals point up: z must not be negative.
+    """
+    known = normals.isfinite().all(1)
+    x, y, z = normals[known].unbind(1)
+    # Twice the half angle's cosine and sine along (0, 0, 1) x normal, both times the cosine.
+    rows.quaternions[known] = normalized(torch.stack((1 + z, -y, x, torch.zeros_like(z)), 1))
+    rows.log_scales[known, 2] = rows.log_scales[known, 2].clamp(max=math.log(FLAT))

@@ -13,7 +13,7 @@ from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.boxes import outside_swept_boxes
 from sparsestreet.scene.initialize.coverage import Coverage, coverage
-from sparsestreet.scene.initialize.gaussians import neighbor_scales
+from sparsestreet.scene.initialize.gaussians import lie_flat, neighbor_scales
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
@@ -113,9 +113,12 @@ class BackgroundSettings(NodeSettings):
         generator: torch.Generator,
         columns: Mapping[str, Tensor] | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """Calls ``start`` with the scales, meters, that seeds and their neighbors allow."""
+        """Calls ``start`` with the scales, meters, that seeds and their neighbors allow; what is on a surface lies in
+        it."""
         scales = neighbor_scales(seeds.points.positions).clamp(seeds.smallest, seeds.largest)
-        return self.start(data, seeds.points, scales, seeds.opacities, generator, columns=columns)
+        rows, mask = self.start(data, seeds.points, scales, seeds.opacities, generator, columns=columns)
+        lie_flat(rows, seeds.normals)
+        return rows, mask
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Background":
         return Background(self, rows)

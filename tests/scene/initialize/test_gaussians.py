@@ -1,9 +1,10 @@
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.gaussians import init_gaussians, neighbor_scales
+from sparsestreet.scene.initialize.gaussians import init_gaussians, lie_flat, neighbor_scales
 from tests.scene.street import static_mask
 
 
@@ -49,7 +50,8 @@ def test_rows_of_points():
     colors = torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.3, 0.4]])
     rows = seeded(torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]]), colors)
     # color = 0.5 + basis_0 sh_0 with basis_0 = 0.28209479
-    torch.testing.assert_close(0.5 + 0.28209479177387814 * rows.sh_dc[:, 0], colors)
+    # Black starts half a gray level above 0, where a color has a gradient.
+    torch.testing.assert_close(0.5 + 0.28209479177387814 * rows.sh_dc[:, 0], colors.clamp(min=1 / 510))
     assert rows.sh_rest.shape == (2, 15, 3)
     assert (rows.sh_rest == 0).all()
     torch.testing.assert_close(torch.sigmoid(rows.opacity_logits), torch.full((2,), 0.1))
@@ -79,3 +81,27 @@ def test_impossible_opacities_are_errors(opacity: float):
 def test_an_unknown_degree_is_an_error():
     with pytest.raises(ValueError, match="sh_degree=4"):
         seeded(torch.rand(3, 3), torch.rand(3, 3), sh_degree=4)
+
+
+def test_gaussians_lie_flat_on_their_surface_and_others_stay():
+    generator = torch.Generator().manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(6, 3, generator=generator), dim=1)
+    normals[:, 2] = normals[:, 2].abs()
+    normals[0], normals[1] = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
+    normals[5] = torch.nan
+    points = torch.rand(6, 3, generator=generator)
+    rows, before = seeded(points, points), seeded(points, points)
+    lie_flat(rows, normals)
+    # scipy's quaternions end with w.
+    turned = Rotation.from_quat(rows.quaternions[:5].detach().roll(-1, 1).numpy()).apply([0.0, 0.0, 1.0])
+    torch.testing.assert_close(torch.from_numpy(turned).float(), normals[:5])
+    assert rows.log_scales[:5, 2].exp().tolist() == pytest.approx([0.01] * 5)
+    assert torch.equal(rows.log_scales[:, :2], before.log_scales[:, :2])
+    assert torch.equal(rows.quaternions[5], before.quaternions[5])
+    assert torch.equal(rows.log_scales[5], before.log_scales[5])
+
+
+def test_what_is_thinner_than_a_surface_stays_so():
+    rows = seeded(torch.zeros(2, 3), torch.ones(2, 3))
+    lie_flat(rows, torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3))
+    assert rows.log_scales.exp().flatten().tolist() == pytest.approx([1e-3] * 6)

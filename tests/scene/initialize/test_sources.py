@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.planes import fit_planes
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
+from sparsestreet.types import Sweep
 from tests.scene.street import frame_at, rigid_settings, street_log, training_data, triangulated
 from tests.typed import there
 
@@ -181,18 +183,78 @@ def test_returns_from_moving_objects_if_no_box_is_cut_out():
 
 def test_seeds_of_several_sources_follow_each_other():
     points, twice = Points(torch.ones(2, 3), torch.zeros(2, 3)), torch.ones(2)
-    one = Seeds(points, twice, 2 * twice, 0.3 * twice, 0.2 * twice)
-    two = Seeds(
-        Points(torch.zeros(1, 3), torch.ones(1, 3)), torch.zeros(1), torch.ones(1), torch.tensor([0.4]), torch.ones(1)
-    )
+    one = Seeds(points, twice, 2 * twice, 0.3 * twice, 0.2 * twice, torch.zeros(2, 3))
+    white = Points(torch.zeros(1, 3), torch.ones(1, 3))
+    two = Seeds(white, torch.zeros(1), torch.ones(1), torch.tensor([0.4]), torch.ones(1), torch.ones(1, 3))
     both = Seeds.concatenate([one, two])
     assert both.points.positions[:, 0].tolist() == [1, 1, 0]
     assert both.points.colors[:, 0].tolist() == [0, 0, 1]
     assert (both.smallest.tolist(), both.largest.tolist()) == ([1, 1, 0], [2, 2, 1])
     assert both.opacities.tolist() == pytest.approx([0.3, 0.3, 0.4])
     assert both.times.tolist() == pytest.approx([0.2, 0.2, 1.0])
+    assert both.normals[:, 0].tolist() == [0, 0, 1]
+    assert both.where(torch.tensor([False, True, True])).normals[:, 0].tolist() == [0, 1]
     assert len(both) == 3
     assert len(Seeds.concatenate([])) == 0
+
+
+def road(seed: int = 0) -> torch.Tensor:
+    """400 returns of a road that rises by 1 in 10 along x, 2 cm off it; 1 m long and wide."""
+    generator = torch.Generator().manual_seed(seed)
+    x, y = torch.rand(2, 400, generator=generator)
+    return torch.stack((x, y, 0.05 + 0.1 * x + 0.02 * torch.randn(400, generator=generator)), 1)
+
+
+def log_with_returns(points: torch.Tensor) -> TrainingData:
+    sweep = Sweep(0, points, torch.full_like(points, 0.5), torch.ones(len(points), dtype=torch.bool))
+    return training_data(replace(street_log(), sweeps=Sweeps.of((sweep,)), tracks=()))
+
+
+def test_returns_of_a_road_lie_in_its_plane_and_know_its_normal():
+    hedge = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) + torch.tensor([0.0, 2.0, 0.0])
+    seeds = drawn(LidarPoints(), 10_000, log_with_returns(torch.cat((road(), hedge))))
+    flat = seeds.normals.isfinite().all(1)
+    assert torch.equal(flat, seeds.points.positions[:, 1] < 1.5)
+    normal = torch.tensor([-0.1, 0.0, 1.0]) / 1.01**0.5
+    # 100 returns a cube of 0.5 m, 2 cm off: the slope's standard error is 0.02 / sqrt(100) / 0.144 = 0.014.
+    assert (seeds.normals[flat] - normal).norm(dim=1).max() < 0.06
+    assert torch.allclose(seeds.normals[flat].norm(dim=1), torch.ones(400))
+    x, _, z = seeds.points.positions[flat].unbind(1)
+    # The plane itself is known to 2 mm at its center and 5 mm at a corner; 2 cm remain without it.
+    assert (z - 0.05 - 0.1 * x).abs().max() < 0.02
+    assert (z - 0.05 - 0.1 * x).square().mean().sqrt() < 0.005
+
+
+def test_returns_start_as_balls_if_nothing_is_flattened():
+    points = road()
+    seeds = drawn(LidarPoints(flat=False), 10_000, log_with_returns(points))
+    assert seeds.normals.isnan().all()
+    assert torch.equal(seeds.points.positions.sort(0).values, points.sort(0).values)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        road()[:9],  # too few
+        torch.linspace(0, 0.4, 50)[:, None] * torch.tensor([[1.0, 0.5, 0.0]]) + 0.05,  # a beam
+        torch.rand(400, 3, generator=torch.Generator().manual_seed(0)),  # a hedge
+        torch.zeros(50, 3) + 0.25,  # one place
+    ],
+)
+def test_what_is_no_plane_is_left_alone(points: torch.Tensor):
+    at, normals = fit_planes(points).onto(points)
+    assert normals.isnan().all()
+    assert torch.equal(at, points)
+
+
+def test_a_place_without_returns_has_no_plane():
+    planes = fit_planes(road())
+    _, normals = planes.onto(
+        torch.tensor([[0.25, 0.25, 0.1], [0.25, 0.25, 9.0], [-0.25, 0.25, 0.1], [900.0, 0.0, 0.0]])
+    )
+    assert normals.isfinite().all(1).tolist() == [True, False, False, False]
+    nobody, _ = planes.onto(torch.zeros(0, 3))
+    assert len(nobody) == 0
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import torch
 
 from sparsestreet.scene.initialize.boxes import outside_boxes
 from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.planes import fit_planes
 from sparsestreet.scene.initialize.points import Points, at_most, thinned
 from sparsestreet.scene.initialize.sources.source import PointSource, Seeds, check_positive
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -23,6 +24,8 @@ class LidarPoints(PointSource):
     from moving objects are taken too."""
     voxel: float | None = None
     """Side of a cube, meters, from which one return is taken; None: all returns."""
+    flat: bool = True
+    """Whether a return on a road or wall starts in its plane, as a thin disk; False: as a ball, like all others."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -32,14 +35,18 @@ class LidarPoints(PointSource):
         return coverage.lidar
 
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
-        parts, times = [], [torch.zeros(0)]
+        parts, instants = [], [torch.zeros(0)]
         for sweep in data.sweeps:
             taken = sweep.colored
             if self.box_enlargement is not None:
                 taken = taken & outside_boxes(data.moving, sweep.index, sweep.points, self.box_enlargement)
             parts.append(Points(sweep.points, sweep.colors).where(taken))
-            times.append(torch.full((len(parts[-1]),), sweep.index / max(data.log.num_frames - 1, 1)))
+            instants.append(torch.full((len(parts[-1]),), sweep.index / max(data.log.num_frames - 1, 1)))
         points = Points.concatenate(parts)
         rows = torch.arange(len(points)) if self.voxel is None else thinned(points.positions, self.voxel, generator)
         chosen = at_most(count, rows, generator)
-        return self.seeds(points.at(chosen), times=torch.cat(times)[chosen])
+        taken, normals = points.at(chosen), None
+        if self.flat:
+            positions, normals = fit_planes(points.positions).onto(taken.positions)
+            taken = Points(positions, taken.colors)
+        return self.seeds(taken, times=torch.cat(instants)[chosen], normals=normals)

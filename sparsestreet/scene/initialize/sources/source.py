@@ -25,13 +25,20 @@ class Seeds:
     opacities: Float[Tensor, " n"]
     times: Float[Tensor, " n"]
     """Normalized time at which each point was measured; NaN if unknown."""
+    normals: Float[Tensor, "n 3"]
+    """Of the flat piece that a point lies in, unit length, z not negative; NaN if it lies in none, or unknown."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     def where(self, mask: Bool[Tensor, " n"]) -> "Seeds":
         return Seeds(
-            self.points.where(mask), self.smallest[mask], self.largest[mask], self.opacities[mask], self.times[mask]
+            self.points.where(mask),
+            self.smallest[mask],
+            self.largest[mask],
+            self.opacities[mask],
+            self.times[mask],
+            self.normals[mask],
         )
 
     @staticmethod
@@ -43,6 +50,7 @@ class Seeds:
             torch.cat([empty, *(part.largest for part in parts)]),
             torch.cat([empty, *(part.opacities for part in parts)]),
             torch.cat([empty, *(part.times for part in parts)]),
+            torch.cat([torch.zeros(0, 3), *(part.normals for part in parts)]),
         )
 
 
@@ -80,9 +88,10 @@ class PointSource(ABC):
         smallest: Float[Tensor, " n"] | None = None,
         largest: Float[Tensor, " n"] | None = None,
         times: Float[Tensor, " n"] | None = None,
+        normals: Float[Tensor, "n 3"] | None = None,
     ) -> Seeds:
         """Returns seeds with the source's opacity; limits of the scale are meters (None: no limit on that side),
-        ``times`` are normalized times of measurement (None: unknown)."""
+        ``times`` are normalized times of measurement, ``normals`` those of surfaces (None: unknown)."""
         count = len(points)
         return Seeds(
             points,
@@ -90,6 +99,7 @@ class PointSource(ABC):
             torch.full((count,), torch.inf) if largest is None else largest,
             torch.full((count,), self.initial_opacity),
             torch.full((count,), torch.nan) if times is None else times,
+            torch.full((count, 3), torch.nan) if normals is None else normals,
         )
 
 
