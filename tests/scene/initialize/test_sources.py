@@ -235,7 +235,7 @@ def test_returns_start_as_balls_if_nothing_is_flattened():
 @pytest.mark.parametrize(
     "points",
     [
-        road()[:9],  # too few
+        0.4 * road()[:9],  # too few
         torch.linspace(0, 0.4, 50)[:, None] * torch.tensor([[1.0, 0.5, 0.0]]) + 0.05,  # a beam
         torch.rand(400, 3, generator=torch.Generator().manual_seed(0)),  # a hedge
         torch.zeros(50, 3) + 0.25,  # one place
