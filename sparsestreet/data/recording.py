@@ -1,0 +1,230 @@
+"""What a reader finds in a data set's own files, and the log that follows from it.
+
+A reader decodes files into its data set's own world and stops there. Re-centering, the clock, the window of an object,
+depth images and colors of returns are the same for all data sets, and are done here.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, UInt8
+from torch import Tensor
+
+from sparsestreet.data.clock import LogClock
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.notes import absence_notes
+from sparsestreet.data.poses import dataset_from_world, recentered
+from sparsestreet.data.problems import LogError, Problem
+from sparsestreet.data.reader import LogReader
+from sparsestreet.data.rig import RigCamera
+from sparsestreet.data.scene_folder import SceneFolder
+from sparsestreet.data.tracks import checked_track, track_in_window
+from sparsestreet.types import Frame, Shutter, View
+
+MASK_KINDS = ("sky", "human", "vehicle", "ego")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One recorded image."""
+
+    frame: int
+    """The instant it belongs to, counted from 0 in the window that is read. A camera has one image an instant."""
+    camera: int
+    """Place of its camera in the rig."""
+    world_from_camera: Float64[Tensor, "4 4"]
+    """OpenCV's axes; in the data set's own world, at the middle of the readout."""
+    key: Hashable
+    """What ``Recording.read_image`` needs to find the pixels: mostly a path."""
+    stem: str
+    """Its name without folder and ending; a user's own masks are found by it."""
+    stamp: int | None = None
+    """Nanoseconds on the data set's clock at the middle of exposure and readout; None: the data set has no clock."""
+    shutter: Shutter | None = None
+    """Its motion while it is read out, where the data set declares a rolling shutter."""
+    exposure: float | None = None
+    """Seconds that a pixel is exposed, where declared."""
+
+
+@dataclass(frozen=True)
+class LidarSweep:
+    """The returns of one instant, of all lidars together."""
+
+    read: Callable[[], Float64[Tensor, "n 3"]]
+    """Points in the data set's own world, meters, the sensor's motion taken out. Raises LogError for broken files."""
+    stamp: int | None = None
+    """Nanoseconds at which the points are where they are."""
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """One annotated object."""
+
+    name: str
+    """Unique in the log."""
+    class_name: str
+    """As the data set calls it."""
+    frames: np.ndarray
+    """f integer instants that its boxes belong to, in the window's count, strictly increasing. Those outside of the
+    window (negative, or behind its end) are dropped later."""
+    poses: np.ndarray
+    """f x 4 x 4 world_from_object in the data set's own world: x along the length, y left, z up, origin at the center."""
+    sizes: np.ndarray
+    """f x 3 length, width, height, meters."""
+    path: Path
+    """The file that they are from."""
+    stamps: tuple[int, ...] | None = None
+    """f, nanoseconds at which the object was there; None: at the stamps of its frames."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was found of the wanted part of a log."""
+
+    name: str
+    rig: Sequence[RigCamera]
+    shots: Sequence[Shot]
+    """Ordered by (frame, camera); an instant may lack cameras."""
+    read_image: Callable[[Shot], UInt8[Tensor, "h w 3"]]
+    """At the size of the rig's camera. Raises LogError for a broken file."""
+    read_masks: Callable[[Shot], Mapping[str, Bool[Tensor, "h w"]]]
+    """Those of MASK_KINDS that the image has."""
+    mask_kinds: frozenset[str] = frozenset()
+    """Which kinds the log has at all."""
+    frame_stamps: tuple[int, ...] | None = None
+    """Stamp of each instant; None: the data set has no clock."""
+    sweeps: Mapping[int, LidarSweep] | None = None
+    """Instant -> its sweep; None: no lidar."""
+    boxes: Sequence[Boxes] | None = None
+    """None: the data set has no annotations."""
+    notes: tuple[str, ...] = ()
+    """What a user should know about how it was read, one sentence each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedReader(LogReader):
+    """A data set as its publisher ships it. Subclasses say how to find and decode its files."""
+
+    root: Path | str
+    cameras: Sequence[str] | None = None
+    """Names as the data set has them; None: the reader's usual ones."""
+    first_frame: int = 0
+    last_frame: int = -1
+    """Included; -1: to the end."""
+    width: int | None = None
+    """Pixels; every image is scaled to it at its own aspect, and the intrinsics with it. None: as recorded."""
+    lidar: bool = True
+    """False: as if the log had none."""
+    min_lens_shift: float | None = 0.5
+    """As ``DriveStudioReader`` has it."""
+    masks: Path | str | None = None
+    """Folder of masks that somebody made: ``sky``, ``human``, ``vehicle``, ``ego``, in each a folder a camera, in it
+    PNGs with the stems of the images, white where the kind is. None: those of the data set, if it has any."""
+    cache_mb: int = 512
+    """Decoded frames kept in memory, MB (1e6 bytes)."""
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.root)
+
+    @abstractmethod
+    def recording(self) -> Recording:
+        """What is in the files, nothing large decoded. Raises LogError with every problem found, ValueError where the
+        wanted part is not there."""
+
+    @abstractmethod
+    def check_contents(self) -> list[Problem]:
+        """What is wrong with pixels and points, all of which are decoded."""
+
+    def check(self) -> list[Problem]:
+        try:
+            self.recording()
+        except LogError as error:
+            return list(error.problems)
+        return self.check_contents()
+
+    def read(self) -> DrivingLog:
+        return log_of(self.recording(), cache_bytes=1_000_000 * self.cache_mb, check=self.check_contents)
+
+
+def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[Problem]]) -> DrivingLog:
+    """The log whose world has the data set's axes and its origin at the first camera of the first instant.
+
+    Args:
+        recording: what was found.
+        cache_bytes: of decoded frames that are kept in memory.
+        check: finds everything that is wrong with pixels and points; it is asked once something is.
+
+    Raises LogError for boxes that cannot be.
+    """
+    num_frames = 1 + max(shot.frame for shot in recording.shots)
+    origin = recording.shots[0].world_from_camera[:3, 3]
+    clock = LogClock(num_frames, recording.frame_stamps)
+    shots = {(shot.frame, shot.camera): shot for shot in recording.shots}
+    folder = SceneFolder(
+        [_view(shot, recording.rig, origin, clock) for shot in recording.shots],
+        partial(_frame, recording, shots),
+        None if recording.sweeps is None else partial(_points, recording.sweeps, origin),
+        clock=clock,
+        cache_bytes=cache_bytes,
+        check=check,
+    )
+    tracks = (
+        track_in_window(
+            checked_track(
+                boxes.name,
+                boxes.class_name,
+                boxes.frames,
+                boxes.poses,
+                boxes.sizes,
+                path=boxes.path,
+                num_frames=num_frames,
+            ),
+            range(num_frames),
+            origin,
+        )
+        for boxes in recording.boxes or ()
+    )
+    return DrivingLog(
+        name=recording.name,
+        frames=folder.frames,
+        sweeps=folder.sweeps,
+        tracks=tuple(track for track in tracks if track is not None),
+        num_frames=num_frames,
+        num_cameras=len(recording.rig),
+        dataset_from_world=dataset_from_world(origin),
+        notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
+    )
+
+
+def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
+    camera = rig[shot.camera].at(recentered(shot.world_from_camera, origin))
+    return clock.view(camera, shot.frame, shot.camera, shot.stamp)
+
+
+def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
+    shot = shots[view.indices]
+    masks = recording.read_masks(shot)
+    return Frame.of(view, image=recording.read_image(shot), **{kind: masks.get(kind) for kind in MASK_KINDS})
+
+
+def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], index: int) -> Float[Tensor, "n 3"]:
+    if index not in sweeps:
+        return torch.zeros(0, 3)
+    return (sweeps[index].read() - origin).float()
+
+
+def _absent(recording: Recording) -> tuple[str, ...]:
+    return absence_notes(
+        sky="sky" in recording.mask_kinds,
+        human="human" in recording.mask_kinds,
+        vehicle="vehicle" in recording.mask_kinds,
+        lidar=recording.sweeps is not None,
+        boxes=recording.boxes is not None,
+        clock=recording.frame_stamps is not None,
+    )
