@@ -73,7 +73,7 @@ class Boxes:
     """f integer instants that its boxes belong to, in the window's count, strictly increasing. Those outside of the
     window (negative, or behind its end) are dropped later."""
     poses: np.ndarray
-    """f x 4 x 4 world_from_object in the data set's own world: x along the length, y left, z up, origin at the center."""
+    """f x 4 x 4 world_from_object in the data set's own world: x along the length, y left, z up, from the center."""
     sizes: np.ndarray
     """f x 3 length, width, height, meters."""
     path: Path
