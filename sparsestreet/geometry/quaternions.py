@@ -105,6 +105,21 @@ def from_rotation_vector(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"
     return torch.cat((cosine, sinc * half), dim=-1)
 
 
+def to_rotation_vector(quaternions: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3"]:
+    """Logarithm: the axis times the angle, radians, of the shorter turn (at most pi); undoes ``from_rotation_vector``.
+
+    >>> to_rotation_vector(torch.tensor([0.0, 0.0, 0.0, -2.0])).tolist()  # half a turn about -z
+    [0.0, 0.0, -3.1415927410125732]
+    """
+    unit = normalized(quaternions)
+    unit = torch.where(unit[..., :1] < 0, -unit, unit)
+    sine = unit[..., 1:].norm(dim=-1, keepdim=True)
+    # Near zero the angle over its sine is 2, to the square of 1e-8.
+    small = sine < 1e-8
+    safe = torch.where(small, torch.ones_like(sine), sine)
+    return unit[..., 1:] * torch.where(small, 2.0, 2 * torch.atan2(sine, unit[..., :1]) / safe)
+
+
 def slerp(a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"], fraction: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4"]:
     """The rotation at ``fraction`` of the shorter arc from a to b (q and -q are the same rotation).
 

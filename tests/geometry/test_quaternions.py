@@ -158,3 +158,14 @@ def test_batches_and_empty_batches():
     assert quat.to_matrix(torch.ones(2, 0, 4)).shape == (2, 0, 3, 3)
     assert quat.from_matrix(torch.eye(3).expand(4, 5, 3, 3)).shape == (4, 5, 4)
     np.testing.assert_array_equal(quat.from_matrix(torch.eye(3)[None]).numpy(), [[1, 0, 0, 0]])
+
+
+@examples
+@given(vectors)
+def test_logarithm_is_scipys_and_undoes_the_exponential_map(vector: Tensor):
+    quaternion = quat.from_rotation_vector(vector)
+    found = quat.to_rotation_vector(quaternion)
+    assert float(found.norm()) <= math.pi + 1e-12
+    assert_same_rotation(quat.from_rotation_vector(found), quaternion)
+    if float(found.norm()) < math.pi - 1e-6:  # of a half turn either axis is right
+        assert np.abs(found.numpy() - scipy_of(quaternion).as_rotvec()).max() < 1e-9
