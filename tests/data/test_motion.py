@@ -144,19 +144,22 @@ def test_chunks_change_nothing_and_a_large_sweep_is_fast():
     began = time.process_time()
     moved = untwisted(points, stamps, path)
     assert time.process_time() - began < 1  # 0.1 s alone; a loop over points takes ten
-    some = torch.arange(0, count, 997)
+    some = torch.cat((torch.arange(0, count, 997), torch.arange(16_380, 16_390)))  # and around the end of a chunk
     assert torch.equal(moved[some], untwisted(points[some], stamps[some], path))
 
 
 def test_motion_during_a_readout():
     """Of a camera that drives 10 m/s along its z axis and turns right (about y, which is down)."""
     turn = torch.from_numpy(Rotation.from_rotvec([[0, 0, 0], [0, 0.4, 0]]).as_matrix())
-    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    poses[:, :3, :3] = turn
-    poses[1, 2, 3] = 10.0
-    path = PosePath(torch.tensor([0, 1_000_000_000]), poses)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:2, :3, :3] = turn
+    poses[1:, 2, 3] = torch.tensor([10.0, 90.0])  # another speed later, which no readout in the first second sees
+    path = PosePath(torch.tensor([0, 1_000_000_000, 2_000_000_000]), poses)
     translation, rotation = path.motion_during(500_000_000, 40_000_000)
     # In the camera's frame at the middle, turned by 0.2 rad: ahead is partly to the left.
     expected = torch.tensor([-0.4 * math.sin(0.2), 0.0, 0.4 * math.cos(0.2)])
     torch.testing.assert_close(translation, expected, atol=1e-6, rtol=0)  # float32
     torch.testing.assert_close(rotation, torch.tensor([0.0, 0.016, 0.0]), atol=1e-6, rtol=0)
+    with pytest.raises(ValueError, match="outside of the poses"):
+        path.motion_during(19_999_999, 40_000_000)
+    assert path.motion_during(980_000_000, 40_000_000)[0].norm() == pytest.approx(0.4, abs=1e-6)

@@ -169,3 +169,10 @@ def test_logarithm_is_scipys_and_undoes_the_exponential_map(vector: Tensor):
     assert_same_rotation(quat.from_rotation_vector(found), quaternion)
     if float(found.norm()) < math.pi - 1e-6:  # of a half turn either axis is right
         assert np.abs(found.numpy() - scipy_of(quaternion).as_rotvec()).max() < 1e-9
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 3e-8, 1e-4])
+def test_logarithm_of_small_turns_is_exact(angle: float):
+    vector = angle * torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64)
+    found = quat.to_rotation_vector(quat.from_rotation_vector(vector))
+    torch.testing.assert_close(found, vector, atol=0, rtol=1e-12)
