@@ -64,10 +64,10 @@ def nuscenes_camera(
     )
 
 
-def ego_mask(scene: str, camera: RigCamera[str], recorded_height: int) -> Bool[Tensor, "h w"] | None:
+def ego_mask(scene: str, camera: RigCamera[str]) -> Bool[Tensor, "h w"] | None:
     """True where the recording car is seen, at the camera's size; None where it is not."""
-    rows = {**_EGO_ROWS, **_EGO_ROWS_OF_SCENES.get(scene, {})}.get(camera.name, 0) * recorded_height // _HEIGHT
-    return bottom_rows(camera.size, rows, recorded_height) if rows else None
+    rows = {**_EGO_ROWS, **_EGO_ROWS_OF_SCENES.get(scene, {})}.get(camera.name)
+    return None if rows is None else bottom_rows(camera.size, rows, _HEIGHT)
 
 
 def _intrinsics(scene: SceneFiles, file: DataFile) -> Float64[np.ndarray, "3 3"]:

@@ -60,7 +60,7 @@ class NuScenesReader(RecordedReader):
         boxes, notes = self._boxes()
         if far := check_extent(_placed(shots, boxes or ())):
             raise LogError(far)
-        masks = self._ego_masks(rig)
+        masks = {one.index: mask for one in rig if (mask := ego_mask(chosen.scene.name, one)) is not None}
         return Recording(
             name=chosen.scene.name,
             rig=rig,
@@ -124,13 +124,6 @@ class NuScenesReader(RecordedReader):
             )
             for index, name in enumerate(chosen.cameras)
         ]
-
-    def _ego_masks(self, rig: Sequence[RigCamera[str]]) -> dict[int, Bool[Tensor, "h w"]]:
-        """Camera -> where it sees the recording car, of those that do."""
-        chosen = self._selection
-        heights = [recorded_size(chosen.images_of(camera.index))[1] for camera in rig]
-        masks = [ego_mask(chosen.scene.name, camera, height) for camera, height in zip(rig, heights, strict=True)]
-        return {index: mask for index, mask in enumerate(masks) if mask is not None}
 
     def _sweeps(self) -> dict[int, LidarSweep] | None:
         """None: there is no lidar, or it is not wanted."""
