@@ -36,7 +36,7 @@ def nuscenes_camera(
     files: Sequence[DataFile],
     *,
     width: int | None,
-    principal_shift: float,
+    principal_shift: float | int,
 ) -> RigCamera[str]:
     """A pinhole: the publisher has taken the lens out of the images. Raises LogError for broken intrinsics.
 

@@ -2,26 +2,27 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import get_args
 
 import torch
-from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles, hash_files
-from sparsestreet.data.images import check_camera_images, image_size, read_image
+from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.images import check_camera_images
 from sparsestreet.data.nuscenes.boxes import read_boxes
-from sparsestreet.data.nuscenes.cameras import ego_mask, nuscenes_camera, recorded_size
+from sparsestreet.data.nuscenes.cameras import nuscenes_camera, recorded_size
 from sparsestreet.data.nuscenes.instants import Rate
+from sparsestreet.data.nuscenes.pixels import ScenePixels, check_size
 from sparsestreet.data.nuscenes.scene import LIDAR
 from sparsestreet.data.nuscenes.selection import Selection, select
 from sparsestreet.data.nuscenes.sweeps import read_sweep
-from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera
 
@@ -40,7 +41,7 @@ class NuScenesReader(RecordedReader):
     """Folder of the tables, as "v1.0-mini"; None: the only one."""
     rate: Rate = "keyframes"
     """"keyframes": an instant is a sample, 2 a second; "all": an image of the front camera, 12 a second."""
-    principal_shift: float = 0.5
+    principal_shift: float | int = 0.5
     """Pixels of the recorded images that are added to cx and cy, because here pixel centers are at +0.5. 0 for tables
     whose numbers are counted so already."""
 
@@ -55,19 +56,23 @@ class NuScenesReader(RecordedReader):
         files = [*chosen.images.values(), *(chosen.sweeps.values() if self.lidar else ())]
         if problems := missing_files(file.path for file in files):
             raise LogError(problems)
-        rig = self._rig()
-        shots = _shots(chosen)
+        rig, shots = self._rig(), _shots(chosen)
+        if self._given is not None and (
+            problems := self._given.check((rig[shot.camera].name, shot.stem) for shot in shots)
+        ):
+            raise LogError(problems)
         boxes, notes = self._boxes()
         if far := check_extent(_placed(shots, boxes or ())):
             raise LogError(far)
-        masks = {one.index: mask for one in rig if (mask := ego_mask(chosen.scene.name, one)) is not None}
+        sizes = [recorded_size(chosen.images_of(camera.index)) for camera in rig]
+        pixels = ScenePixels(rig, sizes, chosen.scene.name, self._given)
         return Recording(
             name=chosen.scene.name,
             rig=rig,
             shots=shots,
-            read_image=partial(_read_image, [recorded_size(chosen.images_of(one.index)) for one in rig], rig),
-            read_masks=partial(_read_masks, masks),
-            mask_kinds=frozenset({"ego"} if masks else ()),
+            read_image=pixels.image,
+            read_masks=pixels.masks,
+            mask_kinds=pixels.mask_kinds,
             # Behind the last image there are no frames.
             frame_stamps=tuple(chosen.instants.stamps[instant] for instant in chosen.window)[: 1 + shots[-1].frame],
             sweeps=self._sweeps(),
@@ -80,10 +85,14 @@ class NuScenesReader(RecordedReader):
         for index, name in enumerate(chosen.cameras):
             images = chosen.images_of(index)
             for file in images:
-                attempt(problems, partial(_check_size, file.path, recorded_size(images)))
+                attempt(problems, partial(check_size, file.path, recorded_size(images)))
             wrong = {problem.path for problem in problems}
             sound = [file.path for file in images if file.path not in wrong]
             problems += check_camera_images(name, sound, (), decode=True)
+        if self._given is not None:
+            recording = self.recording()
+            for shot in recording.shots:
+                attempt(problems, partial(recording.read_masks, shot))
         for sweep in (self._sweeps() or {}).values():
             attempt(problems, sweep.read)
         return problems
@@ -97,6 +106,10 @@ class NuScenesReader(RecordedReader):
         """Equal for the same scene in other tables too, as those of v1.0-mini and v1.0-trainval."""
         rows = json.dumps(self._selection.rows(), sort_keys=True)
         return hashlib.sha256(f"{hash_files(self.folder, self.files())}\n{rows}".encode()).hexdigest()[:12]
+
+    @property
+    def _given(self) -> GivenMasks | None:
+        return None if self.masks is None else GivenMasks(Path(self.masks))
 
     @cached_property
     def _selection(self) -> Selection:
@@ -161,21 +174,3 @@ def _shots(chosen: Selection) -> list[Shot]:
 def _placed(shots: Sequence[Shot], boxes: Sequence[Boxes]) -> list[tuple[Path, Tensor]]:
     placed = [(Path(str(shot.key)), shot.world_from_camera[:3, 3]) for shot in shots]
     return placed + [(box.path, torch.from_numpy(position)) for box in boxes for position in box.poses[:, :3, 3]]
-
-
-def _read_image(sizes: Sequence[tuple[int, int]], rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
-    path = Path(str(shot.key))
-    _check_size(path, sizes[shot.camera])
-    return read_image(path, rig[shot.camera].size)
-
-
-def _read_masks(masks: Mapping[int, Bool[Tensor, "h w"]], shot: Shot) -> dict[str, Bool[Tensor, "h w"]]:
-    return {"ego": masks[shot.camera]} if shot.camera in masks else {}
-
-
-def _check_size(path: Path, size: tuple[int, int]) -> None:
-    """Raises LogError unless the image has the size that the tables say."""
-    found = image_size(path)
-    if found != size:
-        message = f"the image is {found[0]}x{found[1]}, sample_data.json says {size[0]}x{size[1]}"
-        raise fault(path, message, "extract the image again from the data set's archive")

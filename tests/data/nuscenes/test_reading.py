@@ -1,12 +1,10 @@
 """The drive of the plan, written as nuScenes publishes one, is read as it was planned."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from sparsestreet.data.recording import Recording
 from tests.data.nuscenes.written import CHANNELS, Written, sweep_end, token, write_nuscenes
@@ -128,7 +126,9 @@ def test_all_images_are_grouped_around_those_of_the_front_camera(sparse):
 
 
 def test_a_window_keeps_boxes_outside_of_it_apart(sparse):
-    recording = NuScenesReader(root=sparse.root, rate="all", first_frame=2, last_frame=5, cameras=["CAM_FRONT_LEFT"]).recording()
+    recording = NuScenesReader(
+        root=sparse.root, rate="all", first_frame=2, last_frame=5, cameras=["CAM_FRONT_LEFT"]
+    ).recording()
     assert [(shot.frame, shot.camera) for shot in recording.shots] == [(0, 0), (1, 0), (2, 0), (3, 0)]
     (boxes,) = recording.boxes
     assert boxes.frames.tolist() == [-2, 1, 4]
@@ -138,15 +138,15 @@ def test_without_lidar(drive):
     assert NuScenesReader(root=drive.root, lidar=False).recording().sweeps is None
 
 
-def test_an_image_that_the_tables_lack(drive, tmp_path):
+def test_an_image_that_the_tables_lack(tmp_path):
     drive = write_nuscenes(tmp_path / "drive", PLAN)
     gone = token("file", "scene-0061", "CAM_FRONT_LEFT", 3)
     drive.edit("sample_data", lambda rows: rows.remove(next(row for row in rows if row["token"] == gone)))
     drive.edit("sample_data", lambda rows: [row.update(next="") for row in rows if row["next"] == gone])
     recording = NuScenesReader(root=drive.root).recording()
     assert "1 images are not in the tables, so some instants lack cameras" in recording.notes
-    log = NuScenesReader(root=drive.root, cameras=["CAM_FRONT_LEFT"]).read()
-    assert log.num_frames == 3
+    recording = NuScenesReader(root=drive.root, cameras=["CAM_FRONT_LEFT"]).recording()
+    assert len(there(recording.frame_stamps)) == len(recording.shots) == 3
 
 
 def test_objects_that_no_return_hit_are_left_out(tmp_path):
@@ -187,3 +187,17 @@ def test_the_hash_is_of_the_scene_in_whatever_tables(drive, tmp_path):
     assert NuScenesReader(root=other.root, scene="scene-0061").data_hash() == before
     other.edit("sample_annotation", lambda rows: rows[2]["translation"].__setitem__(0, 4150.0))
     assert NuScenesReader(root=other.root, scene="scene-0061").data_hash() != before
+
+
+def test_masks_that_somebody_made(drive, tmp_path):
+    folder = tmp_path / "masks" / "sky" / "CAM_FRONT"
+    folder.mkdir(parents=True)
+    reader = NuScenesReader(root=drive.root, masks=tmp_path / "masks")
+    assert len(reader.check()) == 1
+    for frame in range(4):
+        path = drive.file("CAM_FRONT", frame)
+        Image.new("L", (32, 24), 255 * (frame == 1)).save(folder / f"{path.stem}.png")
+    log = reader.read()
+    assert reader.check() == []
+    assert [there(log.frames[index].sky).all().item() for index in (0, 2)] == [False, True]
+    assert log.frames[1].sky is None

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
     "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
+Tables = dict[str, list[dict[str, Any]]]
 CHANNELS = {"front": "CAM_FRONT", "left": "CAM_FRONT_LEFT"}
 
 
@@ -64,26 +65,10 @@ class Written:
 
 def write_nuscenes(root: Path, plan: Plan, *, keyframe_every: int = 1, scene: str = "scene-0061") -> Written:
     """Frames are keyframes, or each ``keyframe_every``-th; the frames behind one belong to the next, or to the last."""
-    written = Written(root)
-    written.table("scene").parent.mkdir(parents=True)
     keyframes = list(range(0, plan.num_frames, keyframe_every))
     samples = [token("sample", scene, frame) for frame in keyframes]
-    tables: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
-    tables["log"] = [{"token": token("log"), "logfile": "n015", "vehicle": "n015", "date_captured": "2018-07-24", "location": "a"}]
-    tables["map"] = [{"token": token("map"), "log_tokens": [token("log")], "category": "semantic_prior", "filename": "maps/a.png"}]
-    (root / "maps").mkdir()
-    Image.new("L", (4, 4)).save(root / "maps" / "a.png")
-    tables["scene"] = [
-        {
-            "token": token("scene", scene), "log_token": token("log"), "nbr_samples": len(samples),
-            "first_sample_token": samples[0], "last_sample_token": samples[-1], "name": scene, "description": "a {curve}",
-        }
-    ]  # fmt: skip
-    for place, frame in enumerate(keyframes):
-        tables["sample"].append(
-            {"token": samples[place], "timestamp": sweep_end(plan, frame) // 1000, "scene_token": token("scene", scene)}
-            | linked(samples, place)
-        )
+    tables: Tables = {name: [] for name in TABLES}
+    _write_scene(root, plan, scene, samples, keyframes, tables)
     _write_sensors(plan, tables)
     for channel in (*CHANNELS.values(), "LIDAR_TOP"):
         files = [token("file", scene, channel, frame) for frame in range(plan.num_frames)]
@@ -96,14 +81,38 @@ def write_nuscenes(root: Path, plan: Plan, *, keyframe_every: int = 1, scene: st
                 | {"calibrated_sensor_token": token("mount", channel), "is_key_frame": key}
                 | linked(files, frame)
             )
-    tables["ego_pose"] = [
-        {"token": row["token"], "timestamp": row["timestamp"]} | placed(plan.world_from_vehicle(1000 * row["timestamp"]))
-        for row in tables["sample_data"]
-    ]
+    for row in tables["sample_data"]:
+        ego = placed(plan.world_from_vehicle(1000 * row["timestamp"]))
+        tables["ego_pose"].append({"token": row["token"], "timestamp": row["timestamp"]} | ego)
     _write_boxes(plan, samples, keyframes, tables)
+    written = Written(root)
+    written.table("scene").parent.mkdir(parents=True)
     for name, rows in tables.items():
         written.write(name, rows)
     return written
+
+
+def _write_scene(
+    root: Path,
+    plan: Plan,
+    scene: str,
+    samples: list[str],
+    keyframes: list[int],
+    tables: Tables,
+) -> None:
+    (root / "maps").mkdir(parents=True)
+    Image.new("L", (4, 4)).save(root / "maps" / "a.png")
+    log = {"token": token("log"), "logfile": "n015", "vehicle": "n015", "date_captured": "2018-07-24", "location": "a"}
+    tables["log"].append(log)
+    tables["map"].append(
+        {"token": token("map"), "log_tokens": [log["token"]], "category": "semantic_prior", "filename": "maps/a.png"}
+    )
+    ends = {"first_sample_token": samples[0], "last_sample_token": samples[-1], "nbr_samples": len(samples)}
+    described = {"token": token("scene", scene), "log_token": log["token"], "name": scene, "description": "a {curve}"}
+    tables["scene"].append(described | ends)
+    for place, frame in enumerate(keyframes):
+        row = {"token": samples[place], "timestamp": sweep_end(plan, frame) // 1000, "scene_token": described["token"]}
+        tables["sample"].append(row | linked(samples, place))
 
 
 def linked(tokens: list[str], place: int) -> dict[str, str]:
@@ -113,7 +122,7 @@ def linked(tokens: list[str], place: int) -> dict[str, str]:
     }
 
 
-def _write_sensors(plan: Plan, tables: Mapping[str, list[dict[str, Any]]]) -> None:
+def _write_sensors(plan: Plan, tables: Tables) -> None:
     mounts = {CHANNELS[one.name]: (one.vehicle_from_camera, one.intrinsics) for one in plan.cameras}
     for channel, (mount, intrinsics) in {**mounts, "LIDAR_TOP": (plan.vehicle_from_lidar, None)}.items():
         modality = "lidar" if intrinsics is None else "camera"
@@ -148,9 +157,7 @@ def sensor_points(plan: Plan, frame: int) -> np.ndarray:
     return np.concatenate((moved(np.linalg.inv(world_from_lidar), plan.world_points(frame)), [[0.0, 1.2, -0.8]]))
 
 
-def _write_boxes(
-    plan: Plan, samples: list[str], keyframes: list[int], tables: Mapping[str, list[dict[str, Any]]]
-) -> None:
+def _write_boxes(plan: Plan, samples: list[str], keyframes: list[int], tables: Tables) -> None:
     length, width, height = plan.box_size
     tokens = [token("box", sample) for sample in samples]
     tables["category"].append({"token": token("car"), "name": "vehicle.car", "description": ""})
