@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sparsestreet.data.nuscenes import NuScenesReader
+from sparsestreet.data.problems import LogError
 from tests.conftest import unchecked
 from tests.data.nuscenes.written import TABLES, Written, write_nuscenes
 from tests.data.plan import Plan
@@ -252,3 +254,10 @@ def test_tables_with_some_bytes_changed_are_read_or_refused(drive):
                 refused += 1
             path.write_bytes(before)
     assert 100 < refused < 150
+
+
+def test_an_image_that_is_changed_later_is_found_when_it_is_decoded(drive):
+    log = NuScenesReader(root=drive.root).read()
+    Image.new("RGB", (30, 24)).save(image(drive))
+    with pytest.raises(LogError, match="the image is 30x24, sample_data.json says 32x24"):
+        log.frames[2]

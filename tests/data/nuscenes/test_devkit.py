@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from sparsestreet.data.nuscenes import NuScenesReader
 from tests.data.nuscenes.written import sweep_end, write_nuscenes
 from tests.data.plan import Plan
 from tests.typed import there
 
+_PIXELS = Image.MAX_IMAGE_PIXELS
 devkit = pytest.importorskip("nuscenes.nuscenes", reason="nuscenes-devkit is not installed")
 data_classes = pytest.importorskip("nuscenes.utils.data_classes")
 Quaternion = pytest.importorskip("pyquaternion").Quaternion
+# It lifts Pillow's limit for all.
+Image.MAX_IMAGE_PIXELS = _PIXELS
 PLAN = Plan(num_frames=3)
 
 
