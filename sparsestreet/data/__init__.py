@@ -15,6 +15,7 @@ reader       LogReader, what every data set offers: check and read
 problems     what is wrong with a log on disk, all at once, with remedies
 check        what `sparsestreet data check` prints
 images       pixels and masks from files
+given_masks  masks that somebody made for a data set
 numbers      numbers from text files
 lidar        colors that points take from images, depth that pixels take from points
 formats      data sets as they are published, to be named where they must be converted first
