@@ -76,11 +76,10 @@ def stamped_files(folder: Path, ending: str) -> dict[int, Path]:
     for path in folder.glob(f"*{ending}"):
         if path.name.startswith("."):
             continue
-        if not (path.stem.isascii() and path.stem.isdigit() and int(path.stem[:20]) < _LATEST and len(path.stem) < 20):
+        stem = path.stem
+        if not (stem.isascii() and stem.isdigit() and len(stem) < 20 and str(int(stem)) == stem and int(stem) < _LATEST):
             raise fault(path, "the name is no stamp in nanoseconds", _REMEDY)
-        if int(path.stem) in files:
-            raise fault(path, "another file has the same stamp", "remove one of them")
-        files[int(path.stem)] = path
+        files[int(stem)] = path
     return dict(sorted(files.items()))
 
 

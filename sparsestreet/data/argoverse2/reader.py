@@ -14,6 +14,7 @@ from sparsestreet.data.argoverse2.tables import MountedCamera, read_boxes, read_
 from sparsestreet.data.ego import bottom_rows
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, image_size, read_image
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
@@ -41,15 +42,21 @@ class Argoverse2Reader(RecordedReader):
         boxes, homeless = _boxes(chosen, path)
         placed = [(chosen.layout.poses, shot.world_from_camera[:3, 3]) for shot in shots]
         placed += [(one.path, position) for one in boxes or () for position in torch.from_numpy(one.poses[:, :3, 3])]
-        if far := check_extent(placed):
-            raise LogError(far)
+        given = None if self.masks is None else GivenMasks(Path(self.masks))
+        problems = check_extent(placed)
+        if given is not None:
+            problems += given.check((rig[shot.camera].name, shot.stem) for shot in shots)
+        if problems:
+            raise LogError(problems)
         return Recording(
             name=chosen.layout.root.resolve().name,
             rig=rig,
             shots=shots,
             read_image=partial(_read_image, rig),
-            read_masks=partial(_read_masks, rig),
-            mask_kinds=frozenset({"ego"} if EGO_ROWS.keys() & chosen.images.keys() else ()),
+            read_masks=partial(_read_masks, rig, mounts, given),
+            mask_kinds=frozenset({"ego"} if EGO_ROWS.keys() & chosen.images.keys() else ()).union(
+                given.kinds if given else ()
+            ),
             frame_stamps=chosen.instants,
             sweeps=_sweeps(chosen, path) if self.lidar else None,
             boxes=boxes,
@@ -149,9 +156,15 @@ def _read_image(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w
     return read_image(Path(str(shot.key)), rig[shot.camera].size)
 
 
-def _read_masks(rig: Sequence[RigCamera[str]], shot: Shot) -> dict[str, Bool[Tensor, "h w"]]:
+def _read_masks(
+    rig: Sequence[RigCamera[str]], mounts: Mapping[str, MountedCamera], given: GivenMasks | None, shot: Shot
+) -> dict[str, Bool[Tensor, "h w"]]:
+    """Rows of the own car, and what somebody made, which counts where both are."""
     camera = rig[shot.camera]
-    return {"ego": bottom_rows(camera.size, *EGO_ROWS[camera.name])} if camera.name in EGO_ROWS else {}
+    own = {"ego": bottom_rows(camera.size, *EGO_ROWS[camera.name])} if camera.name in EGO_ROWS else {}
+    if given is None:
+        return own
+    return own | given.read(camera.name, shot.stem, recorded_size=mounts[camera.name].size, size=camera.size)
 
 
 def _notes(chosen: Selection, duplicates: int, homeless: int, shots: int) -> tuple[str, ...]:
