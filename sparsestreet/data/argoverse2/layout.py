@@ -1,5 +1,6 @@
 """Where a log lies, and which of its images belong to which sweep."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +78,7 @@ def stamped_files(folder: Path, ending: str) -> dict[int, Path]:
         if path.name.startswith("."):
             continue
         stem = path.stem
-        if not (stem.isascii() and stem.isdigit() and len(stem) < 20 and str(int(stem)) == stem and int(stem) < _LATEST):
+        if not re.fullmatch("[1-9][0-9]{0,18}", stem) or int(stem) >= _LATEST:
             raise fault(path, "the name is no stamp in nanoseconds", _REMEDY)
         files[int(stem)] = path
     return dict(sorted(files.items()))
