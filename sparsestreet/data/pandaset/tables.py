@@ -92,11 +92,11 @@ def read_poses(path: Path) -> Float64[Tensor, "n 4 4"]:
 def read_intrinsics(path: Path) -> Float64[Tensor, "3 3"]:
     """Pixels; raises LogError. Where pixel centers lie is not documented: the numbers are taken as they are."""
     entry = _json(path)
-    names = ("fx", "fy", "cx", "cy")
-    numbers = [entry.get(name) if isinstance(entry, dict) else None for name in names]
-    if not all(type(number) in (int, float) and 0 < number < 1e6 for number in numbers):
-        raise fault(path, f"fx, fy, cx, cy must be positive pixels, they are {str(numbers)[:100]}", _REMEDY)
-    fx, fy, cx, cy = (float(number) for number in numbers if number is not None)
+    found = [entry.get(name) for name in ("fx", "fy", "cx", "cy")] if isinstance(entry, dict) else []
+    numbers = [float(number) for number in found if type(number) in (int, float) and 0 < number < 1e6]
+    if len(numbers) < 4:
+        raise fault(path, f"fx, fy, cx, cy must be positive pixels, they are {str(found)[:100]}", _REMEDY)
+    fx, fy, cx, cy = numbers
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
@@ -120,12 +120,12 @@ def read_cuboids(path: Path) -> Cuboids:
     table = read_columns(path, kinds)
     front = table["cuboids.sensor_id"] == _FRONT_LIDAR
     kept: dict[str, int] = {}
-    for row in np.argsort(front, kind="stable"):
+    for row in np.argsort(front, kind="stable").tolist():
         name, sibling = table["uuid"][row], table["cuboids.sibling_id"][row]
         if name in kept:
             raise fault(path, f"object {name} has two boxes", "keep one box of an object at an instant")
         if not sibling or sibling not in kept:
-            kept[name] = int(row)
+            kept[name] = row
     rows = sorted(kept.values())
     centers, sizes = (np.stack([table[f"{what}.{axis}"][rows] for axis in "xyz"], -1) for what in _SHAPES)
     # A heading of 0 points along y, and the length lies along it; ours points along x.

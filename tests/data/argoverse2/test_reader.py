@@ -32,7 +32,7 @@ def test_images_have_the_poses_of_their_own_stamps(log):
         camera = next(one for one in PLAN.cameras if one.name == planned)
         assert shot.stamp == sweep_stamp(PLAN, shot.frame) + delay
         assert shot.stem == str(shot.stamp)
-        expected = PLAN.world_from_vehicle(shot.stamp) @ camera.vehicle_from_camera
+        expected = PLAN.world_from_vehicle(there(shot.stamp)) @ camera.vehicle_from_camera
         np.testing.assert_allclose(shot.world_from_camera.numpy(), expected, atol=ARC)
         error = recording.read_image(shot).numpy().astype(int) - PLAN.image(shot.frame, camera)
         assert np.abs(error).mean() < 2  # JPEG

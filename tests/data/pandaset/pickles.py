@@ -3,7 +3,7 @@
 import gzip
 import io
 import pickle
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +32,8 @@ class Call:
 
 
 class _Pickler(pickle._Pickler):
+    write: Callable[[bytes], object]
+
     def save(self, obj: Any, save_persistent_id: bool = True) -> None:
         if isinstance(obj, Global):
             self.write(pickle.GLOBAL + f"{obj.module}\n{obj.name}\n".encode())
@@ -43,7 +45,7 @@ class _Pickler(pickle._Pickler):
                 self.save(obj.state)
                 self.write(pickle.BUILD)
         else:
-            super().save(obj, save_persistent_id)
+            super().save(obj, save_persistent_id)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def pickled(value: Any, protocol: int = 4) -> bytes:
