@@ -143,7 +143,7 @@ class RecordedReader(LogReader):
 
     def check(self) -> list[Problem]:
         try:
-            self.recording()
+            self.read()
         except LogError as error:
             return list(error.problems)
         return self.check_contents()
