@@ -259,5 +259,5 @@ def test_tables_with_some_bytes_changed_are_read_or_refused(drive):
 def test_an_image_that_is_changed_later_is_found_when_it_is_decoded(drive):
     log = NuScenesReader(root=drive.root).read()
     Image.new("RGB", (30, 24)).save(image(drive))
-    with pytest.raises(LogError, match="the image is 30x24, sample_data.json says 32x24"):
+    with pytest.raises(LogError, match=r"the image is 30x24, sample_data\.json says 32x24"):
         log.frames[2]
