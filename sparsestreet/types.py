@@ -120,7 +120,7 @@ class View:
 
     camera: Camera
     time: float
-    """Normalized time in [0, 1]."""
+    """Normalized time in [0, 1]: that of its own stamp where the log has a clock, else that of its frame."""
     frame_index: int | None = None
     """Integer frame of the log; all cameras of one instant share it. None: not a recorded frame."""
     camera_index: int | None = None
@@ -165,6 +165,8 @@ class Sweep:
     """Lidar points of one instant in the world frame, with colors where a camera of that instant sees them."""
 
     index: int
+    time: float
+    """Normalized time in [0, 1] at which the points are where they are."""
     points: Float[Tensor, "n 3"]
     colors: Float[Tensor, "n 3"]
     """RGB in [0, 1]; rows without ``colored`` are gray 0.5."""
@@ -216,6 +218,11 @@ class Track:
     """Length, width, height, meters (mean over the annotated frames)."""
     body: BodyPoses | None = None
     """How a person moves inside the box; None: unknown, or not a person."""
+    times: Float64[Tensor, " f"] | None = None
+    """Normalized times of the boxes; None: those of their frames in a log without a clock, frame / (frames - 1)."""
+    span: tuple[float, float] | None = None
+    """Normalized times of the first and last image or box of the annotated frames, between which it is there; None:
+    from the first box to the last."""
 
     @property
     def path_length(self) -> float:
