@@ -11,6 +11,7 @@ from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
@@ -32,7 +33,10 @@ def train(arguments: list[str]) -> int:
         try:
             problem = flag_problem(arguments)
             if problem is None:
-                arguments = _shown(as_sweep(resumed_overrides(arguments)))
+                arguments, found = with_found_data(resumed_overrides(arguments))
+                if found:
+                    print(f"sparsestreet train: {found}", file=sys.stderr)
+                arguments = _shown(as_sweep(arguments))
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)

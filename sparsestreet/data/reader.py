@@ -2,14 +2,19 @@
 
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import ClassVar
 
 from sparsestreet.data.fingerprint import LogFiles, hash_files
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import Problem
 
 
 class LogReader(ABC):
     """A log on disk and the part of it that is wanted; both verbs look at that part only."""
+
+    marks: ClassVar[Marks | None] = None
+    """How ``data=auto`` knows a folder that it reads; None: it is chosen by its name alone."""
 
     @property
     @abstractmethod

@@ -195,6 +195,8 @@ def test_a_reader(tmp_path, capsys):
         Image.fromarray(np.full((20, 32, 3), 40 * index, np.uint8)).save(tmp_path / f"{index:03d}.png")
     assert data(["check", *words]) == 0
     assert "3 x 1" in capsys.readouterr().out
+    assert data(["check", *("data=auto" if word == "data=pictures" else word for word in words)]) == 0
+    assert capsys.readouterr().out.startswith("data=pictures, as ")
     street = data_of(composed(*words[1:], "split.stride=2", "split.offset=1", "seed=7"))
     split = street.split
     assert street.seed == 7  # of the order of its frames

@@ -16,6 +16,7 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, image_size, read_image
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
@@ -28,6 +29,8 @@ class Argoverse2Reader(RecordedReader):
 
     The world is the city's. Pinholes, whose images are shipped without the lens, with global shutters.
     """
+
+    marks = Marks(("city_SE3_egovehicle.feather",), depth=2)
 
     scene: str | None = None
     """First characters of the log's name; None: the only log below the root."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sparsestreet.data.colmap.model import SparseModel, find_model, read_images, read_points
 from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images
 from sparsestreet.data.problems import LogError, Problem, attempt
 from sparsestreet.data.recording import RecordedReader, Recording
@@ -19,6 +20,8 @@ class ColmapReader(RecordedReader):
 
     The world is the model's. There are no returns and no boxes.
     """
+
+    marks = Marks(("cameras.*", "sparse/0/cameras.*", "sparse/cameras.*", "colmap/sparse/0/cameras.*"))
 
     model: str | None = None
     """The model's folder below the root; None: the root, sparse/0, sparse or colmap/sparse/0."""

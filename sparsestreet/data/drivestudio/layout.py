@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.data.drivestudio.flavors import Flavor, FlavorName, flavor_of, named_flavor
-from sparsestreet.data.formats import published_format
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.window import chosen_cameras, frame_window
 
@@ -140,16 +139,13 @@ def find_layout(
 def _no_log(root: Path) -> LogError:
     """What is there instead of a scene, and what to do about it."""
     wanted = "the folder of one scene in DriveStudio's processed layout"
-    published = published_format(root)
-    if published:
-        remedy = f"convert it with DriveStudio's preprocessing, and name {wanted}"
-        return fault(root, f"this is {published}, which must be converted before it can be read", remedy)
     if not root.is_dir():
         return fault(root, "this is a file" if root.exists() else "nothing is there", f"name {wanted}")
     scenes = sorted(path.parent.name for path in root.glob("*/images"))
     if scenes:
         return fault(root, f"the folder has no images/; it holds {len(scenes)} scenes", f"name one: {root / scenes[0]}")
-    return fault(root, "the folder has no images/", f"name {wanted}")
+    remedy = f"name {wanted}, or say data=auto, which finds out whose files these are"
+    return fault(root, "the folder has no images/", remedy)
 
 
 def _count_frames(root: Path, flavor: Flavor, lidar: bool) -> int:

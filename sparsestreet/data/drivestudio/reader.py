@@ -20,6 +20,7 @@ from sparsestreet.data.drivestudio.poses import first_pose, read_clock
 from sparsestreet.data.drivestudio.sweeps import read_points
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.log import DrivingLog, SceneExtent
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world
 from sparsestreet.data.problems import LogError, Problem
@@ -40,6 +41,8 @@ class DriveStudioReader(LogReader):
     A file ``timestamps.txt`` beside the folders is the clock: the seconds of each frame, one a line, by any zero. All
     cameras and the lidar share the stamp of their frame.
     """
+
+    marks = Marks(("images/[0-9][0-9][0-9]_[0-9].jpg", "extrinsics/*.txt"))
 
     root: Path | str
     cameras: Sequence[int] | None = None

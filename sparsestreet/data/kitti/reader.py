@@ -21,6 +21,7 @@ from sparsestreet.data.kitti.layout import GRAY, Drive, find_drive
 from sparsestreet.data.kitti.oxts import Oxts, read_oxts
 from sparsestreet.data.kitti.tracklets import Tracklet, read_tracklets
 from sparsestreet.data.kitti.velodyne import point_stamps, read_points
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
@@ -52,6 +53,8 @@ class KittiReader(RecordedReader):
     ``root`` is the folder of the dates. Frame k has the files of the name k. Its instant is the one at which the lidar
     faced forward, which triggered all four cameras. The world is Mercator's plane: x east, y north, z up.
     """
+
+    marks = Marks(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
 
     drive: str
     """Such as 2011_09_26_drive_0001."""

@@ -21,6 +21,7 @@ from sparsestreet.data.kitti360.boxes import read_boxes
 from sparsestreet.data.kitti360.layout import SequenceFolders, find_sequence
 from sparsestreet.data.kitti360.poses import Calibration360, check_pose, read_calibration, read_poses
 from sparsestreet.data.kitti360.semantics import KINDS, read_semantics
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.poses import RIGIDITY_TOLERANCE
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
@@ -55,6 +56,8 @@ class Kitti360Reader(RecordedReader):
     ``first_frame`` and ``last_frame`` are the data set's own numbers. Cameras and lidar share the instant of their
     frame, for which the images' stamps stand. The world is that of the shipped poses.
     """
+
+    marks = Marks(("data_2d_raw/*_drive_*_sync",))
 
     sequence: int | str
     """0, 2 to 10 or 18."""

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.nerfstudio.transforms import Transforms, read_transforms
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images
@@ -18,6 +19,8 @@ class NerfstudioReader(RecordedReader):
 
     The world is that of the file's poses and points. There are no returns and no boxes.
     """
+
+    marks = Marks(("transforms.json",))
 
     scale: float = 1.0
     """Meters to a unit of the file."""

@@ -15,6 +15,7 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles, hash_files
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.nuscenes.boxes import read_boxes
 from sparsestreet.data.nuscenes.cameras import nuscenes_camera, recorded_size
 from sparsestreet.data.nuscenes.instants import Rate
@@ -34,6 +35,8 @@ class NuScenesReader(RecordedReader):
     The world is that of the scene's map. Shutters are global, images have no lens. Each image has the pose of its own
     stamp. Lidar points are where they were at the end of a turn. Boxes are those of the samples, at their stamps.
     """
+
+    marks = Marks(("*/sample_data.json",))
 
     scene: str | int | None = None
     """Its name, as "scene-0061"; or its place in scene.json, from 0, as DriveStudio counts; None: the only one."""

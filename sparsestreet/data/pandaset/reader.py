@@ -15,6 +15,7 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, image_size, read_image
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.pandaset.boxes import Objects, read_objects
 from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR, EGO_ROWS, FRONT, USUAL_CAMERAS, Layout, find_sequence
 from sparsestreet.data.pandaset.spin import Spin, spin_of
@@ -32,6 +33,8 @@ class PandaSetReader(RecordedReader):
     The stamp of an instant is that of the front camera, which is taken at the middle of the sweep. Cameras are taken
     as pinholes whose rows are exposed at once; the data set declares neither lens nor shutter.
     """
+
+    marks = Marks(("camera/front_camera/poses.json",), depth=2)
 
     scene: str | int | None = None
     """Name of the sequence, "001" or 1; None: the only one below the root."""

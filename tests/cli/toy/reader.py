@@ -9,6 +9,7 @@ from sparsestreet.data.clock import LogClock
 from sparsestreet.data.images import check_pixels, image_size, read_image
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import LogError, Problem, attempt
 from sparsestreet.data.reader import LogReader
 from sparsestreet.types import Camera, Frame, View
@@ -17,6 +18,8 @@ from sparsestreet.types import Camera, Frame, View
 @dataclass(frozen=True)
 class PicturesReader(LogReader):
     """000.png, 001.png ...: one camera that drives ahead, a meter a picture."""
+
+    marks = Marks(("000.png",))
 
     root: Path | str
     focal: float

@@ -1,0 +1,103 @@
+"""``data=auto``: which option of conf/data a folder is for, by the marks of each option's reader.
+
+The options are those of every conf folder that Hydra searches, so a reader of one's own is among them.
+"""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from hydra import compose
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from sparsestreet.cli.compose import configuration
+from sparsestreet.data.marks import UNREAD, Marks
+
+AUTO = "data=auto"
+_MORE = "docs/datasets/README.md says what is read"
+_NEIGHBORS = 50
+"""Folders below a wrong root that are looked at."""
+
+
+def with_found_data(arguments: Sequence[str], root: Path | None = None) -> tuple[list[str], str | None]:
+    """The arguments with the option that ``data=auto`` stands for, and a sentence that says why; None without it.
+
+    Args:
+        arguments: of a command.
+        root: the folder, where it is not given as ``data.root``.
+
+    Raises ValueError where no reader or more than one knows the folder, or it is not given.
+    """
+    if any(text.startswith("data=") and "auto" in text[5:].split(",") and text != AUTO for text in arguments):
+        raise ValueError("data=auto looks at one folder; name the readers of a sweep")
+    if AUTO not in arguments:
+        return list(arguments), None
+    root = _root_of(arguments) if root is None else root
+    name, why = found_option(root, [text for text in arguments if text.startswith("hydra.searchpath=")])
+    return [f"data={name}" if text == AUTO else text for text in arguments], f"data={name}, as {why} tells"
+
+
+def found_option(root: Path, searchpath: Sequence[str] = ()) -> tuple[str, Path]:
+    """The option of conf/data whose reader knows a folder, and the file that tells. Raises ValueError."""
+    if not root.is_dir():
+        what = "is a file" if root.exists() else "is not there"
+        raise ValueError(f"data.root={root} {what}: name the folder of a log")
+    marks = _marks_of_options(searchpath)
+    known = _known_as(root, marks)
+    if len(known) == 1:
+        return next(iter(known.items()))
+    if known:
+        told = " and ".join(f"data={name} ({path} is there)" for name, path in known.items())
+        raise ValueError(f"{root} has the files of {told}: name the one that is meant")
+    for unread in UNREAD:
+        if path := unread.marks.found_in(root):
+            raise ValueError(f"{root} is {unread.name}, as {path.name} tells, which is not read: {unread.remedy}")
+    if (near := _nearby(root, marks)) is not None:
+        raise ValueError(f"no reader knows {root}, but {near[0]} is for data={near[1]}: name that folder")
+    missed = "".join(f"\n  data={name}: {one}" for name, one in marks.items())
+    raise ValueError(f"no reader knows {root}; {_MORE}. There is none of{missed}")
+
+
+def _root_of(arguments: Sequence[str]) -> Path:
+    given = [text for text in arguments if text.startswith("data.root=")]
+    if not given:
+        raise ValueError("data=auto needs a folder to look at: give data.root=DIR")
+    override = OverridesParser.create().parse_override(given[-1])
+    if override.is_sweep_override():
+        raise ValueError("data=auto looks at one folder, data.root names several: name the reader, data=...")
+    return Path(str(override.value()))
+
+
+def _marks_of_options(searchpath: Sequence[str]) -> dict[str, Marks]:
+    """Of every option with a root whose reader states its marks."""
+    found = {}
+    with configuration():
+        loader = GlobalHydra.instance().config_loader()
+        options = loader.get_group_options("data", ObjectType.CONFIG, config_name="train", overrides=list(searchpath))
+        for name in options:
+            data = compose(None, [*searchpath, f"+data={name}"]).data
+            if "root" in set(data) and (marks := getattr(_reader_of(name, data.log._target_), "marks", None)):
+                found[name] = marks
+    return found
+
+
+def _reader_of(name: str, target: str) -> type:
+    module, _, reader = target.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), reader)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"data={name} names {target}, which cannot be imported: {error}") from error
+
+
+def _known_as(root: Path, marks: Mapping[str, Marks]) -> dict[str, Path]:
+    """Option -> the file that tells."""
+    return {name: path for name, one in marks.items() if (path := one.found_in(root))}
+
+
+def _nearby(root: Path, marks: Mapping[str, Marks]) -> tuple[Path, str] | None:
+    """A folder that a reader knows, above or below a wrong one, and the option."""
+    below = sorted(path for path in root.iterdir() if path.is_dir())[:_NEIGHBORS]
+    around = ((folder, name) for folder in (*root.absolute().parents[:2], *below) for name in _known_as(folder, marks))
+    return next(around, None)
