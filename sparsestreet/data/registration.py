@@ -41,7 +41,8 @@ def edge_shift(frames: Frames, sweeps: Sweeps) -> EdgeShift | None:
 
     An edge lies midway between two returns of a row (or column) of pixels of which one is clearly nearer. The mean
     slope of the gray image at all of them is largest where they belong; a parabola through the best shift and its
-    neighbors gives parts of a step. Lidars stand above cameras and look over edges, so ``down`` is -0.5 where all is right.
+    neighbors gives parts of a step. Lidars stand above cameras and look over edges, so ``down`` is about -0.5 where all
+    is right.
     """
     places = {index: place for place, index in enumerate(sweeps.indices)}
     shifts = torch.arange(-REACH, REACH + STEP / 2, STEP)
