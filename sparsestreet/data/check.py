@@ -23,6 +23,7 @@ def report_check(reader: LogReader, console: Console | None = None) -> int:
         return 1
     log = reader.read()
     console.print(_summary(log))
+    console.print(_camera_table(log))
     if log.tracks:
         console.print(_track_table(log))
     for note in log.notes:
@@ -41,17 +42,47 @@ def _problem_table(root: Path, problems: Sequence[Problem]) -> Table:
 
 def _summary(log: DrivingLog) -> Table:
     table = Table("log", escape(log.name), title="What the log holds")
-    sizes = sorted({(view.camera.width, view.camera.height) for view in log.views}, reverse=True)
     counts = [(len(sweep.points), int(sweep.colored.sum())) for sweep in log.sweeps.gray()]
     points, colored = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     table.add_row("frames x cameras", f"{log.num_frames} x {log.num_cameras}")
     table.add_row("frames a second", "not known" if log.frame_rate is None else f"{log.frame_rate:.4g}")
-    table.add_row("image size", ", ".join(f"{width}x{height}" for width, height in sizes))
-    table.add_row("lidar points", f"{points:,} ({colored:,} seen by a camera)" if log.sweeps else "none")
+    if log.stamps:
+        table.add_row("stamps", _stamps(log))
+    table.add_row(
+        "lidar", f"{points:,} points in {len(counts)} sweeps ({colored:,} seen by a camera)" if counts else "none"
+    )
     if log.sparse_points is not None:
         table.add_row("sparse points", f"{len(log.sparse_points()):,}")
     table.add_row("objects", str(len(log.tracks)))
     table.add_row("scene radius", f"{log.radius:.1f} m")
+    return table
+
+
+def _stamps(log: DrivingLog) -> str:
+    """The first stamp, how long the log is, and how far apart the images of a frame are."""
+    found: dict[int, list[int]] = {}
+    for view in log.views:
+        if view.stamp is not None:
+            found.setdefault(view.indices[0], []).append(view.stamp)
+    apart = max(max(stamps) - min(stamps) for stamps in found.values())
+    first, last = min(log.stamps.values()), max(log.stamps.values())
+    return f"from {first} ns, {(last - first) / 1e9:.1f} s; images of a frame are at most {apart / 1e6:.1f} ms apart"
+
+
+def _camera_table(log: DrivingLog) -> Table:
+    """Sizes, lenses, shutters, and the masks of each camera's first image."""
+    table = Table("camera", "images", "size", "lens", "shutter", "masks", title="Cameras")
+    for index in range(log.num_cameras):
+        frames = log.frames.where(lambda view, index=index: view.camera_index == index)
+        if not frames:
+            continue
+        frame, camera = frames[0], frames.views[0].camera
+        lens = "none" if camera.distortion is None else "simulated"
+        shutter = "none" if camera.shutter is None else "rolling"
+        masks = [kind for kind in ("sky", "human", "vehicle", "ego") if getattr(frame, kind) is not None]
+        size = f"{camera.width}x{camera.height}"
+        name = log.camera_names[index] if log.camera_names else str(index)
+        table.add_row(escape(name), str(len(frames)), size, lens, shutter, ", ".join(masks) or "none")
     return table
 
 

@@ -1,6 +1,7 @@
 """Frames in the order that training and validation want them."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Int
@@ -10,6 +11,7 @@ from torch import Tensor
 from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog, split
+from sparsestreet.data.recolored import recolored
 from sparsestreet.phases import phase
 from sparsestreet.types import Frame
 
@@ -100,6 +102,7 @@ class StreetData(LightningDataModule):
         *,
         stride: int = 10,
         offset: int = 5,
+        cameras: Sequence[str | int] = (),
         seed: int = 0,
         val_frames: int | None = None,
         with_replacement: bool = False,
@@ -109,6 +112,7 @@ class StreetData(LightningDataModule):
             log: what to train on.
             stride: as in ``split``.
             offset: as in ``split``.
+            cameras: as in ``split``.
             seed: of the order of the training frames.
             val_frames: images that each validation looks at, spread over the held-out ones; None: all.
             with_replacement: as in ``ShuffledFrames``.
@@ -116,9 +120,12 @@ class StreetData(LightningDataModule):
         super().__init__()
         if val_frames is not None and val_frames < 1:
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
-        self.driving_log = log
-        self.split = split(log, stride=stride, offset=offset)
-        self.split_in_words = f"every {stride}th frame from {offset}" if stride else "none"
+        self.split = split(log, stride=stride, offset=offset, cameras=cameras)
+        # Colors of a sweep are those of images, so a camera that is held out gives none.
+        self.driving_log = replace(log, sweeps=recolored(log, self.split.train)) if cameras else log
+        instants = [f"every {stride}th frame from {offset}"] if stride else []
+        held_out = instants + [f"camera {name}" for name in cameras]
+        self.split_in_words = " and ".join(held_out) or "none"
         """Which frames are held out, for records."""
         self.seed = seed
         self.val_frames = val_frames

@@ -1,7 +1,7 @@
 """A driving log as the rest of the package sees it, whatever data set it came from."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -56,6 +56,8 @@ class DrivingLog:
     """Axes of the first pose, as columns in the world; center and radius are then those of DriveStudio: of a box along
     these axes around the lidar alone. They do not depend on where the street leads. None: the box lies along the axes
     of the world, and holds the cameras too."""
+    camera_names: tuple[str, ...] = ()
+    """As the data set calls them, by camera index; empty: they have none but their indices."""
     sparse_points: Callable[[], SparsePoints] | None = None
     """Reads points that came with the log, where it has any. Gaussians start from them, and without lidar the scene's
     box lies around them; they are no returns, so they give no depth."""
@@ -149,23 +151,34 @@ class DrivingLog:
 
 @dataclass(frozen=True)
 class Split:
-    """Which images are trained on and which are only looked at; no instant is in both."""
+    """Which images are trained on and which are only looked at; no image is in both."""
 
     train: Frames
     held_out: Frames
 
     @property
     def held_out_indices(self) -> frozenset[int]:
-        """Integer frames whose images, sweeps and boxes must not be trained on."""
-        return frozenset(view.indices[0] for view in self.held_out.views)
+        """Integer frames whose images, sweeps and boxes must not be trained on: those without an image to train on."""
+        trained = {view.indices[0] for view in self.train.views}
+        return frozenset(view.indices[0] for view in self.held_out.views) - trained
 
 
-def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:
-    """Hold out every ``stride``-th instant with all its cameras: indices offset, offset + stride, ...
+def split(log: DrivingLog, *, stride: int = 10, offset: int = 5, cameras: Sequence[str | int] = ()) -> Split:
+    """Hold out every ``stride``-th instant with all its cameras: indices offset, offset + stride, ... Every image of
+    ``cameras``, given by name, is held out too.
 
     ``offset=stride`` starts at ``stride``, so that frame 0 is trained on (DriveStudio's split). ``stride=0`` holds out
-    nothing. Raises ValueError where no training frame, or no held-out one, would be left. Decodes no image.
+    no instant. Raises ValueError where no training frame, or no held-out one, would be left, and for a camera that the
+    log lacks. Decodes no image.
     """
+    if cameras:
+        chosen = _camera_indices(log, cameras)
+        others = replace(log, frames=log.frames.where(lambda view: view.camera_index not in chosen))
+        if not others.frames:
+            raise ValueError(f"split.cameras holds out all cameras of {log.name!r}: leave one to train on")
+        parts = split(others, stride=stride, offset=offset)
+        trained = {view.indices for view in parts.train.views}
+        return Split(parts.train, log.frames.where(lambda view: view.indices not in trained))
     if stride == 0:
         return Split(log.frames, Frames.of(()))
     if not 0 <= offset <= stride:
@@ -184,6 +197,13 @@ def split(log: DrivingLog, *, stride: int = 10, offset: int = 5) -> Split:
             "lower the offset, or say stride=0 to train on every frame"
         )
     return Split(train, held_out)
+
+
+def _camera_indices(log: DrivingLog, cameras: Sequence[str | int]) -> frozenset[int]:
+    names = log.camera_names or tuple(map(str, range(log.num_cameras)))
+    if unknown := [camera for camera in cameras if str(camera) not in names]:
+        raise ValueError(f"split.cameras names {unknown}, the cameras of {log.name!r} are {', '.join(names)}")
+    return frozenset(names.index(str(camera)) for camera in cameras)
 
 
 def _seen_points(sweeps: Sweeps) -> Float[np.ndarray, "n 3"]:

@@ -15,8 +15,8 @@ class Marks:
 
     def found_in(self, root: Path) -> Path | None:
         """What tells, below ``root``; None where there is nothing of it."""
-        places = ["*/" * depth + pattern for depth in range(self.depth + 1) for pattern in self.patterns]
-        return next((path for place in places for path in root.glob(place)), None)
+        places = ("*/" * depth + pattern for depth in range(self.depth + 1) for pattern in self.patterns)
+        return next((path for place in places if (path := min(root.glob(place), default=None))), None)
 
     def __str__(self) -> str:
         below = f", up to {self.depth} folders below" if self.depth else ""

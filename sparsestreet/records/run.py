@@ -61,6 +61,8 @@ class RunDescription:
     seed: int
     split: str
     """Which frames are held out, in words, such as "every 10th frame from 5"; "none"."""
+    cameras: tuple[str, ...] = ()
+    """Name and image size of each camera that is read, such as "CAM_FRONT 1600x900"; empty: the record is older."""
     config: dict[str, Setting] = field(metadata=EXACT)
     """The resolved configuration, flat: dotted key -> value."""
     config_hash: str

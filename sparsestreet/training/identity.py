@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.log import DrivingLog
 from sparsestreet.records.configuration import Setting, config_hash
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.records.run import RunDescription
@@ -36,6 +37,7 @@ class RunIdentity:
             scene=data.driving_log.name,
             seed=recipe.seed,
             split=data.split_in_words,
+            cameras=_cameras(data.driving_log),
             config=dict(self.config),
             config_hash=config_hash(self.config),
             data_hash=self.data_hash,
@@ -50,3 +52,10 @@ class RunIdentity:
             machine=this_machine(),
             source=this_source(),
         )
+
+
+def _cameras(log: DrivingLog) -> tuple[str, ...]:
+    """Name and size of each camera, in their order."""
+    sizes = {view.indices[1]: f"{view.camera.width}x{view.camera.height}" for view in log.views}
+    names = log.camera_names or tuple(map(str, range(log.num_cameras)))
+    return tuple(f"{names[index]} {sizes[index]}" for index in sorted(sizes))

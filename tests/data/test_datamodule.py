@@ -10,8 +10,10 @@ import torch
 
 from sparsestreet.data.datamodule import ShuffledFrames, StreetData
 from sparsestreet.data.device import to_device
+from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.lazy import Frames
 from sparsestreet.types import Frame, View
+from tests.data.drivestudio.folders import make_nuscenes
 from tests.data.streets import make_log
 
 
@@ -248,3 +250,23 @@ def test_with_replacement_a_frame_comes_at_any_step_and_a_resume_draws_the_same(
     assert keys(resumed) == epochs[1][4:]
     again = StreetData(make_log(9), stride=0, with_replacement=True).train_dataloader()
     assert keys(again) == epochs[0]
+
+
+def test_a_camera_that_is_held_out_gives_returns_no_colors(tmp_path):
+    """Images of one gray each, so that a color says which camera it is from."""
+    log = DriveStudioReader(make_nuscenes(tmp_path)).read()
+    assert len(log.camera_names) == 2
+    data = StreetData(log, stride=0, cameras=["0"])
+    assert data.split_in_words == "camera 0"
+    alone = DriveStudioReader(tmp_path, cameras=[1]).read()
+    for whole, mine, other in zip(log.sweeps, data.driving_log.sweeps, alone.sweeps, strict=True):
+        assert torch.equal(mine.points, whole.points)
+        assert torch.equal(mine.colors, other.colors)
+        assert torch.equal(mine.colored, other.colored)
+    assert [sweep.colored.tolist() for sweep in data.driving_log.sweeps.gray()] == [
+        sweep.colored.tolist() for sweep in alone.sweeps
+    ]
+    assert any(
+        not torch.equal(sweep.colors, other.colors) for sweep, other in zip(log.sweeps, alone.sweeps, strict=True)
+    )
+    assert StreetData(log, stride=2, offset=1, cameras=["0"]).split_in_words == "every 2th frame from 1 and camera 0"

@@ -41,6 +41,27 @@ def test_stride_zero_holds_out_nothing():
     assert len(split(log, stride=0).held_out) == 0
 
 
+def test_a_camera_is_held_out_at_all_frames_and_its_instants_are_trained_on():
+    log = replace(make_log(8, 2), camera_names=("front", "rear"))
+    parts = split(log, stride=0, cameras=["rear"])
+    assert {view.camera_index for view in parts.train.views} == {0}
+    assert [view.indices for view in parts.held_out.views] == [(index, 1) for index in range(8)]
+    assert parts.held_out_indices == frozenset()
+
+
+def test_a_camera_and_instants_are_held_out_together():
+    parts = split(make_log(8, 2), stride=4, offset=1, cameras=[0])
+    assert [view.indices for view in parts.train.views] == [(index, 1) for index in (0, 2, 3, 4, 6, 7)]
+    assert len(parts.held_out) == 10
+    assert parts.held_out_indices == {1, 5}
+
+
+@pytest.mark.parametrize(("cameras", "said"), [(["rear"], r"\['rear'\].* are 0, 1"), ([0, 1], "leave one to train on")])
+def test_a_camera_that_cannot_be_held_out(cameras, said):
+    with pytest.raises(ValueError, match=said):
+        split(make_log(8, 2), cameras=cameras)
+
+
 @pytest.mark.parametrize(
     ("choice", "message"),
     [

@@ -102,6 +102,7 @@ def test_a_run_is_called_after_its_folder_and_leaves_what_the_command_leaves(who
 def test_the_seed_of_a_run_is_that_of_its_recipe(tmp_path):
     described = RunIdentity(label="mine").describe(replace(recipe(tmp_path), seed=3), data(), STEPS)
     assert described.seed == 3
+    assert described.cameras == ("0 32x16",)
 
 
 class Steps(Callback):

@@ -118,6 +118,7 @@ class DriveStudioReader(LogReader):
             tracks=tracks,
             num_frames=len(layout.frames),
             num_cameras=len(rig),
+            camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
             notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
