@@ -209,7 +209,11 @@ def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], cl
 
 def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
     shot = shots[view.indices]
-    masks = recording.read_masks(shot)
+    masks = dict(recording.read_masks(shot))
+    undistortion = recording.rig[shot.camera].undistortion
+    blank = None if undistortion is None else undistortion.blank
+    if blank is not None:  # a pinhole's pixels that the lens did not record
+        masks["ego"] = blank | masks["ego"] if "ego" in masks else blank
     return Frame.of(view, image=recording.read_image(shot), **{kind: masks.get(kind) for kind in MASK_KINDS})
 
 

@@ -1,5 +1,6 @@
 """The cameras of a rig: what is the same in all images of one, and whether its lens is simulated."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -11,10 +12,14 @@ from torch import Tensor
 from sparsestreet.data.problems import fault
 from sparsestreet.data.undistortion import Undistortion
 from sparsestreet.geometry.distortion import largest_shift
+from sparsestreet.geometry.lenses import BrownConrady, Lens
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import Camera
 
 Name = TypeVar("Name", str, int)
+
+_WIDEST_PINHOLE = 170.0
+"""Degrees. At its border such a pinhole has 130 times as many pixels for a small angle as at its center."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class RigCamera(Generic[Name]):
     """As the log counts it."""
     intrinsics: Float[Tensor, "3 3"]
     size: tuple[int, int]
-    """(width, height) of the images as they are read, pixels."""
+    """(width, height) of the images as they are read, pixels; without their lens too."""
     distortion: Float[Tensor, "5"] | None
     """Of a lens that is simulated."""
     note: str | None
@@ -66,22 +71,81 @@ def rig_camera(
 
     Raises ValueError for a width that the images do not have.
     """
-    full_width, full_height = recorded_size
-    if width is not None and not 0 < width <= full_width:
-        raise ValueError(f"width must be within 1 to {full_width}, the images of camera {name}, got {width}")
-    size = (full_width, full_height) if width is None else (width, max(1, round(full_height * width / full_width)))
-    scale = torch.tensor([size[0] / full_width, size[1] / full_height, 1.0], dtype=torch.float64)
-    intrinsics = scale[:, None] * intrinsics
+    size = _scaled_size(name, recorded_size, width)
+    intrinsics = _scaled(intrinsics, recorded_size, size)
     simulated, note, undistortion = False, None, None
     if distortion.any():
         shift = largest_shift(intrinsics, distortion, *size)
         if undistort:
-            undistortion = Undistortion.of(intrinsics, distortion, *size)
+            undistortion = Undistortion.of(BrownConrady.of(intrinsics, distortion), intrinsics, size, size)
             note = f"camera {name}: its lens, which moves pixels by up to {shift:.3g}, is taken out of the images"
         else:
             simulated, note = _lens_decision(name, shift, min_lens_shift)
     lens = distortion.float() if simulated else None
     return RigCamera(name, index, intrinsics.float(), size, lens, note, undistortion)
+
+
+def lens_camera(
+    name: Name,
+    index: int,
+    *,
+    lens: Lens,
+    recorded_size: tuple[int, int],
+    width: int | None = None,
+    min_lens_shift: float | None = 0.5,
+    pinhole_fov: float | None = None,
+) -> RigCamera[Name]:
+    """As ``rig_camera``, of a camera with a lens of any model. What the splat op cannot simulate is taken out.
+
+    Images and masks are then resampled, at their size, to a pinhole. By default it has the lens's resolution at the
+    center, so that nothing there is blurred or thinned out, and a wide lens loses what lies far outside.
+
+    Args:
+        name: as the data set calls the camera.
+        index: as the log counts it.
+        lens: in pixels of the recorded images.
+        recorded_size: (width, height) of the recorded images.
+        width: as in ``rig_camera``.
+        min_lens_shift: as in ``rig_camera``; None keeps no lens in the images that cannot be simulated.
+        pinhole_fov: degrees that the pinhole sees from its left to its right edge; None: by the resolution.
+
+    Raises ValueError for a width or an angle that cannot be.
+    """
+    brown_conrady = lens.brown_conrady()
+    if brown_conrady is not None:
+        return rig_camera(
+            name,
+            index,
+            intrinsics=lens.pinhole,
+            distortion=brown_conrady,
+            recorded_size=recorded_size,
+            width=width,
+            min_lens_shift=min_lens_shift,
+        )
+    size = _scaled_size(name, recorded_size, width)
+    intrinsics = _scaled(lens.pinhole, recorded_size, size)
+    if pinhole_fov is not None:
+        intrinsics = _seeing(intrinsics, size[0], pinhole_fov)
+    undistortion = Undistortion.of(lens, intrinsics, size, recorded_size)
+    shift = undistortion.largest_shift
+    if pinhole_fov is None and min_lens_shift is not None and shift < min_lens_shift:
+        _, note = _lens_decision(name, shift, min_lens_shift)
+        return RigCamera(name, index, intrinsics.float(), size, None, note)
+    return RigCamera(
+        name, index, intrinsics.float(), size, None, _resampling(name, lens, intrinsics, undistortion), undistortion
+    )
+
+
+def check_lens_camera(path: Path, lens: Lens, size: tuple[int, int]) -> None:
+    """As ``check_lens``, for a lens of any model."""
+    brown_conrady = lens.brown_conrady()
+    if brown_conrady is not None:
+        check_lens(path, lens.pinhole, brown_conrady, size)
+        return
+    try:
+        lens.check(*size)
+    except ValueError as error:
+        raise fault(path, str(error), "write the coefficients of the calibration, by the model's own names") from error
 
 
 def check_lens(
@@ -106,3 +170,41 @@ def _lens_decision(name: str | int, shift: float, min_lens_shift: float | None) 
     if shift < min_lens_shift:
         return False, f"{lens} moves pixels by at most {shift:.3g} and is left out (data.log.min_lens_shift)"
     return True, f"{lens} moves pixels by up to {shift:.3g} and is simulated"
+
+
+def _scaled_size(name: str | int, recorded_size: tuple[int, int], width: int | None) -> tuple[int, int]:
+    full_width, full_height = recorded_size
+    if width is not None and not 0 < width <= full_width:
+        raise ValueError(f"width must be within 1 to {full_width}, the images of camera {name}, got {width}")
+    return (full_width, full_height) if width is None else (width, max(1, round(full_height * width / full_width)))
+
+
+def _scaled(
+    intrinsics: Float64[Tensor, "3 3"], recorded_size: tuple[int, int], size: tuple[int, int]
+) -> Float64[Tensor, "3 3"]:
+    scale = torch.tensor([size[0] / recorded_size[0], size[1] / recorded_size[1], 1.0], dtype=torch.float64)
+    return scale[:, None] * intrinsics
+
+
+def _seeing(intrinsics: Float64[Tensor, "3 3"], width: int, degrees: float) -> Float64[Tensor, "3 3"]:
+    """The pinhole zoomed to this field of view, around the middle column; pixels keep their aspect."""
+    if not 0 < degrees < _WIDEST_PINHOLE:
+        raise ValueError(f"pinhole_fov must lie within 0 and {_WIDEST_PINHOLE:g} degrees, got {degrees:g}: take 100")
+    focal = width / 2 / math.tan(math.radians(degrees) / 2)
+    zoomed = intrinsics.clone()
+    zoomed[0, 2] = width / 2
+    zoomed[0, 0], zoomed[1, 1] = focal, focal * intrinsics[1, 1] / intrinsics[0, 0]
+    return zoomed
+
+
+def _resampling(name: str | int, lens: Lens, intrinsics: Float64[Tensor, "3 3"], undistortion: Undistortion) -> str:
+    """What a user must know about a lens that is taken out."""
+    width = undistortion.columns.shape[1]
+    (fx, _, cx), _, _ = intrinsics.tolist()
+    degrees = math.degrees(math.atan(cx / fx) + math.atan((width - cx) / fx))
+    blank = 0.0 if undistortion.blank is None else float(undistortion.blank.double().mean())
+    return (
+        f"camera {name}: its lens ({type(lens).__name__}) is none that is simulated; its images are resampled to a "
+        f"pinhole of {degrees:.0f} degrees, outside of which lie {undistortion.lost:.1%} of the recorded pixels; "
+        f"nothing was recorded for {blank:.1%} of its own, which no loss sees"
+    )

@@ -1,8 +1,20 @@
-"""Cameras of a rig, scaled."""
+"""Cameras of a rig: scaled, with a lens that is simulated, left out, or taken out of the images."""
 
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
 import torch
 
-from sparsestreet.data.rig import rig_camera
+from sparsestreet.data.problems import LogError
+from sparsestreet.data.rig import check_lens_camera, lens_camera, rig_camera
+from sparsestreet.geometry.lenses import BrownConrady, Fisheye, FTheta, Rational
+from tests.typed import there
+
+FOCAL = {"fx": 200.0, "fy": 210.0, "cx": 60.0, "cy": 40.0}
+BARREL = {"k1": -0.2, "k2": 0.02, "p1": 1e-3, "p2": -1e-3, "k3": 0.0}
 
 
 def test_a_scaled_image_keeps_a_row():
@@ -13,3 +25,92 @@ def test_a_scaled_image_keeps_a_row():
     assert camera.size == (10, 1)
     expected = torch.tensor([[20.0, 0, 5], [0, 200 / 3, 0.5], [0, 0, 1]])
     torch.testing.assert_close(camera.intrinsics, expected)
+
+
+@pytest.mark.parametrize("lens", [BrownConrady(**FOCAL, **BARREL), Rational(**FOCAL, **BARREL)], ids=["brown", "eight"])
+@pytest.mark.parametrize("min_lens_shift", [0.5, 100.0, None])
+def test_brown_conrady_is_simulated_however_it_is_written(lens, min_lens_shift):
+    size, width = (120, 80), 60
+    camera = lens_camera("a", 3, lens=lens, recorded_size=size, width=width, min_lens_shift=min_lens_shift)
+    intrinsics, numbers = lens.pinhole, torch.tensor([*BARREL.values()], dtype=torch.float64)
+    same = rig_camera(
+        "a",
+        3,
+        intrinsics=intrinsics,
+        distortion=numbers,
+        recorded_size=size,
+        width=width,
+        min_lens_shift=min_lens_shift,
+    )
+    assert (camera.index, camera.size, camera.note) == (3, (60, 40), same.note)
+    assert torch.equal(camera.intrinsics, same.intrinsics)
+    assert camera.undistortion is None
+    if min_lens_shift == 0.5:
+        assert torch.equal(there(camera.distortion), numbers.float())
+    else:
+        assert camera.distortion is None
+
+
+def test_another_lens_is_taken_out_at_the_resolution_of_its_center():
+    lens = Fisheye(**FOCAL, k1=-0.05)
+    camera = lens_camera("wide", 0, lens=lens, recorded_size=(120, 80), width=60)
+    take_out = there(camera.undistortion)
+    assert (camera.size, camera.distortion) == ((60, 40), None)
+    assert camera.intrinsics.tolist() == [[100, 0, 30], [0, 105, 20], [0, 0, 1]]
+    assert take_out.columns.shape == (40, 60)
+    # The corner of the pinhole is 0.36 rad outside, which the lens images nearer to the center.
+    assert take_out.columns[0, 0] > 0.3
+    assert take_out.blank is None
+    note = there(camera.note)
+    degrees = round(2 * math.degrees(math.atan(60 / 200)))
+    assert note.startswith("camera wide: its lens (Fisheye) is none that is simulated; its images are resampled to a ")
+    assert f"pinhole of {degrees} degrees, outside of which lie {take_out.lost:.1%} of the recorded pixels" in note
+    assert "nothing was recorded for 0.0% of its own" in note
+    assert 0.01 < take_out.lost < 0.1
+
+
+def test_the_pinhole_may_keep_a_field_of_view():
+    lens = FTheta(polynomial=(0.0, 50.0), cx=61.0, cy=40.0, linear=(1.1, 0.0, 0.0))
+    camera = lens_camera("wide", 0, lens=lens, recorded_size=(120, 80), pinhole_fov=120.0)
+    focal = 60 / math.tan(math.radians(60))
+    expected = torch.tensor([[focal, 0, 60], [0, focal / 1.1, 40], [0, 0, 1]])
+    torch.testing.assert_close(camera.intrinsics, expected)
+    blank = there(there(camera.undistortion).blank)
+    share = float(blank.double().mean())
+    assert share > 0.05
+    assert "pinhole of 120 degrees" in there(camera.note)
+    assert f"nothing was recorded for {share:.1%} of its own" in there(camera.note)
+    for degrees in (0.0, 170.0, math.nan):
+        with pytest.raises(ValueError, match="pinhole_fov must lie within 0 and 170 degrees"):
+            lens_camera("wide", 0, lens=lens, recorded_size=(120, 80), pinhole_fov=degrees)
+    with pytest.raises(ValueError, match="width must be within 1 to 120"):
+        lens_camera("wide", 0, lens=lens, recorded_size=(120, 80), width=121)
+
+
+def test_a_lens_that_moves_nothing_is_left_out():
+    lens = Rational(**FOCAL, k1=0.3, k4=0.3001)
+    camera = lens_camera("a", 0, lens=lens, recorded_size=(120, 80))
+    assert camera.undistortion is None
+    assert re.fullmatch(r"camera a: its lens moves pixels by at most \S+ and is left out .*", there(camera.note))
+    for always in (0.0, None):
+        camera = lens_camera("a", 0, lens=lens, recorded_size=(120, 80), min_lens_shift=always)
+        assert camera.undistortion is not None
+
+
+def test_a_lens_without_an_inverse_is_refused():
+    path = Path("calibration.json")
+    for lens in (Rational(**FOCAL, k1=-9.0, k4=1e-9), BrownConrady(**FOCAL, p1=-9.0, p2=9.0)):
+        with pytest.raises(LogError, match=r"calibration\.json: .*; write the coefficients of the calibration"):
+            check_lens_camera(path, lens, (120, 80))
+    check_lens_camera(path, BrownConrady(**FOCAL, **BARREL), (120, 80))
+    check_lens_camera(path, Fisheye(**FOCAL, k1=-0.05), (120, 80))
+
+
+def test_a_wide_image_through_both_doors():
+    """The undistorted image does not depend on whether the same lens is called a fisheye or f-theta."""
+    fisheye = Fisheye(fx=50.0, fy=50.0, cx=60.0, cy=40.0, k1=0.02)
+    f_theta = FTheta(polynomial=(0.0, 50.0, 0.0, 1.0), cx=60.0, cy=40.0)
+    pixels = np.random.default_rng(0).integers(0, 255, (80, 120, 3), np.uint8)
+    cameras = [lens_camera("a", 0, lens=lens, recorded_size=(120, 80)) for lens in (fisheye, f_theta)]
+    first, second = (there(camera.undistortion)(pixels) for camera in cameras)
+    assert (first == second).all()

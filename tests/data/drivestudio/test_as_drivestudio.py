@@ -9,6 +9,8 @@ import torch
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.images import read_image, read_mask
 from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.geometry.lenses import BrownConrady
+from sparsestreet.types import Camera
 from tests.conftest import unchecked
 from tests.data.drivestudio.folders import (
     FOCAL,
@@ -24,6 +26,12 @@ from tests.data.drivestudio.folders import (
 )
 
 BARREL, SLIGHT = [-0.25, 0.05, 1e-3, -1e-3, 0.0], [0.01, 0.0, 0.0, 0.0, 0.0]
+
+
+def taken_out(camera: Camera, coefficients: list[float]) -> Undistortion:
+    intrinsics, size = camera.intrinsics.double(), (camera.width, camera.height)
+    lens = BrownConrady.of(intrinsics, torch.tensor(coefficients, dtype=torch.float64))
+    return Undistortion.of(lens, intrinsics, size, size)
 
 
 @pytest.fixture
@@ -53,11 +61,11 @@ def test_lenses_are_taken_out_of_images_and_masks(bent, width):
         # The same intrinsics, scaled with the image.
         assert torch.equal(seen.camera.intrinsics, recorded.camera.intrinsics)
         assert float(seen.camera.intrinsics[0, 0]) == FOCAL * (1 if width is None else 0.5)
-        take_out = Undistortion.of(seen.camera.intrinsics, torch.tensor(lens), *recorded.image.shape[1::-1])
+        take_out = taken_out(seen.camera, lens)
         assert torch.equal(seen.image, torch.from_numpy(take_out(recorded.image.numpy())))
         assert not torch.equal(seen.image, recorded.image)
     size = log.frames[4].image.shape[1::-1]
-    take_out = Undistortion.of(log.frames[4].camera.intrinsics, torch.tensor(BARREL), *size)
+    take_out = taken_out(log.frames[4].camera, BARREL)
     for kind, path in (("sky", "sky_masks"), ("human", "dynamic_masks/human"), ("vehicle", "dynamic_masks/vehicle")):
         mask = read_mask(bent / path / "001_1.png", size, sky=kind == "sky", undistortion=take_out)
         assert torch.equal(getattr(log.frames[4], kind), mask)

@@ -1,0 +1,43 @@
+"""The log that follows from what a reader found: here, of a camera whose lens is taken out of its images."""
+
+import pytest
+import torch
+
+from sparsestreet.data.recording import Recording, Shot, log_of
+from sparsestreet.data.rig import RigCamera, lens_camera
+from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
+from tests.typed import there
+
+SIZE = (24, 16)
+WIDE = Fisheye(fx=8.0, fy=8.0, cx=12.0, cy=8.0, k1=-0.02)
+FLAT = Rational(fx=30.0, fy=30.0, cx=12.0, cy=8.0)
+HOOD = torch.zeros(16, 24, dtype=torch.bool)
+HOOD[13:] = True
+
+
+def camera(lens: Lens) -> RigCamera[str]:
+    return lens_camera("front", 0, lens=lens, recorded_size=SIZE, pinhole_fov=None if lens is FLAT else 150.0)
+
+
+@pytest.mark.parametrize("user", [{}, {"ego": HOOD}], ids=["no mask", "a hood"])
+@pytest.mark.parametrize("lens", [WIDE, FLAT], ids=["fisheye", "pinhole"])
+def test_no_loss_sees_what_the_lens_did_not_record(lens, user):
+    mounted = camera(lens)
+    recording = Recording(
+        name="a",
+        rig=[mounted],
+        shots=[Shot(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
+        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
+        read_masks=lambda shot: user,
+    )
+    log = log_of(recording, cache_bytes=0, check=list)
+    ego = log.frames[0].ego
+    if lens is FLAT:
+        assert ego is user.get("ego")
+        assert "resampled" not in " ".join(log.notes)
+    else:
+        blank = there(there(mounted.undistortion).blank)
+        assert 0 < int(blank.sum()) < blank.numel()
+        assert torch.equal(there(ego), blank | HOOD if user else blank)
+        assert any("resampled to a pinhole of 150 degrees" in note for note in log.notes)
+    assert user in ({}, {"ego": HOOD})  # what a reader keeps is not changed
