@@ -5,19 +5,22 @@ azimuths: column 0 looks to the rear of the vehicle, and columns go clockwise se
 """
 
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from sparsestreet.data.waymo.segment import LidarCalibration, Returns
+from sparsestreet.data.problems import fault
+from sparsestreet.data.waymo.segment import REMEDY, LidarCalibration, Returns
 
+_FARTHEST = 1000.0
 SPIN = 100_000_000
 """Nanoseconds of a turn of the lidar TOP."""
 
 
 def returns_of(
-    lidar: str, images: list[Float[np.ndarray, "h w c"]], poses: Float[np.ndarray, "h w 6"] | None
+    lidar: str, images: list[Float[np.ndarray, "_ _ c"]], poses: Float[np.ndarray, "_ _ 6"] | None
 ) -> Returns:
     """What came back, of the range images of the first and the second return; range is their first channel."""
     pixels, ranges = [], []
@@ -28,6 +31,25 @@ def returns_of(
         ranges.append(values[some])
     height, width = images[0].shape[:2]
     return Returns(lidar, (height, width), np.concatenate(pixels), np.concatenate(ranges), poses)
+
+
+def check_returns(returns: Returns, lidar: LidarCalibration | None, path: Path, frame: int) -> LidarCalibration:
+    """The calibration. Raises LogError, naming the file, for returns that it or the poses of the pixels do not fit."""
+    what = f"lidar {returns.lidar}"
+    if lidar is None:
+        raise fault(path, f"{what} has range images, but no calibration", REMEDY)
+    if len(lidar.inclinations) not in (0, returns.shape[0]):
+        message = f"{what} has range images of {returns.shape} pixels, but {len(lidar.inclinations)} inclinations"
+        raise fault(path, message, REMEDY)
+    what = f"{what} at frame {frame}"
+    if returns.poses is not None and returns.poses.shape[:2] != returns.shape:
+        message = f"{what} has a range image of {returns.shape} pixels, and poses of {returns.poses.shape[:2]}"
+        raise fault(path, message, REMEDY)
+    broken = int((~(returns.ranges < _FARTHEST)).sum())
+    if broken or not (returns.poses is None or np.isfinite(returns.poses).all()):
+        message = f"{what} has {broken} ranges that are NaN, infinite or more than {_FARTHEST:g} m, or such poses"
+        raise fault(path, message, REMEDY)
+    return lidar
 
 
 def world_points(

@@ -20,7 +20,7 @@ from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import read_boxes
 from sparsestreet.data.waymo.find import find_segment
 from sparsestreet.data.waymo.images import camera_at, middle, shutter
-from sparsestreet.data.waymo.lidar import SPIN, world_points
+from sparsestreet.data.waymo.lidar import SPIN, check_returns, world_points
 from sparsestreet.data.waymo.notes import segment_notes
 from sparsestreet.data.waymo.pixels import decode_image, decode_masks
 from sparsestreet.data.waymo.segment import REMEDY, ImageMotion, Segment
@@ -202,7 +202,7 @@ def _read_masks(
         return {}
     data, divisor = segment.panoptic(frame, camera.name)
     what = f"the panoptic label of {camera.name} at frame {frame}"
-    return decode_masks(data, divisor, recorded, camera.size, segment.image_file(camera.name), what)
+    return decode_masks(data, divisor, recorded, camera.size, segment.label_file, what)
 
 
 def _read_points(segment: Segment, spool: Spool, frame: int) -> Float64[Tensor, "n 3"]:
@@ -211,19 +211,10 @@ def _read_points(segment: Segment, spool: Spool, frame: int) -> Float64[Tensor, 
     if frame not in spool:
         parts = [np.zeros((0, 3))]
         for returns in segment.returns(frame):
-            path = segment.source
-            calibration = segment.lidars.get(returns.lidar)
-            what = f"lidar {returns.lidar} at frame {frame}"
-            if calibration is None:
-                raise fault(path, f"{what} has a range image, but no calibration", REMEDY)
-            rows = len(calibration.inclinations) or returns.shape[0]
-            poses = returns.shape if returns.poses is None else returns.poses.shape[:2]
-            if rows != returns.shape[0] or poses != returns.shape:
-                message = f"{what} has a range image of {returns.shape}, poses of {poses} and {rows} inclinations"
-                raise fault(path, message, REMEDY)
+            calibration = check_returns(returns, segment.lidars.get(returns.lidar), segment.lidar_file, frame)
             parts.append(world_points(returns, calibration, pose))
         near = torch.from_numpy(np.concatenate(parts)) - pose[:3, 3]
-        check_points(near, segment.source, remedy=REMEDY)
+        check_points(near, segment.lidar_file, remedy=REMEDY)
         spool.put(frame, near.float().numpy().tobytes())
     near = np.frombuffer(spool.get(frame), np.float32).reshape(-1, 3)
     return torch.from_numpy(near.astype(np.float64)) + pose[:3, 3]

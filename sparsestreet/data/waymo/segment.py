@@ -109,6 +109,9 @@ class Segment(ABC):
     source: Path
     """The file of poses and calibrations, which errors name."""
     box_file: Path
+    lidar_file: Path
+    label_file: Path
+    """Of panoptic labels."""
     notes: tuple[str, ...] = ()
 
     @abstractmethod

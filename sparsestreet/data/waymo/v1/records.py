@@ -10,8 +10,8 @@ from sparsestreet.data.waymo.segment import REMEDY
 from sparsestreet.data.waymo.v1.crc32c import masked_crc32c
 
 _HEADER, _FOOTER = 12, 4
-_MOST_RECORDS = 10_000
-"""Fifty times the frames of a segment."""
+_MOST_RECORDS = 2_000
+"""Ten times the frames of a segment."""
 _GZIP = b"\x1f\x8b"
 
 

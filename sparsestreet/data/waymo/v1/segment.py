@@ -30,7 +30,7 @@ class RecordSegment(Segment):
 
     def __init__(self, path: Path) -> None:
         """Raises LogError for a file whose frames cannot be told apart."""
-        self.source = self.box_file = path
+        self.source = self.box_file = self.lidar_file = self.label_file = path
         self._records = Records(path)
         if not len(self._records):
             raise fault(path, "the file has no records", REMEDY)

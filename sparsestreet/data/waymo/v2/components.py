@@ -40,7 +40,7 @@ SEEN_BY = "most_visible_camera_name"
 def sensor(value: Any, names: dict[int, str], path: Path) -> str:
     """The name of a camera or lidar from its number or its name: both are found in Waymo's files."""
     name = names.get(value) if isinstance(value, int) else value
-    if name not in names.values():
+    if not isinstance(name, str) or name not in names.values():
         raise fault(path, f"a row is of {value!r}, which is not one of {names}", REMEDY)
     return name
 
@@ -51,14 +51,14 @@ def numbers(row: dict[str, Any], columns: Sequence[str], path: Path) -> list[flo
     for column, value in zip(columns, values, strict=True):
         if not isinstance(value, int | float):
             raise fault(path, f"a row has {value!r} as {column}, not a number", REMEDY)
-    return values
+    return [float(value) for value in values]
 
 
 def matrix(row: dict[str, Any], column: str, path: Path) -> list[float]:
     value = row[column]
     if not isinstance(value, list) or not all(isinstance(entry, int | float) for entry in value):
         raise fault(path, f"a row has no numbers as {column}", REMEDY)
-    return value
+    return [float(entry) for entry in value]
 
 
 def read_cameras(table: Table) -> dict[str, CameraCalibration]:

@@ -45,7 +45,8 @@ def pack_returns(cells: list[Any], path: Path) -> bytes:
 
 
 def pack_poses(cells: list[Any], path: Path) -> bytes:
-    found = image(*cells, 6, path)
+    values, shape = cells
+    found = image(values, shape, 6, path)
     if found is None:
         raise fault(path, "a row of the lidar TOP has no poses", REMEDY)
     return np.array(found.shape[:2], "<i8").tobytes() + found.astype("<f4").tobytes()

@@ -37,6 +37,7 @@ class TableSegment(Segment):
         """``root``: the folder of the components. Raises LogError for a segment that lacks what is always needed."""
         self.name, self._root = name, root
         self.source, self.box_file = self._path("vehicle_pose"), self._path("lidar_box")
+        self.lidar_file, self.label_file = self._path("lidar"), self._path("camera_segmentation")
         poses = self._table("vehicle_pose", "VehiclePoseComponent").rows([SEGMENT, FRAME], [_POSE])
         self._check_name(poses)
         self._poses = {row[FRAME]: components.matrix(row, _POSE, self.source) for row in poses}
