@@ -55,7 +55,7 @@ class WaymoReader(RecordedReader):
             raise LogError(_once(problems))
         shots = _shots(segment, frames, cameras, motions)
         if not shots:
-            raise fault(segment.image_file(cameras[0]), f"there are no images of {', '.join(cameras)}", REMEDY)
+            raise fault(segment.image_file, f"there are no images of {', '.join(cameras)}", REMEDY)
         boxes, notes = (None, ()) if found is None else found
         if far := check_extent(_placed(segment, shots, boxes or ())):
             raise LogError(far)
@@ -119,7 +119,7 @@ class WaymoReader(RecordedReader):
             # Counted from the left and upper edge of the image, as here: pixel centers are at +0.5.
             intrinsics = torch.tensor([[f_u, 0, c_u], [0, f_v, c_v], [0, 0, 1]], dtype=torch.float64)
             distortion = torch.tensor(lens, dtype=torch.float64)
-            check_lens(self._segment.source, intrinsics, distortion, calibration.size)
+            check_lens(self._segment.calibration_file, intrinsics, distortion, calibration.size)
             rig.append(
                 rig_camera(
                     name,
@@ -173,7 +173,7 @@ def _shots(
 
 
 def _placed(segment: Segment, shots: Sequence[Shot], boxes: Sequence[Boxes]) -> list[tuple[Path, Float64[Tensor, "3"]]]:
-    cameras = [(segment.source, shot.world_from_camera[:3, 3]) for shot in shots]
+    cameras = [(segment.image_file, shot.world_from_camera[:3, 3]) for shot in shots]
     return cameras + [(one.path, torch.from_numpy(place)) for one in boxes for place in one.poses[:, :3, 3]]
 
 
@@ -181,9 +181,7 @@ def _read_image(segment: Segment, rig: Sequence[RigCamera[str]], shot: Shot) -> 
     camera = rig[shot.camera]
     frame = int(shot.stem)
     data, recorded = segment.jpeg(frame, camera.name), segment.cameras[camera.name].size
-    return decode_image(
-        data, recorded, camera.size, segment.image_file(camera.name), f"the image of {camera.name} at frame {frame}"
-    )
+    return decode_image(data, recorded, camera.size, segment.image_file, f"the image of {camera.name} at frame {frame}")
 
 
 def _read_masks(

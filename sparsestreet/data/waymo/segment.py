@@ -107,7 +107,10 @@ class Segment(ABC):
     cameras: Mapping[str, CameraCalibration]
     lidars: Mapping[str, LidarCalibration]
     source: Path
-    """The file of poses and calibrations, which errors name."""
+    """The file of the frames' poses."""
+    calibration_file: Path
+    """Of cameras."""
+    image_file: Path
     box_file: Path
     lidar_file: Path
     label_file: Path
@@ -125,10 +128,6 @@ class Segment(ABC):
     @abstractmethod
     def jpeg(self, frame: int, camera: str) -> bytes:
         """An image as it is stored."""
-
-    @abstractmethod
-    def image_file(self, camera: str) -> Path:
-        """The file of a camera's images, for errors."""
 
     @abstractmethod
     def boxes(self, frame: int) -> Sequence[BoxLabel]: ...

@@ -174,9 +174,9 @@ def test_a_bomb_takes_no_more_memory_than_a_range_image_may(messages, tmp_path):
 
 
 def test_mutated_messages_are_read_or_refused(messages, tmp_path):
-    """300 files with a few bytes changed, lengths right again: no other error than LogError."""
+    """200 files with a few bytes changed, lengths right again: no other error than LogError."""
     generator, refused = np.random.default_rng(0), 0
-    for number in range(300):
+    for number in range(200):
         payload = bytearray(messages[1])
         for place in generator.integers(0, len(payload), generator.integers(1, 6)):
             payload[place] = generator.integers(256)
@@ -193,7 +193,7 @@ def test_mutated_messages_are_read_or_refused(messages, tmp_path):
         except LogError:
             refused += 1
         path.unlink()
-    assert 50 < refused < 300
+    assert 40 < refused < 200
 
 
 def test_checksums_are_those_of_the_definition(messages):

@@ -30,7 +30,8 @@ class RecordSegment(Segment):
 
     def __init__(self, path: Path) -> None:
         """Raises LogError for a file whose frames cannot be told apart."""
-        self.source = self.box_file = self.lidar_file = self.label_file = path
+        self.source = self.calibration_file = self.image_file = path
+        self.box_file = self.lidar_file = self.label_file = path
         self._records = Records(path)
         if not len(self._records):
             raise fault(path, "the file has no records", REMEDY)
@@ -54,9 +55,6 @@ class RecordSegment(Segment):
 
     def jpeg(self, frame: int, camera: str) -> bytes:
         return bytes(self._images(frame)[camera].data(fields.JPEG))
-
-    def image_file(self, camera: str) -> Path:
-        return self.source
 
     def boxes(self, frame: int) -> Sequence[BoxLabel]:
         return [fields.read_label(label) for label in self._frames[frame].messages(fields.LABELS, "laser_labels")]

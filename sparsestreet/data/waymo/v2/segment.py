@@ -23,7 +23,7 @@ from sparsestreet.data.waymo.segment import (
 )
 from sparsestreet.data.waymo.v2 import components
 from sparsestreet.data.waymo.v2.range_images import pack_poses, pack_returns, unpack
-from sparsestreet.data.waymo.v2.tables import CAMERA, FRAME, LASER, OBJECT, SEGMENT, Table
+from sparsestreet.data.waymo.v2.tables import CAMERA, FRAME, LASER, OBJECT, SEGMENT, Table, data_of
 
 _POSE = "world_from_vehicle.transform"
 _LABEL, _DIVISOR = "panoptic_label", "panoptic_label_divisor"
@@ -36,7 +36,8 @@ class TableSegment(Segment):
     def __init__(self, root: Path, name: str) -> None:
         """``root``: the folder of the components. Raises LogError for a segment that lacks what is always needed."""
         self.name, self._root = name, root
-        self.source, self.box_file = self._path("vehicle_pose"), self._path("lidar_box")
+        self.source, self.calibration_file = self._path("vehicle_pose"), self._path("camera_calibration")
+        self.image_file, self.box_file = self._path("camera_image"), self._path("lidar_box")
         self.lidar_file, self.label_file = self._path("lidar"), self._path("camera_segmentation")
         poses = self._table("vehicle_pose", "VehiclePoseComponent").rows([SEGMENT, FRAME], [_POSE])
         self._check_name(poses)
@@ -60,9 +61,6 @@ class TableSegment(Segment):
     def jpeg(self, frame: int, camera: str) -> bytes:
         return self._read_image((self.stamps[frame], camera))
 
-    def image_file(self, camera: str) -> Path:
-        return self._images.path
-
     def boxes(self, frame: int) -> Sequence[BoxLabel]:
         return self._labels.get(self.stamps[frame], ())
 
@@ -80,10 +78,10 @@ class TableSegment(Segment):
         return self._read_label(key), self._divisors[key]
 
     def has_returns(self, frame: int) -> bool:
-        return any((self.stamps[frame], name) in self._return_places for name in self.lidars)
+        return any((self.stamps[frame], name) in self._return_places for name in LIDARS.values())
 
     def returns(self, frame: int) -> Sequence[Returns]:
-        keys = [(self.stamps[frame], name) for name in self.lidars]
+        keys = [(self.stamps[frame], name) for name in LIDARS.values()]
         return [
             unpack(key[1], self._read_returns(key), self._read_poses(key) if key[1] == "TOP" else None)
             for key in keys
@@ -115,7 +113,7 @@ class TableSegment(Segment):
     def _read_image(self) -> Callable[[Any], bytes]:
         rows = self._image_rows.items()
         places = {(stamp, name): row["place"] for stamp, images in rows for name, row in images.items()}
-        return self._images.spooled(places, ["image"], lambda key, cells: cells[0].as_py() or b"")
+        return self._images.spooled(places, ["image"], lambda key, cells: data_of(cells[0], self._images.path))
 
     @cached_property
     def _labels(self) -> Mapping[int, list[BoxLabel]]:
@@ -152,7 +150,7 @@ class TableSegment(Segment):
         table, rows = self._segmentation
         assert table is not None  # it has the rows that are asked for
         places = {key: place for key, (place, _) in rows.items()}
-        return table.spooled(places, [_LABEL], lambda key, cells: cells[0].as_py() or b"")
+        return table.spooled(places, [_LABEL], lambda key, cells: data_of(cells[0], table.path))
 
     @cached_property
     def _returns_table(self) -> Table | None:

@@ -25,7 +25,7 @@ class Table:
         self.path = path
         self._prefix = f"[{component}]."
         self._file = _opened(path)
-        self.columns = set(self._file.schema_arrow.names)
+        self.columns: set[str] = self._explained(lambda: set(self._file.schema_arrow.names))
 
     def column(self, name: str) -> str:
         """The name of a column as the file has it; a key keeps its own."""
@@ -36,7 +36,7 @@ class Table:
         wanted = [*keys, *columns]
         names = [self.column(name) for name in wanted]
         self._require(names)
-        size = self._size(names)
+        size = self._explained(lambda: self._size(names))
         if size > _LARGEST_TABLE:
             message = f"the columns {', '.join(names[:3])} ... take {size} bytes, a segment's take a few million"
             raise fault(self.path, message, REMEDY)
@@ -113,6 +113,14 @@ class Table:
             raise
         except (pyarrow.ArrowException, OSError, ValueError, UnicodeDecodeError) as error:
             raise _unreadable(self.path, error) from error
+
+
+def data_of(cell: Any, path: Path) -> bytes:
+    """The bytes of an Arrow cell, none where it is empty."""
+    value = cell.as_py() or b""
+    if not isinstance(value, bytes):
+        raise fault(path, f"a cell of the type {cell.type} holds no bytes", REMEDY)
+    return value
 
 
 def _opened(path: Path) -> Any:
