@@ -1,0 +1,74 @@
+"""Where KITTI-360 keeps what, and which part of a sequence is read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sparsestreet.data.problems import fault
+from sparsestreet.data.window import chosen_cameras
+
+RECTIFIED = ("image_00", "image_01")
+FISHEYE = ("image_02", "image_03")
+
+
+@dataclass(frozen=True)
+class SequenceFolders:
+    """The folders of a sequence below the data set's root. Frame k has files of the name k."""
+
+    root: Path
+    name: str
+    """Such as 2013_05_28_drive_0000_sync."""
+    cameras: tuple[str, ...]
+
+    @property
+    def poses(self) -> Path:
+        return self.root / "data_poses" / self.name / "poses.txt"
+
+    @property
+    def calibration(self) -> Path:
+        return self.root / "calibration"
+
+    @property
+    def lidar(self) -> Path:
+        return self.root / "data_3d_raw" / self.name / "velodyne_points" / "data"
+
+    @property
+    def boxes(self) -> Path | None:
+        """Those of the whole sequence (train_full) only where there are no others: sequence 0004."""
+        paths = [self.root / "data_3d_bboxes" / part / f"{self.name}.xml" for part in ("train", "train_full")]
+        return next((path for path in paths if path.is_file()), None)
+
+    def image(self, camera: str, frame: int) -> Path:
+        return self._images(camera) / "data_rect" / f"{frame:010d}.png"
+
+    def stamps(self, camera: str) -> Path:
+        return self._images(camera) / "timestamps.txt"
+
+    def sweep(self, frame: int) -> Path:
+        return self.lidar / f"{frame:010d}.bin"
+
+    def semantics(self, camera: str) -> Path:
+        return self.root / "data_2d_semantics" / "train" / self.name / camera / "semantic"
+
+    def _images(self, camera: str) -> Path:
+        return self.root / "data_2d_raw" / self.name / camera
+
+
+def find_sequence(root: Path, sequence: int | str, cameras: Sequence[str] | None) -> SequenceFolders:
+    """Raises LogError where the sequence is not there, ValueError for a name or cameras that cannot be."""
+    number = str(sequence).removeprefix("2013_05_28_drive_").removesuffix("_sync")
+    if not (number.isascii() and number.isdigit() and len(number) <= 4):
+        message = f"a sequence of KITTI-360 is a number from 0 to 18, got {sequence!r}: set data.log.sequence"
+        raise ValueError(message)
+    name = f"2013_05_28_drive_{int(number):04d}_sync"
+    images = root / "data_2d_raw" / name
+    if not images.is_dir():
+        found = sorted(path.name[-9:-5] for path in root.glob("data_2d_raw/2013_05_28_drive_*_sync"))
+        there = f"there are sequences {', '.join(found)}" if found else "root must be the folder of data_2d_raw"
+        raise fault(images, f"the sequence is not there; {there}", "set data.root and data.log.sequence")
+    if fisheye := [camera for camera in cameras or () if camera in FISHEYE]:
+        raise ValueError(f"{', '.join(fisheye)} are fisheye cameras, which are not read: take {', '.join(RECTIFIED)}")
+    on_disk = [camera for camera in RECTIFIED if (images / camera / "data_rect").is_dir()]
+    if not on_disk:
+        raise fault(images, "it holds neither image_00/data_rect nor image_01/data_rect", "unpack data_2d_perspective")
+    return SequenceFolders(root, name, chosen_cameras(on_disk, cameras, root))

@@ -1,0 +1,155 @@
+"""A sequence written as KITTI-360 ships it is read as it was planned."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.data.kitti360 import Kitti360Reader
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.recording import Recording
+from tests.data.kitti360.write import LABELED, PARKED, PARKED_SIZE, PLAN, SEQUENCE, UNPOSED, write_kitti360
+from tests.data.plan import moved
+from tests.shared import made_once
+
+FRAMES = [frame for frame in range(PLAN.num_frames) if frame != UNPOSED]
+POSITION = 1e-9
+"""Meters: rounding of doubles at 4000 m, through a quaternion."""
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    return made_once(tmp_path_factory, "kitti360", write_kitti360)
+
+
+@pytest.fixture(scope="module")
+def recording(root) -> Recording:
+    return Kitti360Reader(root=root, sequence=3).recording()
+
+
+@pytest.fixture(scope="module")
+def log(root) -> DrivingLog:
+    return Kitti360Reader(root=root, sequence=3).read()
+
+
+def test_frames_are_those_with_poses(recording):
+    assert recording.frame_stamps == tuple(PLAN.stamps[FRAMES].tolist())
+    assert [shot.stem for shot in recording.shots[::2]] == [f"{frame:010d}" for frame in FRAMES]
+    assert "1 frames have no pose, as the car hardly moved, and are left out" in recording.notes
+
+
+def test_cameras_are_where_they_were(recording):
+    for shot in recording.shots:
+        stamp = int(PLAN.stamps[FRAMES[shot.frame]])
+        wanted = PLAN.world_from_vehicle(stamp) @ PLAN.cameras[shot.camera].vehicle_from_camera
+        assert np.abs(shot.world_from_camera.numpy() - wanted).max() < POSITION
+        assert shot.stamp == stamp
+    for camera, planned in zip(recording.rig, PLAN.cameras, strict=True):
+        assert np.abs(camera.intrinsics.numpy() - planned.intrinsics).max() < 1e-5  # float32
+
+
+def test_points_are_where_the_street_was(recording):
+    """Between poses the path is straight: a chord misses the arc by d^2 curvature / 8, which is 2.5 mm over 1 m and 10
+    mm where a pose is missing; as much again beyond the ends. Points as recorded are half a meter off."""
+    curvature = PLAN.yaw_rate / PLAN.speed
+    for place, sweep in recording.sweeps.items():
+        points, frame = sweep.read().numpy(), FRAMES[place]
+        wanted = PLAN.world_points(frame)
+        step = 2.0 if abs(frame - UNPOSED) == 1 else 1.0
+        # Behind the last pose the way goes on straight for half a meter: s (s + d) curvature / 2.
+        outside = 0.5 * 0.5 * 1.5 * curvature
+        bound = max(step**2 * curvature / 8, outside if frame in (0, 5) else 0) + 2e-5
+        assert np.linalg.norm(points - wanted, axis=1).max() < 1.2 * bound + 0.02 * 0.02
+        still = moved(PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar, PLAN.sweep(frame)[0])
+        assert np.abs(still - wanted).max() > 0.4
+
+
+def test_points_of_a_straight_drive_are_exact(tmp_path):
+    """Where the path is straight nothing is left but float32 of the files."""
+    straight = dataclasses.replace(PLAN, yaw_rate=1e-6)
+    write_kitti360(tmp_path, straight)
+    sweeps = Kitti360Reader(root=tmp_path, sequence="0003").recording().sweeps
+    for place, sweep in sweeps.items():
+        assert np.abs(sweep.read().numpy() - straight.world_points(FRAMES[place])).max() < 2e-5
+
+
+def test_objects_that_move_and_that_stand(recording):
+    moving, parked = recording.boxes
+    assert (moving.name, moving.class_name, parked.name) == ("car-7", "car", "car-8")
+    frames = [frame for frame in FRAMES if frame >= 1]
+    assert [FRAMES[place] for place in moving.frames] == frames
+    assert np.abs(moving.poses - PLAN.world_from_box(PLAN.stamps[frames])).max() < POSITION
+    assert np.abs(moving.sizes - PLAN.box_size).max() < POSITION
+    assert parked.frames.tolist() == [0, 1, 2, 3, 4]
+    assert np.abs(parked.poses - PARKED).max() < POSITION
+    assert np.abs(parked.sizes - PARKED_SIZE).max() < POSITION
+
+
+def test_labels_give_masks_on_the_images_that_have_them(log):
+    first, right, *_ = log.frames
+    assert first.sky[:10].all()
+    assert not first.sky[10:].any()
+    assert torch.equal(first.human.nonzero()[:, 1].unique(), torch.arange(24, 32))
+    assert (first.vehicle.sum(), first.vehicle[20:, :8].sum()) == (32, 32)
+    assert right.sky is None
+    with_sky = [FRAMES[frame.frame_index] for frame in log.frames if frame.sky is not None]
+    assert with_sky == list(LABELED)
+    assert "3 of 10 images have labels, those of image_00: the others have no masks" in log.notes
+    assert not any(note.startswith("no sky") for note in log.notes)
+
+
+def test_labels_shrink_with_the_images(root):
+    frame = Kitti360Reader(root=root, sequence=3, width=16).read().frames[0]
+    assert frame.image.shape == (12, 16, 3)
+    assert frame.sky[:5].all()
+    assert not frame.sky[5:].any()
+
+
+def test_it_reads_as_a_log(log):
+    assert (log.num_frames, log.num_cameras, len(log.sweeps), len(log.tracks)) == (5, 2, 5, 2)
+    for frame in log.frames:
+        index, camera = frame.indices
+        assert np.array_equal(frame.image.numpy(), PLAN.image(FRAMES[index], PLAN.cameras[camera]))
+    assert log.name == "2013_05_28_drive_0003"
+
+
+def test_a_window_in_the_data_sets_own_numbers(root, recording):
+    """A pose before the window and one after it keep their say in how its lidar moved."""
+    reader = Kitti360Reader(root=root, sequence=SEQUENCE, first_frame=2, last_frame=4, cameras=["image_01"])
+    part = reader.recording()
+    assert [shot.stem for shot in part.shots] == ["0000000003", "0000000004"]
+    assert torch.equal(part.sweeps[0].read(), recording.sweeps[2].read())
+    assert torch.equal(part.sweeps[1].read(), recording.sweeps[3].read())
+    assert reader.check() == []
+    with pytest.raises(ValueError, match=r"no frame from 2 to 2 has a pose: those of .* lie between 0 and 5"):
+        Kitti360Reader(root=root, sequence=3, first_frame=2, last_frame=2).read()
+
+
+def test_fisheye_cameras_are_refused(root):
+    with pytest.raises(ValueError, match="image_02 are fisheye cameras, which are not read: take image_00, image_01"):
+        Kitti360Reader(root=root, sequence=3, cameras=["image_00", "image_02"]).read()
+
+
+def test_lidar_and_boxes_that_are_not_there(tmp_path):
+    """Sequence 0002 has no lidar before frame 4391; the boxes of 0004 lie in train_full."""
+    write_kitti360(tmp_path)
+    lidar = tmp_path / "data_3d_raw" / SEQUENCE / "velodyne_points" / "data"
+    (lidar / "0000000000.bin").unlink()
+    (tmp_path / "data_3d_bboxes/train").rename(tmp_path / "data_3d_bboxes/train_full")
+    log = Kitti360Reader(root=tmp_path, sequence=3).read()
+    assert len(log.sweeps[0].points) == 0
+    assert "1 of 5 frames have no lidar file: they have no points" in log.notes
+    assert len(log.tracks) == 2
+    assert len(Kitti360Reader(root=tmp_path, sequence=3, lidar=False).read().sweeps) == 0
+
+
+def test_its_hash_is_of_what_it_reads(root, tmp_path):
+    before = Kitti360Reader(root=root, sequence=3).data_hash()
+    write_kitti360(tmp_path)
+    (tmp_path / "other.txt").write_text("")
+    assert Kitti360Reader(root=tmp_path, sequence=3).data_hash() == before
+    path = tmp_path / "data_3d_bboxes/train" / f"{SEQUENCE}.xml"
+    path.write_text(path.read_text().replace("<timestamp>5", "<timestamp>4"))
+    assert Kitti360Reader(root=tmp_path, sequence=3).data_hash() != before
