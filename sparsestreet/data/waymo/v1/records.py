@@ -23,7 +23,10 @@ class Records:
         self.path = path
         try:
             with path.open("rb") as file:
-                self._bytes = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+                # Fields are far apart: what lies behind one is not read ahead.
+                mapped.madvise(mmap.MADV_RANDOM)
+                self._bytes = memoryview(mapped)
         except (OSError, ValueError) as error:  # ValueError: an empty file
             raise fault(path, f"the file cannot be read ({error})", REMEDY) from error
         self._places = self._index()
