@@ -1,4 +1,4 @@
-"""Rigid transforms of a data set: checked, and re-centered in float64."""
+"""Rigid transforms of a data set: made of quaternions, checked, and re-centered in float64."""
 
 from pathlib import Path
 
@@ -7,11 +7,35 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.data.problems import fault
+from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.transforms import rigidity_error
 
 RIGIDITY_TOLERANCE = 1e-4
 """Largest entry of R^T R - I that is let through: it moves a point 100 m away by 5 mm, less than lidar noise, and is a
 hundred times what poses stored in float32 show."""
+
+
+_LENGTH_TOLERANCE = 1e-3
+"""How far a quaternion's length may be from 1: one that was stored with four digits is let through, and made 1."""
+
+
+def rigid_poses(
+    quaternions: Float64[Tensor, "n 4"], translations: Float64[Tensor, "n 3"], path: Path, what: str
+) -> Float64[Tensor, "n 4 4"]:
+    """Transforms of rotations (wxyz) and translations. Raises LogError, naming the file and the first row, for numbers
+    that are not finite, and quaternions that are no rotations."""
+    broken = ~(torch.isfinite(quaternions).all(-1) & torch.isfinite(translations).all(-1))
+    if broken.any():
+        row = int(torch.nonzero(broken)[0])
+        raise fault(path, f"{what} {row} holds NaN or infinity", "write the pose again, or leave it out")
+    lengths = quaternions.norm(dim=-1)
+    if ((lengths - 1).abs() > _LENGTH_TOLERANCE).any():
+        row = int((lengths - 1).abs().argmax())
+        message = f"{what} {row} has a quaternion of length {float(lengths[row]):.4g}, which is no rotation"
+        raise fault(path, message, "write unit quaternions, w first")
+    poses = torch.zeros(len(quaternions), 4, 4, dtype=torch.float64)
+    poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = quat.to_matrix(quaternions), translations, 1
+    return poses
 
 
 def check_rigid(pose: Float64[Tensor, "4 4"], path: Path, what: str) -> None:

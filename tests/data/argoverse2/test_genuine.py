@@ -1,0 +1,90 @@
+"""What holds of genuine logs: poses at the sweeps, and the points that the data set counts in each box."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.data.argoverse2 import Argoverse2Reader
+from sparsestreet.data.argoverse2.layout import Layout, find_log, stamped_files
+from sparsestreet.data.argoverse2.tables import read_boxes, read_cameras, read_path, read_sweep
+from sparsestreet.data.problems import LogError
+
+pytest.importorskip("pyarrow", reason="feather files need pyarrow")
+
+from tests.data.argoverse2.write import read_table
+
+LOG = "7fab2350"
+
+
+@pytest.fixture(scope="module")
+def genuine() -> Path:
+    default = Path(__file__).resolve().parents[4] / "shared" / "data"
+    root = Path(os.environ.get("SPARSESTREET_DATA", default)) / "av2_sensor"
+    if not root.is_dir():
+        pytest.skip(f"no logs of Argoverse 2 at {root}: set SPARSESTREET_DATA to the folder that holds av2_sensor")
+    return root
+
+
+@pytest.fixture(scope="module")
+def layout(genuine) -> Layout:
+    return find_log(genuine, LOG)
+
+
+def test_each_sweep_has_a_pose_of_exactly_its_stamp(layout):
+    table = read_table(layout.poses)
+    stamps = list(stamped_files(layout.sweeps, ".feather"))
+    rows = [int(np.flatnonzero(table["timestamp_ns"] == stamp)[0]) for stamp in stamps]
+    assert rows == [1983, 2000]
+    path, duplicates = read_path(layout)
+    assert (duplicates, len(path.stamps)) == (314, 2706 - 314)
+    positions = np.stack([table[name][rows] for name in ("tx_m", "ty_m", "tz_m")], -1)
+    # A row of the pair may be the one that is left out; its neighbor stands up to 1e-6 m away.
+    np.testing.assert_allclose(path.at(torch.tensor(stamps))[:, :3, 3].numpy(), positions, atol=1e-6)
+
+
+def test_every_box_holds_as_many_points_as_the_data_set_counts(layout):
+    """Points as they are stored (float16), in the vehicle's frame, of two sweeps: 162 boxes."""
+    path, _ = read_path(layout)
+    sweeps = stamped_files(layout.sweeps, ".feather")
+    boxes, homeless = read_boxes(layout, list(sweeps), {stamp: place for place, stamp in enumerate(sweeps)}, path)
+    counted = read_table(layout.boxes)
+    known = {
+        (stamp, name): number
+        for stamp, name, number in zip(
+            counted["timestamp_ns"], counted["track_uuid"], counted["num_interior_pts"], strict=True
+        )
+    }
+    checked = 0
+    for place, (stamp, file) in enumerate(sweeps.items()):
+        city_from_ego = path.at(torch.tensor([stamp]))[0]
+        points = read_sweep(file, city_from_ego).numpy()
+        for box in boxes:
+            for row in np.flatnonzero(box.frames == place):
+                inside = (points - box.poses[row, :3, 3]) @ box.poses[row, :3, :3]
+                found = int((np.abs(inside) <= box.sizes[row] / 2).all(1).sum())
+                assert found == known[stamp, box.name], box.name
+                checked += 1
+    assert checked == 162
+    assert homeless == len(counted["timestamp_ns"]) - 162
+
+
+def test_its_cameras_are_pinholes_and_one_stands_upright(layout):
+    cameras = read_cameras(layout)
+    assert len(cameras) == 9
+    assert {name for name, camera in cameras.items() if camera.size == (1550, 2048)} == {"ring_front_center"}
+    assert {camera.size for name, camera in cameras.items() if name != "ring_front_center"} == {(2048, 1550)}
+    front = cameras["ring_front_center"]
+    assert front.intrinsics[0].tolist() == pytest.approx([1776.0414843455, 0, 777.9905731522801 + 0.5])
+    # Looks ahead, and its image's y goes down.
+    assert front.ego_from_camera[0, 2] > 0.99
+    assert front.ego_from_camera[2, 1] < -0.99
+
+
+def test_a_log_whose_images_were_not_fetched_is_refused_in_words(genuine):
+    (problem,) = Argoverse2Reader(root=genuine, scene=LOG).check()
+    assert problem.message == "there are no images"
+    with pytest.raises(LogError, match="fetch those of the cameras that you want"):
+        Argoverse2Reader(root=genuine, scene=LOG).read()
