@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from sparsestreet.data.problems import fault
 from sparsestreet.data.recording import Boxes
 from sparsestreet.data.waymo.images import camera_at, middle, readout
 from sparsestreet.data.waymo.lidar import crossing
-from sparsestreet.data.waymo.segment import CLASSES, BoxLabel, CameraCalibration, ImageMotion, Segment
+from sparsestreet.data.waymo.segment import CLASSES, REMEDY, BoxLabel, CameraCalibration, ImageMotion, Segment
 from sparsestreet.geometry.distortion import distort
 from sparsestreet.geometry.transforms import inverse
 
@@ -43,6 +44,7 @@ def read_boxes(segment: Segment, first: int) -> tuple[list[Boxes], tuple[str, ..
     """
     objects: dict[str, list[_Placed]] = defaultdict(list)
     signs: set[str] = set()
+    late = 0
     for frame in range(len(segment.stamps)):
         images: Mapping[str, ImageMotion] | None = None
         pose = None
@@ -52,10 +54,16 @@ def read_boxes(segment: Segment, first: int) -> tuple[list[Boxes], tuple[str, ..
                 continue
             if pose is None:
                 pose, images = segment.world_from_vehicle(frame).numpy(), segment.images(frame)
-            objects[label.name].append(_placed(segment, frame, label, pose, images or {}))
+            before, one = objects[label.name][-1:], _placed(segment, frame, label, pose, images or {})
+            if before and before[0].frame == frame:
+                raise fault(segment.box_file, f"frame {frame} has two boxes of the object {label.name}", REMEDY)
+            if before and before[0].stamp >= one.stamp:
+                late += 1
+                continue
+            objects[label.name].append(one)
     found = [_boxes(name, placed, segment, first) for name, placed in objects.items()]
     every = [one for placed in objects.values() for one in placed]
-    return found, _notes(len(signs), sum(one.seen for one in every), len(every))
+    return found, _notes(len(signs), sum(one.seen for one in every), len(every), late)
 
 
 def _boxes(name: str, placed: Sequence[_Placed], segment: Segment, first: int) -> Boxes:
@@ -115,7 +123,7 @@ def _pose(box: Sequence[float]) -> Float64[np.ndarray, "4 4"]:
     return np.array([[c, -s, 0, box[0]], [s, c, 0, box[1]], [0, 0, 1, box[2]], [0, 0, 0, 1.0]])
 
 
-def _notes(signs: int, seen: int, count: int) -> tuple[str, ...]:
+def _notes(signs: int, seen: int, count: int, late: int) -> tuple[str, ...]:
     notes = [f"{signs} signs are left out: they stand still, and become part of the background"] if signs else []
     if seen:
         notes.append(f"{seen} of {count} boxes are those of the instant when a camera saw the object, as labelled")
@@ -123,4 +131,6 @@ def _notes(signs: int, seen: int, count: int) -> tuple[str, ...]:
         notes.append(
             f"{count - seen} of {count} boxes are the lidar's, taken to be of the instant when the beam crossed them"
         )
+    if late:
+        notes.append(f"{late} boxes are left out: their instants do not come after those of the frames before")
     return tuple(notes)

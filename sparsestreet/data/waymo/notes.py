@@ -20,15 +20,14 @@ def segment_notes(
     frames: range,
     cameras: Sequence[str],
     shots: Sequence[Shot],
-    labelled: frozenset[tuple[int, str]],
+    num_labelled: int,
 ) -> tuple[str, ...]:
     """One sentence each: the shutter's direction, labels made by hand, and images and sweeps that are missing."""
     notes = [*segment.notes, *_shutters(segment, cameras)]
-    hand = sum(shot.key in labelled for shot in shots)
-    if hand:
+    if num_labelled:
         notes.append(
-            f"{hand} of {len(shots)} images have masks of sky, people and vehicles, which Waymo had drawn by hand; "
-            "the others have none"
+            f"{num_labelled} of {len(shots)} images have masks of sky, people and vehicles, which Waymo had drawn by "
+            "hand; the others have none"
         )
     lacking = len(frames) * len(cameras) - len(shots)
     if lacking:

@@ -46,25 +46,12 @@ class WaymoReader(RecordedReader):
 
     def recording(self) -> Recording:
         segment, frames, cameras = self._segment, self._frames, self._cameras
-        rig, problems = self._rig(), []
-        motions = {frame: attempt(problems, partial(segment.images, frame)) or {} for frame in frames}
-        found = attempt(problems, partial(read_boxes, segment, frames.start)) if segment.has_boxes else None
-        for frame in frames:
-            attempt(problems, partial(segment.world_from_vehicle, frame))
-        if problems:
-            raise LogError(_once(problems))
-        shots = _shots(segment, frames, cameras, motions)
-        if not shots:
-            raise fault(segment.image_file, f"there are no images of {', '.join(cameras)}", REMEDY)
-        boxes, notes = (None, ()) if found is None else found
-        if far := check_extent(_placed(segment, shots, boxes or ())):
-            raise LogError(far)
+        rig, shots, boxes, notes = self._rig(), *self._placed()
         given = None if self.masks is None else GivenMasks(Path(self.masks))
-        labelled = frozenset() if given is not None else segment.labelled
         if given is not None and (missing := given.check((cameras[shot.camera], shot.stem) for shot in shots)):
             raise LogError(missing)
-        kinds = frozenset({"sky", "human", "vehicle"} if any(shot.key in labelled for shot in shots) else ())
-        last = 1 + shots[-1].frame
+        labelled = frozenset(shot.key for shot in shots if given is None) & segment.labelled
+        kinds = frozenset({"sky", "human", "vehicle"} if labelled else ())
         return Recording(
             name=segment.name,
             rig=rig,
@@ -72,11 +59,32 @@ class WaymoReader(RecordedReader):
             read_image=partial(_read_image, segment, rig),
             read_masks=partial(_read_masks, segment, rig, labelled, given),
             mask_kinds=kinds if given is None else given.kinds,
-            frame_stamps=tuple(_instant(segment, frame) for frame in frames)[:last],
+            # Behind the last image there are no frames.
+            frame_stamps=tuple(_instant(segment, frame) for frame in frames)[: 1 + shots[-1].frame],
             sweeps=self._sweeps() if self.lidar else None,
             boxes=boxes,
-            notes=(*segment_notes(segment, frames, cameras, shots, labelled), *notes),
+            notes=(*segment_notes(segment, frames, cameras, shots, len(labelled)), *notes),
         )
+
+    def _placed(self) -> tuple[list[Shot], list[Boxes] | None, tuple[str, ...]]:
+        """Images, boxes, and what has to be said about these. Raises LogError with all that is wrong with them."""
+        segment, frames, problems = self._segment, self._frames, []
+        motions = {frame: attempt(problems, partial(segment.images, frame)) or {} for frame in frames}
+        boxes, notes = None, ()
+        if segment.has_boxes:
+            boxes, notes = attempt(problems, partial(read_boxes, segment, frames.start)) or (None, ())
+        for frame in frames:
+            attempt(problems, partial(segment.world_from_vehicle, frame))
+        if problems:
+            raise LogError(_once(problems))
+        shots = _shots(segment, frames, self._cameras, motions)
+        if not shots:
+            raise fault(segment.image_file, f"there are no images of {', '.join(self._cameras)}", REMEDY)
+        cameras = [(segment.image_file, shot.world_from_camera[:3, 3]) for shot in shots]
+        objects = [(one.path, torch.from_numpy(place)) for one in boxes or () for place in one.poses[:, :3, 3]]
+        if far := check_extent(cameras + objects):
+            raise LogError(far)
+        return shots, boxes, notes
 
     def check_contents(self) -> list[Problem]:
         recording, problems = self.recording(), self._segment.check_files()
@@ -170,11 +178,6 @@ def _shots(
                 )
             )
     return shots
-
-
-def _placed(segment: Segment, shots: Sequence[Shot], boxes: Sequence[Boxes]) -> list[tuple[Path, Float64[Tensor, "3"]]]:
-    cameras = [(segment.image_file, shot.world_from_camera[:3, 3]) for shot in shots]
-    return cameras + [(one.path, torch.from_numpy(place)) for one in boxes for place in one.poses[:, :3, 3]]
 
 
 def _read_image(segment: Segment, rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:

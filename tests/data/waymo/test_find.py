@@ -81,6 +81,7 @@ def test_masks_of_a_user_replace_those_of_waymo(tmp_path):
     assert [None if one.sky is None else bool(one.sky.any()) for one in log.frames] == [False, None, True, None]
     # Frame 1 of FRONT has labels made by hand: they are not mixed with the user's.
     assert {one.vehicle for one in log.frames} == {None}
+    assert "by hand" not in " ".join(log.notes)
     (tmp_path / "masks" / "sky" / "FRONT" / "001.png").unlink()
     (problem,) = WaymoReader(root=tmp_path / "log", masks=tmp_path / "masks").check()
     assert problem.path.name == "001.png"

@@ -9,6 +9,7 @@ from sparsestreet.geometry import quaternions as quat
 from tests.data.plan import moved
 from tests.data.waymo import records
 from tests.data.waymo.drive import EXPOSURE, HALF_SPIN, LENS, READOUT, Drive
+from tests.typed import there
 
 CLOCK = 240
 """Nanoseconds: doubles of 1.5e9 seconds are so far apart."""
@@ -68,7 +69,7 @@ def test_the_declared_side_is_read_first(direction, tmp_path):
 
 
 def test_points_come_back_to_a_millimeter(root, drive):
-    sweeps = WaymoReader(root=root).recording().sweeps
+    sweeps = there(WaymoReader(root=root).recording().sweeps)
     assert sorted(sweeps) == [0, 1, 2, 3]
     for frame, sweep in sweeps.items():
         points = sweep.read().numpy()
@@ -106,11 +107,14 @@ def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
     assert max(still) > 5
 
 
-def test_boxes_are_at_their_own_instants(root, drive):
-    (car,) = WaymoReader(root=root).recording().boxes
+@pytest.mark.parametrize("direction", [2, 4])
+def test_boxes_are_at_their_own_instants(direction, tmp_path):
+    drive = Drive(directions={"front": direction, "left": 4})
+    records.write_drive(tmp_path, drive)
+    (car,) = there(WaymoReader(root=tmp_path).recording().boxes)
     assert (car.name, car.class_name, car.frames.tolist()) == ("car-1", "Vehicle", [0, 1, 2, 3])
     np.testing.assert_allclose(car.sizes, np.tile(drive.box_size, (4, 1)), rtol=1e-12)
-    for frame, (stamp, pose) in enumerate(zip(car.stamps, car.poses, strict=True)):
+    for frame, (stamp, pose) in enumerate(zip(there(car.stamps), car.poses, strict=True)):
         # The camera's clock is rounded, and it is moved on by a velocity for up to half of its readout.
         assert abs(stamp - drive.seen_stamp(frame)) < 1000
         np.testing.assert_allclose(pose[:3, 3], drive.world_from_box(drive.seen_stamp(frame))[:3, 3], atol=1e-9)
@@ -118,11 +122,19 @@ def test_boxes_are_at_their_own_instants(root, drive):
         np.testing.assert_allclose(pose[:3, :3], drive.world_from_box(stamp)[:3, :3], atol=3e-3)
 
 
+def test_both_versions_have_the_same_boxes(roots):
+    if 2 not in roots:
+        pytest.skip("version 2 needs pyarrow: pip install 'sparsestreet[parquet]'")
+    (one,), (other,) = (there(WaymoReader(root=root).recording().boxes) for root in roots.values())
+    assert one.stamps == other.stamps
+    assert np.array_equal(one.poses, other.poses)
+
+
 def test_boxes_of_the_lidar_are_of_the_instant_when_the_beam_crossed_them(tmp_path):
     drive = Drive(synced=False)
     records.write_drive(tmp_path, drive)
-    (car,) = WaymoReader(root=tmp_path).recording().boxes
-    for frame, (stamp, pose) in enumerate(zip(car.stamps, car.poses, strict=True)):
+    (car,) = there(WaymoReader(root=tmp_path).recording().boxes)
+    for frame, (stamp, pose) in enumerate(zip(there(car.stamps), car.poses, strict=True)):
         assert abs(stamp - drive.box_stamp(frame)) <= 1
         assert abs(stamp - drive.begin(frame) - HALF_SPIN) < 5_000_000
         np.testing.assert_allclose(pose[:3, 3], drive.world_from_box(stamp)[:3, 3], atol=1e-7)

@@ -187,7 +187,7 @@ def test_mutated_messages_are_read_or_refused(messages, tmp_path):
         try:
             with unchecked():
                 segment = RecordSegment(path)
-                segment.world_from_vehicle(0), segment.images(0), segment.boxes(0), segment.returns(0)
+                _ = segment.world_from_vehicle(0), segment.images(0), segment.boxes(0), segment.returns(0)
                 for frame, camera in segment.labelled:
                     segment.panoptic(frame, camera)
         except LogError:
