@@ -50,7 +50,7 @@ class WaymoReader(RecordedReader):
         given = None if self.masks is None else GivenMasks(Path(self.masks))
         if given is not None and (missing := given.check((cameras[shot.camera], shot.stem) for shot in shots)):
             raise LogError(missing)
-        labelled = frozenset(shot.key for shot in shots if given is None) & segment.labelled
+        labelled = segment.labelled & {shot.key for shot in shots if given is None}
         kinds = frozenset({"sky", "human", "vehicle"} if labelled else ())
         return Recording(
             name=segment.name,

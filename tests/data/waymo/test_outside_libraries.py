@@ -12,6 +12,7 @@ from tests.data.waymo import records, tables
 from tests.data.waymo.drive import Drive
 from tests.data.waymo.records import NAME
 from tests.data.waymo.tables import FRAME, LASER, SEGMENT, Row
+from tests.typed import there
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -77,11 +78,11 @@ def test_tri3d_finds_the_same_points_boxes_and_images(tmp_path):
         points = [theirs._points(0, frame, "LIDAR_TOP")]
         world = points[0] @ pose[:3, :3].T + pose[:3, 3]
         # Theirs are float32 in the vehicle's frame, after poses of 4 km in float32.
-        np.testing.assert_allclose(ours.sweeps[frame].read()[: len(world)], world, atol=5e-3)
-        assert ours.frame_stamps[frame] / 1e9 == pytest.approx(theirs.timelines[0]["LIDAR_TOP"][frame], abs=1e-6)
+        np.testing.assert_allclose(there(ours.sweeps)[frame].read()[: len(world)], world, atol=5e-3)
+        assert there(ours.frame_stamps)[frame] / 1e9 == pytest.approx(theirs.timelines[0]["LIDAR_TOP"][frame], abs=1e-6)
         shots = [shot for shot in ours.shots if (shot.frame, shot.camera) == (frame, 0)]
         assert np.array_equal(theirs.image(0, frame, "IMG_FRONT"), ours.read_image(shots[0]))
-    (car,), boxes = ours.boxes, theirs._boxes(0)
+    (car,), boxes = there(ours.boxes), theirs._boxes(0)
     for frame, box in enumerate(boxes):
         center = drive.frame_pose(frame) @ np.append(box.center, 1)
         np.testing.assert_allclose(car.poses[frame][:3, 3], center[:3], atol=1e-9)
