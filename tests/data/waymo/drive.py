@@ -160,8 +160,8 @@ class Drive(Plan):
         return np.concatenate((*found, moved(self.frame_pose(frame) @ self.ahead_from_lidar, points)))
 
     def png(self, frame: int, camera: PlannedCamera) -> bytes:
-        """Waymo's images are JPEG, which would change their pixels."""
-        return encoded(self.image(frame, camera))
+        """Waymo's images are JPEG, which would change their pixels. Enlarged images are left out: none looks at them."""
+        return b"none" if self.scale > 1 else encoded(self.image(frame, camera))
 
     def panoptic(self, camera: PlannedCamera) -> bytes:
         """Sky in the upper rows, a car and a pedestrian at the left, road elsewhere."""

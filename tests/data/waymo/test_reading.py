@@ -87,9 +87,8 @@ def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
     for shot in recording.shots:
         camera, pose = drive.cameras[shot.camera], shot.world_from_camera.numpy()
         sign = {"left": 1, "right": -1}[shot.shutter.direction]
-        for point in points:
-            if moved(np.linalg.inv(pose), point[None])[0, 2] < 1:
-                continue
+        ahead = moved(np.linalg.inv(pose), points)[:, 2]
+        for point in points[ahead > 2][::3]:
             _, truth = drive.read_at(0, camera, lambda stamp, point=point: point)
             if not (0 < truth[0] < camera.width and 0 < truth[1] < camera.height):
                 continue
@@ -101,8 +100,8 @@ def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
             errors.append(np.linalg.norm(drive.pixels(camera, then, point[None])[0] - truth))
             still.append(np.linalg.norm(drive.pixels(camera, pose, point[None])[0] - truth))
             seen += 1
-    # Points are good to half a millimeter, 0.2 pixels at 5 m.
-    assert seen > 30
+    # Points are good to 0.4 mm, 0.4 pixels at 2 m.
+    assert seen > 15
     assert max(errors) < 0.5
     assert max(still) > 5
 

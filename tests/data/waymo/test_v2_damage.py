@@ -197,7 +197,7 @@ def test_mutated_tables_are_read_or_refused(components, tmp_path):
                 table = Table(path, "CameraImageComponent")
                 for row in table.rows([FRAME, CAMERA], [components_of.POSE, *components_of.VELOCITY]):
                     components_of.matrix(row, components_of.POSE, path)
-                read = table.spooled({0: 0, 3: 3}, ["image"], lambda key, cells: data_of(cells[0], path))
+                read = table.spooled({0: 0, 3: 3}, ["image"], lambda cells: data_of(cells[0], path))
                 _ = read(0), read(3)
         except LogError:
             refused += 1

@@ -113,7 +113,7 @@ class TableSegment(Segment):
     def _read_image(self) -> Callable[[Any], bytes]:
         rows = self._image_rows.items()
         places = {(stamp, name): row["place"] for stamp, images in rows for name, row in images.items()}
-        return self._images.spooled(places, ["image"], lambda key, cells: data_of(cells[0], self._images.path))
+        return self._images.spooled(places, ["image"], lambda cells: data_of(cells[0], self._images.path))
 
     @cached_property
     def _labels(self) -> Mapping[int, list[BoxLabel]]:
@@ -150,7 +150,7 @@ class TableSegment(Segment):
         table, rows = self._segmentation
         assert table is not None  # it has the rows that are asked for
         places = {key: place for key, (place, _) in rows.items()}
-        return table.spooled(places, [_LABEL], lambda key, cells: data_of(cells[0], table.path))
+        return table.spooled(places, [_LABEL], lambda cells: data_of(cells[0], table.path))
 
     @cached_property
     def _returns_table(self) -> Table | None:
@@ -165,13 +165,13 @@ class TableSegment(Segment):
         table = self._returns_table
         assert table is not None  # it has the rows that are asked for
         second = [name for name in _RETURNS if table.column(name) in table.columns]
-        return table.spooled(self._return_places, second, lambda key, cells: pack_returns(cells, table.path))
+        return table.spooled(self._return_places, second, lambda cells: pack_returns(cells, table.path))
 
     @cached_property
     def _read_poses(self) -> Callable[[Any], bytes]:
         table = self._table("lidar_pose", "LiDARPoseComponent")
         places = self._places(table)
-        read = table.spooled(places, _RETURNS[:2], lambda key, cells: pack_poses(cells, table.path))
+        read = table.spooled(places, _RETURNS[:2], lambda cells: pack_poses(cells, table.path))
 
         def checked(key: tuple[int, str]) -> bytes:
             if key not in places:

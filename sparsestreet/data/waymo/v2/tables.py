@@ -1,6 +1,8 @@
 """Tables of a component in parquet files: small columns whole, large cells one at a time."""
 
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -45,45 +47,46 @@ class Table:
         return [dict(zip(wanted, row, strict=True)) for row in zip(*cells, strict=True)]
 
     def spooled(
-        self, places: dict[Any, int], columns: Sequence[str], pack: Callable[[Any, list[Any]], bytes]
+        self, places: dict[Any, int], columns: Sequence[str], pack: Callable[[list[Any]], bytes]
     ) -> Callable[[Any], bytes]:
         """A function from a key to what ``pack`` made of its row.
 
         A group of rows is decoded from its start when one of its rows is asked for, a few rows at a time, and what was
-        packed is kept in a temporary file: Waymo's files are of few, large groups.
+        packed is kept in a temporary file: groups may be large.
 
         Args:
             places: key -> row of the file.
             columns: those that ``pack`` gets, in this order, as one Arrow scalar each.
-            pack: of a key and its cells.
+            pack: of the cells of a row.
         """
         names = [self.column(name) for name in columns]
         self._require(names)
-        keys = {place: key for key, place in places.items()}
-        spool, first = Spool(), 0
-        groups: list[range] = []
-        for number in range(self._file.metadata.num_row_groups):
-            count = self._file.metadata.row_group(number).num_rows
-            groups.append(range(first, first + count))
-            first += count
+        keys, spool = {place: key for key, place in places.items()}, Spool()
 
-        def decode(number: int) -> None:
-            place = groups[number].start
-            batches = self._file.iter_batches(_ROWS_AT_ONCE, row_groups=[number], columns=names, use_threads=False)
-            for batch in batches:
-                cells = [batch.column(name) for name in names]
-                for row in range(batch.num_rows):
-                    if place in keys:
-                        spool.put(keys[place], pack(keys[place], [column[row] for column in cells]))
-                    place += 1
+        def keep(row: int) -> None:
+            for place, cells in self._group_around(row, names):
+                if place in keys:
+                    spool.put(keys[place], pack(cells))
 
         def read(key: Any) -> bytes:
             if key not in spool:
-                number = next(n for n, group in enumerate(groups) if places[key] in group)
-                self._explained(lambda: decode(number))
+                self._explained(lambda: keep(places[key]))
             return spool.get(key)
 
         return read
+
+    def _group_around(self, row: int, names: Sequence[str]) -> Iterator[tuple[int, list[Any]]]:
+        """Place and cells of each row of the group that holds a row."""
+        metadata = self._file.metadata
+        counts = [metadata.row_group(number).num_rows for number in range(metadata.num_row_groups)]
+        firsts = list(accumulate(counts, initial=0))
+        number = bisect_right(firsts, row) - 1
+        place = firsts[number]
+        for batch in self._file.iter_batches(_ROWS_AT_ONCE, row_groups=[number], columns=names, use_threads=False):
+            cells = [batch.column(name) for name in names]
+            for inside in range(batch.num_rows):
+                yield place + inside, [column[inside] for column in cells]
+            place += batch.num_rows
 
     def _require(self, names: Sequence[str]) -> None:
         missing = [name for name in names if name not in self.columns]
