@@ -19,7 +19,7 @@ def masked_crc32c(data: bytes | memoryview) -> int:
     """As it stands behind the length, and behind the bytes, of a record.
 
     >>> hex(masked_crc32c(b"123456789"))  # the CRC is 0xe3069283
-    '0xc78ab3d4'
+    '0xc78ab0e5'
     """
     crc = _linear_crc(data) ^ _applied(_zeros(len(data)), np.array([0xFFFFFFFF], np.uint32))[0] ^ 0xFFFFFFFF
     return ((int(crc) >> 15 | int(crc) << 17) + _MASK_DELTA) & 0xFFFFFFFF
