@@ -6,6 +6,7 @@ from itertools import pairwise, product
 from pathlib import Path
 from statistics import median_low
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -127,7 +128,8 @@ class Kitti360Reader(RecordedReader):
         calibration = attempt(problems, lambda: read_calibration(sequence.calibration, sequence.cameras))
         lines = attempt(problems, lambda: read_stamps(sequence.stamps(sequence.cameras[0]))) or []
         stamps = attempt(problems, lambda: _stamps(sequence, lines, frames)) if lines else None
-        boxes = attempt(problems, lambda: None if (xml := sequence.boxes) is None else read_boxes(xml, list(frames)))
+        path, positions = sequence.boxes, torch.stack([poses[frame][:3, 3] for frame in frames]).numpy()
+        boxes = None if path is None else attempt(problems, lambda: read_boxes(path, np.array(frames), positions))
         if problems or calibration is None or stamps is None:
             raise LogError(problems)
         turn = _turn(lines, frames)

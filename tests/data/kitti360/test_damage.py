@@ -4,6 +4,7 @@ import random
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sparsestreet.data.kitti360 import Kitti360Reader
@@ -122,7 +123,7 @@ def test_a_cuboid_that_is_none_is_refused(tmp_path, matrix, said):
     path = tmp_path / "boxes.xml"
     path.write_text(f"<opencv_storage><a>{fields}<transform><data>{matrix}</data></transform></a></opencv_storage>")
     with pytest.raises(LogError, match=said):
-        read_boxes(path, [0])
+        read_boxes(path, np.array([0]), np.zeros((1, 3)))
 
 
 def test_whatever_is_not_there_is_said(whole, tmp_path):
@@ -148,7 +149,7 @@ def test_nothing_but_problems_comes_of_random_bytes(whole, tmp_path):
             broken[at : at + source.randint(0, 3)] = source.randbytes(source.randint(0, 3))
         path.write_bytes(broken)
         try:
-            read_boxes(path, [0, 1, 3])
+            read_boxes(path, np.array([0, 1, 3]), np.zeros((3, 3)))
         except LogError:
             refused += 1
     assert 50 < refused < 200

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.data.kitti360 import Kitti360Reader
+from sparsestreet.data.kitti360.boxes import read_boxes
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
 from tests.data.kitti360.write import (
@@ -18,6 +19,7 @@ from tests.data.kitti360.write import (
     SEQUENCE,
     SIDEWAYS,
     UNPOSED,
+    cuboid,
     write_fisheye,
     write_kitti360,
 )
@@ -94,6 +96,19 @@ def test_objects_that_move_and_that_stand(recording):
     assert parked.frames.tolist() == [0, 1, 2, 3, 4]
     assert np.abs(parked.poses - PARKED).max() < POSITION
     assert np.abs(parked.sizes - PARKED_SIZE).max() < POSITION
+
+
+def test_objects_that_stand_are_there_while_the_car_is_near(tmp_path):
+    """A sequence of kilometers with thousands of parked cars would take gigabytes otherwise."""
+    path = tmp_path / "boxes.xml"
+    path.write_text(f"<opencv_storage>{cuboid(1, 13, 8, -1, PARKED, PARKED_SIZE)}</opencv_storage>")
+    frames = np.array([0, 400, 401, 499, 501, 800])
+    away = np.array([0.0, 149, 151, 0, 0, 0])
+    positions = PARKED[:3, 3] + away[:, None] * [0, 1, 0]
+    (boxes,) = read_boxes(path, frames, positions)
+    # It is annotated at frames 0 to 200.
+    assert frames[boxes.frames].tolist() == [0, 400, 499]
+    assert read_boxes(path, frames[4:], positions[4:]) == []
 
 
 def test_labels_give_masks_on_the_images_that_have_them(log):
