@@ -24,7 +24,7 @@ from sparsestreet.data.kitti360.layout import FISHEYE, SequenceFolders, find_seq
 from sparsestreet.data.kitti360.poses import Calibration360, check_pose, read_calibration, read_poses
 from sparsestreet.data.kitti360.semantics import KINDS, read_semantics
 from sparsestreet.data.motion import PosePath, untwisted
-from sparsestreet.data.poses import RIGIDITY_TOLERANCE
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE, are_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, lens_camera, rig_camera
@@ -122,8 +122,9 @@ class Kitti360Reader(RecordedReader):
         if self.masks is not None:
             stems = product(sequence.cameras, (sequence.image("", frame).stem for frame in frames))
             problems += GivenMasks(Path(self.masks)).check(stems)
-        for frame in frames:
-            attempt(problems, partial(check_pose, poses[frame], frame, sequence.poses))
+        if not are_rigid(torch.stack([poses[frame] for frame in frames])):
+            for frame in frames:
+                attempt(problems, partial(check_pose, poses[frame], frame, sequence.poses))
         problems += check_extent([(sequence.poses, poses[frame][:3, 3]) for frame in frames])
         calibration = attempt(problems, lambda: read_calibration(sequence.calibration, sequence.cameras))
         lines = attempt(problems, lambda: read_stamps(sequence.stamps(sequence.cameras[0]))) or []
