@@ -21,6 +21,7 @@ from sparsestreet.training.moved_views.build import report_shift
             logging.WARNING,
             "and 1.2 below: check calibration, poses and stamps, or train with",
         ),
+        (EdgeShift(-1.1, 0.0, 900), logging.WARNING, "-1.1 pixels to the right"),
         (None, logging.INFO, "too few edges are seen by lidar and cameras"),
     ],
 )
