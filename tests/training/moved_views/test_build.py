@@ -14,7 +14,7 @@ from sparsestreet.training.moved_views.build import report_shift
         (
             EdgeShift(0.9, -1.9, 900),
             logging.INFO,
-            "edges of the images lie 0.2 pixels to the right of those of the lidar",
+            "0.9 pixels to the right of those of the lidar and -1.9 below",
         ),
         (
             EdgeShift(-0.1, -2.1, 900),
