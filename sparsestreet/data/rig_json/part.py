@@ -15,7 +15,8 @@ from sparsestreet.data.motion import PosePath
 from sparsestreet.data.recording import Boxes, LidarSweep, Shot
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.rig_json.sweeps import read_sweep
-from sparsestreet.data.rig_json.table import FrameEntry, ImageEntry, RigTable
+from sparsestreet.data.rig_json.table import CameraEntry, FrameEntry, ImageEntry, RigTable
+from sparsestreet.types import Shutter
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,24 @@ def _shot(table: RigTable, drive: PosePath | None, entry: FrameEntry, frame: int
             except ValueError as error:
                 remedy = "give the image its own world_from_camera, or the frames poses around it"
                 raise image.where.fault(f"has no pose: {error}", remedy) from error
-    return Shot(frame, index, pose, image, image.path.stem, stamp)
+    shutter = _shutter(table.cameras[name], drive, image, stamp)
+    exposure = table.cameras[name].exposure
+    return Shot(frame, index, pose, image, image.path.stem, stamp, shutter, exposure)
+
+
+def _shutter(camera: CameraEntry, drive: PosePath | None, image: ImageEntry, stamp: int | None) -> Shutter | None:
+    """The camera's motion on the vehicle's path while the image is read out; None: it is exposed at once."""
+    if not camera.readout:
+        return None
+    if drive is None or stamp is None or camera.vehicle_from_camera is None:
+        remedy = "write stamps and world_from_vehicle of the frames and the camera's mount, or leave out its shutter"
+        raise image.where.fault("has a shutter, but nothing tells how the camera moves", remedy)
+    path = replace(drive, poses=drive.poses @ camera.vehicle_from_camera)
+    try:
+        return Shutter(*path.motion_during(stamp, camera.readout), camera.side)
+    except ValueError as error:
+        remedy = "give the frames poses around it, or leave the image out"
+        raise image.where.fault(f"is read out where no pose is known: {error}", remedy) from error
 
 
 def _drive(table: RigTable) -> PosePath | None:

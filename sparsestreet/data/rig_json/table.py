@@ -10,8 +10,9 @@ from torch import Tensor
 
 from sparsestreet.data.json_tree import JsonValue, read_json
 from sparsestreet.data.recording import Boxes
-from sparsestreet.data.rig_json.values import read_lens, read_pose, read_stamp
+from sparsestreet.data.rig_json.values import read_lens, read_pose, read_shutter, read_stamp
 from sparsestreet.geometry.lenses import Lens
+from sparsestreet.types import Side
 
 _LARGEST_IMAGE = 100_000
 _COLUMNS = ("x", "y", "z", "intensity")
@@ -28,6 +29,12 @@ class CameraEntry:
     """None: each image has its own pose."""
     ego_mask: Path | None
     """White where the recording car is."""
+    readout: int
+    """Nanoseconds from the first row or column to the last; 0: all are exposed at once."""
+    side: Side
+    """The side of the image that is read first."""
+    exposure: float | None
+    """Seconds that a pixel is exposed."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +110,20 @@ def read_table(path: Path) -> RigTable:
 
 
 def _camera(name: str, value: JsonValue) -> CameraEntry:
-    value.only("width", "height", "lens", "vehicle_from_camera", "ego_mask")
+    value.only("width", "height", "lens", "vehicle_from_camera", "ego_mask", "shutter", "exposure")
     if not name or name in (".", "..") or "/" in name or "\\" in name or "\0" in name:
         raise value.fault("is no name of a camera", "name it as a folder may be named")
-    mount, mask = value.get("vehicle_from_camera"), value.get("ego_mask")
+    mount, mask, exposure = value.get("vehicle_from_camera"), value.get("ego_mask"), value.get("exposure")
+    readout, side = read_shutter(value.get("shutter"))
     size = value["width"].whole(1, _LARGEST_IMAGE), value["height"].whole(1, _LARGEST_IMAGE)
     return CameraEntry(
         read_lens(value["lens"]),
         size,
         None if mount is None else read_pose(mount),
         None if mask is None else mask.path(),
+        readout,
+        side,
+        None if exposure is None else exposure.number(positive=True),
     )
 
 

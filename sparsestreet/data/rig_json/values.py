@@ -1,6 +1,7 @@
 """Poses, lenses and stamps as ``rig.json`` has them."""
 
 from dataclasses import MISSING, fields
+from typing import get_args
 
 import torch
 from jaxtyping import Float64
@@ -10,8 +11,10 @@ from sparsestreet.data.json_tree import JsonValue
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye, FTheta, Lens, Mei, Rational
+from sparsestreet.types import Side
 
 _LATEST = 2**62
+_LONGEST_READOUT = 0.5
 LENSES: dict[str, type[Lens]] = {
     "pinhole": BrownConrady,
     "opencv": BrownConrady,
@@ -46,6 +49,21 @@ def read_pose(value: JsonValue) -> Float64[Tensor, "4 4"]:
 def read_stamp(value: JsonValue) -> int:
     """Nanoseconds, whole: a decimal second would be rounded."""
     return value.whole(-_LATEST, _LATEST)
+
+
+def read_shutter(value: JsonValue | None) -> tuple[int, Side]:
+    """How long a readout takes, nanoseconds, and on which side it starts; None: all pixels are exposed at once."""
+    if value is None:
+        return 0, "top"
+    seconds = value.only("readout", "first")["readout"].number(positive=True)
+    if seconds > _LONGEST_READOUT:
+        message = f"is {seconds:g} s, longer than any readout"
+        raise value["readout"].fault(message, "write seconds from the first row or column to the last")
+    side = value["first"]
+    for known in get_args(Side):
+        if side.text() == known:
+            return round(1e9 * seconds), known
+    raise side.fault(f"is {side.text()[:40]!r}, no side of an image", f"write one of {', '.join(get_args(Side))}")
 
 
 def read_lens(value: JsonValue) -> Lens:

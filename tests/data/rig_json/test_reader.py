@@ -17,6 +17,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.recording import Recording
 from sparsestreet.data.rig_json import RigJsonReader
+from sparsestreet.data.rig_json.sweeps import read_rows
 from sparsestreet.data.rig_json.values import LENSES
 from tests.data.plan import Plan
 from tests.data.rig_json.write import in_lidar, write_json, write_rig
@@ -112,6 +113,30 @@ def test_an_image_may_have_its_own_pose(written):
     for shot in RigJsonReader(root=folder).recording().shots:
         expected = PLAN.world_from_camera(shot.frame, PLAN.cameras[shot.camera])
         np.testing.assert_allclose(shot.world_from_camera.numpy(), expected, atol=1e-9)
+
+
+def test_a_declared_shutter_follows_the_drive(written):
+    folder, content = written
+    content["cameras"]["left"] |= {"shutter": {"readout": 0.04, "first": "right"}, "exposure": 0.003}
+    write_json(folder, content)
+    shots = RigJsonReader(root=folder).recording().shots
+    for shot in shots:
+        camera = PLAN.cameras[shot.camera]
+        if camera.name == "front":
+            assert (shot.shutter, shot.exposure) == (None, None)
+            continue
+        middle = PLAN.image_stamp(shot.frame, camera)
+        begin, at, end = (
+            PLAN.world_from_vehicle(middle + np.array([-20, 0, 20]) * 1_000_000) @ camera.vehicle_from_camera
+        )
+        shutter = there(shot.shutter)
+        assert (shutter.direction, shot.exposure) == ("right", 0.003)
+        # 0.4 m; velocity is constant between frames, and turns by 0.02 between two of them.
+        expected = at[:3, :3].T @ (end - begin)[:3, 3]
+        assert np.abs(shutter.translation.numpy() - expected).max() < 0.4 * 0.02
+        # 0.2 rad/s about the world's z axis, which climbs by 0.03.
+        turn = at[:3, :3].T @ np.array([0, 0, 0.2 * 0.04])
+        assert np.abs(shutter.rotation.numpy() - turn).max() < 1e-5
 
 
 def test_without_a_clock_images_are_at_the_frames_pose(written):
@@ -294,6 +319,13 @@ DAMAGE = {
     "a mount of 3 numbers": (camera_with(vehicle_from_camera=turned([1, 0, 0])), "has 3 numbers, not 4"),
     "a mount mirrored": (camera_with(vehicle_from_camera=np.diag([1.0, 1, -1, 1]).tolist()), "is no rigid transform"),
     "no mount": (camera_with(vehicle_from_camera=None), r"frames\[0\].images.front has no pose"),
+    "a shutter without a side": (camera_with(shutter={"readout": 0.01}), "cameras.front.shutter has no 'first'"),
+    "a shutter from nowhere": (camera_with(shutter={"readout": 0.01, "first": "up"}), "'up', no side of an image"),
+    "a readout of milliseconds": (
+        camera_with(shutter={"readout": 33, "first": "top"}),
+        "33 s, longer than any",
+    ),
+    "no exposure": (camera_with(exposure=0), "cameras.front.exposure must be positive"),
     "no ego mask": (camera_with(ego_mask="none.png"), "none.png: the file is missing"),
     "a decimal stamp": (frame_with(stamp=1.5), "stamp must be a whole number"),
     "a huge stamp": (frame_with(stamp=10**30), "stamp must be a whole number"),
@@ -365,6 +397,22 @@ def test_damage_of_points_is_one_clear_error(damage, said, written):
     assert problem.path.name == "002.npy"
     with pytest.raises(LogError, match=said):
         log.sweeps[2]
+
+
+def test_mutated_arrays_are_read_or_refused(root, tmp_path):
+    path, random, refused = tmp_path / "a.npy", np.random.default_rng(0), 0
+    sound = (root / "lidar/000.npy").read_bytes()
+    for _ in range(200):
+        content = bytearray(sound)
+        for place in random.integers(0, 128, 1):
+            content[place] = random.integers(256)
+        path.write_bytes(content)
+        try:
+            points, _ = read_rows(path, ("time", "x", "y", "z"))
+            assert points.shape[1] == 3
+        except LogError:
+            refused += 1
+    assert refused > 50
 
 
 def test_a_bin_of_part_rows(written):
