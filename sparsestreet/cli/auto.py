@@ -17,6 +17,8 @@ from sparsestreet.data.marks import UNREAD, Marks
 
 AUTO = "data=auto"
 _MORE = "docs/datasets/README.md says what is read"
+_ABOVE = 2
+"""Folders above a wrong root that are looked at."""
 _NEIGHBORS = 50
 """Folders below a wrong root that are looked at."""
 
@@ -97,7 +99,11 @@ def _known_as(root: Path, marks: Mapping[str, Marks]) -> dict[str, Path]:
 
 
 def _nearby(root: Path, marks: Mapping[str, Marks]) -> tuple[Path, str] | None:
-    """A folder that a reader knows, above or below a wrong one, and the option."""
+    """A folder that a reader knows, around a wrong one or in it, and the option."""
+    inside = root.absolute()
+    for above in inside.parents[:_ABOVE]:
+        for name, one in marks.items():
+            if one.tell_of(inside, above):
+                return above, name
     below = sorted(path for path in root.iterdir() if path.is_dir())[:_NEIGHBORS]
-    around = ((folder, name) for folder in (*root.absolute().parents[:2], *below) for name in _known_as(folder, marks))
-    return next(around, None)
+    return next(((folder, name) for folder in below for name in _known_as(folder, marks)), None)

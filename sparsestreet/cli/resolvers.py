@@ -109,6 +109,15 @@ def by_drive(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -
     return values.get(int(name), otherwise) if name.isdigit() else otherwise
 
 
+def by_scene(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
+    """Of conf/protocol: the entry of the scene, drive or sequence that is read. Names are compared without underscores,
+    because Hydra reads digits with underscores as a number."""
+    log = _root_.data.log
+    scene = next((log[key] for key in ("scene", "drive", "sequence") if log.get(key) is not None), None)
+    named = {str(name).replace("_", ""): value for name, value in values.items()}
+    return named.get(str(scene).replace("_", ""), otherwise)
+
+
 def dashed(values: Iterable[Any]) -> str:
     """Of conf/experiment: a list in a name."""
     return "-".join(map(str, values))
@@ -135,6 +144,7 @@ _RESOLVERS = {
     "of_preset": of_preset,
     "gaussians_of": gaussians_of,
     "by_drive": by_drive,
+    "by_scene": by_scene,
     "dashed": dashed,
     "last_part": last_part,
 }

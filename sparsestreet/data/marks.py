@@ -1,6 +1,6 @@
 """How a folder shows whose data set it holds: by files that only that one has."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,17 @@ class Marks:
 
     def found_in(self, root: Path) -> Path | None:
         """What tells, below ``root``; None where there is nothing of it."""
-        places = ("*/" * depth + pattern for depth in range(self.depth + 1) for pattern in self.patterns)
-        return next((path for place in places if (path := min(root.glob(place), default=None))), None)
+        return next((path for found in self._searched(root) if (path := min(found, default=None))), None)
+
+    def tell_of(self, folder: Path, root: Path) -> bool:
+        """Whether something below ``root`` that tells is ``folder``, or in it, or around it."""
+        every = (path for found in self._searched(root) for path in found)
+        return any(path.is_relative_to(folder) or folder.is_relative_to(path) for path in every)
+
+    def _searched(self, root: Path) -> Iterator[Iterator[Path]]:
+        for depth in range(self.depth + 1):
+            for pattern in self.patterns:
+                yield root.glob("*/" * depth + pattern)
 
     def __str__(self) -> str:
         below = f", up to {self.depth} folders below" if self.depth else ""

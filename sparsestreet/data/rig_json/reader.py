@@ -9,6 +9,7 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, check_image_sizes
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
@@ -20,6 +21,8 @@ from sparsestreet.data.window import chosen_cameras, frame_window
 @dataclass(frozen=True, kw_only=True)
 class RigJsonReader(RecordedReader):
     """A folder with a ``rig.json`` that somebody wrote by hand (docs/datasets/rig_json.md)."""
+
+    marks = Marks(("rig.json",))
 
     pinhole_fov: float | None = None
     """Degrees that the pinhole of a lens that is not simulated sees from left to right; None: its resolution is that of

@@ -14,6 +14,7 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.lidar import check_points
+from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
@@ -38,6 +39,8 @@ class WaymoReader(RecordedReader):
     The world is Waymo's. An instant is a spin of the lidar TOP, its stamp that of half of the spin, which the pose of
     the frame is of. Each image has the pose and the stamp of the middle of its readout.
     """
+
+    marks = Marks(("*.tfrecord", "vehicle_pose/*.parquet", "camera_image/*.parquet"), depth=2)
 
     scene: str | int | None = None
     """Name of a segment, or its place in ``scenes``, from 0; None: the only one."""

@@ -1,0 +1,69 @@
+"""conf/protocol: scene lists that papers use, with their windows, cameras and splits."""
+
+import pytest
+from hydra import compose
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from sparsestreet.cli.compose import CONF, composed, configuration
+
+PROTOCOLS = sorted(path.stem for path in (CONF / "protocol").glob("*.yaml"))
+OMNIRE = {
+    "10455472356147194054_1560_000_1580_000": (0, 150),
+    "12505030131868863688_1740_000_1760_000": (0, 150),
+    "16951470340360921766_2840_000_2860_000": (0, 150),
+    "5846229052615948000_2120_000_2140_000": (0, 140),
+    "7761658966964621355_1000_000_1020_000": (0, 170),
+    "1382515516588059826_780_000_800_000": (30, 180),
+    "4487677815262010875_4940_000_4960_000": (0, 140),
+    "9653249092275997647_980_000_1000_000": (130, -1),
+}
+STREETGS = {6: (0, 85), 26: (0, 100), 90: (0, 102), 105: (20, 186), 108: (20, 115), 134: (106, 198), 150: (96, 197)} | {
+    181: (0, 160)
+}
+
+
+def jobs(name: str) -> list[str]:
+    """The overrides of the scenes, as Hydra's sweeper splits them."""
+    with configuration():
+        params = compose("train", [f"protocol={name}", "data.root=x"], return_hydra_config=True).hydra.sweeper.params
+    ((key, values),) = ((key, value) for key, value in params.items() if key.startswith("data.log."))
+    (override,) = OverridesParser.create().parse_overrides([f"{key}={values}"])
+    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+
+
+def logs(name: str) -> list:
+    return [composed([f"protocol={name}", "data.root=x", job]).data.log for job in jobs(name)]
+
+
+@pytest.mark.parametrize(("name", "windows"), [("omnire", OMNIRE), ("streetgs", STREETGS)])
+def test_each_scene_has_its_window(name, windows):
+    found = {log.scene: (log.first_frame, log.last_frame) for log in logs(name)}
+    assert found == windows
+
+
+def test_a_name_that_hydra_takes_for_a_number_has_its_window_too():
+    """Without quotes the digits are one number."""
+    log = composed(["protocol=omnire", "data.root=x", "data.log.scene=1382515516588059826_780_000_800_000"]).data.log
+    assert isinstance(log.scene, int)
+    assert (log.first_frame, log.last_frame) == (30, 180)
+
+
+def test_drives_of_kitti_are_told_by_their_names():
+    assert [log.last_frame for log in logs("drivestudio_kitti")] == [-1, 200, 200, 200]
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_protocol_is_a_sweep_over_scenes_and_a_choice_for_one(name):
+    words = jobs(name)
+    assert len(words) == len(set(words)) > 1
+    cfg = composed([f"protocol={name}", "data.root=x", words[0], "split.stride=5", "data.log.width=640"])
+    assert (cfg.split.stride, cfg.data.log.width) == (5, 640)  # what is typed still counts
+
+
+SPLITS = {"omnire": (10, 10), "streetgs": (4, 4), "pvg": (4, 3), "neurad": (2, 1)}
+
+
+@pytest.mark.parametrize("name", SPLITS.keys() & set(PROTOCOLS))
+def test_what_is_held_out(name):
+    split = composed([f"protocol={name}", "data.root=x"]).split
+    assert (split.stride, split.offset) == SPLITS[name]
