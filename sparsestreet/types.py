@@ -162,6 +162,19 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+class SparsePoints:
+    """Points on what stands still that came with a log: found in its images, such as COLMAP's, measured by no lidar."""
+
+    positions: Float[Tensor, "n 3"]
+    """World, meters."""
+    colors: Float[Tensor, "n 3"]
+    """RGB in [0, 1]; gray 0.5 where it is not known."""
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+
+@dataclass(frozen=True)
 class BodyPoses:
     """Rotations of a person's 24 joints (SMPL's, in its order), one entry per annotated frame of the track.
 

@@ -19,6 +19,7 @@ given_masks  masks that somebody made for a data set
 numbers      numbers from text files
 lidar        colors that points take from images, depth that pixels take from points
 formats      data sets as they are published, to be named where they must be converted first
+nuscenes     reader of nuScenes as it is published: tables of JSON, images, sweeps
 drivestudio  reader of DriveStudio's processed layout
 synthetic    the embedded street: traced, written in that layout, read from there
 datamodule   the loaders of training and validation

@@ -48,6 +48,8 @@ def _summary(log: DrivingLog) -> Table:
     table.add_row("frames a second", "not known" if log.frame_rate is None else f"{log.frame_rate:.4g}")
     table.add_row("image size", ", ".join(f"{width}x{height}" for width, height in sizes))
     table.add_row("lidar points", f"{points:,} ({colored:,} seen by a camera)" if log.sweeps else "none")
+    if log.sparse_points is not None:
+        table.add_row("sparse points", f"{len(log.sparse_points()):,}")
     table.add_row("objects", str(len(log.tracks)))
     table.add_row("scene radius", f"{log.radius:.1f} m")
     return table

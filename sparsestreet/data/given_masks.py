@@ -9,6 +9,7 @@ from torch import Tensor
 
 from sparsestreet.data.images import image_size, read_mask
 from sparsestreet.data.problems import Problem, fault, missing_files
+from sparsestreet.data.undistortion import Undistortion
 
 _KINDS = ("sky", "human", "vehicle", "ego")
 
@@ -32,9 +33,18 @@ class GivenMasks:
         return {kind: folder / f"{stem}.png" for kind, folder in folders.items() if folder.is_dir()}
 
     def read(
-        self, camera: str, stem: str, *, recorded_size: tuple[int, int], size: tuple[int, int]
+        self,
+        camera: str,
+        stem: str,
+        *,
+        recorded_size: tuple[int, int],
+        size: tuple[int, int],
+        undistortion: Undistortion | None = None,
     ) -> dict[str, Bool[Tensor, "h w"]]:
-        """Kind -> mask at ``size``, both (width, height). Raises LogError for a file that is missing or broken."""
+        """Kind -> mask at ``size``, both (width, height), without the lens if told.
+
+        Raises LogError for a file that is missing or broken.
+        """
         masks = {}
         for kind, path in self.paths(camera, stem).items():
             if not path.is_file():
@@ -42,7 +52,7 @@ class GivenMasks:
             if (found := image_size(path)) != recorded_size:
                 message = "the mask is {}x{}, the camera's images are {}x{}".format(*found, *recorded_size)
                 raise fault(path, message, "write masks at the size of the recorded images")
-            masks[kind] = read_mask(path, size, sky=kind == "sky")
+            masks[kind] = read_mask(path, size, sky=kind == "sky", undistortion=undistortion)
         return masks
 
     def check(self, images: Iterable[tuple[str, str]]) -> list[Problem]:

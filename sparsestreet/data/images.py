@@ -25,7 +25,7 @@ def image_size(path: Path) -> tuple[int, int]:
     try:
         with Image.open(path) as image:
             return image.size
-    except OSError as error:
+    except (OSError, Image.DecompressionBombError) as error:
         raise _unreadable(path, error) from error
 
 
@@ -97,7 +97,8 @@ def _decode(path: Path, mode: str, size: tuple[int, int] | None, resampling: Ima
         with Image.open(path) as image:
             pixels = image.convert(mode)
         return np.array(pixels if size in (None, pixels.size) else pixels.resize(size, resampling))
-    except (OSError, SyntaxError, ValueError) as error:  # Pillow reports a broken PNG chunk as SyntaxError
+    # Pillow reports a broken PNG chunk as SyntaxError.
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise _unreadable(path, error) from error
 
 

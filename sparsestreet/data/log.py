@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, Sweeps
-from sparsestreet.types import Frame, Track, View
+from sparsestreet.types import Frame, SparsePoints, Track, View
 
 _QUANTILES = (0.02, 0.98)
 _MARGIN = 1.1
@@ -55,6 +55,9 @@ class DrivingLog:
     """Axes of the first pose, as columns in the world; center and radius are then those of DriveStudio: of a box along
     these axes around the lidar alone. They do not depend on where the street leads. None: the box lies along the axes
     of the world, and holds the cameras too."""
+    sparse_points: Callable[[], SparsePoints] | None = None
+    """Reads points that came with the log, where it has any. Gaussians start from them, and without lidar the scene's
+    box lies around them; they are no returns, so they give no depth."""
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -99,10 +102,13 @@ class DrivingLog:
     def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
         """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.
 
-        Points that some camera sees count (DriveStudio's rule); without lidar, what lies 50 m ahead of each camera.
+        Points that some camera sees count (DriveStudio's rule); without lidar, the points that came with the log, and
+        without these what lies 50 m ahead of each camera.
         Along ``first_axes``, if given: there the lidar alone counts, and the box reaches 20 m along the last axis.
         """
         points = self._along_axes(_seen_points(self.sweeps))
+        if not len(points) and self.sparse_points is not None:
+            points = self._along_axes(self.sparse_points().positions.numpy())
         if len(points) and self.first_axes is not None:
             low, high = np.quantile(points, _QUANTILES, axis=0)
             high[2] = max(high[2], _FIRST_POSE_REACH)

@@ -7,7 +7,7 @@ depth images and colors of returns are the same for all data sets, and are done 
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from sparsestreet.data.reader import LogReader
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.scene_folder import SceneFolder
 from sparsestreet.data.tracks import checked_track, track_in_window
-from sparsestreet.types import Frame, Shutter, View
+from sparsestreet.types import Frame, Shutter, SparsePoints, View
 
 MASK_KINDS = ("sky", "human", "vehicle", "ego")
 
@@ -102,6 +102,8 @@ class Recording:
     """Instant -> its sweep; None: no lidar."""
     boxes: Sequence[Boxes] | None = None
     """None: the data set has no annotations."""
+    sparse_points: Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]] | None = None
+    """Positions in the data set's own world and RGB in [0, 1] of points that came with it, such as COLMAP's."""
     notes: tuple[str, ...] = ()
     """What a user should know about how it was read, one sentence each."""
 
@@ -198,6 +200,7 @@ def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[P
         num_frames=num_frames,
         num_cameras=len(recording.rig),
         dataset_from_world=dataset_from_world(origin),
+        sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
     )
 
@@ -221,6 +224,12 @@ def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], inde
     if index not in sweeps:
         return torch.zeros(0, 3)
     return (sweeps[index].read() - origin).float()
+
+
+def _sparse_points(recording: Recording, origin: Float64[Tensor, "3"]) -> SparsePoints:
+    assert recording.sparse_points is not None  # else it is not asked
+    positions, colors = recording.sparse_points()
+    return SparsePoints((positions - origin).float(), colors)
 
 
 def _absent(recording: Recording) -> tuple[str, ...]:

@@ -4,10 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.problems import LogError
+from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.geometry.lenses import Fisheye
 
 SIZES = {"recorded_size": (8, 4), "size": (8, 4)}
 
@@ -43,3 +46,12 @@ def test_a_mask_of_another_size_and_a_folder_of_none_are_refused(masks, tmp_path
         masks.read("front", "000", recorded_size=(16, 8), size=(8, 4))
     (problem,) = GivenMasks(tmp_path / "sky").check([])
     assert "none of the folders sky, human, vehicle, ego" in problem.message
+
+
+def test_a_lens_is_taken_out_of_masks_too(masks):
+    lens = Fisheye(fx=4.0, fy=4.0, cx=4.0, cy=2.0)
+    take_out = Undistortion.of(lens, lens.pinhole, (8, 4), (8, 4))
+    plain, seen = masks.read("front", "000", **SIZES), masks.read("front", "000", undistortion=take_out, **SIZES)
+    expected = take_out(255 * plain["sky"].numpy().astype(np.uint8)) > 0
+    assert (seen["sky"].numpy() == expected).all()
+    assert not torch.equal(seen["sky"], plain["sky"])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import split
-from sparsestreet.types import Sweep
+from sparsestreet.types import SparsePoints, Sweep
 from tests.data.streets import make_log
 
 
@@ -108,6 +108,20 @@ def test_without_lidar_cameras_see_fifty_metres_ahead():
     along_x = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     frame = replace(log.frames[0], camera=replace(log.frames[0].camera, camera_from_world=along_x))
     assert torch.allclose(replace(log, frames=Frames.of([frame])).center, torch.tensor([25.0, 0, 0]))
+
+
+def test_without_lidar_the_box_reaches_around_the_points_that_came_with_the_log():
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-90, 90, (5000, 3)).astype(np.float32))
+    sparse = SparsePoints(points, torch.zeros_like(points))
+    log = replace(make_log(num_frames=1, num_cameras=1), sparse_points=lambda: sparse)
+    low, high = np.quantile(points.numpy(), (0.02, 0.98), axis=0)
+    assert log.radius == pytest.approx(1.1 * (high - low).max() / 2)
+    np.testing.assert_allclose(log.center.numpy(), (low + high) / 2, atol=1e-5)
+    assert not len(log.sweeps)
+    # Returns come before them.
+    returns = sweep(torch.zeros(10, 3), torch.ones(10, dtype=torch.bool))
+    with_lidar = make_log(num_frames=41, num_cameras=1, sweeps=(returns,))
+    assert replace(with_lidar, sparse_points=lambda: sparse).radius == with_lidar.radius
 
 
 def test_very_many_points_are_thinned_evenly():

@@ -41,3 +41,25 @@ def test_no_loss_sees_what_the_lens_did_not_record(lens, user):
         assert torch.equal(there(ego), blank | HOOD if user else blank)
         assert any("resampled to a pinhole of 150 degrees" in note for note in log.notes)
     assert user in ({}, {"ego": HOOD})  # what a reader keeps is not changed
+
+
+def test_points_that_came_with_the_log_are_in_its_world_and_give_no_depth():
+    pose, reads = torch.eye(4, dtype=torch.float64), []
+    pose[:3, 3] = torch.tensor([4e6, -2e6, 100.0])
+    ahead = pose[:3, 3] + torch.tensor([[0.0, 0.25, 5.0]], dtype=torch.float64)
+    recording = Recording(
+        name="a",
+        rig=[camera(FLAT)],
+        shots=[Shot(0, 0, pose, key=None, stem="0")],
+        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
+        read_masks=lambda shot: {},
+        sparse_points=lambda: reads.append(1) or (ahead, torch.tensor([[0.25, 0.5, 0.75]])),
+    )
+    log = log_of(recording, cache_bytes=0, check=list)
+    assert not reads  # nothing is decoded when a log is opened
+    sparse = there(log.sparse_points)
+    assert sparse().positions.tolist() == [[0.0, 0.25, 5.0]]
+    assert sparse().colors.tolist() == [[0.25, 0.5, 0.75]]
+    assert len(reads) == 1
+    assert log.frames[0].depth is None
+    assert not len(log.sweeps)

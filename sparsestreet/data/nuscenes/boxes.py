@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from sparsestreet.data.nuscenes.scene import SceneFiles, pose_of
 from sparsestreet.data.nuscenes.tables import Row, all_rows, rows_of_tokens
@@ -55,17 +56,25 @@ def _boxes(scene: SceneFiles, token: str, category: str, rows: Sequence[Row], of
         if by_sample.setdefault(place, row) is not row:
             raise row.fault("instance_token", "must have one box a sample", token)
     places = [place for place in sorted(by_sample) if place in of_samples]
-    sizes = np.array([by_sample[place].numbers("size", (3,)) for place in places]).reshape(-1, 3)
+    sizes = np.array([_size(by_sample[place]) for place in places]).reshape(-1, 3)
     poses = [pose_of(by_sample[place]).numpy() for place in places]
     return Boxes(
         name=token,
         class_name=category,
         frames=np.array([of_samples[place] for place in places], np.int64),
         poses=np.array(poses).reshape(-1, 4, 4),
-        sizes=sizes[:, _LENGTH_WIDTH_HEIGHT],
+        sizes=sizes,
         path=scene.tables / "sample_annotation.json",
         stamps=tuple(scene.sample_stamps[place] for place in places),
     )
+
+
+def _size(row: Row) -> Float64[np.ndarray, "3"]:
+    """Length, width, height, meters."""
+    size = row.numbers("size", (3,))
+    if not (size > 0).all():
+        raise row.fault("size", "must be a positive width, length and height", size.tolist())
+    return size[_LENGTH_WIDTH_HEIGHT]
 
 
 def _notes(scene: SceneFiles, objects: Mapping[str, Sequence[Row]], unseen: int) -> list[str]:

@@ -137,7 +137,7 @@ def _pieces(path: Path) -> Iterator[bytes]:
                     raise fault(path, f"no row ends within {_LONGEST_ROW} bytes", REMEDY)
     except OSError as error:
         raise _unreadable(path, error) from error
-    if rest.strip() not in (b"]", b"[]"):
+    if b"".join(rest.split()) not in (b"]", b"[]"):
         raise fault(path, f"the table is cut short: it ends with {rest[-20:]!r}", REMEDY)
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from sparsestreet.data.lazy import spread
-from sparsestreet.data.lidar import near_returns
+from sparsestreet.data.lidar import depth_image, near_returns
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Frame
@@ -39,6 +39,7 @@ class Coverage:
 def coverage(data: TrainingData) -> Coverage:
     """Returns the coverage of training views; "near" is the window of ``near_returns``. No pixels: all is uncovered."""
     static = None if data.image_points is None else data.image_points.static
+    sparse = None if data.log.sparse_points is None else data.log.sparse_points()
     pixels = by_lidar = by_images = 0
     for place in spread(len(data.frames), VIEWS):
         frame = data.frames[place]
@@ -46,8 +47,10 @@ def coverage(data: TrainingData) -> Coverage:
         returned = _near_lidar(frame) & solid
         pixels += int(solid.sum())
         by_lidar += int(returned.sum())
-        if static is not None:
-            by_images += int((_near_points(static, place, frame) & solid & ~returned).sum())
+        shown = torch.zeros_like(solid) if static is None else _near_points(static, place, frame)
+        if sparse is not None:  # of these nobody knows whether something hides them
+            shown = shown | near_returns(depth_image(sparse.positions, frame.camera))
+        by_images += int((shown & solid & ~returned).sum())
     return Coverage(by_lidar / max(pixels, 1), by_images / max(pixels, 1))
 
 

@@ -59,7 +59,7 @@ def test_a_width_scales_shifted_intrinsics(drive):
 
 
 def test_boxes_are_those_of_the_keyframes_at_their_stamps(recording):
-    (boxes,) = recording.boxes
+    (boxes,) = there(recording.boxes)
     assert (boxes.name, boxes.class_name, boxes.frames.tolist()) == (token("one"), "vehicle.car", [0, 1, 2, 3])
     assert boxes.stamps == tuple(sweep_end(PLAN, frame) for frame in range(4))
     assert np.array_equal(boxes.sizes, [PLAN.box_size] * 4)
@@ -120,9 +120,10 @@ def test_all_images_are_grouped_around_those_of_the_front_camera(sparse):
     assert {frame: sweep.stamp for frame, sweep in there(recording.sweeps).items()} == {
         frame: sweep_end(plan, frame) for frame in range(8)
     }
-    (boxes,) = recording.boxes
+    (boxes,) = there(recording.boxes)
     assert boxes.frames.tolist() == [0, 3, 6]
     assert boxes.stamps == tuple(sweep_end(plan, frame) for frame in (0, 3, 6))
+    assert recording.notes[1] == "boxes are annotated at 3 of 8 instants: the others have none of their own"
 
 
 def test_a_window_keeps_boxes_outside_of_it_apart(sparse):
@@ -130,7 +131,7 @@ def test_a_window_keeps_boxes_outside_of_it_apart(sparse):
         root=sparse.root, rate="all", first_frame=2, last_frame=5, cameras=["CAM_FRONT_LEFT"]
     ).recording()
     assert [(shot.frame, shot.camera) for shot in recording.shots] == [(0, 0), (1, 0), (2, 0), (3, 0)]
-    (boxes,) = recording.boxes
+    (boxes,) = there(recording.boxes)
     assert boxes.frames.tolist() == [-2, 1, 4]
 
 
@@ -156,7 +157,7 @@ def test_objects_that_no_return_hit_are_left_out(tmp_path):
     assert recording.boxes == []
     assert "1 objects that no lidar or radar return hit at any keyframe are left out" in recording.notes
     drive.edit("sample_annotation", lambda rows: rows[2].update(num_radar_pts=1))
-    (boxes,) = NuScenesReader(root=drive.root).recording().boxes
+    (boxes,) = there(NuScenesReader(root=drive.root).recording().boxes)
     assert len(boxes.frames) == 4
 
 

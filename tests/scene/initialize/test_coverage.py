@@ -10,7 +10,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.scene.initialize.coverage import VIEWS, Coverage, beyond_lidar, coverage
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints
-from sparsestreet.types import Frame, View
+from sparsestreet.types import Frame, SparsePoints, View
 from tests.scene.street import camera_at, street_log, triangulated
 
 WIDTH, HEIGHT = 25, 20
@@ -54,6 +54,24 @@ def test_without_sky_mask_every_pixel_counts():
 def test_without_lidar_points_from_images_count_alone():
     points = triangulated([[0.0] * 3], [(0, 0, 0.5, 0.5)])
     assert coverage(data_of(frame(), points=points)) == Coverage(lidar=0.0, images=4 / 500)
+
+
+def test_points_of_the_log_count_where_they_are_seen():
+    """One lies behind the camera; the others in the middle of the image and in its top left corner."""
+    view = frame(sky_rows=1)
+    (fx, _, cx), (_, fy, cy), _ = view.camera.intrinsics.tolist()
+    at = torch.tensor([[0.0, 0, 4], [4 * (0.5 - cx) / fx, 4 * (0.5 - cy) / fy, 4], [0, 0, -4]])
+    world_from_camera = torch.linalg.inv(view.camera.camera_from_world)
+    sparse = SparsePoints(at @ world_from_camera[:3, :3].T + world_from_camera[:3, 3], torch.zeros(3, 3))
+    data = replace(data_of(view), log=replace(street_log(), sparse_points=lambda: sparse))
+    # Windows of 9, and of 4 without the sky's 2.
+    assert coverage(data) == Coverage(lidar=0.0, images=11 / 475)
+    # The lidar's window of 3 x 3 overlaps that of the middle in 3 pixels.
+    returned = replace(data, frames=Frames.of([replace(view, depth=frame([(10, 10)]).depth)]))
+    middle = (int(cx), int(cy))
+    shared = max(0, 3 - abs(middle[0] - 10)) * max(0, 3 - abs(middle[1] - 10))
+    assert coverage(returned) == Coverage(lidar=9 / 475, images=(11 - shared) / 475)
+    assert shared > 0
 
 
 @pytest.mark.parametrize("frames", [[frame()], [frame([(1, 1)], sky_rows=HEIGHT)], []], ids=["bare", "sky", "no view"])

@@ -13,7 +13,7 @@ from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
-from sparsestreet.types import Sweep
+from sparsestreet.types import SparsePoints, Sweep
 from tests.scene.street import frame_at, rigid_settings, street_log, training_data, triangulated
 from tests.typed import there
 
@@ -89,6 +89,32 @@ def test_limits_are_of_the_points_that_were_chosen(order: Order):
     points = replace(ten_points(), pixel_sizes=0.01 * np.arange(1, 11, dtype=np.float32))
     seeds = drawn(ImagePoints(order=order, smallest_pixels=2.0), 10, data_with(points))
     torch.testing.assert_close(seeds.smallest, 0.02 * (1 + seeds.points.positions[:, 0]))
+
+
+def test_points_of_the_log_are_points_from_images():
+    """Cameras look along z from x = 0, 1, 2, ...; the points lie 10 m ahead of them."""
+    positions = torch.tensor([[0.0, 0, 10], [2.0, 0, 20]])
+    sparse = SparsePoints(positions, torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]))
+    alone = training_data(replace(street_log(), sparse_points=lambda: sparse))
+    seeds = drawn(ImagePoints(smallest_pixels=2.0, largest_pixels=5.0), 9, alone)
+    assert torch.equal(seeds.points.positions, positions)
+    assert torch.equal(seeds.points.colors, sparse.colors)
+    cameras = [view.camera for view in alone.views]
+    sizes = torch.tensor(
+        [
+            min(float((camera.position - at).norm()) / float(camera.intrinsics[0, 0]) for camera in cameras)
+            for at in positions
+        ]
+    )
+    torch.testing.assert_close(seeds.smallest, 2 * sizes)
+    torch.testing.assert_close(seeds.largest, 5 * sizes)
+    both = replace(alone, image_points=StreetPoints(ten_points(), {}))
+    found = drawn(ImagePoints(), 99, both).points.positions
+    assert sorted(found.tolist()) == sorted([*positions.tolist(), *([float(x), 0, 0] for x in range(10))])
+    choices = {tuple(drawn(ImagePoints(), 3, both, seed).points.positions[:, 2].tolist()) for seed in range(12)}
+    assert len({len(choice) for choice in choices}) == 1
+    assert len(choices) > 2
+    assert len(drawn(ImagePoints(voxel=100.0), 9, alone)) == 1
 
 
 def test_a_run_without_points_from_images_gives_none():

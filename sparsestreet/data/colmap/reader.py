@@ -1,0 +1,62 @@
+"""From a sparse model and its images to a recording."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from sparsestreet.data.colmap.model import SparseModel, find_model, read_images, read_points
+from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images
+from sparsestreet.data.problems import LogError, Problem, attempt
+from sparsestreet.data.recording import RecordedReader, Recording
+
+_HELD_OUT = "points of the model were made of all images, of those that are held out too"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapReader(RecordedReader):
+    """A folder with ``images`` and a sparse model in ``sparse/0``, as COLMAP and 3DGS use it.
+
+    The world is the model's. There are no returns and no boxes.
+    """
+
+    model: str | None = None
+    """The model's folder below the root; None: the root, sparse/0, sparse or colmap/sparse/0."""
+    images: str = "images"
+    """The folder of the images below the root."""
+    scale: float = 1.0
+    """Meters to a unit of the model."""
+    pinhole_fov: float | None = None
+    """Degrees that the pinhole of a fisheye sees from left to right; None: its resolution is that of the center."""
+
+    def recording(self) -> Recording:
+        model, images = self._read()
+        if problems := check_images(images, model.images, masks=self.masks, decode=False):
+            raise LogError(problems)
+        return recording_of(
+            self,
+            images,
+            scale=self.scale,
+            pinhole_fov=self.pinhole_fov,
+            sparse_points=None if model.points is None else partial(read_points, model.points),
+            notes=["the model has no points"] if model.points is None else [_HELD_OUT],
+        )
+
+    def check_contents(self) -> list[Problem]:
+        model, images = self._read()
+        problems = check_images(images, model.images, masks=self.masks, decode=True)
+        if model.points is not None:
+            attempt(problems, partial(read_points, model.points))
+        return problems
+
+    def files(self) -> LogFiles:
+        model, images = self._read()
+        return LogFiles([model.cameras, model.images], [*(image.path for image in images.images), *model.files[2:]])
+
+    def _read(self) -> tuple[SparseModel, PosedImages]:
+        model = find_model(self.folder, self.model)
+        found = read_images(model, self.folder / Path(self.images))
+        images = sort_images(
+            found, model.images, cameras=self.cameras, first_frame=self.first_frame, last_frame=self.last_frame
+        )
+        return model, images

@@ -1,0 +1,134 @@
+"""The content of ``transforms.json``: images, poses and lenses.
+
+What stands at the top holds for all frames; a frame may have its own. Camera axes are OpenGL's (x right, y up, z
+backwards). Pixel centers lie at +0.5, as COLMAP's, from which most such files are made. ``applied_transform`` and
+``applied_scale`` have been applied to poses and points alike when the file was written, so nothing is done with them.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from sparsestreet.data.images import image_size
+from sparsestreet.data.json_tree import JsonValue, read_json
+from sparsestreet.data.posed_images import PosedImage
+from sparsestreet.data.problems import LogError, attempt
+from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens
+
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+_LARGEST_IMAGE = 100_000
+"""Pixels on a side."""
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """What a file says of its images."""
+
+    images: tuple[PosedImage, ...]
+    points: Path | None
+    """The .ply with the sparse points."""
+    has_times: bool
+    has_depth: bool
+
+
+def read_transforms(path: Path) -> Transforms:
+    """Raises LogError with every frame at fault."""
+    top = read_json(path)
+    frames = top["frames"].items()
+    if not frames:
+        raise top["frames"].fault("is empty", "write at least one frame")
+    problems = []
+    images = [attempt(problems, lambda frame=frame: _image(top, frame)) for frame in frames]
+    if problems:
+        raise LogError(problems)
+    found = [image for image in images if image is not None]
+    timed = sum(image.time is not None for image in found)
+    if 0 < timed < len(found):
+        raise top["frames"].fault(
+            f"has a time in {timed} of {len(found)} frames", "write it for all of them, or for none"
+        )
+    points = top.get("ply_file_path")
+    return Transforms(
+        tuple(found),
+        None if points is None else points.path(),
+        timed > 0,
+        any("depth_file_path" in frame for frame in frames),
+    )
+
+
+def _image(top: JsonValue, frame: JsonValue) -> PosedImage:
+    path = frame["file_path"].path()
+    if not path.suffix and not path.is_file():
+        path = path.with_name(path.name + ".png")  # Blender's files leave it out
+    lens, size = _lens(top, frame, path)
+    mask, time = frame.get("mask_path"), frame.get("time")
+    return PosedImage(
+        path,
+        PurePosixPath(path.relative_to(top.file.parent).as_posix()),
+        lens,
+        size,
+        _world_from_camera(frame["transform_matrix"]),
+        None if mask is None else mask.path(),
+        None if time is None else time.number(),
+    )
+
+
+def _world_from_camera(value: JsonValue) -> Float64[Tensor, "4 4"]:
+    """From OpenGL's axes to OpenCV's."""
+    rows = len(value.items())
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:rows] = value.matrix(rows if rows in (3, 4) else 4, 4)
+    return pose @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def _lens(top: JsonValue, frame: JsonValue, image: Path) -> tuple[Lens, tuple[int, int]]:
+    def value(key: str) -> JsonValue | None:
+        return frame.get(key) or top.get(key)
+
+    def number(key: str, otherwise: float = 0.0) -> float:
+        found = value(key)
+        return otherwise if found is None else found.number()
+
+    size = _size(value("w"), value("h"), image)
+    fx = _focal(top, frame, "fl_x", "camera_angle_x", size[0], None)
+    fy = _focal(top, frame, "fl_y", "camera_angle_y", size[1], fx)
+    focal = {"fx": fx, "fy": fy, "cx": number("cx", size[0] / 2), "cy": number("cy", size[1] / 2)}
+    model = value("camera_model")
+    name = "OPENCV" if model is None else model.text()
+    if name in _FISHEYE:
+        return Fisheye(**focal, **{key: number(key) for key in ("k1", "k2", "k3", "k4")}), size
+    if model is not None and name not in _PERSPECTIVE:
+        remedy = f"undistort the images first, or write one of {', '.join(_PERSPECTIVE + _FISHEYE)}"
+        raise model.fault(f"is {name[:40]!r}, a lens that is not read", remedy)
+    if number("k4"):
+        raise (value("k4") or frame).fault(
+            "is not 0, but this model has no k4", "write camera_model OPENCV_FISHEYE, or 0"
+        )
+    return BrownConrady(**focal, **{key: number(key) for key in ("k1", "k2", "p1", "p2", "k3")}), size
+
+
+def _size(width: JsonValue | None, height: JsonValue | None, image: Path) -> tuple[int, int]:
+    if width is None or height is None:
+        return image_size(image)
+    return width.whole(1, _LARGEST_IMAGE), height.whole(1, _LARGEST_IMAGE)
+
+
+def _focal(top: JsonValue, frame: JsonValue, key: str, angle: str, pixels: int, otherwise: float | None) -> float:
+    """Pixels: as such, or from the field of view in radians."""
+    focal = frame.get(key) or top.get(key)
+    if focal is not None:
+        return focal.number(positive=True)
+    field = frame.get(angle) or top.get(angle)
+    if field is None:
+        if otherwise is not None:
+            return otherwise
+        raise frame.fault(f"has no {key!r}, nor has the top of the file", f"write {key} or {angle}")
+    radians = field.number(positive=True)
+    if radians >= math.pi:
+        raise field.fault(f"is {radians:g} radians, a pinhole sees less than pi", "write radians")
+    return pixels / 2 / math.tan(radians / 2)

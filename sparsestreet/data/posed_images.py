@@ -1,0 +1,251 @@
+"""Images with poses and lenses and nothing else, as structure from motion leaves them: cameras and instants from names.
+
+Images of one folder with the same lens are a camera. Images of equal names in different folders are an instant, which
+is how COLMAP wants rigs to be written; images of one folder alone are an instant each. The order is that of the names,
+with numbers in them counted, or of times where the data set gives them.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+
+import torch
+from jaxtyping import Bool, Float, Float64, UInt8
+from torch import Tensor
+
+from sparsestreet.data.extent import check_extent
+from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.images import check_camera_images, image_size, read_image, read_mask
+from sparsestreet.data.poses import check_rigid
+from sparsestreet.data.problems import Problem, attempt, fault, missing_files
+from sparsestreet.data.recording import RecordedReader, Recording, Shot
+from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
+from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.geometry.lenses import Lens
+
+SparsePointsReader = Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]]
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """One image, its pose and the lens that recorded it."""
+
+    path: Path
+    name: PurePosixPath
+    """As the data set names it: folders tell cameras, stems instants."""
+    lens: Lens
+    size: tuple[int, int]
+    """(width, height) that the lens is calibrated for."""
+    world_from_camera: Float64[Tensor, "4 4"]
+    """OpenCV's axes, the data set's own world and unit."""
+    valid: Path | None = None
+    """A mask that is black where the image is not to be used."""
+    time: float | None = None
+    """When it was taken, in whatever unit."""
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """The images of a data set that are read, sorted into cameras and instants."""
+
+    cameras: Mapping[str, tuple[Lens, tuple[int, int]]]
+    """Name -> lens and size, those that are read."""
+    instants: Sequence[Mapping[str, PosedImage]]
+    """Camera -> image, for each instant of the window."""
+
+    @property
+    def images(self) -> list[PosedImage]:
+        return [image for instant in self.instants for image in instant.values()]
+
+
+def sort_images(
+    images: Sequence[PosedImage],
+    table: Path,
+    *,
+    cameras: Sequence[str] | None,
+    first_frame: int,
+    last_frame: int,
+) -> PosedImages:
+    """Cameras and instants of some images. ``table`` is the file that lists them.
+
+    Raises LogError for an instant with two images of a camera, ValueError for cameras or frames that are not there.
+    """
+    names = _camera_names(images)
+    found = sorted(set(names.values()), key=natural)
+    chosen = chosen_cameras(found, cameras, table.parent)
+    by_instant: dict[object, dict[str, PosedImage]] = {}
+    for image in images:
+        name = names[_kind(image)]
+        if name not in chosen:
+            continue
+        instant = by_instant.setdefault(_instant(image), {})
+        if name in instant:
+            message = f"{instant[name].name} and {image.name} are of one camera and one instant"
+            raise fault(table, message, "name images of a camera differently, or give them different times")
+        instant[name] = image
+    ordered = [by_instant[key] for key in sorted(by_instant, key=natural)]
+    window = frame_window(len(ordered), first_frame, last_frame, table.parent)
+    kinds = {name: (lens, size) for (_, lens, size), name in names.items()}
+    return PosedImages({name: kinds[name] for name in chosen}, [ordered[place] for place in window])
+
+
+def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, decode: bool) -> list[Problem]:
+    """What is wrong with lenses, poses and files of images and masks; all pixels are looked at if ``decode``.
+
+    Args:
+        images: those that are read.
+        table: the file that lists them.
+        masks: folder of the user's own, if there is one.
+        decode: whether pixels are decoded.
+    """
+    problems = missing_files(path for image in images.images for path in (image.path, image.valid) if path)
+    placed = []
+    for name, (lens, size) in images.cameras.items():
+        own = [instant[name] for instant in images.instants if name in instant]
+        attempt(problems, partial(check_lens_camera, table, lens, size))
+        valid = [image.valid for image in own if image.valid]
+        problems += check_camera_images(name, [image.path for image in own], valid, decode=decode)
+        problems += _check_sizes(own, size, name)
+        for image in own:
+            attempt(problems, partial(check_rigid, image.world_from_camera, table, f"the pose of {image.name}"))
+            placed.append((table, image.world_from_camera[:3, 3]))
+    if masks is not None:
+        stems = ((name, image.path.stem) for instant in images.instants for name, image in instant.items())
+        problems += GivenMasks(Path(masks)).check(stems)
+    return problems or check_extent(placed)
+
+
+def recording_of(
+    reader: RecordedReader,
+    images: PosedImages,
+    *,
+    scale: float,
+    pinhole_fov: float | None,
+    sparse_points: SparsePointsReader | None,
+    notes: Sequence[str],
+) -> Recording:
+    """The recording of sound images, ``scale`` meters to a unit. Raises ValueError for a scale that is not positive."""
+    if not 0 < scale < math.inf:
+        raise ValueError(f"scale must be positive meters to a unit, got {scale:g}: 1 leaves lengths as they are")
+    rig = [
+        lens_camera(
+            name,
+            index,
+            lens=lens,
+            recorded_size=size,
+            width=reader.width,
+            min_lens_shift=reader.min_lens_shift,
+            pinhole_fov=pinhole_fov,
+        )
+        for index, (name, (lens, size)) in enumerate(images.cameras.items())
+    ]
+    shots = [
+        Shot(frame, camera.index, _scaled(image.world_from_camera, scale), image, image.path.stem)
+        for frame, instant in enumerate(images.instants)
+        for camera in rig
+        if (image := instant.get(camera.name)) is not None
+    ]
+    given = None if reader.masks is None else GivenMasks(Path(reader.masks))
+    kinds = given.kinds if given else frozenset[str]()
+    has_own = any(image.valid for image in images.images)
+    return Recording(
+        name=reader.folder.resolve().name,
+        rig=rig,
+        shots=shots,
+        read_image=partial(_image, rig),
+        read_masks=partial(_masks, rig, given),
+        mask_kinds=kinds | {"ego"} if has_own else kinds,
+        sparse_points=None if sparse_points is None else partial(_scaled_points, sparse_points, scale),
+        notes=(_note_of_scale(shots, scale), *notes),
+    )
+
+
+def natural(key: object) -> list[tuple[int, float, str]]:
+    """Orders names as people count: 2 before 10. A time is a number.
+
+    >>> sorted(["b10", "b9", "a"], key=natural)
+    ['a', 'b9', 'b10']
+    """
+    if isinstance(key, float):
+        return [(0, key, "")]
+    parts = re.split(r"(\d+)", str(key))
+    return [(0, float(part), part) if place % 2 else (1, 0.0, part) for place, part in enumerate(parts)]
+
+
+def _kind(image: PosedImage) -> tuple[str, Lens, tuple[int, int]]:
+    return image.name.parent.as_posix(), image.lens, image.size
+
+
+def _instant(image: PosedImage) -> object:
+    return image.name.stem if image.time is None else image.time
+
+
+def _camera_names(images: Sequence[PosedImage]) -> dict[tuple[str, Lens, tuple[int, int]], str]:
+    """Kind of image -> camera: the folder's name, with a number where a folder has several lenses."""
+    kinds = dict.fromkeys(_kind(image) for image in images)
+    folders: dict[str, list[tuple[str, Lens, tuple[int, int]]]] = {}
+    for kind in kinds:
+        folders.setdefault(kind[0], []).append(kind)
+    named = {}
+    for folder, own in folders.items():
+        base = "camera" if folder == "." else folder
+        named |= {kind: base if len(own) == 1 else f"{base}_{number}" for number, kind in enumerate(own)}
+    return named
+
+
+def _check_sizes(images: Sequence[PosedImage], size: tuple[int, int], camera: str) -> list[Problem]:
+    """Whether the images have the size that their camera is calibrated for; the first that has not is named."""
+    for image in images:
+        found = attempt([], partial(image_size, image.path)) if image.path.is_file() else None
+        if found is not None and found != size:
+            message = "the image is {}x{}, camera {} is calibrated for {}x{}".format(*found, camera, *size)
+            return [Problem(image.path, message, "read the images that the calibration was made with")]
+    return []
+
+
+def _image(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+    camera = rig[shot.camera]
+    return read_image(_posed(shot).path, camera.size, camera.undistortion)
+
+
+def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot) -> dict[str, Bool[Tensor, "h w"]]:
+    """Those that the data set and the user have; what either excludes is excluded."""
+    camera, image = rig[shot.camera], _posed(shot)
+    masks: dict[str, Bool[Tensor, "h w"]] = {}
+    if given is not None:
+        masks = given.read(
+            camera.name, shot.stem, recorded_size=image.size, size=camera.size, undistortion=camera.undistortion
+        )
+    if image.valid is not None:
+        # The nearest pixel: between black and white nothing is valid in part.
+        excluded = ~read_mask(image.valid, camera.size, sky=True, undistortion=camera.undistortion)
+        masks["ego"] = masks["ego"] | excluded if "ego" in masks else excluded
+    return masks
+
+
+def _posed(shot: Shot) -> PosedImage:
+    assert isinstance(shot.key, PosedImage)
+    return shot.key
+
+
+def _scaled(pose: Float64[Tensor, "4 4"], scale: float) -> Float64[Tensor, "4 4"]:
+    scaled = pose.clone()
+    scaled[:3, 3] *= scale
+    return scaled
+
+
+def _scaled_points(read: SparsePointsReader, scale: float) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    positions, colors = read()
+    return scale * positions, colors
+
+
+def _note_of_scale(shots: Sequence[Shot], scale: float) -> str:
+    first = [shot.world_from_camera[:3, 3] for shot in shots if shot.camera == shots[0].camera]
+    length = float((torch.stack(first[1:]) - torch.stack(first[:-1])).norm(dim=-1).sum()) if len(first) > 1 else 0.0
+    return (
+        f"the unit of length is not known: one unit is read as {scale:g} m, so the first camera goes {length:.3g} m; "
+        "data.log.scale says otherwise"
+    )
