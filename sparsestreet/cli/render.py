@@ -76,6 +76,7 @@ def _render(request: RenderRequest) -> None:
     from sparsestreet.cli.progress import shown
     from sparsestreet.cli.scene import open_scene
     from sparsestreet.export.video import check_destination, path_pictures, write_pictures
+    from sparsestreet.geometry.trajectories import frame_periods
     from sparsestreet.scene.views import FILE_NAME, read_views
 
     started = time.perf_counter()
@@ -89,7 +90,7 @@ def _render(request: RenderRequest) -> None:
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
     fps = request.fps or log_fps
     speed = f"the log's speed, {log_fps:g} of its frames a second"
-    path = _path(request, views.all, step=log_fps / fps / max(stored.num_frames - 1, 1))
+    path = _path(request, views.all, step=log_fps / fps / frame_periods(views.all))
     pictures = shown(path_pictures(stored, path), len(path), "frames")
     count = write_pictures(request.out, pictures, fps=fps, quality=request.quality)
     cameras, seconds = ", ".join(str(view.camera_index) for view in path[0]), time.perf_counter() - started

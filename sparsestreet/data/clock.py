@@ -1,7 +1,9 @@
 """When the frames of a log were recorded: normalized time, and seconds and stamps where the log has a clock."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path
 
 from sparsestreet.data.problems import fault
@@ -15,11 +17,17 @@ _REMEDY = "write the seconds of each frame on a line of its own, or remove the f
 
 @dataclass(frozen=True)
 class LogClock:
-    """The times of a log's frames. Raises ValueError for stamps of another number, or that do not increase."""
+    """The times of what was recorded. Raises ValueError for stamps of another number, or that do not increase.
+
+    Normalized time runs from the least stamp of anything in the window to the largest. Without a clock it is
+    frame / (frames - 1). Evenly spaced stamps that all images of a frame share give the same.
+    """
 
     num_frames: int
     stamps: tuple[int, ...] | None = None
     """Of each frame, nanoseconds on the log's own clock; None: the log has no clock."""
+    others: Sequence[int] = ()
+    """Those of images, sweeps and boxes of the window that have stamps of their own."""
 
     def __post_init__(self) -> None:
         if self.stamps is not None and (problem := _disorder(self.stamps, self.num_frames)):
@@ -27,8 +35,26 @@ class LogClock:
 
     def view(self, camera: Camera, frame_index: int, camera_index: int, stamp: int | None = None) -> View:
         """A recorded view; ``stamp`` is that of the image, where it is not its frame's."""
-        time = frame_index / max(self.num_frames - 1, 1)
+        time = self.time(frame_index, stamp)
         return View(camera, time, frame_index, camera_index, *self.moment(frame_index, stamp))
+
+    def time(self, frame_index: int, stamp: int | None = None) -> float:
+        """Normalized time of a frame, or of what was recorded with it at a stamp of its own; 0 in a log of one instant.
+
+        Raises ValueError for a stamp outside of those that the clock was made with.
+        """
+        if self.stamps is None:
+            return frame_index / max(self.num_frames - 1, 1)
+        first, last = self._reach
+        stamp = self.stamps[frame_index] if stamp is None else stamp
+        if not first <= stamp <= last:
+            raise ValueError(f"stamp {stamp} lies outside of the clock's {first} to {last}: name it in LogClock.others")
+        return (stamp - first) / max(last - first, 1)
+
+    @cached_property
+    def _reach(self) -> tuple[int, int]:
+        every = (*(self.stamps or ()), *self.others)
+        return min(every), max(every)
 
     def moment(self, frame_index: int, stamp: int | None = None) -> tuple[float | None, int | None]:
         """Seconds since the first frame, and stamp, of a frame or of what was recorded with it.

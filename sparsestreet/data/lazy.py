@@ -38,6 +38,10 @@ class LazySequence(Sequence):
     def __getitem__(self, index: int | slice) -> Any:
         return self._of(self.keys[index]) if isinstance(index, slice) else self.load(self.keys[index])
 
+    def __iter__(self) -> Iterator[Any]:
+        # Not the default of a sequence, which takes an IndexError of ``load`` for the end.
+        return map(self.load, self.keys)
+
     def where(self, keep: Callable[[Any], bool]) -> Any:
         """The items whose keys are wanted, in their order; none is loaded."""
         return self._of(filter(keep, self.keys))

@@ -26,28 +26,33 @@ def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "d
 
 
 def color_points(
-    points: Float[Tensor, "n 3"], views: Sequence[tuple[Camera, UInt8[Tensor, "_ _ 3"]]]
+    points: Float[Tensor, "n 3"],
+    views: Sequence[tuple[Camera, UInt8[Tensor, "_ _ 3"]]],
+    places: Sequence[Float[Tensor, "n 3"]] | None = None,
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
     """RGB in [0, 1] from the pixel each point falls into, and which points any camera sees; the others are gray.
 
-    Where several cameras see a point the first one counts. As in DriveStudio nothing tests whether the camera's view
+    ``places``: where the points are in each of the views; None: in all of them where they were measured. Where several
+    cameras see a point the first one counts. As in DriveStudio nothing tests whether the camera's view
     of the point is blocked: lidar and cameras sit close together.
     """
     colors = torch.full((points.shape[0], 3), 0.5)
     colored = torch.zeros(points.shape[0], dtype=torch.bool)
-    for camera, image in views:
-        rows, pixels, _ = visible_pixels(camera, points)
+    for (camera, image), seen in zip(views, places or [points] * len(views), strict=True):
+        rows, pixels, _ = visible_pixels(camera, seen)
         new = ~colored[rows]
         colors[rows[new]] = image.reshape(-1, 3)[pixels[new]].float() / 255
         colored[rows] = True
     return colors, colored
 
 
-def seen_points(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+def seen_points(
+    points: Float[Tensor, "n 3"], cameras: Sequence[Camera], places: Sequence[Float[Tensor, "n 3"]] | None = None
+) -> Bool[Tensor, " n"]:
     """Which points any of the cameras sees: those that ``color_points`` colors."""
     seen = torch.zeros(points.shape[0], dtype=torch.bool)
-    for camera in cameras:
-        seen[visible_pixels(camera, points)[0]] = True
+    for camera, place in zip(cameras, places or [points] * len(cameras), strict=True):
+        seen[visible_pixels(camera, place)[0]] = True
     return seen
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.types import Frame, SparsePoints, Track, View
 
 _QUANTILES = (0.02, 0.98)
@@ -86,6 +87,11 @@ class DrivingLog:
             return None
         first, last = min(self.stamps), max(self.stamps)
         return 1e9 * (last - first) / (self.stamps[last] - self.stamps[first])
+
+    @cached_property
+    def frame_periods(self) -> float:
+        """How many frames' worth normalized time 0 to 1 is; num_frames - 1 if frames are evenly spaced."""
+        return frame_periods(self.views)
 
     def _first_views(self) -> dict[int, tuple[int, View]]:
         """Frame index -> the lowest stamp and the view with it; empty where some view has none."""

@@ -8,6 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,12 @@ from sparsestreet.data.clock import LogClock
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
-from sparsestreet.data.problems import LogError, Problem
+from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.scene_folder import SceneFolder
-from sparsestreet.data.tracks import checked_track, track_in_window
-from sparsestreet.types import Frame, Shutter, SparsePoints, View
+from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
+from sparsestreet.types import Frame, Shutter, SparsePoints, Track, View
 
 MASK_KINDS = ("sky", "human", "vehicle", "ego")
 
@@ -166,43 +167,71 @@ def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[P
     """
     num_frames = 1 + max(shot.frame for shot in recording.shots)
     origin = recording.shots[0].world_from_camera[:3, 3]
-    clock = LogClock(num_frames, recording.frame_stamps)
+    boxes = [_checked(each) for each in recording.boxes or ()]
+    clock = _clock(recording, num_frames)
+    views = [_view(shot, recording.rig, origin, clock) for shot in recording.shots]
+    found = [track_in_window(track, range(num_frames), origin) for track in boxes]
+    tracks = timed_tracks(
+        [track for track in found if track is not None], clock, views, _box_stamps(recording, num_frames)
+    )
     shots = {(shot.frame, shot.camera): shot for shot in recording.shots}
     folder = SceneFolder(
-        [_view(shot, recording.rig, origin, clock) for shot in recording.shots],
+        views,
         partial(_frame, recording, shots),
         None if recording.sweeps is None else partial(_points, recording.sweeps, origin),
         clock=clock,
         cache_bytes=cache_bytes,
         check=check,
-    )
-    tracks = (
-        track_in_window(
-            checked_track(
-                boxes.name,
-                boxes.class_name,
-                boxes.frames,
-                boxes.poses,
-                boxes.sizes,
-                path=boxes.path,
-                num_frames=num_frames,
-            ),
-            range(num_frames),
-            origin,
-        )
-        for boxes in recording.boxes or ()
+        tracks=tracks,
+        sweep_stamps=_sweep_stamps(recording, num_frames),
     )
     return DrivingLog(
         name=recording.name,
         frames=folder.frames,
         sweeps=folder.sweeps,
-        tracks=tuple(track for track in tracks if track is not None),
+        tracks=tracks,
         num_frames=num_frames,
         num_cameras=len(recording.rig),
         dataset_from_world=dataset_from_world(origin),
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
     )
+
+
+def _clock(recording: Recording, num_frames: int) -> LogClock:
+    """Of frames, images, sweeps and boxes of the window."""
+    if recording.frame_stamps is None:
+        return LogClock(num_frames)
+    others = [shot.stamp for shot in recording.shots if shot.stamp is not None]
+    others += _sweep_stamps(recording, num_frames).values()
+    others += chain.from_iterable(_box_stamps(recording, num_frames).values())
+    return LogClock(num_frames, recording.frame_stamps, others)
+
+
+def _sweep_stamps(recording: Recording, num_frames: int) -> dict[int, int]:
+    sweeps = recording.sweeps or {}
+    return {index: sweep.stamp for index, sweep in sweeps.items() if sweep.stamp is not None and index < num_frames}
+
+
+def _box_stamps(recording: Recording, num_frames: int) -> dict[str, list[int]]:
+    """Name of an object -> stamps of its boxes in the window, if they have any of their own."""
+    return {
+        each.name: [stamp for frame, stamp in zip(each.frames, each.stamps, strict=True) if 0 <= frame < num_frames]
+        for each in recording.boxes or ()
+        if each.stamps is not None
+    }
+
+
+def _checked(boxes: Boxes) -> Track:
+    """The object in all of its frames. Raises LogError for boxes that cannot be."""
+    track = checked_track(
+        boxes.name, boxes.class_name, boxes.frames, boxes.poses, boxes.sizes, path=boxes.path, num_frames=None
+    )
+    stamps = boxes.stamps
+    if stamps is not None and (len(stamps) != len(boxes.frames) or any(a >= b for a, b in pairwise(stamps))):
+        message = f"object {boxes.name} has {len(boxes.frames)} boxes, and {len(stamps)} stamps or some out of order"
+        raise fault(boxes.path, message, "write a stamp for each box, in the order of time")
+    return track
 
 
 def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:

@@ -1,24 +1,29 @@
 """A log on disk: its views are known at once, its images and points are read when a frame or a sweep is asked for."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.problems import LogError, Problem
-from sparsestreet.types import Frame, Sweep, View
+from sparsestreet.geometry.boxes import CarriedPoints
+from sparsestreet.types import Frame, Sweep, Track, View
 
 T = TypeVar("T")
 
 
 class SceneFolder:
-    """Frames with the lidar depth of their instant, and sweeps in the colors of its images, from what decodes files."""
+    """Frames with the lidar depth of their instant, and sweeps in the colors of its images, from what decodes files.
+
+    An image may be taken at another time than the sweep. Depth and colors then come from points that the objects'
+    boxes carry from one time to the other.
+    """
 
     def __init__(
         self,
@@ -29,25 +34,31 @@ class SceneFolder:
         clock: LogClock,
         cache_bytes: int,
         check: Callable[[], list[Problem]],
+        tracks: Sequence[Track] = (),
+        sweep_stamps: Mapping[int, int] | None = None,
     ) -> None:
         """
         Args:
             views: of the log, ordered by (frame_index, camera_index), in its re-centered world.
             read_frame: decodes the image and the masks of a view; depth is added here.
             read_points: lidar points of a frame index in the log's world; None: the log has no lidar.
-            clock: whose stamps are those of the sweeps.
+            clock: of the log.
             cache_bytes: of decoded frames that are kept in memory.
             check: finds everything that is wrong with the folder; it is asked once something is.
+            tracks: objects that carry points, with the times of their boxes.
+            sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
         """
         self._views: dict[int, list[View]] = {}
         for view in views:
             self._views.setdefault(view.indices[0], []).append(view)
         self._read_pixels = read_frame
         self._clock = clock
+        self._tracks = tuple(tracks)
+        self._sweep_stamps = sweep_stamps or {}
         self._check = check
         self._frames = RecentlyUsed(self._read_frame, _count_bytes, cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
-        self._points = None if read_points is None else RecentlyUsed(read_points, lambda points: 1, 1)
+        self._points = None if read_points is None else RecentlyUsed(self._carried(read_points), lambda points: 1, 1)
 
     @property
     def frames(self) -> Frames:
@@ -79,19 +90,34 @@ class SceneFolder:
         index, camera_index = key
         (view,) = (view for view in self._views[index] if view.camera_index == camera_index)
         frame = self._read_pixels(view)
-        return frame if self._points is None else replace(frame, depth=depth_image(self._points(index), view.camera))
+        if self._points is None:
+            return frame
+        return replace(frame, depth=depth_image(self._points(index).at(view.time), view.camera))
 
-    def _sweep(self, index: int, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Sweep:
+    def _carried(self, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Callable[[int], CarriedPoints]:
+        def carried(index: int) -> CarriedPoints:
+            time = self._clock.time(index, self._sweep_stamps.get(index))
+            return CarriedPoints(read_points(index), time, index, self._tracks)
+
+        return carried
+
+    def _sweep(self, index: int, read_points: Callable[[int], CarriedPoints]) -> Sweep:
         frames = [self._frames(view.indices) for view in self._views[index]]
         points = read_points(index)
-        colors, colored = color_points(points, [(frame.camera, frame.image) for frame in frames])
-        return Sweep(index, points, colors, colored, *self._clock.moment(index))
+        places = [points.at(frame.time) for frame in frames]
+        colors, colored = color_points(points.points, [(frame.camera, frame.image) for frame in frames], places)
+        return self._timed(points, colors, colored)
 
-    def _gray_sweep(self, index: int, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Sweep:
+    def _gray_sweep(self, index: int, read_points: Callable[[int], CarriedPoints]) -> Sweep:
         """The same without colors, for which no image need be decoded."""
-        points = read_points(index)
-        seen = seen_points(points, [view.camera for view in self._views[index]])
-        return Sweep(index, points, torch.full_like(points, 0.5), seen, *self._clock.moment(index))
+        views, points = self._views[index], read_points(index)
+        places = [points.at(view.time) for view in views]
+        seen = seen_points(points.points, [view.camera for view in views], places)
+        return self._timed(points, torch.full_like(points.points, 0.5), seen)
+
+    def _timed(self, points: CarriedPoints, colors: Float[Tensor, "n 3"], colored: Bool[Tensor, " n"]) -> Sweep:
+        moment = self._clock.moment(points.frame, self._sweep_stamps.get(points.frame))
+        return Sweep(points.frame, points.time, points.points, colors, colored, *moment)
 
 
 def _count_bytes(frame: Frame) -> int:

@@ -1,5 +1,6 @@
-"""Tracks of annotated objects: checked, and cut to the frames that are read."""
+"""Tracks of annotated objects: checked, cut to the frames that are read, and timed by the log's clock."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.data.clock import LogClock
 from sparsestreet.data.poses import check_rigid, recentered
 from sparsestreet.data.problems import fault
-from sparsestreet.types import Track
+from sparsestreet.types import Track, View
 
 
 def checked_track(
@@ -21,7 +23,7 @@ def checked_track(
     sizes: np.ndarray,
     *,
     path: Path,
-    num_frames: int,
+    num_frames: int | None,
 ) -> Track:
     """An object whose size is the mean over its boxes. Raises LogError, naming the file, for boxes that cannot be.
 
@@ -32,7 +34,7 @@ def checked_track(
         poses: world_from_object of each, f x 4 x 4: x along the length, y left, z up, origin at the center of the box.
         sizes: length, width, height of each, f x 3, meters.
         path: the file that the boxes are from.
-        num_frames: of the log.
+        num_frames: of the log; None: frames may lie outside of it.
     """
     what, count = f"object {name}", len(frames)
     if count == 0:
@@ -69,10 +71,40 @@ def track_in_window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -
     return replace(track, frames=track.frames[inside] - frames.start, world_from_object=poses, body=body)
 
 
-def _check_frames(frames: np.ndarray, path: Path, what: str, num_frames: int) -> None:
+def timed_tracks(
+    tracks: Sequence[Track],
+    clock: LogClock,
+    views: Sequence[View],
+    stamps: Mapping[str, Sequence[int]] | None = None,
+) -> tuple[Track, ...]:
+    """Tracks of the window with normalized times; as they are where the log has no clock.
+
+    Args:
+        tracks: frames counted from the start of the window.
+        clock: of the log; it knows all stamps.
+        views: of the log. An object is there from the first to the last of them in its annotated frames.
+        stamps: name of an object -> nanoseconds of each of its boxes in the window; others have those of their frames.
+    """
+    if clock.stamps is None:
+        return tuple(tracks)
+    seen: dict[int, list[float]] = {}
+    for view in views:
+        seen.setdefault(view.indices[0], []).append(view.time)
+    return tuple(_timed(track, clock, seen, (stamps or {}).get(track.name)) for track in tracks)
+
+
+def _timed(track: Track, clock: LogClock, seen: Mapping[int, Sequence[float]], stamps: Sequence[int] | None) -> Track:
+    frames = track.frames.tolist()
+    own = [None] * len(frames) if stamps is None else stamps
+    times = [clock.time(frame, stamp) for frame, stamp in zip(frames, own, strict=True)]
+    first, last = min((times[0], *seen.get(frames[0], ()))), max((times[-1], *seen.get(frames[-1], ())))
+    return replace(track, times=torch.tensor(times, dtype=torch.float64), span=(first, last))
+
+
+def _check_frames(frames: np.ndarray, path: Path, what: str, num_frames: int | None) -> None:
     if frames.ndim != 1 or not (frames % 1 == 0).all() or not (np.diff(frames) > 0).all():
         message = f"{what} has frame_idx {frames.tolist()[:5]} ..., not strictly increasing integers"
         raise fault(path, message, "sort its boxes by frame and keep one a frame")
-    if frames[0] < 0 or frames[-1] >= num_frames:
+    if num_frames is not None and (frames[0] < 0 or frames[-1] >= num_frames):
         message = f"{what} has boxes at frames {frames[0]:g} to {frames[-1]:g}, the log ends at {num_frames - 1}"
         raise fault(path, message, "number frames from 0 as the images are, or drop the boxes behind the end")

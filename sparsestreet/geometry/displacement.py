@@ -50,10 +50,11 @@ def position_noise(track: Track) -> float:
     >>> round(position_noise(trembling), 3)  # 0.1 beside each line, over sqrt(1.5), times 1.4826
     0.121
     """
-    centers, frames = track.world_from_object[:, :3, 3], track.frames.double()
+    centers = track.world_from_object[:, :3, 3]
+    times = track.frames.double() if track.times is None else track.times
     if len(centers) < 3:
         return 0.0
-    after = ((frames[1:-1] - frames[:-2]) / (frames[2:] - frames[:-2]))[:, None]
+    after = ((times[1:-1] - times[:-2]) / (times[2:] - times[:-2]))[:, None]
     beside = centers[1:-1] - (1 - after) * centers[:-2] - after * centers[2:]
     # Of three independent errors, with these weights.
     errors = beside / (1 + (1 - after).square() + after.square()).sqrt()

@@ -8,10 +8,26 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.types import Track
+from sparsestreet.types import Track, View
 
 TIME_TOLERANCE = 1e-5
 """A tenth of a frame of a 10,000-frame log. Equal instants may differ by the rounding of frame / (frames - 1)."""
+
+
+def frame_periods(views: Sequence[View]) -> float:
+    """How many frames' worth normalized time 0 to 1 is, by the first view of each frame: frames - 1 if they are even.
+
+    >>> from sparsestreet.types import Camera
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
+    >>> frame_periods([View(camera, 0.0, 0, 0), View(camera, 0.2, 0, 1), View(camera, 0.8, 4, 0)])
+    5.0
+    """
+    first: dict[int, float] = {}
+    for view in views:
+        index, _ = view.indices
+        first[index] = min(view.time, first.get(index, view.time))
+    start, end = min(first, default=0), max(first, default=0)
+    return (end - start) / (first[end] - first[start]) if start < end else 1.0
 
 
 @dataclass(frozen=True)
@@ -25,11 +41,11 @@ class Trajectories:
     """Box center in the world, meters."""
     valid: Bool[Tensor, "i k"]
     spans: Float[Tensor, "i 2"]
-    """First and last annotated instant, held-out ones included."""
+    """From when to when the object is there: of the first and last annotated frame, held-out ones included."""
 
     @staticmethod
     def from_tracks(tracks: Sequence[Track], held_out: frozenset[int], num_frames: int) -> "Trajectories":
-        """The tracks' annotations without those of held-out frames, float32.
+        """The tracks' annotations without those of held-out frames, float32; ``num_frames`` is that of the log.
 
         Raises ValueError if a track keeps no annotation.
 
@@ -54,11 +70,12 @@ class Trajectories:
         for i, (track, count) in enumerate(zip(tracks, counts, strict=True)):
             kept = torch.tensor([int(frame) not in held_out for frame in track.frames], dtype=torch.bool)
             poses = track.world_from_object[kept]
-            times[i, :count] = (track.frames[kept].double() / last_frame).float()
+            instants = track.frames.double() / last_frame if track.times is None else track.times
+            times[i, :count] = instants[kept].float()
             rotations[i, :count] = quat.from_matrix(poses[:, :3, :3]).float()
             translations[i, :count] = poses[:, :3, 3].float()
             valid[i, :count] = True
-            spans[i] = torch.stack((track.frames[0], track.frames[-1])).double() / last_frame
+            spans[i] = instants[[0, -1]] if track.span is None else torch.tensor(track.span, dtype=torch.float64)
         return Trajectories(times, rotations, translations, valid, spans)
 
 

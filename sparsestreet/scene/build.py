@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import Assignment, assign_tracks
 from sparsestreet.scene.effects import Effect, EffectSettings
@@ -48,11 +49,12 @@ def build_scene(
     _report(assignment)
     # Before the points, which take long: an effect that the log cannot support is an error.
     seen_through = _effects(effects, TrainingData(log, train_frames, held_out), seed)
+    moving = without_frames(assignment.claimed, held_out)
     with stage("points"):
-        points = None if image_points is None else cached_street_points(train_frames, assignment.claimed, image_points)
+        points = None if image_points is None else cached_street_points(train_frames, moving, image_points)
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
-        data = TrainingData(log, train_frames, held_out, assignment.by_node[name], assignment.claimed, points)
+        data = TrainingData(log, train_frames, held_out, assignment.by_node[name], moving, points)
         node = settings.build(data, named_generator(seed, name))
         if node is None:
             _log.warning("node %r has no instance in %s: the scene goes without it", name, log.name)

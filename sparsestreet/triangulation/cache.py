@@ -56,6 +56,10 @@ def _key(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) 
         digest.update(track.name.encode())
         for tensor in (track.frames, track.world_from_object, track.size):
             digest.update(tensor.numpy().tobytes())
+        if track.times is not None:  # the box at a view's time lies between two annotated ones
+            digest.update(track.times.numpy().tobytes())
+    if any(track.times is not None for track in moving):
+        digest.update(json.dumps([view.time for view in frames.views]).encode())
     return digest.hexdigest()[:16]
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float64
 
 from sparsestreet.data.lazy import Frames
+from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.distortion import undistort
 from sparsestreet.triangulation.features import Features, find_features
 from sparsestreet.triangulation.points import Sighting, TriangulatedPoints, triangulate
@@ -115,12 +116,11 @@ def _rays(pixels: Float64[np.ndarray, "n 2"], camera: Camera) -> Float64[np.ndar
 
 
 def _from_box(sighting: Sighting, track: Track) -> Sighting | None:
-    """The sighting with its pose in the box's frame; None if the box is not annotated then."""
-    at = torch.nonzero(track.frames == sighting.view.frame_index).flatten()
-    if not len(at):
+    """The sighting with its pose in the frame of the box at the view's time; None if the box is not annotated then."""
+    world_from_box = box_at(track, sighting.view.indices[0], sighting.view.time)
+    if world_from_box is None:
         return None
-    world_from_box = track.world_from_object[int(at[0])].numpy()
-    return replace(sighting, camera_from_frame=sighting.camera_from_frame @ world_from_box)
+    return replace(sighting, camera_from_frame=sighting.camera_from_frame @ world_from_box.numpy())
 
 
 def _through_box(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:

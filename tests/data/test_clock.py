@@ -69,19 +69,41 @@ def camera():
 
 
 def test_views_have_normalized_time_and_that_of_the_clock():
-    clock = LogClock(3, (SINCE_1970, SINCE_1970 + 70_000_000, SINCE_1970 + 250_000_001))
+    clock = LogClock(3, (SINCE_1970, SINCE_1970 + 100_000_000, SINCE_1970 + 250_000_001))
     views = [clock.view(camera(), index, 0) for index in range(3)]
     assert [(view.time, view.frame_index, view.camera_index) for view in views] == [
         (0.0, 0, 0),
-        (0.5, 1, 0),
+        (float(Fraction(100_000_000, 250_000_001)), 1, 0),
         (1.0, 2, 0),
     ]
     assert [view.stamp for view in views] == list(there(clock.stamps))
     # One rounding of an exact integer quotient.
-    assert [view.seconds for view in views] == [0.0, 0.07, float(Fraction(250_000_001, 10**9))]
-    early = clock.view(camera(), 0, 1, stamp=SINCE_1970 - 43_000_000)
-    assert (early.time, early.seconds, early.stamp) == (0.0, -0.043, SINCE_1970 - 43_000_000)
+    assert [view.seconds for view in views] == [0.0, 0.1, float(Fraction(250_000_001, 10**9))]
     assert clock.moment(2) == (views[2].seconds, views[2].stamp)
+
+
+def test_images_have_instants_of_their_own():
+    """The second camera fires 50 ms before the first, which shares the stamps of the frames, and the lidar 50 after."""
+    stamps = tuple(SINCE_1970 + 100_000_000 * frame for frame in range(3))
+    early = [stamp - 50_000_000 for stamp in stamps]
+    clock = LogClock(3, stamps, [*early, stamps[2] + 50_000_000])
+    first = clock.view(camera(), 0, 1, stamp=early[0])
+    assert (first.time, first.seconds, first.stamp) == (0.0, -0.05, early[0])
+    assert [clock.view(camera(), frame, 0).time for frame in range(3)] == [1 / 6, 0.5, 5 / 6]
+    assert [clock.view(camera(), frame, 1, early[frame]).time for frame in range(3)] == [0.0, 1 / 3, 2 / 3]
+    assert (clock.time(2, stamps[2] + 50_000_000), clock.moment(2)[0]) == (1.0, 0.2)
+    with pytest.raises(ValueError, match=r"lies outside of the clock's .*: name it in LogClock.others"):
+        clock.time(0, early[0] - 1)
+    with pytest.raises(ValueError, match="lies outside"):
+        clock.time(2, stamps[2] + 50_000_001)
+
+
+@pytest.mark.parametrize("count", [2, 3, 40, 199])
+def test_even_stamps_give_the_times_of_a_log_without_a_clock(count):
+    clock = LogClock(count, tuple(SINCE_1970 + 99_999_999 * frame for frame in range(count)))
+    bare = LogClock(count)
+    assert [clock.time(frame) for frame in range(count)] == [bare.time(frame) for frame in range(count)]
+    assert LogClock(1, (5,)).time(0) == 0.0
 
 
 def test_without_a_clock_there_is_normalized_time_alone():

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
+from sparsestreet.data.lazy import Frames, LazySequence, RecentlyUsed, Sweeps
 from sparsestreet.types import Frame, Sweep, View
 from tests.data.streets import make_log
 
@@ -46,7 +46,7 @@ def test_frames_in_memory_are_their_own_views():
 
 
 def test_sweeps_are_found_by_their_place_and_told_by_their_index():
-    sweeps = tuple(Sweep(index, torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1).bool()) for index in (0, 2, 5))
+    sweeps = tuple(Sweep(index, 0.0, torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1).bool()) for index in (0, 2, 5))
     held = Sweeps.of(sweeps)
     assert (held.indices, held[1], tuple(held.gray())) == ((0, 2, 5), sweeps[1], sweeps)
     with pytest.raises(ValueError, match="one sweep an instant"):
@@ -57,7 +57,7 @@ def test_a_part_of_the_sweeps_stays_as_cheap_as_the_whole():
     def load(index: int) -> Sweep:
         raise AssertionError(f"sweep {index} was colored")
 
-    gray = Sweep(7, torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1).bool())
+    gray = Sweep(7, 0.0, torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1).bool())
     part = Sweeps((3, 7), load, lambda index: gray).where(lambda index: index > 3)
     assert part.indices == (7,)
     assert list(part.gray()) == list(part[:1].gray()) == [gray]
@@ -120,3 +120,11 @@ def test_a_cache_never_holds_more_than_it_may_and_forgets_only_where_it_must(key
         while sum(held) > room:
             held.pop(0)
     assert asked == expected
+
+
+def test_an_error_of_reading_does_not_end_an_iteration():
+    def load(key: int) -> int:
+        return [5, 6][key]
+
+    with pytest.raises(IndexError):
+        list(LazySequence(range(3), load))

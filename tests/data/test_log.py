@@ -15,7 +15,7 @@ from tests.data.streets import make_log
 
 
 def sweep(points: torch.Tensor, colored: torch.Tensor) -> Sweep:
-    return Sweep(0, points, torch.full_like(points, 0.5), colored)
+    return Sweep(0, 0.0, points, torch.full_like(points, 0.5), colored)
 
 
 @pytest.mark.lengthy
@@ -137,7 +137,7 @@ def test_points_are_thinned_alike_in_however_many_sweeps_they_lie():
     colored = torch.ones(1_100_000, dtype=torch.bool)
     whole = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(points, colored),))
     parts = torch.split(points, [1, 600_000, 0, 300_001, 199_998])
-    sweeps = tuple(Sweep(index, part, part, colored[: len(part)]) for index, part in enumerate(parts))
+    sweeps = tuple(Sweep(index, 0.0, part, part, colored[: len(part)]) for index, part in enumerate(parts))
     log = make_log(num_frames=1, num_cameras=1, sweeps=sweeps)
     assert log.radius == whole.radius
     assert torch.equal(log.center, whole.center)

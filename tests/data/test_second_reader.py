@@ -74,7 +74,8 @@ def test_it_reads_as_a_log(root):
 def test_its_cameras_have_instants_of_their_own(root):
     log = ToyRigReader(root).read()
     assert [view.seconds for view in log.views] == [0.0, 0.02, 0.1, 0.12, 0.2, 0.22]
-    assert [view.time for view in log.views] == [0.0, 0.0, 0.5, 0.5, 1.0, 1.0]
+    assert [view.time for view in log.views] == pytest.approx([0, 2 / 22, 10 / 22, 12 / 22, 20 / 22, 1], abs=1e-12)
+    assert [sweep.time for sweep in log.sweeps] == pytest.approx([0, 10 / 22, 20 / 22], abs=1e-12)
     assert log.frames[3].stamp == FIRST + 120_000_000
     assert (log.sweeps[1].stamp, log.frame_rate) == (FIRST + 100_000_000, 10.0)
 

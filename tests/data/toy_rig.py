@@ -24,7 +24,7 @@ from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.scene_folder import SceneFolder
-from sparsestreet.data.tracks import checked_track, track_in_window
+from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
 from sparsestreet.data.window import chosen_cameras, frame_window
 from sparsestreet.types import Frame, Track, View
 
@@ -66,23 +66,25 @@ class ToyRigReader(LogReader):
         if problems := self.check():
             raise LogError(problems)
         stamps, frames, origin = self._log["stamps"], self._frames(), self._origin()
-        clock = LogClock(len(frames), tuple(stamps[frame] for frame in frames))
+        images = [self._camera(name)["stamps"][frame] for name in self._names() for frame in frames]
+        clock = LogClock(len(frames), tuple(stamps[frame] for frame in frames), images)
         rig = [self._mounted(name, index) for index, name in enumerate(self._names())]
         views = [
             clock.view(camera.at(recentered(one["poses"][frame], origin)), index, camera.index, one["stamps"][frame])
             for index, frame in enumerate(frames)
             for camera, one in ((camera, self._camera(camera.name)) for camera in rig)
         ]
+        tracks = [track_in_window(track, frames, origin) for track in self._tracks()]
+        tracks = timed_tracks([track for track in tracks if track is not None], clock, views)
         folder = SceneFolder(
-            views, partial(self._frame, rig), self._points, clock=clock, cache_bytes=0, check=self.check
+            views, partial(self._frame, rig), self._points, clock=clock, cache_bytes=0, check=self.check, tracks=tracks
         )
         absent = absence_notes(sky=False, human=False, vehicle=False, lidar=True, boxes=True, clock=True)
-        tracks = [track_in_window(track, frames, origin) for track in self._tracks()]
         return DrivingLog(
             self.root.name,
             folder.frames,
             folder.sweeps,
-            tuple(track for track in tracks if track is not None),
+            tracks,
             len(frames),
             len(rig),
             dataset_from_world(origin),

@@ -8,6 +8,7 @@ import torch
 
 from sparsestreet.export.path import left_to_right, of_cameras, of_frames, recorded, resampled, resized, shifted
 from sparsestreet.geometry.cameras import project
+from sparsestreet.geometry.trajectories import frame_periods
 from tests.export.street import NUM_FRAMES, street_views
 from tests.typed import there
 
@@ -170,3 +171,13 @@ def test_lens_and_shutter_stay(tmp_path):
     path = recorded(views)
     for changed in (shifted(path, 1.0), resampled(path, STEP / 2), resized(path, 20)):
         assert torch.equal(there(changed[1][0].camera.distortion), there(views[0].camera.distortion))
+
+
+def test_at_the_logs_own_rate_the_recorded_instants_are_shown():
+    """Whose cameras fire one after the other, so that the last frame's first image is not the end of the log."""
+    late = [replace(view, time=(view.indices[0] + 0.2 * view.indices[1]) / 4.6) for view in street_views()]
+    path = recorded(late)
+    assert resampled(path, 1 / frame_periods(late)) == path
+    between = resampled(path, 0.5 / frame_periods(late))
+    assert len(between) == 2 * NUM_FRAMES - 1
+    assert [view.time for view in between[1]] == pytest.approx([(0.5 + 0.2 * camera) / 4.6 for camera in range(4)])

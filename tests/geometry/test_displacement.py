@@ -1,6 +1,7 @@
 """What moves, and what only trembles: random noise, slow and fast, there and back, strays."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -114,3 +115,13 @@ def test_few_boxes():
     assert displacement(track(along_x(torch.tensor([5.0, 7.0, 9.0])))) == 4.0
     assert displacement(track(along_x(torch.tensor([5.0, 5.0, 9.0])))) == 0.0  # one of three is no majority
     assert displacement(track(along_x(torch.tensor([0.0, 0.0, 0.0])))) == 0.0
+
+
+def test_boxes_have_the_times_of_their_stamps():
+    """At constant speed, boxes that are unevenly spaced in time show no noise."""
+    times = torch.tensor([0.0, 0.1, 0.4, 0.5, 1.0], dtype=torch.float64)
+    poses = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    poses[:, 0, 3] = 20 * times
+    even = Track("car", "Car", torch.arange(5), poses, torch.ones(3))
+    assert position_noise(replace(even, times=times)) < 1e-12
+    assert position_noise(even) > 0.1

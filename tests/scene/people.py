@@ -82,7 +82,7 @@ def people_log(*tracks: Track, returns: bool = True) -> DrivingLog:
         found = [track.world_from_object[track.frames == sweep.index, :3, 3].float() for track in tracks if returns]
         points = torch.cat([torch.zeros(0, 3), *found])
         colored = torch.ones(len(points), dtype=torch.bool)
-        sweeps.append(Sweep(sweep.index, points, torch.tensor(SHIRT).expand(len(points), 3), colored))
+        sweeps.append(Sweep(sweep.index, sweep.time, points, torch.tensor(SHIRT).expand(len(points), 3), colored))
     return replace(log, sweeps=Sweeps.of(tuple(sweeps)), tracks=tracks)
 
 

@@ -244,7 +244,7 @@ def sweep_at(index: int, car_points: int) -> Sweep:
     colors = torch.tensor([ROAD_COLOR] * 50 + [CAR_COLOR] * car_points + [(0.5, 0.5, 0.5)])
     colored = torch.ones(points.shape[0], dtype=torch.bool)
     colored[-1] = False
-    return Sweep(index, points, colors, colored)
+    return Sweep(index, index / (NUM_FRAMES - 1), points, colors, colored)
 
 
 def street_log(car_points: int = 60) -> DrivingLog:

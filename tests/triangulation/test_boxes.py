@@ -1,13 +1,16 @@
 """Which features are seen through a box, and which of its points count."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from sparsestreet.triangulation.features import Features
 from sparsestreet.triangulation.points import Sighting, TriangulatedPoints
-from sparsestreet.triangulation.street import _inside, _through_box
+from sparsestreet.triangulation.street import _from_box, _inside, _through_box
 from sparsestreet.types import Track
 from tests.triangulation.worlds import descriptors, pose, view
+from tests.typed import there
 
 BOX = Track("car", "Car", torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None], torch.tensor([4.0, 2.0, 1.5]))
 
@@ -33,3 +36,18 @@ def test_points_of_a_box_name_the_views_that_were_given():
     assert found.observed.tolist() == [0, 0, 1, 1]
     assert found.views.tolist() == [3, 8, 5, 8]
     assert found.pixels.tolist() == pixels[[0, 1, 3, 4]].tolist()
+
+
+def test_a_box_is_where_it_is_when_the_image_is_taken():
+    """The box drives 2 m from frame 0 to frame 1; the image of frame 0 is taken a quarter of the way."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[1, 0, 3] = 2.0
+    times = torch.tensor([0.0, 0.8], dtype=torch.float64)
+    track = replace(BOX, frames=torch.tensor([0, 1]), world_from_object=poses, times=times)
+    at = pose(z=-6.0)
+    features = Features(np.zeros((0, 2)), descriptors(np.random.default_rng(0), 0))
+    seen = replace(view(at, 0), time=0.2)
+    sighting = Sighting(seen, at, features, np.zeros((0, 2)), np.zeros((0, 3), np.float32))
+    moved = there(_from_box(sighting, track)).camera_from_frame @ np.linalg.inv(at)
+    np.testing.assert_allclose(moved[:3, 3], at[:3, :3] @ (0.5, 0, 0), atol=1e-12)
+    assert _from_box(replace(sighting, view=replace(seen, frame_index=2)), track) is None

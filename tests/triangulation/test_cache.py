@@ -111,6 +111,19 @@ def test_other_boxes_make_other_points(tmp_path, made, tracks):
     assert len(made) == 2
 
 
+def test_other_times_make_other_points_where_boxes_have_times(tmp_path, made):
+    """A box at the time of a view lies between two annotated ones."""
+    late = (FRAMES[0], replace(FRAMES[1], time=0.5))
+    _get(tmp_path)
+    _get(tmp_path, late)  # a log without a clock: the time says nothing that the frame does not
+    assert len(made) == 1
+    timed = replace(TRACK, times=torch.tensor([0.0, 0.5], dtype=torch.float64))
+    later = replace(TRACK, times=torch.tensor([0.0, 0.6], dtype=torch.float64))
+    for frames, track in ((FRAMES, timed), (FRAMES, later), (late, timed)):
+        _get(tmp_path, frames, tracks=(track,))
+    assert len(made) == 4
+
+
 @pytest.mark.parametrize(
     "change",
     [

@@ -25,7 +25,7 @@ from sparsestreet.data.poses import dataset_from_world
 from sparsestreet.data.problems import LogError, Problem
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.scene_folder import SceneFolder
-from sparsestreet.data.tracks import track_in_window
+from sparsestreet.data.tracks import timed_tracks, track_in_window
 from sparsestreet.types import Track
 
 
@@ -35,7 +35,7 @@ class DriveStudioReader(LogReader):
 
     The world keeps the data set's axes and is shifted, in float64, so that the vehicle (flavors of mounted cameras) or
     the front camera (nuScenes, PandaSet) starts at the origin. Frames are counted from the window's
-    start, cameras by their place in ``cameras``. Time is frame / (frames - 1), 0 in a log of one frame.
+    start, cameras by their place in ``cameras``. Without a clock time is frame / (frames - 1), 0 in a log of one frame.
 
     A file ``timestamps.txt`` beside the folders is the clock: the seconds of each frame, one a line, by any zero. All
     cameras and the lidar share the stamp of their frame.
@@ -97,13 +97,16 @@ class DriveStudioReader(LogReader):
         origin = start[:3, 3]
         tracks, people = _read_tracks(layout, origin)
         clock, rig = read_clock(layout), read_rig(layout, self.width, self.min_lens_shift, self.undistort)
+        views = read_views(layout, rig, origin, clock)
+        tracks = timed_tracks(tracks, clock, views)
         folder = SceneFolder(
-            read_views(layout, rig, origin, clock),
+            views,
             partial(read_frame, layout, rig),
             partial(read_points, layout, origin, self.lidar_ahead) if layout.has_lidar else None,
             clock=clock,
             cache_bytes=1_000_000 * self.cache_mb,
             check=lambda: check_layout(layout, contents=True),
+            tracks=tracks,
         )
         return DrivingLog(
             name=layout.root.resolve().name,

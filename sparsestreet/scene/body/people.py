@@ -79,14 +79,16 @@ def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
 
     Poses are relative to the box, so a person without a pose turns with the box.
     """
-    body, usable, frames = _body(track), trained_poses(track, held_out), track.frames
+    body, usable = _body(track), trained_poses(track, held_out)
+    times = track.frames if track.times is None else track.times
     world_from_box = quat.from_matrix(track.world_from_object[:, :3, :3]).to(body.rotations.dtype)
     rotations = body.rotations.clone()
     rotations[:, 0] = quat.multiply(world_from_box * torch.tensor([1.0, -1.0, -1.0, -1.0]), rotations[:, 0])
-    known, rotations = frames[usable], rotations[usable]
-    upper = torch.searchsorted(known, frames).clamp(max=len(known) - 1)
-    lower = (torch.searchsorted(known, frames, right=True) - 1).clamp(min=0)
-    fraction = ((frames - known[lower]) / (known[upper] - known[lower]).clamp(min=1)).clamp(0, 1)
+    known, rotations = times[usable], rotations[usable]
+    upper = torch.searchsorted(known, times).clamp(max=len(known) - 1)
+    lower = (torch.searchsorted(known, times, right=True) - 1).clamp(min=0)
+    step = torch.where(upper > lower, known[upper] - known[lower], 1)
+    fraction = ((times - known[lower]) / step).clamp(0, 1).float()
     return quat.slerp(rotations[lower], rotations[upper], fraction[:, None].expand(-1, 24))
 
 

@@ -3,41 +3,26 @@
 from collections.abc import Iterable, Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from sparsestreet.geometry.boxes import box_at, inside_box
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.types import Sweep, Track
 
 
-def points_in_box_frame(track: Track, frame: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"] | None:
-    """Returns world points in the track's box frame at an integer frame, meters; None if the track has no box there."""
-    found = torch.nonzero(track.frames == frame).flatten()
-    if found.numel() == 0:
-        return None
-    object_from_world = inverse(track.world_from_object[int(found[0])])
-    return transform_points(object_from_world, points.double()).to(points.dtype)
+def returns_in_box_frame(track: Track, sweep: Sweep) -> Float[Tensor, "n 3"] | None:
+    """Returns a sweep in the track's box frame at its time, meters; None if the track has no box in its frame."""
+    world_from_object = box_at(track, sweep.index, sweep.time)
+    return None if world_from_object is None else _in_frame(world_from_object, sweep.points)
 
 
-def inside_box(
-    points_in_box: Float[Tensor, "n 3"], size: Float[Tensor, "3"], enlargement: float = 1.0
-) -> Bool[Tensor, " n"]:
-    """Returns whether points of the box frame lie in the box, whose sides are multiplied by ``enlargement``.
-
-    >>> inside_box(torch.tensor([[1.9, 0.0, 0.0], [2.1, 0.0, 0.0]]), torch.tensor([4.0, 2.0, 1.5])).tolist()
-    [True, False]
-    """
-    return (points_in_box.abs() <= 0.5 * enlargement * size).all(1)
-
-
-def outside_boxes(
-    tracks: Sequence[Track], frame: int, points: Float[Tensor, "n 3"], enlargement: float
-) -> Bool[Tensor, " n"]:
-    """Returns whether world points lie in none of the tracks' boxes at an integer frame."""
-    outside = torch.ones(points.shape[0], dtype=torch.bool)
+def outside_boxes(tracks: Sequence[Track], sweep: Sweep, enlargement: float) -> Bool[Tensor, " n"]:
+    """Returns whether the points of a sweep lie in none of the tracks' boxes at its time."""
+    outside = torch.ones(sweep.points.shape[0], dtype=torch.bool)
     for track in tracks:
-        in_box_frame = points_in_box_frame(track, frame, points)
+        in_box_frame = returns_in_box_frame(track, sweep)
         if in_box_frame is not None:
             outside &= ~inside_box(in_box_frame, track.size, enlargement)
     return outside
@@ -53,10 +38,9 @@ def outside_swept_boxes(
         reach = track.size.norm() / 2
         # Few points lie near the path of an object; only these are taken to its boxes, of which there are many.
         near = ((points >= centers.amin(0) - reach) & (points <= centers.amax(0) + reach)).all(1).nonzero().flatten()
-        for frame in sorted(set(track.frames.tolist()) - held_out):
-            in_box_frame = points_in_box_frame(track, frame, points[near])
-            if in_box_frame is not None:
-                outside[near[inside_box(in_box_frame, track.size)]] = False
+        for frame, world_from_object in zip(track.frames.tolist(), track.world_from_object, strict=True):
+            if frame not in held_out:
+                outside[near[inside_box(_in_frame(world_from_object, points[near]), track.size)]] = False
     return outside
 
 
@@ -85,8 +69,12 @@ def lidar_in_boxes(tracks: Sequence[Track], sweeps: Iterable[Sweep]) -> list[Poi
     parts: list[list[Points]] = [[] for _ in tracks]
     for sweep in sweeps:
         for track, found in zip(tracks, parts, strict=True):
-            in_box_frame = points_in_box_frame(track, sweep.index, sweep.points)
+            in_box_frame = returns_in_box_frame(track, sweep)
             if in_box_frame is not None:
                 inside = inside_box(in_box_frame, track.size) & sweep.colored
                 found.append(Points(in_box_frame, sweep.colors).where(inside))
     return [Points.concatenate(found) for found in parts]
+
+
+def _in_frame(world_from_object: Float64[Tensor, "4 4"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    return transform_points(inverse(world_from_object), points.double()).to(points.dtype)

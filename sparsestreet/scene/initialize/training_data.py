@@ -32,8 +32,12 @@ class TrainingData:
 
     @property
     def times(self) -> Sequence[float]:
-        """Normalized times of the training frames, each once, in order."""
-        return sorted({view.time for view in self.views})
+        """Normalized times of the training frames, in order: of each the time of its first view."""
+        first: dict[int, float] = {}
+        for view in self.views:
+            index, _ = view.indices
+            first[index] = min(view.time, first.get(index, view.time))
+        return sorted(first.values())
 
     @property
     def sweeps(self) -> Sweeps:

@@ -9,9 +9,6 @@ from torch import Tensor
 REACH = 5
 """Most keyframes between a pose and those it is compared with (DriveStudio draws one distance of 1 ... 5 a step)."""
 
-SAME_TIME = 1e-5
-"""Times in [0, 1] that differ by less are those of one frame."""
-
 
 def sharp_shape(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -> Float[Tensor, ""]:
     """Returns the mean of relu(log s_max - log s_min - log r), above 0 if axes differ by more than a factor r.
@@ -61,7 +58,8 @@ def temporal_smoothness_at(
     """Returns the part of ``temporal_smoothness`` of the keyframes at one time and their neighbors at one distance.
 
     The mean is over the objects that have all three keyframes. DriveStudio's term of a step: the time is that of its
-    frame, the distance is drawn. 0 if no object has them.
+    view, the distance is drawn. A keyframe is that of a time up to half of the shortest step between keyframes away,
+    because cameras have instants of their own. 0 if no object has all three.
 
     >>> jerk = torch.tensor([[[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
     >>> whole = torch.ones(1, 3, dtype=torch.bool)
@@ -72,8 +70,10 @@ def temporal_smoothness_at(
     here = (times - time).abs().masked_fill(~valid, torch.inf)
     each, middle = torch.arange(len(times), device=times.device), here.argmin(1)
     before, after = middle - distance, middle + distance
-    # A time is that of a keyframe up to rounding; frames lie at least 1e-4 of a log apart.
-    whole = (here.amin(1) < SAME_TIME) & (before >= 0) & (after < count)
+    steps = torch.where(valid[:, 1:], times[:, 1:] - times[:, :-1], torch.inf)
+    # Just above a half: a camera may fire in the middle of two boxes.
+    near = here.amin(1) < 0.501 * torch.nn.functional.pad(steps, (0, 1), value=torch.inf).amin()
+    whole = near & (before >= 0) & (after < count)
     before, after = before.clamp(min=0), after.clamp(max=count - 1)
     # Valid keyframes come first, so the last of three decides.
     whole = whole & valid[each, after]

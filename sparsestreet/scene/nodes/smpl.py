@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
 from sparsestreet.ops.raw import RawGaussians
@@ -98,7 +99,7 @@ class SmplSettings(TrackedSettings):
             torch.stack([track.size.float() for track in tracks]),
             anatomy=Anatomy.of(template, people),
             names=tuple(track.name for track in tracks),
-            max_gap=self.max_gap / max(data.log.num_frames - 1, 1),
+            max_gap=self.max_gap / data.log.frame_periods + view_lag(tracks, data.log.views),
             mask=mask,
         )
 
@@ -152,7 +153,8 @@ def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "
     Measured points are returns and points from images, pooled over all frames; limbs swing about their mean places.
     """
     colors = []
-    for track, returns, vertices in zip(tracks, lidar_in_boxes(tracks, data.sweeps), places, strict=True):
+    pooled = lidar_in_boxes(without_frames(tracks, data.held_out), data.sweeps)
+    for track, returns, vertices in zip(tracks, pooled, places, strict=True):
         found = None if data.image_points is None else data.image_points.in_boxes[track.name]
         points = [returns, *([] if found is None else [_measured(found)])]
         measured = Points.concatenate(points)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
@@ -36,7 +37,7 @@ class TrackedSettings(NodeSettings):
     an instance without any point is left out."""
     initial_opacity: float = 0.1
     max_gap: int = 2
-    """Frames; within its span, an object is present up to this far from a training annotation."""
+    """Frames' worth of time; within its span, an object is present up to this far from a training annotation."""
     temporal_smooth: float = 0.0
     """Weight of the term that keeps learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: the term is
     not computed."""
@@ -62,7 +63,7 @@ class TrackedSettings(NodeSettings):
         tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
         if not tracks:
             return None
-        measured = lidar_in_boxes(tracks, data.sweeps)
+        measured = lidar_in_boxes(without_frames(tracks, data.held_out), data.sweeps)
         objects = [
             self._object_points(track, Points.concatenate([_from_images(track, data), returns]), generator)
             for track, returns in zip(tracks, measured, strict=True)
@@ -90,7 +91,7 @@ class TrackedSettings(NodeSettings):
             keyframes,
             sizes,
             names=tuple(track.name for track in tracks),
-            max_gap=self.max_gap / max(data.log.num_frames - 1, 1),
+            max_gap=self.max_gap / data.log.frame_periods + view_lag(tracks, data.log.views),
             mask=mask,
         )
 

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.geometry.displacement import displacement
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import assign_tracks
@@ -35,6 +36,7 @@ def moved_view_term(
     rigid = [track for name, tracks in by_node.items() if isinstance(nodes[name], RigidSettings) for track in tracks]
     taken = {track.name for tracks in by_node.values() for track in tracks}
     moving = [track for track in log.tracks if track.name in taken or displacement(track) > MOVES]
+    moving, rigid = without_frames(moving, held_out), without_frames(rigid, held_out)
     with stage("points"):
         returns = collect(sweeps, data.split.train, moving, rigid, settings, seed)
     _log.info(

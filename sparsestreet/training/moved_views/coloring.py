@@ -12,16 +12,17 @@ from sparsestreet.types import Frame
 
 
 def seen_colors(
-    points: Float[Tensor, "n 3"], frames: Sequence[Frame]
+    points: Float[Tensor, "n 3"], frames: Sequence[Frame], places: Sequence[Float[Tensor, "n 3"]] | None = None
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
     """RGB of each point in the first image that shows it, and which points one shows.
 
-    Unlike ``data.lidar.color_points`` a point behind nearer ones has no color: the lidar stands higher than the
-    cameras and looks over cars, whose color such a point would take.
+    ``places``: where the points are in each of the images; None: in all of them where they were measured. Unlike
+    ``data.lidar.color_points`` a point behind nearer ones has no color: the lidar stands higher than the cameras and
+    looks over cars, whose color such a point would take.
     """
     colors, seen = torch.zeros_like(points), torch.zeros(len(points), dtype=torch.bool)
-    for frame in frames:
-        rows, positions, _ = unhidden(frame.camera, points)
+    for frame, place in zip(frames, places or [points] * len(frames), strict=True):
+        rows, positions, _ = unhidden(frame.camera, place)
         column, line = positions.long().unbind(-1)
         new = ~seen[rows]
         colors[rows[new]] = frame.image[line[new], column[new]].float() / 255

@@ -14,7 +14,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering, from_another_camera
 from sparsestreet.training.moved_views.returns import StreetReturns
 from sparsestreet.training.moved_views.settings import MovedViews
-from sparsestreet.training.moved_views.target import NEAREST, Returns, target
+from sparsestreet.training.moved_views.target import NEAREST, target
 from sparsestreet.types import Camera, Frame, View
 
 _log = logging.getLogger(__name__)
@@ -60,12 +60,11 @@ class MovedViewTerm:
         if len(rows) > settings.returns_per_view:
             rows = rows[torch.randint(len(rows), (settings.returns_per_view,), generator=generator)]
         index, _ = frame.indices
-        none = Returns.concatenate([])
         found = target(
             camera,
             self.returns.street.at(rows),
-            self.returns.objects.get(index, none),
-            self.returns.boxes(index),
+            self.returns.objects_at(index, frame.time),
+            self.returns.boxes(index, frame.time),
             0.5 / settings.divisor,
         )
         view = View(camera, frame.time, frame.frame_index, frame.camera_index, frame.seconds, frame.stamp)

@@ -59,7 +59,8 @@ def test_frames_and_sweeps_have_the_stamps_of_the_folder(make, tmp_path):
     log = DriveStudioReader(tmp_path).read()
     assert [frame.stamp for frame in log.frames] == [stamp for stamp in stamps for _ in range(2)]
     assert [frame.seconds for frame in log.frames[::2]] == [0.0, 0.07, 0.2]
-    assert [frame.time for frame in log.frames[::2]] == [0.0, 0.5, 1.0]
+    assert [frame.time for frame in log.frames[::2]] == [0.0, 0.35, 1.0]
+    assert [sweep.time for sweep in log.sweeps] == log.tracks[0].times.tolist() == [0.0, 0.35, 1.0]
     for sweeps in (log.sweeps, log.sweeps.gray()):
         assert [(sweep.seconds, sweep.stamp) for sweep in sweeps] == list(zip([0.0, 0.07, 0.2], stamps, strict=True))
     assert (log.frame_rate, list(log.stamps.values())) == (10.0, stamps)

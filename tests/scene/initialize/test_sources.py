@@ -232,7 +232,7 @@ def road(seed: int = 0) -> torch.Tensor:
 
 
 def log_with_returns(points: torch.Tensor) -> TrainingData:
-    sweep = Sweep(0, points, torch.full_like(points, 0.5), torch.ones(len(points), dtype=torch.bool))
+    sweep = Sweep(0, 0.0, points, torch.full_like(points, 0.5), torch.ones(len(points), dtype=torch.bool))
     return training_data(replace(street_log(), sweeps=Sweeps.of((sweep,)), tracks=()))
 
 

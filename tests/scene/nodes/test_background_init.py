@@ -191,7 +191,7 @@ def test_the_same_seed_gives_the_same_rows():
 def test_duplicated_returns_start_finite():
     log = street_log()
     sweep = log.sweeps[0]
-    doubled = Sweep(0, sweep.points.repeat(5, 1), sweep.colors.repeat(5, 1), sweep.colored.repeat(5))
+    doubled = Sweep(0, 0.0, sweep.points.repeat(5, 1), sweep.colors.repeat(5, 1), sweep.colored.repeat(5))
     node = build(LIDAR_ONLY, log=replace(log, sweeps=Sweeps.of((doubled,))))
     assert torch.isfinite(node.rows.log_scales).all()
     assert all(torch.isfinite(parameter).all() for parameter in node.parameters())

@@ -77,9 +77,10 @@ def test_the_term_of_a_frame_is_a_mean_over_the_objects_that_have_it():
     translations = torch.zeros(3, 3, 3)
     translations[0, 1], translations[1, 1] = 1.0, 5.0
     valid = torch.tensor([[True] * 3, [True] * 3, [True, True, False]])
-    at = [temporal_smoothness_at(times, translations, valid, time, 1).item() for time in (0.0, 0.1, 0.2, 0.15)]
-    # |0 + 0 - 2 x 1|, then |0 + 0 - 2 x 5|; the third object has no keyframe after its second.
-    assert at == pytest.approx([0, 2, 10, 0])
+    at = [temporal_smoothness_at(times, translations, valid, time, 1).item() for time in (0.0, 0.1, 0.2, 0.24, 0.36)]
+    # |0 + 0 - 2 x 1|, then |0 + 0 - 2 x 5|; the third object has no keyframe after its second. A camera that fires
+    # 0.04 after the boxes sees these; one 0.06 after the last of an object sees none.
+    assert at == pytest.approx([0, 2, 10, 10, 0])
     translations.requires_grad_()
     temporal_smoothness_at(times, translations, valid, 0.1, 1).backward()
     assert translations.grad[0, :, 0].tolist() == pytest.approx([0, 2 / 3, 0])  # the neighbors stand still

@@ -37,7 +37,7 @@ CAR_TRACK, PERSON_TRACK = track("car", CAR, [4.0, 2.0, 1.5]), track("person", PE
 
 def sweep(index: int) -> Sweep:
     points = torch.tensor([STREET, CAR, ROAD, PERSON, UNSEEN])
-    return Sweep(index, points, torch.zeros(5, 3), torch.ones(5, dtype=torch.bool))
+    return Sweep(index, index / 4, points, torch.zeros(5, 3), torch.ones(5, dtype=torch.bool))
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_the_street_is_what_lies_in_no_moving_box(found):
 def test_objects_of_fixed_shape_without_the_road_below_them(found):
     assert found.objects[0].points.tolist() == [CAR]
     assert not len(found.objects[4])
-    assert [len(found.boxes(frame)) for frame in (0, 1, 2, 4)] == [2, 0, 2, 0]
+    assert [len(found.boxes(frame, frame / 4)) for frame in (0, 1, 2, 4)] == [2, 0, 2, 0]
 
 
 def test_colors_are_those_of_the_frames_own_image(found):
@@ -83,7 +83,7 @@ def test_a_frame_sees_the_sweeps_around_it(found):
 
 def test_an_objects_hidden_returns_have_no_color():
     points = torch.tensor([CAR, HIDDEN])
-    sweeps = Sweeps.of((Sweep(0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
+    sweeps = Sweeps.of((Sweep(0, 0.0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
     long = track("truck", CAR, [4.0, 4.0, 8.0])
     assert collect(sweeps, Frames.of([frame_at(0)]), [long], [long], SETTINGS, 0).objects[0].points.tolist() == [CAR]
 
@@ -91,7 +91,7 @@ def test_an_objects_hidden_returns_have_no_color():
 def test_images_of_the_nearest_instants_weigh():
     """One gray that agrees at the next instant before or after, and black images elsewhere."""
     gray, black = (torch.full((16, 32, 3), value, dtype=torch.uint8) for value in (100, 0))
-    point = Sweep(4, torch.tensor([STREET]), torch.zeros(1, 3), torch.ones(1, dtype=torch.bool))
+    point = Sweep(4, 1.0, torch.tensor([STREET]), torch.zeros(1, 3), torch.ones(1, dtype=torch.bool))
     for agreeing, weight in ((3, 1.0), (5, 1.0), (2, math.exp(-1000 / 255)), (7, math.exp(-1000 / 255))):
         frames = [replace(frame_at(0), frame_index=i, image=gray if i in (4, agreeing) else black) for i in range(2, 8)]
         found = collect(Sweeps.of((point,)), Frames.of(frames), [], [], SETTINGS, 0)
@@ -135,3 +135,26 @@ def test_a_sweep_keeps_no_more_than_it_may():
 def test_settings_that_cannot_be(wrong, said):
     with pytest.raises(ValueError, match=said):
         MovedViews(**wrong)
+
+
+def test_objects_are_where_they_are_when_the_image_is_taken():
+    """A car drives 2 m to the right from frame 0 to frame 2. The image of frame 0 is taken at half of that."""
+    there = [CAR[0] + 2.0, *CAR[1:]]
+    car = track("car", CAR, [1.0, 1.0, 1.5])
+    poses = car.world_from_object.clone()
+    poses[1, :3, 3] = torch.tensor(there, dtype=torch.float64)
+    car = replace(car, world_from_object=poses, times=torch.tensor([0.0, 0.4], dtype=torch.float64))
+    points = torch.tensor([CAR, STREET])
+    sweeps = Sweeps.of((Sweep(0, 0.0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
+    frame = replace(frame_at(0), time=0.2)
+    found = collect(sweeps, Frames.of([frame]), [car], [car], SETTINGS, seed=0)
+    halfway = torch.tensor([[CAR[0] + 1.0, *CAR[1:]]])
+    assert torch.equal(found.objects_at(0, 0.0).points, torch.tensor([CAR]))
+    torch.testing.assert_close(found.objects_at(0, 0.2).points, halfway)
+    assert not len(found.objects_at(3, 0.2))
+    position = frame.camera.intrinsics @ halfway[0]
+    column, line = (position[:2] / position[2]).long().tolist()
+    torch.testing.assert_close(found.objects[0].colors[0], frame.image[line, column] / 255)
+    ((pose, _),) = found.boxes(0, 0.2)
+    torch.testing.assert_close(pose[:3, 3], halfway[0].double())
+    assert found.street.points.tolist() == [STREET]

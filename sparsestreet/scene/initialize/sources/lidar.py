@@ -39,9 +39,9 @@ class LidarPoints(PointSource):
         for sweep in data.sweeps:
             taken = sweep.colored
             if self.box_enlargement is not None:
-                taken = taken & outside_boxes(data.moving, sweep.index, sweep.points, self.box_enlargement)
+                taken = taken & outside_boxes(data.moving, sweep, self.box_enlargement)
             parts.append(Points(sweep.points, sweep.colors).where(taken))
-            instants.append(torch.full((len(parts[-1]),), sweep.index / max(data.log.num_frames - 1, 1)))
+            instants.append(torch.full((len(parts[-1]),), sweep.time))
         points = Points.concatenate(parts)
         rows = torch.arange(len(points)) if self.voxel is None else thinned(points.positions, self.voxel, generator)
         chosen = at_most(count, rows, generator)
