@@ -16,11 +16,14 @@ problems     what is wrong with a log on disk, all at once, with remedies
 check        what `sparsestreet data check` prints
 images       pixels and masks from files
 given_masks  masks that somebody made for a data set
+ego          rows of images that show the recording car
 numbers      numbers from text files
 lidar        colors that points take from images, depth that pixels take from points
 formats      data sets as they are published, to be named where they must be converted first
 nuscenes     reader of nuScenes as it is published: tables of JSON, images, sweeps
 drivestudio  reader of DriveStudio's processed layout
+argoverse2   reader of Argoverse 2's sensor data set
+pandaset     reader of PandaSet
 synthetic    the embedded street: traced, written in that layout, read from there
 datamodule   the loaders of training and validation
 device       frozen values from one device to another

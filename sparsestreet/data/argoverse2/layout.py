@@ -52,7 +52,7 @@ class Layout:
         return self.root / "sensors" / "cameras" / camera
 
 
-def find_log(root: Path, scene: str | float | None) -> Layout:
+def find_log(root: Path, scene: str | int | float | None) -> Layout:
     """The log whose name begins with ``scene``, at the root or at most two folders below.
 
     Raises ValueError where there is none, or more than one, or for a scene that is no text: 7e128381 is a number.
