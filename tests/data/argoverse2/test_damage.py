@@ -217,6 +217,19 @@ def test_a_bomb_is_refused_before_memory_is_taken(log, monkeypatch):
         read_columns(log / SWEEP, dict.fromkeys("xyz", float))
 
 
+def test_text_that_lies_outside_of_its_buffer_is_refused(tmp_path):
+    import pyarrow as pa
+
+    offsets = pa.py_buffer(np.array([0, 3, 2**30], np.int32).tobytes())
+    column = pa.StringArray.from_buffers(2, offsets, pa.py_buffer(b"abcdef"))
+    with pa.OSFile(str(tmp_path / "t.feather"), "wb") as file:
+        batch = pa.RecordBatch.from_arrays([column], ["name"])
+        with pa.ipc.new_file(file, batch.schema) as writer:
+            writer.write_batch(batch)
+    with pytest.raises(LogError, match="no whole feather file"):
+        read_columns(tmp_path / "t.feather", {"name": str})
+
+
 def test_thrown_bytes_are_an_error_or_a_table(sound, tmp_path):
     """300 files with some bytes thrown: nothing else is raised, and what is read has rows of one number."""
     data, dice = (sound / POSES).read_bytes(), random.Random(0)
