@@ -222,7 +222,8 @@ def test_text_that_lies_outside_of_its_buffer_is_refused(tmp_path):
     write_table(path, {"name": ["abc", "def"]}, compression="uncompressed")
     assert read_columns(path, {"name": str})["name"].tolist() == ["abc", "def"]
     data = path.read_bytes()
-    assert data.count(ends := struct.pack("<3i", 0, 3, 6)) == 1
+    ends = struct.pack("<3i", 0, 3, 6)
+    assert data.count(ends) == 1
     path.write_bytes(data.replace(ends, struct.pack("<3i", 0, 3, 2**30)))
     with pytest.raises(LogError, match="no whole feather file"):
         read_columns(path, {"name": str})
