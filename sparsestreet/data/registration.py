@@ -12,7 +12,7 @@ from sparsestreet.geometry.cameras import project
 from sparsestreet.types import Frame
 
 MOST_FRAMES = 36
-"""Images that are looked at: a tenth of a pixel of noise on the embedded street, in half a second."""
+"""Images that are looked at, in half a second: embedded streets of 240x144 that fit have -0.3 to 0.4 pixels right."""
 FEWEST_EDGES = 300
 """Of one direction; fewer say nothing."""
 REACH, STEP = 4.0, 0.5
@@ -31,18 +31,14 @@ class EdgeShift:
     down: float
     edges: int
 
-    @property
-    def length(self) -> float:
-        return (self.right**2 + self.down**2) ** 0.5
-
 
 def edge_shift(frames: Frames, sweeps: Sweeps) -> EdgeShift | None:
     """The shifts, right and down, at which edges of the lidar meet the steepest colors; None where too few are seen.
 
     An edge lies midway between two returns of a row (or column) of pixels of which one is clearly nearer. The mean
     slope of the gray image at all of them is largest where they belong; a parabola through the best shift and its
-    neighbors gives parts of a step. Lidars stand above cameras and look over edges, so ``down`` is about -0.5 where all
-    is right.
+    neighbors gives parts of a step. Lidars stand above cameras and look over edges, so ``down`` is -0.4 to -1.0
+    where all is right.
     """
     places = {index: place for place, index in enumerate(sweeps.indices)}
     shifts = torch.arange(-REACH, REACH + STEP / 2, STEP)

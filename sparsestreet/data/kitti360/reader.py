@@ -233,7 +233,7 @@ def _read_sweep(sequence: SequenceFolders, parts: _Parts, place: int) -> Float64
 def _labeled(sequence: SequenceFolders, frames: tuple[int, ...]) -> set[tuple[str, Path]]:
     """Cameras and files of the images of labels that are there."""
     found = set()
-    for camera in sequence.cameras:
+    for camera in (name for name in sequence.cameras if name not in FISHEYE):
         folder = sequence.semantics(camera)
         there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         names = (f"{frame:010d}.png" for frame in frames)

@@ -1,6 +1,7 @@
 """A sequence written as KITTI-360 ships it is read as it was planned."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -155,7 +156,11 @@ def test_fisheyes_are_resampled_to_pinholes(tmp_path):
     """What the fisheye shows in a direction is at the pixel that the pinhole has for it."""
     write_kitti360(tmp_path)
     write_fisheye(tmp_path)
-    reader = Kitti360Reader(root=tmp_path, sequence=3, cameras=["image_00", "image_02"], pinhole_fov=100.0)
+    # The same dot as a mask that somebody made.
+    images = tmp_path / "data_2d_raw" / SEQUENCE / "image_02" / "data_rgb"
+    shutil.copytree(images, tmp_path / "masks" / "vehicle" / "image_02")
+    cameras, masks = ["image_00", "image_02"], tmp_path / "masks"
+    reader = Kitti360Reader(root=tmp_path, sequence=3, cameras=cameras, pinhole_fov=100.0, masks=masks)
     assert reader.check() == []
     log = reader.read()
     recording = reader.recording()
@@ -169,6 +174,7 @@ def test_fisheyes_are_resampled_to_pinholes(tmp_path):
     row = int(camera.intrinsics[1, 2])
     assert image[row, column, 0] > 100
     assert image[:, : column - 3].max() == 0
+    assert torch.equal(log.frames[1].vehicle, image[..., 0] > 0)
 
 
 def test_lidar_and_boxes_that_are_not_there(tmp_path):

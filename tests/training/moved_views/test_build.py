@@ -12,15 +12,16 @@ from sparsestreet.training.moved_views.build import report_shift
     ("shift", "level", "said"),
     [
         (
-            EdgeShift(0.2, -0.5, 900),
+            EdgeShift(0.9, -1.9, 900),
             logging.INFO,
-            "edges of the images lie 0.2 pixels to the right of those of the lidar",
+            "0.9 pixels to the right of those of the lidar and -1.9 below",
         ),
         (
-            EdgeShift(-0.1, 1.2, 900),
+            EdgeShift(-0.1, -2.1, 900),
             logging.WARNING,
-            "and 1.2 below: check calibration, poses and stamps, or train with",
+            "-2.1 below: check calibration, poses and stamps",
         ),
+        (EdgeShift(-1.1, 0.0, 900), logging.WARNING, "-1.1 pixels to the right"),
         (None, logging.INFO, "too few edges are seen by lidar and cameras"),
     ],
 )
