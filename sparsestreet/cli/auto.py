@@ -5,6 +5,7 @@ The options are those of every conf folder that Hydra searches, so a reader of o
 
 import importlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 from hydra import compose
@@ -46,7 +47,7 @@ def found_option(root: Path, searchpath: Sequence[str] = ()) -> tuple[str, Path]
     if not root.is_dir():
         what = "is a file" if root.exists() else "is not there"
         raise ValueError(f"data.root={root} {what}: name the folder of a log")
-    marks = _marks_of_options(searchpath)
+    marks = _marks_of_options(tuple(searchpath))
     known = _known_as(root, marks)
     if len(known) == 1:
         return next(iter(known.items()))
@@ -72,7 +73,8 @@ def _root_of(arguments: Sequence[str]) -> Path:
     return Path(str(override.value()))
 
 
-def _marks_of_options(searchpath: Sequence[str]) -> dict[str, Marks]:
+@cache
+def _marks_of_options(searchpath: tuple[str, ...]) -> dict[str, Marks]:
     """Of every option with a root whose reader states its marks."""
     found = {}
     with configuration():

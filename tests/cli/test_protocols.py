@@ -1,8 +1,11 @@
 """conf/protocol: scene lists that papers use, with their windows, cameras and splits."""
 
+import copy
+
 import pytest
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.compose import CONF, composed, configuration
 
@@ -22,23 +25,29 @@ STREETGS = {6: (0, 85), 26: (0, 100), 90: (0, 102), 105: (20, 186), 108: (20, 11
 }
 
 
-def jobs(name: str) -> list[str]:
-    """The overrides of the scenes, as Hydra's sweeper splits them."""
+def scenes(name: str) -> tuple[str, list]:
+    """The key and the values of the sweep, as Hydra splits them."""
     with configuration():
         params = compose("train", [f"protocol={name}", "data.root=x"], return_hydra_config=True).hydra.sweeper.params
     ((key, values),) = ((key, value) for key, value in params.items() if key.startswith("data.log."))
-    (override,) = OverridesParser.create().parse_overrides([f"{key}={values}"])
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    parser = OverridesParser.create()
+    (override,) = parser.parse_overrides([f"{key}={values}"])
+    return key, [parser.parse_override(f"{key}={one}").value() for one in override.sweep_string_iterator()]
 
 
-def logs(name: str) -> list:
-    return [composed([f"protocol={name}", "data.root=x", job]).data.log for job in jobs(name)]
+def windows(name: str) -> dict[str | int, tuple[int, int]]:
+    """Scene -> first and last frame."""
+    key, values = scenes(name)
+    cfg, found = copy.deepcopy(composed([f"protocol={name}", "data.root=x"])), {}
+    for value in values:
+        OmegaConf.update(cfg, key, value)
+        found[value] = cfg.data.log.first_frame, cfg.data.log.last_frame
+    return found
 
 
-@pytest.mark.parametrize(("name", "windows"), [("omnire", OMNIRE), ("streetgs", STREETGS)])
-def test_each_scene_has_its_window(name, windows):
-    found = {log.scene: (log.first_frame, log.last_frame) for log in logs(name)}
-    assert found == windows
+@pytest.mark.parametrize(("name", "published"), [("omnire", OMNIRE), ("streetgs", STREETGS)])
+def test_each_scene_has_its_window(name, published):
+    assert windows(name) == published
 
 
 def test_a_name_that_hydra_takes_for_a_number_has_its_window_too():
@@ -49,14 +58,14 @@ def test_a_name_that_hydra_takes_for_a_number_has_its_window_too():
 
 
 def test_drives_of_kitti_are_told_by_their_names():
-    assert [log.last_frame for log in logs("drivestudio_kitti")] == [-1, 200, 200, 200]
+    assert [last for _, last in windows("drivestudio_kitti").values()] == [-1, 200, 200, 200]
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_a_protocol_is_a_sweep_over_scenes_and_a_choice_for_one(name):
-    words = jobs(name)
-    assert len(words) == len(set(words)) > 1
-    cfg = composed([f"protocol={name}", "data.root=x", words[0], "split.stride=5", "data.log.width=640"])
+    _, values = scenes(name)
+    assert len(values) == len(set(values)) > 1
+    cfg = composed([f"protocol={name}", "data.root=x", "split.stride=5", "data.log.width=640"])
     assert (cfg.split.stride, cfg.data.log.width) == (5, 640)  # what is typed still counts
 
 

@@ -32,8 +32,8 @@ class Argoverse2Reader(RecordedReader):
 
     marks = Marks(("city_SE3_egovehicle.feather",), depth=2)
 
-    scene: str | None = None
-    """First characters of the log's name; None: the only log below the root."""
+    scene: str | int | float | None = None
+    """First characters of the log's name (a command line may take them for a whole number); None: the only one."""
 
     def recording(self) -> Recording:
         chosen = self._selection()
