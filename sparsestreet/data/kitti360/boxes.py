@@ -40,7 +40,7 @@ _SHEAR = 1e-3
 _REMEDY = "copy it again from the published archive, or remove it to read the sequence without boxes"
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Object:
     class_name: str
     window: tuple[int, int]
