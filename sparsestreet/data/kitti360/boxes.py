@@ -1,6 +1,6 @@
 """Annotated objects of a sequence that can move, from its XML of cuboids."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -86,7 +86,7 @@ def _add(objects: dict[str, _Object], item: Element, path: Path, what: str) -> N
     pose, size = _decomposed(_matrix(item, path, what), path, what)
     name = f"{CLASSES[semantic]}-{instance}"
     found = objects.setdefault(name, _Object(CLASSES[semantic], (start, end)))
-    found.window = min(start, found.window[0]), max(end, found.window[1])
+    found = objects[name] = replace(found, window=(min(start, found.window[0]), max(end, found.window[1])))
     found.poses[stamp], found.sizes[stamp] = pose, size
 
 
