@@ -23,7 +23,8 @@ numbers      numbers from text files
 json_tree    values of JSON files that know where they stand
 ply          points from .ply files
 lidar        colors that points take from images, depth that pixels take from points
-formats      data sets as they are published, to be named where they must be converted first
+marks        how a folder shows whose data set it holds; what is known and not read
+recolored    sweeps without the colors of cameras that are held out
 nuscenes     reader of nuScenes as it is published: tables of JSON, images, sweeps
 drivestudio  reader of DriveStudio's processed layout
 argoverse2   reader of Argoverse 2's sensor data set
