@@ -7,6 +7,7 @@ import importlib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
@@ -76,18 +77,15 @@ def _root_of(arguments: Sequence[str]) -> Path:
 @cache
 def _marks_of_options(searchpath: tuple[str, ...]) -> dict[str, Marks]:
     """Of every option with a root whose reader states its marks."""
-    found = {}
     with configuration():
         loader = GlobalHydra.instance().config_loader()
         options = loader.get_group_options("data", ObjectType.CONFIG, config_name="train", overrides=list(searchpath))
-        for name in options:
-            data = compose(None, [*searchpath, f"+data={name}"]).data
-            if "root" in set(data) and (marks := getattr(_reader_of(name, data.log._target_), "marks", None)):
-                found[name] = marks
-    return found
+        every = compose(None, [*searchpath, *(f"+data@{name}={name}" for name in options)])
+    readers = {name: _reader_of(name, every[name].log._target_) for name in options if "root" in set(every[name])}
+    return {name: reader.marks for name, reader in readers.items() if getattr(reader, "marks", None)}
 
 
-def _reader_of(name: str, target: str) -> type:
+def _reader_of(name: str, target: str) -> Any:
     module, _, reader = target.rpartition(".")
     try:
         return getattr(importlib.import_module(module), reader)

@@ -5,6 +5,7 @@ import itertools
 from pathlib import Path
 
 import lightning
+import numpy as np
 import pytest
 import torch
 
@@ -270,3 +271,17 @@ def test_a_camera_that_is_held_out_gives_returns_no_colors(tmp_path):
         not torch.equal(sweep.colors, other.colors) for sweep, other in zip(log.sweeps, alone.sweeps, strict=True)
     )
     assert StreetData(log, stride=2, offset=1, cameras=["0"]).split_in_words == "every 2th frame from 1 and camera 0"
+
+
+def test_returns_that_only_a_held_out_camera_sees_count_as_unseen(tmp_path):
+    """The other camera looks back, where there are other returns."""
+    make_nuscenes(tmp_path)
+    for path in (tmp_path / "extrinsics").glob("*_1.txt"):
+        np.savetxt(path, np.loadtxt(path) @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    log = DriveStudioReader(tmp_path).read()
+    sweeps = StreetData(log, stride=0, cameras=["0"]).driving_log.sweeps
+    alone = DriveStudioReader(tmp_path, cameras=[1]).read()
+    expected = [sweep.colored.tolist() for sweep in alone.sweeps]
+    assert [sweep.colored.tolist() for sweep in sweeps] == expected
+    assert [sweep.colored.tolist() for sweep in sweeps.gray()] == expected
+    assert [sweep.colored.tolist() for sweep in log.sweeps] != expected
