@@ -10,11 +10,14 @@ Conventions, everywhere:
 """
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
+
+Side = Literal["top", "bottom", "left", "right"]
+"""A side of an image."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +74,23 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Shutter:
-    """Motion of a camera while its rows are read from first to last. The camera's pose is that at the middle row."""
+    """Motion of a camera while its rows or columns are read one after the other. Its pose is that at the middle one."""
 
     translation: Float[Tensor, "3"]
     """Displacement of the camera over the whole readout, meters, in the camera frame."""
     rotation: Float[Tensor, "3"]
     """Rotation vector of the camera over the whole readout, radians, in the camera frame."""
+    direction: Side = "top"
+    """The side of the image that is read first: rows from "top" or "bottom", columns from "left" or "right"."""
+
+    @property
+    def reads_columns(self) -> bool:
+        return self.direction in ("left", "right")
+
+    @property
+    def sign(self) -> int:
+        """1 if later rows or columns have larger pixel coordinates, else -1."""
+        return 1 if self.direction in ("top", "left") else -1
 
 
 @dataclass(frozen=True)
@@ -91,7 +105,7 @@ class Camera:
     distortion: Float[Tensor, "5"] | None = None
     """Brown-Conrady k1, k2, p1, p2, k3, in OpenCV's order; None: a pinhole, which costs nothing."""
     shutter: Shutter | None = None
-    """None: all rows are exposed at once, which costs nothing."""
+    """None: all pixels are exposed at once, which costs nothing."""
 
     @property
     def position(self) -> Float[Tensor, "3"]:

@@ -39,7 +39,7 @@ class Guards:
     past_fold: int = 0
     """Past the fold: farther off the axis than the lens polynomial describes."""
     outruns_shutter: int = 0
-    """Moves down the image nearly as fast as its rows are read."""
+    """Moves over the image nearly as fast as the image is read, in the same direction."""
     vanished: int = 0
     """Screen determinant too small, which happens only without blur. An alarm."""
     overflowed: int = 0

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from typing import get_args
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from sparsestreet.types import Camera, Gaussians
+from sparsestreet.types import Camera, Gaussians, Side
 
 LONGEST_SIDE = 1 << 22
 """Longest side of an image, pixels: up to here all pixel centers are exact in float32."""
@@ -174,6 +175,12 @@ def _check_effects(camera: Camera) -> None:
         values = getattr(camera.shutter, name)
         if tuple(values.shape) != (3,) or not all(math.isfinite(value) for value in values.tolist()):
             raise ValueError(f"camera.shutter.{name} must be 3 finite numbers, got {values.tolist()}")
+    direction = camera.shutter.direction
+    if direction not in get_args(Side):
+        raise ValueError(
+            f"camera.shutter.direction must be one of {', '.join(get_args(Side))}, got {direction!r}: name the side of "
+            "the image that is read first"
+        )
 
 
 def _check_background(background: Tensor, camera: Camera, means: Tensor) -> None:

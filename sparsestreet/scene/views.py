@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.records.strict_json import EXACT, json_line, read_json, version, write_atomically
-from sparsestreet.types import Camera, Shutter, View
+from sparsestreet.types import Camera, Shutter, Side, View
 
 FORMAT = 2
 FILE_NAME = "views.json"
@@ -54,6 +55,8 @@ class _Entry:
     distortion: Numbers | None = field(default=None, metadata=EXACT)
     shutter_translation: Numbers | None = field(default=None, metadata=EXACT)
     shutter_rotation: Numbers | None = field(default=None, metadata=EXACT)
+    shutter_direction: str | None = None
+    """None with a shutter: "top", the only direction of files without this key."""
     seconds: float | None = field(default=None, metadata=EXACT)
     stamp: int | None = None
 
@@ -122,6 +125,7 @@ def _entry(split: str, view: View) -> _Entry:
         distortion=None if camera.distortion is None else _numbers(camera.distortion),
         shutter_translation=None if camera.shutter is None else _numbers(camera.shutter.translation),
         shutter_rotation=None if camera.shutter is None else _numbers(camera.shutter.rotation),
+        shutter_direction=None if camera.shutter is None else camera.shutter.direction,
         seconds=view.seconds,
         stamp=view.stamp,
     )
@@ -133,6 +137,7 @@ def _view(entry: _Entry, where: str) -> View:
         shutter = Shutter(
             _tensor(entry.shutter_translation, (3,), where, "shutter_translation"),
             _tensor(entry.shutter_rotation, (3,), where, "shutter_rotation"),
+            _direction(entry.shutter_direction, where),
         )
     camera = Camera(
         _tensor(entry.camera_from_world, (4, 4), where, "camera_from_world"),
@@ -143,6 +148,13 @@ def _view(entry: _Entry, where: str) -> View:
         shutter,
     )
     return View(camera, entry.time, entry.frame_index, entry.camera_index, entry.seconds, entry.stamp)
+
+
+def _direction(name: str | None, where: str) -> Side:
+    for side in get_args(Side):
+        if side == (name or "top"):
+            return side
+    raise ValueError(f"{where}: shutter_direction must be one of {', '.join(get_args(Side))}, got {name!r}")
 
 
 def _matrix(values: Float[Tensor, "r c"]) -> Matrix:

@@ -11,16 +11,20 @@ from tests.ops.scenes import FIELDS
 
 
 def naive_image(
-    gaussians: Gaussians, view: Camera, settings: SplatSettings, rows: Iterable[int] | None = None
+    gaussians: Gaussians,
+    view: Camera,
+    settings: SplatSettings,
+    rows: Iterable[int] | None = None,
+    columns: Iterable[int] | None = None,
 ) -> np.ndarray:
     """Per pixel, from the textbook: matrix inverse of the covariance, no tricks; pinhole, degree 0 colors.
 
-    Image rows that are not asked for stay black.
+    Image rows and columns that are not asked for stay black.
     """
     splats = sorted(_naive_splats(gaussians, view, settings), key=lambda item: item[0])
     image = np.zeros((view.height, view.width, 3))
     for row in range(view.height) if rows is None else rows:
-        for column in range(view.width):
+        for column in range(view.width) if columns is None else columns:
             passed = 1.0
             for _, mean, conic, opacity, color in splats:
                 d = np.array([column + 0.5, row + 0.5]) - mean

@@ -20,7 +20,14 @@ def vector(*values: float) -> torch.Tensor:
 
 
 LENSES = {"pinhole": None, "folds": vector(-0.25, 0.08, 2e-3, -1e-3, -0.05), "opens": vector(0.1, 0.05, -1e-3, 2e-3, 0)}
-SHUTTERS = {"global": None, "rolling": Shutter(vector(0.15, -0.3, 0.3), vector(0.02, 0.04, 0.02))}
+MOTION = vector(0.15, -0.3, 0.3), vector(0.02, 0.04, 0.02)
+SHUTTERS = {
+    "global": None,
+    "rolling": Shutter(*MOTION),
+    "bottom": Shutter(*MOTION, "bottom"),
+    "left": Shutter(*MOTION, "left"),
+    "right": Shutter(*MOTION, "right"),
+}
 SETTINGS = {
     "default": SplatSettings(),
     "knobs": SplatSettings(max_sigma=1.7, depth_bits=14, half_colors=True, antialias=True, stop="exclusive"),
@@ -37,12 +44,17 @@ def walking(rows: int, view: Camera, terms: int = 4, seed: int = 0) -> Gaussians
     return dataclasses.replace(random_gaussians(rows, view, terms=terms, seed=seed), displacements=speeds.double())
 
 
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
-@pytest.mark.parametrize(("lens", "shutter"), list(itertools.product(LENSES, SHUTTERS)))
+@pytest.mark.parametrize(
+    ("lens", "shutter", "settings"),
+    [
+        *itertools.product(LENSES, ("global", "rolling"), SETTINGS),
+        *itertools.product(LENSES, ("bottom", "left", "right"), ("knobs",)),
+    ],
+)
 def test_float64_equals_the_reference(lens, shutter, settings):
     view = view_through(lens, shutter)
     gaussians = walking(250, view)
-    truth, result = (render(gaussians, view, backend, torch.float64, settings) for backend in ("reference", "cpu"))
+    truth, result = (render(gaussians, view, name, torch.float64, SETTINGS[settings]) for name in ("reference", "cpu"))
     assert torch.equal(result.radii > 0, truth.radii > 0)
     for part in ("images", "gradients"):
         for name, value in getattr(truth, part).items():
@@ -50,7 +62,9 @@ def test_float64_equals_the_reference(lens, shutter, settings):
             assert relative_error(getattr(result, part)[name], value) < 1e-9, name
 
 
-@pytest.mark.parametrize(("lens", "shutter"), [("folds", "global"), ("pinhole", "rolling"), ("opens", "rolling")])
+@pytest.mark.parametrize(
+    ("lens", "shutter"), [("folds", "global"), ("pinhole", "rolling"), ("opens", "rolling"), ("folds", "right")]
+)
 def test_float32_gradients(lens, shutter):
     view = view_through(lens, shutter)
     gaussians = walking(250, view)
@@ -64,8 +78,9 @@ def test_float32_gradients(lens, shutter):
 
 @pytest.mark.parametrize("rows", [0, 1, 3, 17, 33])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-def test_registers_need_not_be_full(rows, dtype):
-    view = view_through("opens", "rolling")
+@pytest.mark.parametrize("shutter", ["rolling", "left"])
+def test_registers_need_not_be_full(rows, dtype, shutter):
+    view = view_through("opens", shutter)
     gaussians = walking(rows, view, terms=16)
     many = Gaussians.concatenate([gaussians, walking(40, view, terms=16, seed=1)])
     hidden = dataclasses.replace(many, opacities=torch.where(torch.arange(rows + 40) < rows, many.opacities, 0.0))
@@ -78,10 +93,11 @@ def test_registers_need_not_be_full(rows, dtype):
 
 
 @pytest.mark.parametrize("variant", [0, 1, 2])
-def test_every_instruction_set(variant):
+@pytest.mark.parametrize("shutter", ["rolling", "right"])
+def test_every_instruction_set(variant, shutter):
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
-    view = view_through("folds", "rolling")
+    view = view_through("folds", shutter)
     gaussians = walking(200, view, terms=16)
     truth = cast(gaussians, torch.float64, requires_grad=True)
     splat(truth, view, settings=SETTINGS["knobs"], backend="reference").rgb.backward(cotangents(view)[0])

@@ -30,7 +30,7 @@ EMPTY = {
         namespace SPLAT_VARIANT {
         constexpr double SLOWEST_READOUT = 0;
         template <class V> struct MovingRow;
-        template <class V, bool LENS> struct Motion;
+        template <class V, bool LENS, bool COLUMNS> struct Motion;
         }""",
 }
 INSTANCE = """

@@ -1,6 +1,7 @@
-"""Rolling shutter against a brute-force one: every image row rendered at its own instant."""
+"""Rolling shutter against a brute-force one: every image row or column rendered at its own instant."""
 
 import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.ops import SplatSettings, contribution, guards, splat
-from sparsestreet.types import Camera, Gaussians, Shutter
+from sparsestreet.types import Camera, Gaussians, Shutter, Side
 from tests.ops.oracles import fitted_splat, naive_image
 from tests.ops.scenes import (
     FIELDS,
@@ -22,24 +23,37 @@ from tests.ops.scenes import (
     random_gaussians,
     render,
 )
+from tests.typed import there
 
 pytestmark = pytest.mark.lengthy
 
 # The low-pass belongs to the sensor and does not move with the splat, so the moving-Gaussian identity is exact without.
 SHARP = SplatSettings(eps2d=0.0)
 FITTED = SplatSettings(eps2d=0.0, alpha_min=0.0, transmittance_min=0.0)
+LENS = (-0.25, 0.08, 2e-3, -1e-3, -0.01)
+every_lens = pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "distorted"])
+every_direction = pytest.mark.parametrize("direction", ["top", "bottom", "left", "right"])
 
 
 def vector(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def rolling(view: Camera, translation=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0)) -> Camera:
-    return dataclasses.replace(view, shutter=Shutter(vector(*translation), vector(*rotation)))
+def rolling(
+    view: Camera, translation=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0), direction: Side = "top", lens=None
+) -> Camera:
+    shutter = Shutter(vector(*translation), vector(*rotation), direction)
+    return dataclasses.replace(view, shutter=shutter, distortion=None if lens is None else vector(*lens))
 
 
 def moved(gaussians: Gaussians, displacements) -> Gaussians:
     return dataclasses.replace(gaussians, displacements=torch.as_tensor(displacements, dtype=torch.float64))
+
+
+def read_at(view: Camera, x: float, y: float) -> float:
+    """When a place of the image is read, -1/2 to 1/2 of the readout."""
+    right, down = x / view.width - 0.5, y / view.height - 0.5
+    return {"top": down, "bottom": -down, "left": right, "right": -right}[there(view.shutter).direction]
 
 
 def at_instant(gaussians: Gaussians, view: Camera, tau: float) -> tuple[Gaussians, Camera]:
@@ -52,14 +66,20 @@ def at_instant(gaussians: Gaussians, view: Camera, tau: float) -> tuple[Gaussian
     if gaussians.displacements is not None:
         means = means + tau * gaussians.displacements
     pose = torch.linalg.inv(turn) @ view.camera_from_world
-    return dataclasses.replace(gaussians, means=means), dataclasses.replace(view, camera_from_world=pose)
+    return dataclasses.replace(gaussians, means=means), dataclasses.replace(view, camera_from_world=pose, shutter=None)
 
 
 def brute_force(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> np.ndarray:
-    image = np.zeros((view.height, view.width, 3))
-    for row in range(view.height):
-        scene, instant = at_instant(gaussians, view, (row + 0.5) / view.height - 0.5)
-        image[row] = naive_image(scene, instant, settings, [row])[row]
+    """Through a lens each line comes from an image of the reference, which has no shutter to simulate there."""
+    image, rows = np.zeros((view.height, view.width, 3)), there(view.shutter).direction in ("top", "bottom")
+    for line in range(view.height if rows else view.width):
+        scene, instant = at_instant(gaussians, view, read_at(view, line + 0.5, line + 0.5))
+        place = line if rows else (slice(None), line)
+        if view.distortion is None:
+            drawn = naive_image(scene, instant, settings, **{"rows" if rows else "columns": [line]})
+        else:
+            drawn = splat(scene, instant, settings=settings, backend="reference").rgb.numpy()
+        image[place] = drawn[place]
     return image
 
 
@@ -80,13 +100,14 @@ def flat_cards(generator_seed: int = 2) -> Gaussians:
 
 
 @every_double
+@every_direction
 @pytest.mark.parametrize(
     ("translation", "displacement"),
     [((0.3, 0.0, 0.0), None), ((0.0, -0.25, 0.0), None), ((-0.2, 0.3, 0.0), (0.1, 0.3, 0.0))],
     ids=["sideways", "up", "both and the rows move"],
 )
-def test_cards_moving_in_their_planes_are_exact(backend, translation, displacement):
-    view = rolling(front_camera(13, 11, 12.0), translation)
+def test_cards_moving_in_their_planes_are_exact(backend, translation, displacement, direction):
+    view = rolling(front_camera(13, 11, 12.0), translation, direction=direction)
     gaussians = flat_cards()
     if displacement is not None:
         speeds = torch.linspace(-1, 1, len(gaussians), dtype=torch.float64)[:, None]
@@ -114,12 +135,15 @@ def test_ball_on_the_axis_is_exact_to_first_order(backend):
 
 
 @every_double
-@pytest.mark.parametrize("lens", [None, (-0.25, 0.08, 2e-3, -1e-3, -0.01)], ids=["pinhole", "distorted"])
-def test_mean_follows_any_motion_to_first_order(backend, lens):
-    # A long lens shifted off the axis shows 20 x 40 pixels; the ball, 1.5 px in size, is read late.
-    focal, mean = 2000.0, vector(0.7, -0.4, 2.0)
+@every_lens
+@every_direction
+def test_mean_follows_any_motion_to_first_order(backend, lens, direction):
+    # A long lens shifted off the axis shows 20 x 40 pixels; the ball, 1.5 px in size, is not read in the middle. For
+    # columns x and y are exchanged, so that it moves as far along the readout.
+    order = [0, 1, 2] if direction in ("top", "bottom") else [1, 0, 2]
+    focal, mean, width, height = 2000.0, vector(0.7, -0.4, 2.0)[order], (20, 40)[order[0]], (20, 40)[order[1]]
     intrinsics = torch.tensor([[focal, 0, 0.0], [0, focal, 0.0], [0, 0, 1]], dtype=torch.float64)
-    view = Camera(torch.eye(4, dtype=torch.float64), intrinsics, 20, 40, None if lens is None else vector(*lens))
+    view = Camera(torch.eye(4, dtype=torch.float64), intrinsics, width, height, None if lens is None else vector(*lens))
     ball = one_gaussian(means=[mean.tolist()], scales=[[1.5 * 2 / focal] * 3])
 
     def place(instant: Camera, scene: Gaussians) -> np.ndarray:
@@ -133,17 +157,18 @@ def test_mean_follows_any_motion_to_first_order(backend, lens):
         return focal * np.array([x_d, y_d])
 
     start = place(view, ball)
-    view.intrinsics[0, 2], view.intrinsics[1, 2] = 10 - start[0], 28 - start[1]
+    view.intrinsics[0, 2], view.intrinsics[1, 2] = (10, 28)[order[0]] - start[0], (10, 28)[order[1]] - start[1]
     settled = fitted_splat(splat(ball, view, settings=FITTED, backend=backend).alpha)[0]
     errors = []
     for size in (1.0, 0.5):
-        shot = rolling(view, (6e-3 * size, -4e-3 * size, 0.02 * size), (3e-3 * size, -5e-3 * size, 4e-3 * size))
-        gaussians = moved(ball, [[4e-3 * size, 6e-3 * size, -0.03 * size]])
+        steps, angles = size * vector(6e-3, -4e-3, 0.02)[order], size * vector(3e-3, -5e-3, 4e-3)[order]
+        shot = rolling(view, steps.tolist(), angles.tolist(), direction, lens)
+        gaussians = moved(ball, size * vector(4e-3, 6e-3, -0.03)[None, order])
         found = fitted_splat(splat(gaussians, shot, settings=FITTED, backend=backend).alpha)[0]
-        # Where the true path crosses the row that is being read; the settled mean includes what the shape adds.
+        # Where the true path crosses the line that is being read; the settled mean includes what the shape adds.
         true = settled
         for _ in range(50):
-            scene, instant = at_instant(gaussians, shot, true[1] / 40 - 0.5)
+            scene, instant = at_instant(gaussians, shot, read_at(shot, *true))
             true = settled + place(instant, scene) - start
         assert np.abs(true - settled).max() > 0.2 * size
         errors.append(np.abs(found - true).max())
@@ -151,18 +176,28 @@ def test_mean_follows_any_motion_to_first_order(backend, lens):
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.15)
 
 
-@every_double
-def test_most_of_a_moving_scene_is_right(backend):
-    # Tilted ellipsoids everywhere, a camera that drives, yaws and bumps, rows that walk: their shapes change during the
-    # readout, which one Gaussian cannot follow. That is a seventh of the effect here.
-    view = rolling(camera(20, 15, focal=80.0), (0.15, -0.05, 0.3), (0.02, 0.03, 0.02))
+@cache
+def moving_scene(direction: Side, lens: tuple[float, ...] | None) -> tuple[Gaussians, Camera, np.ndarray, float]:
+    """A moving scene, its true image, and how far from that the image without a shutter is."""
+    view = rolling(camera(20, 15, focal=80.0), (0.15, -0.05, 0.3), (0.02, 0.03, 0.02), direction, lens)
     still = random_gaussians(30, view, terms=1)
     near = (still.means @ view.camera_from_world[:3, :3].T + view.camera_from_world[:3, 3])[:, 2] < 3
     still = Gaussians(*(getattr(still, name)[~near] for name in FIELDS))
     gaussians = moved(still, 0.2 * torch.randn(len(still), 3, generator=torch.Generator().manual_seed(3)).double())
     expected = brute_force(gaussians, view, FITTED)
+    at_once = splat(gaussians, dataclasses.replace(view, shutter=None), settings=FITTED, backend="reference").rgb
+    return gaussians, view, expected, float(np.linalg.norm(at_once.numpy() - expected))
+
+
+# The lens is as strong as -0.25 would be in four times the angle: without it the error is half of the effect or more.
+@every_double
+@pytest.mark.parametrize("lens", [None, (-4.0, 4.8, 0.04, -0.02, 0.0)], ids=["pinhole", "distorted"])
+@every_direction
+def test_most_of_a_moving_scene_is_right(backend, lens, direction):
+    # Tilted ellipsoids everywhere, a camera that drives, yaws and bumps, rows that walk: their shapes change during the
+    # readout, which one Gaussian cannot follow. That is a sixth of the effect here, or less.
+    gaussians, view, expected, effect = moving_scene(direction, lens)
     image = splat(gaussians, view, settings=FITTED, backend=backend).rgb.numpy()
-    effect = np.linalg.norm(naive_image(gaussians, view, FITTED) - expected)
     assert effect > 0.3
     assert np.linalg.norm(image - expected) < 0.2 * effect
 
@@ -186,12 +221,19 @@ def test_no_motion_is_no_shutter_bit_for_bit(backend, dtype):
 
 
 @every_precision
-@pytest.mark.parametrize(("fall", "drawn"), [(-20.0, True), (0.85, True), (0.95, False), (1.0, False), (20.0, False)])
-def test_rows_that_outrun_the_readout_are_culled(backend, dtype, fall, drawn):
-    # The ball falls by `fall` image heights during the readout, so 1 - u_y / H = 1 - fall; culled below 0.1. Its peak
-    # is at the middle row whenever it is drawn.
-    view = rolling(front_camera(9, 10, 20.0))
-    ball = moved(one_gaussian(), [[0.0, fall * 10 / 20 * 2, 0.0]])
+@pytest.mark.parametrize(
+    ("direction", "fall", "drawn"),
+    [
+        *(("top", fall, fall < 0.9) for fall in (-20.0, 0.85, 0.95, 1.0, 20.0)),
+        *((direction, fall, fall < 0.9) for direction in ("bottom", "left", "right") for fall in (0.85, 0.95)),
+    ],
+)
+def test_rows_that_outrun_the_readout_are_culled(backend, dtype, direction, fall, drawn):
+    # From the top the ball falls by `fall` image heights during the readout, so 1 - u_y / H = 1 - fall; culled below
+    # 0.1. Its peak is at the middle row whenever it is drawn.
+    view = rolling(front_camera(9, 10, 20.0), direction=direction)
+    heights = {"top": (0, 10, 0), "bottom": (0, -10, 0), "left": (9, 0, 0), "right": (-9, 0, 0)}[direction]
+    ball = moved(one_gaussian(), [[fall * height / 20 * 2 for height in heights]])
     result = render(ball, view, backend, dtype)
     assert result.is_finite()
     assert bool(result.radii[0] > 0) == drawn
@@ -231,11 +273,22 @@ def test_contribution_sees_what_is_drawn(backend):
 
 
 @every_double
-@pytest.mark.parametrize("lens", [None, (-0.25, 0.08, 2e-3, -1e-3, -0.01)], ids=["pinhole", "distorted"])
+@every_lens
 @pytest.mark.parametrize("field", FIELDS)
 def test_gradient_of_each_field(backend, field, lens):
-    view = rolling(camera(5, 4), (0.15, -0.3, 0.3), (0.02, 0.04, 0.02))
-    view = dataclasses.replace(view, distortion=None if lens is None else vector(*lens))
+    check_gradient(backend, field, lens, "top")
+
+
+# test_cpu_effects.py compares the gradients of the reference with those of the C++ backend.
+@pytest.mark.parametrize(("direction", "lens"), [("bottom", None), ("left", LENS), ("right", None)])
+@pytest.mark.parametrize("field", FIELDS)
+def test_gradient_of_each_field_in_other_directions(field, direction, lens):
+    check_gradient("reference", field, lens, direction)
+
+
+def check_gradient(backend: str, field: str, lens: tuple[float, ...] | None, direction: Side) -> None:
+    """Against finite differences."""
+    view = rolling(camera(5, 4), (0.15, -0.3, 0.3), (0.02, 0.04, 0.02), direction, lens)
     gaussians = random_gaussians(8, view, terms=4, seed=3)
     speeds = 0.3 * torch.randn(8, 3, generator=torch.Generator().manual_seed(3)).double()
     values = {name: getattr(gaussians, name).clone() for name in FIELDS}

@@ -197,6 +197,12 @@ def test_distortion_that_no_lens_has(place, k):
         splat(one_gaussian(), dataclasses.replace(VIEW, distortion=lens), backend="reference")
 
 
+def test_a_direction_that_no_shutter_has():
+    shutter = unchecked(Shutter(torch.ones(3), torch.ones(3)), direction="TOP")
+    with pytest.raises(ValueError, match="direction must be one of top, bottom, left, right, got 'TOP': name the side"):
+        check_structure(one_gaussian(), dataclasses.replace(VIEW, shutter=shutter), None)
+
+
 @pytest.mark.lengthy
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -19,7 +19,8 @@ def odd_view(frame: int = 3) -> View:
     def numbers(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator) * torch.logspace(-6, 6, shape[-1])
 
-    camera = Camera(numbers(4, 4), numbers(3, 3), 97, 61, numbers(5), Shutter(numbers(3), numbers(3)))
+    direction = ("top", "bottom", "left", "right")[frame]
+    camera = Camera(numbers(4, 4), numbers(3, 3), 97, 61, numbers(5), Shutter(numbers(3), numbers(3), direction))
     return View(camera, frame / 7, frame, 2, frame / 9.7, 1_532_402_927_600_000_251 + 99_999_997 * frame)
 
 
@@ -33,7 +34,7 @@ def same(a: View, b: View) -> None:
 
 def test_views_come_back_bit_for_bit(tmp_path):
     path = tmp_path / "run" / "views.json"
-    plain, odd = street_views(), [odd_view(0), odd_view(3)]  # the first was taken at 0.0 seconds
+    plain, odd = street_views(), [odd_view(frame) for frame in range(4)]  # the first was taken at 0.0 seconds
     write_views(path, odd, plain, frame_rate=12.5)
     views = read_views(path)
     for written, read in zip([*odd, *plain], [*views.training, *views.held_out], strict=True):
@@ -46,6 +47,7 @@ def test_views_come_back_bit_for_bit(tmp_path):
         assert torch.equal(there(written.camera.distortion), there(read.camera.distortion))
         assert torch.equal(written.camera.shutter.translation, read.camera.shutter.translation)
         assert torch.equal(written.camera.shutter.rotation, read.camera.shutter.rotation)
+        assert written.camera.shutter.direction == read.camera.shutter.direction
     assert [entry.name for entry in path.parent.iterdir()] == ["views.json"]
 
 
@@ -55,6 +57,15 @@ def test_all_views_are_in_order_of_frame_and_camera(tmp_path):
     write_views(tmp_path / "views.json", views[8:12], [*views[12:], *views[:8]])
     order = [(view.frame_index, view.camera_index) for view in read_views(tmp_path / "views.json").all]
     assert order == [(view.frame_index, view.camera_index) for view in views]
+
+
+def test_a_shutter_without_a_direction_is_of_an_earlier_version_and_read_from_the_top(tmp_path):
+    path = tmp_path / "views.json"
+    write_views(path, [odd_view(2)], [])
+    file = json.loads(path.read_text())
+    assert file["views"][0].pop("shutter_direction") == "left"
+    path.write_text(json.dumps(file))
+    assert there(read_views(path).training[0].camera.shutter).direction == "top"
 
 
 def test_an_unknown_frame_rate_is_none(tmp_path):
@@ -97,11 +108,15 @@ def test_a_file_that_is_not_there_says_who_writes_it(tmp_path):
         (lambda file: file["views"][2]["intrinsics"][1].pop(), "view 2: intrinsics must be 3 x 3"),
         (lambda file: file["views"][0].pop("time"), r"views\[0\].* lacks the keys \['time'\]"),
         (lambda file: file["views"][0].update(distortion=[0.1]), "view 0: distortion must be 5 numbers"),
+        (
+            lambda file: file["views"][3].update(shutter_direction="up"),
+            "view 3: shutter_direction must be one of top, bottom, left, right, got 'up'",
+        ),
     ],
 )
 def test_a_damaged_file_names_the_place(tmp_path, change, said):
     path = tmp_path / "views.json"
-    write_views(path, street_views(), [])
+    write_views(path, [*street_views()[:3], odd_view()], [])
     file = json.loads(path.read_text())
     change(file)
     path.write_text(json.dumps(file))

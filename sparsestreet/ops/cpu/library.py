@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, to measure and test it."""
-_INTERFACE_VERSION = 12
+_INTERFACE_VERSION = 13
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -36,7 +36,8 @@ class CView(ctypes.Structure):
         *((name, c_int64) for name in ("width", "height")),
         *((name, c_int64) for name in ("exclusive_stop", "antialias", "half_colors")),
         *((name, c_int64) for name in ("clamp_colors", "detach_directions", "plain_gradients", "depth_bits")),
-        *((name, c_int64) for name in ("has_lens", "has_shutter", "every_tile", "pair_limit", "threads")),
+        *((name, c_int64) for name in ("has_lens", "has_shutter", "shutter_columns", "shutter_sign")),
+        *((name, c_int64) for name in ("every_tile", "pair_limit", "threads")),
     )
 
 

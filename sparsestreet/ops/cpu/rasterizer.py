@@ -189,6 +189,8 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
     if camera.shutter is not None:
         view.shutter_translation[:] = camera.shutter.translation.tolist()
         view.shutter_rotation[:] = camera.shutter.rotation.tolist()
+        view.shutter_columns = camera.shutter.reads_columns
+        view.shutter_sign = camera.shutter.sign
     return view
 
 

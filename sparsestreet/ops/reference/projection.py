@@ -142,7 +142,7 @@ def _footprints(
         refusals[Reason.PAST_FOLD] = ~(slopes.square().sum(-1) <= fold_radius_squared(camera.distortion))
     if camera.shutter is not None:
         motion = screen_motion(gaussians, rows, in_camera, camera, camera.shutter)
-        (means, factors), read = read_out(means, factors, motion, camera.height)
+        (means, factors), read = read_out(means, factors, motion, camera, camera.shutter)
         refusals[Reason.OUTRUNS_SHUTTER] = ~read
     return means, factors, refusals
 

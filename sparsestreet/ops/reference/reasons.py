@@ -18,7 +18,7 @@ class Reason(IntEnum):
     PAST_FOLD = 3
     """Farther off the axis than the lens polynomial describes."""
     OUTRUNS_SHUTTER = 4
-    """Moves down the image nearly as fast as its rows are read."""
+    """Moves over the image nearly as fast as the image is read, in the same direction."""
     VANISHED = 5
     """Thinner than the dtype can invert, which happens only without blur."""
     OVERFLOWED = 6

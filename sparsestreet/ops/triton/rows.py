@@ -53,7 +53,9 @@ def all_finite(values, COUNT: tl.constexpr):
 
 
 @jit
-def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: tl.constexpr):
+def on_screen(
+    view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr
+):  # fmt: skip
     """Shape on the screen (lens.py) of rows in front of the camera, and whether the lens and the shutter see them."""
     rotation = load_matrix(view + ROTATION)
     sees = mean[2] > 0
@@ -64,7 +66,7 @@ def on_screen(view, mean, axes, displacement, DISTORTED: tl.constexpr, ROLLING: 
         shape = pinhole(view, mean, axes)
     if ROLLING:
         speed = velocity(view, mean, times(rotation, displacement), DISTORTED)
-        shape, slowness = roll(view, shape, speed)
+        shape, slowness = roll(view, shape, speed, COLUMNS)
         sees = sees & (slowness >= ROLL_LEAST)
     return shape, sees
 
@@ -114,8 +116,8 @@ def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, CLAMPED: tl.conste
 def project_rows(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, numbers, rows,
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, HALF_COLORS: tl.constexpr,
-    BOUNDED: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    BOUNDED: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr,
+    DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
@@ -133,7 +135,7 @@ def project_rows(
     # Lanes of rows that are not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
     unit, _ = unit_quaternion(q)
-    shape, sees = on_screen(view, mean, camera_axes(rotation, unit, size), moved, DISTORTED, ROLLING)
+    shape, sees = on_screen(view, mean, camera_axes(rotation, unit, size), moved, DISTORTED, ROLLING, COLUMNS)
     variance_x, variance_y, determinant = blurred(view, shape[2], shape[3], shape[5])
     seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST)
     effective = opacity * compensation(shape[5], determinant, ANTIALIAS)

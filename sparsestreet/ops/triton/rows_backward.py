@@ -60,7 +60,8 @@ def project_rows_backward(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
     v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,
     TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr,
-    PLAIN: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+    PLAIN: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr,
+    DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -85,7 +86,7 @@ def project_rows_backward(
     if ROLLING:
         moved = times(rotation, load_row(displacements, row, seen & DISPLACED, 3))
         speed = velocity(view, mean, moved, DISTORTED)
-        shape, _ = roll(view, lens, speed)
+        shape, _ = roll(view, lens, speed, COLUMNS)
 
     to = record.record_of(records, row)
     v_screen_mean, v_absolute, v_l, v_effective = screen_gradient(s, to, seen)
@@ -95,7 +96,7 @@ def project_rows_backward(
     v_xx, v_yy, v_xy, v_bare = conic_backward(view, shape, v_l, v_effective, opacity, ANTIALIAS)
     v_shape = (v_screen_mean[0], v_screen_mean[1], v_xx, v_yy, v_xy, v_bare)
     if ROLLING:
-        v_shape, v_speed = roll_backward(view, lens, speed, v_shape)
+        v_shape, v_speed = roll_backward(view, lens, speed, v_shape, COLUMNS)
         v_mean = plus(v_mean, velocity_backward(view, mean, moved, v_speed, DISTORTED))
     through_lens, v_axes = lens_backward(view, mean, axes, v_shape, DISTORTED)
     v_quaternion, v_size = axes_backward(rotation, unit, inverse_length, size, v_axes)

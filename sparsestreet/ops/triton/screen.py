@@ -74,4 +74,5 @@ def given_or(tensor: Tensor | None, other: Tensor) -> Tensor:
 
 def effects(view: KernelView, displacements: Tensor | None) -> dict[str, Any]:
     """The switches of the row kernels."""
-    return {"DISTORTED": view.distorted, "ROLLING": view.rolling, "DISPLACED": displacements is not None}
+    moves = displacements is not None
+    return {"DISTORTED": view.distorted, "ROLLING": view.rolling, "COLUMNS": view.columns, "DISPLACED": moves}

@@ -2,6 +2,9 @@
 
 A point at p + u tau, read at image row y with tau = y / H - 1/2, is seen where y = p_y + u_y (y / H - 1/2). So the map
 from p to the seen point is linear, with a = 1 - u_y / H.
+
+Read from the bottom, tau changes its sign, which is the same as a motion -u. Columns are rows of the image with x and y
+exchanged.
 """
 
 import triton.language as tl
@@ -9,7 +12,7 @@ import triton.language as tl
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.unscented import curvature, jacobian
 from sparsestreet.ops.triton.vectors import cross, plus, scaled
-from sparsestreet.ops.triton.view import FOCAL, SHIFT, SIZE, TURN, load_vector
+from sparsestreet.ops.triton.view import MOTION_FOCAL, SHIFT, SIZE, TURN, load_vector
 
 # Rows with a smaller a outrun the readout.
 ROLL_LEAST = constant(0.1)
@@ -29,12 +32,14 @@ def normalized_speed(mean, dX):
 
 @jit
 def velocity(view, mean, moved, DISTORTED: tl.constexpr):
-    """Motion on the screen, pixels per readout: J dX with the exact Jacobian, through the distortion where given."""
+    """Motion on the screen, pixels per readout: J dX with the exact Jacobian, through the distortion where given.
+
+    It is reversed if the readout runs towards smaller coordinates."""
     n_x, n_y = normalized_speed(mean, drift(view, mean, moved))
     if DISTORTED:
         xx, xy, yy = jacobian(view, mean[0] / mean[2], mean[1] / mean[2])
         n_x, n_y = xx * n_x + xy * n_y, xy * n_x + yy * n_y
-    return tl.load(view + FOCAL) * n_x, tl.load(view + FOCAL + 1) * n_y
+    return tl.load(view + MOTION_FOCAL) * n_x, tl.load(view + MOTION_FOCAL + 1) * n_y
 
 
 @jit
@@ -43,7 +48,7 @@ def velocity_backward(view, mean, moved, v, DISTORTED: tl.constexpr):
     dX, inverse = drift(view, mean, moved), 1.0 / mean[2]
     x, y = mean[0] * inverse, mean[1] * inverse
     n_x, n_y = normalized_speed(mean, dX)
-    g_x, g_y = tl.load(view + FOCAL) * v[0], tl.load(view + FOCAL + 1) * v[1]
+    g_x, g_y = tl.load(view + MOTION_FOCAL) * v[0], tl.load(view + MOTION_FOCAL + 1) * v[1]
     v_x, v_y = 0 * g_x, 0 * g_y
     if DISTORTED:
         xxx, xxy, xyy, yyy = curvature(view, x, y)
@@ -59,9 +64,24 @@ def velocity_backward(view, mean, moved, v, DISTORTED: tl.constexpr):
 
 
 @jit
-def roll(view, shape, speed):
+def exchanged(shape):
+    """A shape (lens.py), or its gradient, with x and y exchanged."""
+    return shape[1], shape[0], shape[3], shape[2], shape[4], shape[5]
+
+
+@jit
+def roll(view, shape, speed, COLUMNS: tl.constexpr):
     """The shape (lens.py) as it is read out, and a."""
-    height = tl.load(view + SIZE + 1)
+    if COLUMNS:
+        rolled, a = roll_rows(tl.load(view + SIZE), exchanged(shape), (speed[1], speed[0]))
+        rolled = exchanged(rolled)
+    else:
+        rolled, a = roll_rows(tl.load(view + SIZE + 1), shape, speed)
+    return rolled, a
+
+
+@jit
+def roll_rows(height, shape, speed):
     a, shear = 1 - speed[1] / height, speed[0] / height
     y = (shape[1] - 0.5 * speed[1]) / a
     x = shape[0] + speed[0] * (y / height - 0.5)
@@ -71,9 +91,19 @@ def roll(view, shape, speed):
 
 
 @jit
-def roll_backward(view, shape, speed, v):
+def roll_backward(view, shape, speed, v, COLUMNS: tl.constexpr):
     """From the gradient of the rolled shape to those of the shape and of the velocity."""
-    height = tl.load(view + SIZE + 1)
+    if COLUMNS:
+        width = tl.load(view + SIZE)
+        v_shape, v_speed = roll_rows_backward(width, exchanged(shape), (speed[1], speed[0]), exchanged(v))
+        v_shape, v_speed = exchanged(v_shape), (v_speed[1], v_speed[0])
+    else:
+        v_shape, v_speed = roll_rows_backward(tl.load(view + SIZE + 1), shape, speed, v)
+    return v_shape, v_speed
+
+
+@jit
+def roll_rows_backward(height, shape, speed, v):
     a, shear = 1 - speed[1] / height, speed[0] / height
     y = (shape[1] - 0.5 * speed[1]) / a
     yy, xy = shape[3] / (a * a), shape[4] / a

@@ -30,6 +30,8 @@ ALPHA_MIN, LOG2_ALPHA_MIN, BOX_REACH = constant(24), constant(25), constant(26)
 DISTORTION, FOLD = constant(27), constant(32)
 SHIFT, TURN = constant(33), constant(36)
 POSITION_REST = constant(39)
+# Focal lengths, negative if the readout runs towards smaller coordinates.
+MOTION_FOCAL = constant(42)
 
 
 @jit
@@ -70,6 +72,11 @@ class KernelView:
         return self.camera.shutter is not None
 
     @property
+    def columns(self) -> bool:
+        """Whether the shutter reads columns one after the other, instead of rows."""
+        return self.camera.shutter is not None and self.camera.shutter.reads_columns
+
+    @property
     def bounded(self) -> bool:
         """Whether splats have an end."""
         return self.settings.alpha_min > 0 or math.isfinite(self.settings.max_sigma)
@@ -96,9 +103,10 @@ class KernelView:
             _slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))
         ]
         distortion = [0.0] * 5 if camera.distortion is None else camera.distortion.double().tolist()
-        motion = [0.0] * 6
+        motion, sign = [0.0] * 6, 0
         if camera.shutter is not None:
             motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
+            sign = camera.shutter.sign
         numbers = (
             *(value for row in pose[:3] for value in row[:3]),
             *position.tolist(),
@@ -112,6 +120,7 @@ class KernelView:
             *motion,
             # The rest of the position, which float32 cannot hold.
             *(position - position.float().double()).tolist(),
+            *(sign * K[0][0], sign * K[1][1]),
         )
         return list(map(float, numbers))
 

@@ -43,11 +43,11 @@ class ShutterSettings(EffectSettings):
 
 
 class RollingShutter(Effect):
-    """The motion that the camera of a view has while its rows are read."""
+    """The motion that the camera of a view has while its image is read."""
 
 
 class GlobalShutter(Effect):
-    """Stands for the rolling shutter that is left out: all rows are exposed at once."""
+    """Stands for the rolling shutter that is left out: all pixels are exposed at once."""
 
     def view(self, view: View, state: SceneState) -> View:
         return view if view.camera.shutter is None else replace(view, camera=replace(view.camera, shutter=None))

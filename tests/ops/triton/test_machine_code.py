@@ -37,6 +37,7 @@ VIEWS = {
     "plain": STILL,
     "lens": dataclasses.replace(STILL, distortion=LENS),
     "shutter": dataclasses.replace(STILL, shutter=SHUTTER),
+    "columns": dataclasses.replace(STILL, shutter=dataclasses.replace(SHUTTER, direction="left")),
     "both": dataclasses.replace(STILL, distortion=LENS, shutter=SHUTTER),
 }
 # Terms of harmonics, view, whether rows move, settings, what is differentiated.
@@ -53,6 +54,7 @@ OTHERS = [
     (4, "plain", False, SplatSettings(plain_gradients=True), "rgb"),
     (1, "lens", False, SplatSettings(), "depth"),
     (4, "shutter", True, SplatSettings.preset("exact"), "depth"),
+    (4, "columns", True, SplatSettings(), "rgb"),
     (16, "both", True, SplatSettings(antialias=True), "rgb"),
 ]
 

@@ -49,6 +49,9 @@ EFFECTS = {
     "folding_lens": {"distortion": FOLDING_LENS},
     "shutter": {"shutter": SHUTTER},
     "lens_and_shutter": {"distortion": LENS, "shutter": SHUTTER},
+    "from_the_bottom": {"shutter": dataclasses.replace(SHUTTER, direction="bottom")},
+    "from_the_left": {"distortion": LENS, "shutter": dataclasses.replace(SHUTTER, direction="left")},
+    "from_the_right": {"shutter": dataclasses.replace(SHUTTER, direction="right")},
 }
 
 

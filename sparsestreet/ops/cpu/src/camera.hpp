@@ -24,6 +24,7 @@ struct Camera {
   T max_sigma_squared;  // the largest |L d|^2 that is drawn
   bool antialias, half_colors, clamp_colors, detach_directions, plain_gradients, every_tile;
   int depth_bits;
+  T motion_fx, motion_fy;  // fx, fy, negative if the readout runs towards smaller coordinates
 
   explicit Camera(const View& v)
       : position(vector(v.position)), position_rest(rest(v.position)), fx(v.fx), fy(v.fy), cx(v.cx), cy(v.cy),
@@ -34,7 +35,7 @@ struct Camera {
         near_plane(v.near_plane), width(v.width), height(v.height), max_sigma_squared(T(v.max_sigma) * T(v.max_sigma)),
         antialias(v.antialias), half_colors(v.half_colors), clamp_colors(v.clamp_colors),
         detach_directions(v.detach_directions), plain_gradients(v.plain_gradients), every_tile(v.every_tile),
-        depth_bits(int(v.depth_bits)) {
+        depth_bits(int(v.depth_bits)), motion_fx(v.shutter_sign * v.fx), motion_fy(v.shutter_sign * v.fy) {
     for (int i = 0; i < 3; ++i) rotation.rows[i] = vector(v.rotation + 3 * i);
     const T margin_x = T(0.3) * width / (2 * fx), margin_y = T(0.3) * height / (2 * fy);
     slope_min[0] = -cx / fx - margin_x, slope_max[0] = (width - cx) / fx + margin_x;

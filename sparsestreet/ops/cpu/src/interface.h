@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 12;
+constexpr int32_t INTERFACE_VERSION = 13;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -24,6 +24,8 @@ struct View {
   int64_t width, height;
   int64_t exclusive_stop, antialias, half_colors, clamp_colors, detach_directions, plain_gradients, depth_bits;
   int64_t has_lens, has_shutter;
+  int64_t shutter_columns;  // read one after the other, instead of rows
+  int64_t shutter_sign;     // -1 if the readout runs towards smaller coordinates, else 1
   int64_t every_tile;  // lists each splat in every tile and looks at all their rows: to check the lists against
   int64_t pair_limit;  // (splat, tile) pairs that may be held
   int64_t threads;

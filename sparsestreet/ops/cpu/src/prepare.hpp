@@ -152,11 +152,16 @@ void report_worst(const Workspace<T>& ws, int64_t rows, Report& report) {
   }
 }
 
+template <bool LENS, class Call>
+inline auto with_shutter(const View& view, Call call) {
+  if (!view.has_shutter) return call(Effects<LENS, false>{});
+  return view.shutter_columns ? call(Effects<LENS, true, true>{}) : call(Effects<LENS, true>{});
+}
+
 // Calls call(Effects<...>{}) with those that the view has.
 template <class Call>
 inline auto with_effects(const View& view, Call call) {
-  if (view.has_lens) return view.has_shutter ? call(Effects<true, true>{}) : call(Effects<true, false>{});
-  return view.has_shutter ? call(Effects<false, true>{}) : call(Effects<false, false>{});
+  return view.has_lens ? with_shutter<true>(view, call) : with_shutter<false>(view, call);
 }
 
 template <class T>

@@ -16,16 +16,16 @@ constexpr double TWO_LN2 = 1.3862943611198906;
 
 struct Nothing {};
 
-// What an image is taken through. Without a part, nothing of it is compiled in.
-template <bool WITH_LENS, bool WITH_SHUTTER>
+// What an image is taken through; a shutter reads rows or columns. Without a part, nothing of it is compiled in.
+template <bool WITH_LENS, bool WITH_SHUTTER, bool OVER_COLUMNS = false>
 struct Effects {
-  static constexpr bool LENS = WITH_LENS, SHUTTER = WITH_SHUTTER;
+  static constexpr bool LENS = WITH_LENS, SHUTTER = WITH_SHUTTER, COLUMNS = OVER_COLUMNS;
   template <class V>
   using Model = std::conditional_t<LENS, Distorted<V>, Pinhole<V>>;
   template <class V>
   using Row = std::conditional_t<SHUTTER, MovingRow<V>, RowValues<V>>;
   template <class V>
-  using Moves = std::conditional_t<SHUTTER, Motion<V, LENS>, Nothing>;
+  using Moves = std::conditional_t<SHUTTER, Motion<V, LENS, COLUMNS>, Nothing>;
 };
 
 // The covariance C = F F^T + eps2d I of a footprint, and its determinant.
@@ -65,8 +65,8 @@ struct Projection {
     seen = placement.mean.z > camera.near_plane;
     if constexpr (E::LENS) seen = seen && model.sees(camera, placement);
     if constexpr (E::SHUTTER) {
-      motion = Motion<V, E::LENS>(camera, placement, row.displacement);
-      seen = seen && read_out(motion, camera.height, footprint) >= T(SLOWEST_READOUT);
+      motion = Motion<V, E::LENS, E::COLUMNS>(camera, placement, row.displacement);
+      seen = seen && read_out(camera, motion, footprint) >= T(SLOWEST_READOUT);
     }
   }
 };

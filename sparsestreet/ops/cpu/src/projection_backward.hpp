@@ -96,7 +96,7 @@ inline RowValues<V> row_backward(const Camera<T>& camera, const RowValues<V>& ro
   v_mean.z += g.depth;
   if constexpr (E::SHUTTER) {
     V v_u_x, v_u_y;
-    read_out_backward(p.motion, camera.height, p.footprint, v_footprint, v_u_x, v_u_y);
+    read_out_backward(camera, p.motion, p.footprint, v_footprint, v_u_x, v_u_y);
     v_mean = v_mean + p.motion.backward(camera, p.placement, v_u_x, v_u_y);
   }
   PlacementGradient<V> v = p.model.backward(camera, p.placement, v_footprint);
