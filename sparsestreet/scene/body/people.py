@@ -13,7 +13,6 @@ from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.scene.body.template import BodyTemplate
 from sparsestreet.types import BodyPoses, Track
 
-
 _LEAST_STEP = 1e-9
 """Of normalized time, far below that from one frame to the next."""
 
