@@ -18,12 +18,13 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN drive.mp4                     what the log's cameras saw, side by side
   sparsestreet render outputs/RUN drive.mp4 cameras=0 fps=30    the front camera, smooth
   sparsestreet render outputs/RUN right.mp4 path=shifted offset=1.5       from 1.5 m farther to the right
+  sparsestreet render outputs/RUN lane.mp4 path=lane_change offset=-3     three meters to the left on the way
   sparsestreet render outputs/RUN still frames=40:60 width=640            single PNGs in the folder still/
 
   scene     a run's folder, or a scene.safetensors; the first word without a key
   out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
-  path      recorded (as the log was driven) or shifted (beside it)
-  offset    meters to the right that path=shifted moves the car; negative: to the left
+  path      recorded (as the log was driven), shifted (beside it) or lane_change (from there to beside it)
+  offset    meters to the right that path=shifted or lane_change moves the car; negative: to the left
   cameras   [1,0,2]: these of the log, shown in this order (default: all, the leftmost first)
   frames    40:60: only these frames of the log, the last one left out
   width     pixels of one camera's image (default: as recorded)
@@ -44,7 +45,7 @@ class RenderRequest:
 
     scene: Path
     out: Path
-    path: Literal["recorded", "shifted"] = "recorded"
+    path: Literal["recorded", "shifted", "lane_change"] = "recorded"
     offset: float | None = None
     cameras: tuple[int, ...] | None = None
     frames: slice | None = None
@@ -56,8 +57,8 @@ class RenderRequest:
     device: str | None = None
 
     def __post_init__(self) -> None:
-        if (self.path == "shifted") != (self.offset is not None):
-            raise ValueError("a shifted path needs both: path=shifted offset=METERS")
+        if (self.path != "recorded") != (self.offset is not None):
+            raise ValueError("a shifted path needs both: path=shifted offset=METERS, or path=lane_change")
         for name in ("fps", "log_fps", "width"):
             value = getattr(self, name)
             if value is not None and value <= 0:
@@ -105,6 +106,6 @@ def _path(request: RenderRequest, views: "Sequence[View]", step: float) -> "Came
     if request.frames is not None:
         path = paths.of_frames(path, request.frames)
     if request.offset is not None:
-        path = paths.shifted(path, request.offset)
+        path = paths.shifted(path, request.offset, gradually=request.path == "lane_change")
     path = paths.resampled(paths.of_cameras(path, cameras), step)
     return path if request.width is None else paths.resized(path, request.width)

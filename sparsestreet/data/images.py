@@ -60,6 +60,19 @@ def check_camera_images(
     return problems
 
 
+def check_image_sizes(camera: str | int, size: tuple[int, int], images: Sequence[Path]) -> list[Problem]:
+    """A problem where the images of a camera have another (width, height) than its calibration; it names the first.
+
+    Files that are missing or broken are passed over.
+    """
+    for path in filter(Path.is_file, images):
+        found = attempt([], partial(image_size, path))
+        if found is not None and found != size:
+            message = "the image is {}x{}, camera {} is calibrated for {}x{}".format(*found, camera, *size)
+            return [Problem(path, message, "read the images that the calibration was made with")]
+    return []
+
+
 def _check_mask(path: Path, size: tuple[int, int], decode: bool) -> None:
     found = image_size(path)
     if found != size:

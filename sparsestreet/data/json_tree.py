@@ -45,6 +45,13 @@ class JsonValue:
             return None
         return self[key]
 
+    def only(self, *keys: str) -> "JsonValue":
+        """The value itself, an object of these entries and no other: a slip in a name must not go unseen."""
+        self._must_be(dict, "an object in braces")
+        if unknown := [key for key in self.value if key not in keys]:
+            raise self.fault(f"has {unknown[0][:40]!r}, which nothing reads", f"write one of {', '.join(keys)}")
+        return self
+
     def entries(self) -> Iterator[tuple[str, "JsonValue"]]:
         """Names and values of an object, in its order."""
         self._must_be(dict, "an object in braces")

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, image_size, read_image, read_mask
+from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import Problem, attempt, fault, missing_files
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
@@ -108,7 +108,7 @@ def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, 
         attempt(problems, partial(check_lens_camera, table, lens, size))
         valid = [image.valid for image in own if image.valid]
         problems += check_camera_images(name, [image.path for image in own], valid, decode=decode)
-        problems += _check_sizes(own, size, name)
+        problems += check_image_sizes(name, size, [image.path for image in own])
         for image in own:
             attempt(problems, partial(check_rigid, image.world_from_camera, table, f"the pose of {image.name}"))
             placed.append((table, image.world_from_camera[:3, 3]))
@@ -194,16 +194,6 @@ def _camera_names(images: Sequence[PosedImage]) -> dict[tuple[str, Lens, tuple[i
         base = "camera" if folder == "." else folder
         named |= {kind: base if len(own) == 1 else f"{base}_{number}" for number, kind in enumerate(own)}
     return named
-
-
-def _check_sizes(images: Sequence[PosedImage], size: tuple[int, int], camera: str) -> list[Problem]:
-    """Whether the images have the size that their camera is calibrated for; the first that has not is named."""
-    for image in images:
-        found = attempt([], partial(image_size, image.path)) if image.path.is_file() else None
-        if found is not None and found != size:
-            message = "the image is {}x{}, camera {} is calibrated for {}x{}".format(*found, camera, *size)
-            return [Problem(image.path, message, "read the images that the calibration was made with")]
-    return []
 
 
 def _image(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:

@@ -48,6 +48,16 @@ def check_rigid(pose: Float64[Tensor, "4 4"], path: Path, what: str) -> None:
         raise fault(path, message, f"write a rotation and a translation in meters, to {RIGIDITY_TOLERANCE:g} or better")
 
 
+def are_rigid(poses: Float64[Tensor, "n 4 4"]) -> bool:
+    """Whether ``check_rigid`` would let all of them through, without a look at each."""
+    rotations = poses[:, :3, :3]
+    gram = (rotations.mT @ rotations - torch.eye(3, dtype=poses.dtype)).abs()
+    last = (poses[:, 3] - torch.tensor([0, 0, 0, 1], dtype=poses.dtype)).abs()
+    # A NaN compares false.
+    near = bool((gram <= RIGIDITY_TOLERANCE).all() & (last <= RIGIDITY_TOLERANCE).all())
+    return near and bool(torch.isfinite(poses).all() & (torch.linalg.det(rotations) > 0).all())
+
+
 def recentered(pose: Float64[Tensor, "*b 4 4"], origin: Float64[Tensor, "3"]) -> Float64[Tensor, "*b 4 4"]:
     """Poses of a data set's world in the log's, whose origin is at ``origin``; the axes are kept."""
     pose = pose.clone()

@@ -6,7 +6,7 @@ depth images and colors of returns are the same for all data sets, and are done 
 
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
@@ -235,7 +235,7 @@ def _checked(boxes: Boxes) -> Track:
 
 
 def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
-    camera = rig[shot.camera].at(recentered(shot.world_from_camera, origin))
+    camera = replace(rig[shot.camera].at(recentered(shot.world_from_camera, origin)), shutter=shot.shutter)
     return clock.view(camera, shot.frame, shot.camera, shot.stamp)
 
 

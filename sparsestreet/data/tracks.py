@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
-from sparsestreet.data.poses import check_rigid, recentered
+from sparsestreet.data.poses import are_rigid, check_rigid, recentered
 from sparsestreet.data.problems import fault
 from sparsestreet.types import Track, View
 
@@ -50,8 +50,9 @@ def checked_track(
     if not (sizes > 0).all() or not np.isfinite(sizes).all():
         message = f"{what} has a box of {sizes.min(axis=0).round(3).tolist()} m (smallest length, width, height)"
         raise fault(path, message, "write positive lengths in meters, or drop the box")
-    for frame, pose in zip(frames.astype(int), torch.from_numpy(poses), strict=True):
-        check_rigid(pose, path, f"the pose of {what} at frame {frame}")
+    if not are_rigid(torch.from_numpy(poses)):
+        for frame, pose in zip(frames.astype(int), torch.from_numpy(poses), strict=True):
+            check_rigid(pose, path, f"the pose of {what} at frame {frame}")
     size = torch.from_numpy(sizes).mean(0).float()
     return Track(name, class_name, torch.from_numpy(frames.astype(np.int64)), torch.from_numpy(poses), size)
 

@@ -81,6 +81,7 @@ class ExtraMetrics:
             command=command,
             truth=truth,
             extractor=None if network is None else LastLayer("alexnet", network),
+            lpips=network,
             absent=missing.get("lpips_alex", ""),
             ramp=self.ramp,
         )

@@ -20,6 +20,7 @@ from sparsestreet.geometry.cameras import moved
 from sparsestreet.metrics.distances import frechet_distance, frechet_name, kernel_distance, kernel_name
 from sparsestreet.metrics.extractors import Extractor
 from sparsestreet.metrics.image import masked_psnr, psnr
+from sparsestreet.metrics.lpips import Lpips
 from sparsestreet.records.novel import NovelRecord, NovelShift
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
@@ -36,6 +37,7 @@ def evaluate_novel(
     command: str,
     truth: Truth | None,
     extractor: Extractor | None,
+    lpips: Lpips | None = None,
     absent: str = "",
     ramp: bool = False,
 ) -> NovelRecord:
@@ -49,6 +51,7 @@ def evaluate_novel(
         command: that asked for it.
         truth: what a view would have recorded; None: nobody knows.
         extractor: of the features that distances compare; None: no distances.
+        lpips: compares renders with true images; None: PSNR alone does.
         absent: why there is no extractor.
         ramp: as in ``NovelRecord``.
 
@@ -70,7 +73,7 @@ def evaluate_novel(
                 features.append(extractor(image))
             true = truth and truth(view)
             if true is not None:
-                quality.append(_psnr(image, to_device(true, device)))
+                quality.append(_quality(image, to_device(true, device), lpips))
         return NovelShift(
             offset=offset,
             views=len(views),
@@ -100,12 +103,13 @@ def _distances(extractor: str, ours: Float[np.ndarray, "n d"], real: Float[np.nd
     }
 
 
-def _psnr(image: Float[Tensor, "h w 3"], true: Frame) -> dict[str, float]:
-    """Of the whole image, and of the regions that it has."""
+def _quality(image: Float[Tensor, "h w 3"], true: Frame, lpips: Lpips | None) -> dict[str, float]:
+    """PSNR of the whole image, and of the regions that it has; LPIPS of the whole."""
     target = true.image.float() / 255
+    whole = {"psnr_full": psnr(image, target)} | ({} if lpips is None else {"lpips_alex": lpips(image, target)})
     regions = {"psnr_human": true.human, "psnr_vehicle": true.vehicle}
     found = {name: masked_psnr(image, target, mask) for name, mask in regions.items() if mask is not None}
-    return {"psnr_full": psnr(image, target)} | {name: value for name, value in found.items() if value is not None}
+    return whole | {name: value for name, value in found.items() if value is not None}
 
 
 def _means(quality: Sequence[dict[str, float]]) -> dict[str, float]:

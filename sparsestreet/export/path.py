@@ -72,11 +72,12 @@ def left_to_right(rig: Rig) -> list[int]:
     return [_camera_of(view) for view in sorted(rig, key=lambda view: (yaw(view), _camera_of(view)))]
 
 
-def shifted(path: CameraPath, offset: float) -> CameraPath:
+def shifted(path: CameraPath, offset: float, *, gradually: bool = False) -> CameraPath:
     """Returns every rig moved sideways as one, ``offset`` meters to the right of its camera with the lowest index.
 
-    The views keep time and camera index. They lose their frame index, because nobody recorded them. Shift before you
-    choose cameras.
+    ``gradually``: as in a change of lane, from nothing at the first instant to all at the last, 3 s^2 - 2 s^3 of it at
+    fraction s of the time between. The views keep time and camera index. They lose their frame index, because nobody
+    recorded them. Shift before you choose cameras.
 
     >>> path = recorded([View(Camera(torch.eye(4), torch.eye(3), width=8, height=6), 0.0, 0, 0)])
     >>> shifted(path, 2.0)[0][0].camera.position.tolist()
@@ -85,8 +86,14 @@ def shifted(path: CameraPath, offset: float) -> CameraPath:
 
     front = min(_camera_of(view) for view in path[0])
 
+    start, end = path[0][0].time, path[-1][0].time
+
+    def share(rig: Rig) -> float:
+        s = (rig[0].time - start) / (end - start) if end > start else 0.0
+        return s * s * (3 - 2 * s) if gradually else 1.0
+
     def beside(rig: Rig) -> Rig:
-        vector = offset * _view_of(rig, front).camera.camera_from_world[0, :3].double()
+        vector = share(rig) * offset * _view_of(rig, front).camera.camera_from_world[0, :3].double()
         return tuple(replace(_bare(view), camera=moved(view.camera, vector), frame_index=None) for view in rig)
 
     return tuple(beside(rig) for rig in path)

@@ -1,12 +1,13 @@
 """Rules that select rows from all training views: the paper's importance, and our leave-one-out cost."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.counts import Keep, check_keep, keep_counts
 from sparsestreet.pruning.importance import Importance
@@ -16,7 +17,7 @@ from sparsestreet.scene.effects import linearized
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import render
-from sparsestreet.types import Frame, LeaveOneOut
+from sparsestreet.types import Frame, LeaveOneOut, View
 
 LEAST_ERROR = 1e-12
 """Squared error (images lie in [0, 1]) that stands for no error; its inverse fits into float32."""
@@ -77,6 +78,10 @@ class LeaveOneOutRule(PruningRule):
     Images are compared after the scene's effects, whose slopes scale the changes (``effects.linearized``).
 
     A row that changes no channel of any pixel by more than ``noticeable`` costs nothing.
+
+    What only a camera beside the path sees is not missed in any training image. With ``beside`` each training view
+    counts once more from so far to one side, in turn right and left; its changes cost what they cost in the training
+    images as a whole.
     """
 
     allowed_db: float
@@ -86,8 +91,12 @@ class LeaveOneOutRule(PruningRule):
     keep: Keep | None = None
     """For comparisons at equal count, node by node: the most expensive rows of each node stay instead, whatever that
     costs (see ``counts.Keep``)."""
+    beside: float | None = None
+    """Meters; None: only recorded views count. Scoring takes twice the time."""
 
     def __post_init__(self) -> None:
+        if self.beside is not None and not self.beside > 0:
+            raise ValueError(f"beside must be above 0 m, got {self.beside}: null asks the recorded views alone")
         if self.keep is not None:
             check_keep(self.keep)
         if not self.allowed_db >= 0:
@@ -112,11 +121,23 @@ class LeaveOneOutRule(PruningRule):
         spans = scene.gaussians_at(frames[0], context.state).spans
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
+        # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
+        share = (1 / errors.clamp(min=LEAST_ERROR)).float()
         for frame in on_device(scene, frames):
-            change = _without_each(scene, frame, errors, context)
-            largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
+            for view, weights in self._seen(frame, share):
+                change = _without_each(scene, view, weights, context)
+                largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         costs = torch.where(largest > self.noticeable, squared, 0.0)
         return {name: costs[rows] for name, rows in spans.items()}
+
+    def _seen(self, frame: Frame, share: Float[Tensor, "3"]) -> Iterator[tuple[View, Float[Tensor, "h w"]]]:
+        """Yields the view and, if asked, the one beside it, with the weight of a squared change of each pixel."""
+        yield frame, torch.einsum("r,rhw->hw", share, _regions(frame))
+        if self.beside is not None:
+            side = 1 if sum(frame.indices) % 2 else -1
+            right = frame.camera.camera_from_world[0, :3].double()
+            camera = moved(frame.camera, side * self.beside * right)
+            yield replace(frame, camera=camera), share[0].expand(frame.image.shape[:2])
 
 
 def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
@@ -127,15 +148,12 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
     return torch.stack([everywhere, *marked]).float()
 
 
-def _without_each(scene: SceneGraph, frame: Frame, errors: Float64[Tensor, "3"], context: RenderContext) -> LeaveOneOut:
-    """Returns the change without each row, after the effects, relative to the error of the regions of each pixel.
+def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], context: RenderContext) -> LeaveOneOut:
+    """Returns the change without each row, after the effects, with the weights of squared changes of the pixels.
 
     The largest change is multiplied by the largest slope of any pixel, an upper bound of the visible change.
     """
-    # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
-    share = 1 / errors.clamp(min=LEAST_ERROR)
-    weights = torch.einsum("r,rhw->hw", share.float(), _regions(frame))
-    placed = scene.gaussians_at(frame, context.state)
+    placed = scene.gaussians_at(view, context.state)
     effects = linearized(scene.effects.values(), placed.view)
     change = leave_one_out(
         placed.gaussians,

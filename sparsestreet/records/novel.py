@@ -8,8 +8,8 @@ from sparsestreet.records.strict_json import version
 FORMAT = 2
 """Version of ``novel.json``; raised when a key changes its meaning."""
 
-TRUTH = ("psnr_full", "psnr_human", "psnr_vehicle")
-"""Metrics that compare a render with the true image: PSNR of all pixels, of people, of vehicles."""
+TRUTH = ("psnr_full", "psnr_human", "psnr_vehicle", "lpips_alex")
+"""Metrics that compare a render with the true image: PSNR of all pixels, of people, of vehicles, in dB; LPIPS."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class NovelShift:
     distances: dict[str, float]
     """Name of a distance, such as "frechet_alexnet" -> its value; empty if none could be measured."""
     truth: dict[str, float]
-    """Some of ``TRUTH`` -> dB, mean over the true images that have such pixels; empty without true images."""
+    """Some of ``TRUTH`` -> mean over the true images that have such pixels; empty without true images."""
     true_views: int
     """Number of true images. A view whose camera lies inside an object has none."""
 

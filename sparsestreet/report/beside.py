@@ -13,8 +13,9 @@ TRUTH = {
     "psnr_full": "PSNR to the truth, dB",
     "psnr_human": "PSNR of people, dB",
     "psnr_vehicle": "PSNR of vehicles, dB",
+    "lpips_alex": "LPIPS (AlexNet)",
 }
-_PSNR = {title: place for place, title in enumerate(TRUTH.values())}
+_PLACES = {title: place for place, title in enumerate(TRUTH.values())}
 
 
 def shifts_of(run: Path) -> dict[float, dict[str, float]]:
@@ -26,7 +27,7 @@ def shifts_of(run: Path) -> dict[float, dict[str, float]]:
     sides: dict[float, dict[str, list[float]]] = {}
     for shift in () if record is None else record.shifts:
         found = sides.setdefault(abs(shift.offset), {})
-        for name, value in (shift.distances | {TRUTH[name]: psnr for name, psnr in shift.truth.items()}).items():
+        for name, value in (shift.distances | {TRUTH[name]: mean for name, mean in shift.truth.items()}).items():
             found.setdefault(name, []).append(value)
     return {meters: {name: statistics.fmean(some) for name, some in found.items()} for meters, found in sides.items()}
 
@@ -44,10 +45,10 @@ def mean_beside(arm: Arm, meters: float, name: str) -> float | None:
 
 
 def beside_the_path(arms: Sequence[Arm]) -> Grid | None:
-    """Returns PSNR to the truth and every recorded distance, by meters; None if no run recorded any."""
+    """Returns PSNR and LPIPS to the truth and every recorded distance, by meters; None if no run recorded any."""
     measured = [shifts_of(record.folder) for arm in arms for record in arm.records]
     found = {(name, meters) for shifts in measured for meters, numbers in shifts.items() for name in numbers}
-    columns = sorted(found, key=lambda column: (column[0] not in _PSNR, _PSNR.get(column[0], 0), column))
+    columns = sorted(found, key=lambda column: (column[0] not in _PLACES, _PLACES.get(column[0], 0), column))
     if not columns:
         return None
     rows = []
@@ -66,4 +67,4 @@ def beside_the_path(arms: Sequence[Arm]) -> Grid | None:
 
 
 def _text(name: str, mean: float) -> str:
-    return f"{mean:.2f}" if name in _PSNR else f"{mean:.4g}"
+    return f"{mean:.2f}" if name.endswith("dB") else f"{mean:.4g}"

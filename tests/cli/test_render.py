@@ -62,6 +62,15 @@ def test_a_shifted_path_is_seen_from_beside(run, tmp_path):
     assert not np.array_equal(shown[1][:, :48], rendered(stored, rig[0]))
 
 
+def test_a_change_of_lane_ends_beside_the_path(run, tmp_path):
+    for out, words in (("lane", ["path=lane_change"]), ("beside", ["path=shifted"]), ("on", [])):
+        offset = ["offset=1.5"] if words else []
+        assert render([f"scene={run}", f"out={tmp_path / out}", "cameras=0", *words, *offset]) == 0
+    lane, beside, on = (pictures(tmp_path / name) for name in ("lane", "beside", "on"))
+    assert np.array_equal(lane[0], on[0])
+    assert np.array_equal(lane[-1], beside[-1])
+
+
 def test_a_smooth_small_video(run, tmp_path):
     words = [f"scene={run / 'scene.safetensors'}", f"out={tmp_path / 'a.mp4'}", "cameras=0", "width=24", "fps=30"]
     assert render([*words, "log_fps=10", "quality=9", "device=cpu"]) == 0

@@ -6,6 +6,7 @@ import torch
 from sparsestreet.data.recording import Recording, Shot, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
+from sparsestreet.types import Shutter
 from tests.typed import there
 
 SIZE = (24, 16)
@@ -63,3 +64,14 @@ def test_points_that_came_with_the_log_are_in_its_world_and_give_no_depth():
     assert len(reads) == 1
     assert log.frames[0].depth is None
     assert not len(log.sweeps)
+
+
+def test_a_declared_shutter_arrives_at_the_view():
+    rolling = Shutter(torch.tensor([0.0, 0.0, 0.4]), torch.zeros(3), direction="left")
+    shots = [
+        Shot(frame, 0, torch.eye(4, dtype=torch.float64), key=None, stem="", shutter=shutter)
+        for frame, shutter in enumerate((rolling, None))
+    ]
+    recording = Recording("a", [camera(FLAT)], shots, lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8), dict)
+    log = log_of(recording, cache_bytes=0, check=list)
+    assert [view.camera.shutter for view in log.views] == [rolling, None]

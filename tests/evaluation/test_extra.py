@@ -83,7 +83,7 @@ def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
     assert asked["evaluate_novel"] == (
         (scene, views, (1.0, 2.5), OPTIONS),
         {"command": "typed", "truth": truth, "absent": "a", "ramp": True,
-         "extractor": ("features", "alexnet", NETWORK) if weights else None},
+         "extractor": ("features", "alexnet", NETWORK) if weights else None, "lpips": NETWORK if weights else None},
     )  # fmt: skip
     ways = {name: RenderOptions(SplatSettings.preset(name)) for name in ("fast", "fine")}
     assert asked["evaluate_presets"] == ((scene, views, ways, OPTIONS), {"command": "typed"})

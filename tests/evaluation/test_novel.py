@@ -11,6 +11,7 @@ from sparsestreet.evaluation import novel as novel_module
 from sparsestreet.evaluation.evaluate import screen_image
 from sparsestreet.evaluation.novel import evaluate_novel, shifted_views
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
+from sparsestreet.metrics.lpips import Lpips
 from sparsestreet.records.novel import NOVEL
 from sparsestreet.types import Frame
 from tests.evaluation.frames import make_frame
@@ -39,6 +40,14 @@ def turned(frame, degrees):
     return dataclasses.replace(
         frame, camera=dataclasses.replace(frame.camera, camera_from_world=torch.linalg.inv(world_from_camera))
     )
+
+
+class MeanDifference(Lpips):
+    def __init__(self):
+        pass
+
+    def __call__(self, image, truth):
+        return float((image - truth).mean())
 
 
 def rig(count):
@@ -101,7 +110,8 @@ def test_the_truth_of_each_shifted_view_is_compared_by_region(monkeypatch):
         return Frame(view.camera, view.time, image=blank, human=human, vehicle=~human)
 
     replace_render(monkeypatch, rendered)
-    right, left = evaluate(rig(2), truth=truth).shifts
+    # A perceptual distance that is the mean difference: 0.1 and, of the front camera, less where nobody is.
+    right, left = evaluate(rig(2), truth=truth, lpips=MeanDifference()).shifts
     assert right.truth == left.truth
     assert (right.views, right.true_views) == (4, 3)
     share = float(people.float().mean())
@@ -110,6 +120,8 @@ def test_the_truth_of_each_shifted_view_is_compared_by_region(monkeypatch):
     assert right.truth["psnr_full"] == pytest.approx((2 * front + 20) / 3, abs=1e-4)
     assert right.truth["psnr_human"] == pytest.approx(20, abs=1e-4)
     assert right.truth["psnr_vehicle"] == pytest.approx((40 + 40 + 20) / 3, abs=1e-4)
+    assert right.truth["lpips_alex"] == pytest.approx((2 * (0.01 + 0.09 * share) + 0.1) / 3, abs=1e-6)
+    assert "lpips_alex" not in evaluate(rig(2), truth=truth).shifts[0].truth
 
 
 def test_two_images_have_a_distance_and_one_has_none():

@@ -88,6 +88,18 @@ def test_a_shifted_rig_moves_as_one_along_the_front_cameras_right():
             assert (new.time, new.frame_index, new.camera_index) == (old.time, None, old.camera_index)
 
 
+def test_a_lane_is_changed_smoothly():
+    path = recorded(street_views())
+    changed = shifted(path, -3.0, gradually=True)
+    went = [
+        float((new[0].camera.position - old[0].camera.position).norm()) for old, new in zip(path, changed, strict=True)
+    ]
+    # 3 s^2 - 2 s^3 at s = 0, 1/4, 1/2, 3/4, 1.
+    assert went == pytest.approx([0.0, 3 * 5 / 32, 1.5, 3 * 27 / 32, 3.0], abs=2e-6)
+    assert float(changed[4][0].camera.camera_from_world[0, 3] - path[4][0].camera.camera_from_world[0, 3]) > 2.9
+    assert shifted(path[:1], 3.0, gradually=True)[0][0].camera.position.equal(path[0][0].camera.position)
+
+
 def test_a_path_at_its_own_rate_is_itself():
     path = recorded(street_views())
     assert resampled(path, STEP) == path

@@ -95,6 +95,36 @@ def test_a_row_seen_in_one_view_of_two_stays():
     assert rule.select(scene, [front, behind], CONTEXT)["background"].removed == 0
 
 
+def test_a_row_that_only_a_view_beside_the_path_sees_stays_if_asked():
+    # Beside the image, 45 degrees to the right at 2 m; from 2 m further right it stands in the middle.
+    scene = scene_of([0.5, 0.5, 0.5], [3.0, 2.0, 2.0])
+    with torch.no_grad():
+        scene.nodes["background"].rows.means.copy_(torch.tensor([[0.0, 0.0, 2.0], [2.0, 0.0, 2.0], [-2.0, 0.0, 2.0]]))
+        scene.nodes["background"].rows.log_scales.fill_(-4.0)
+    frame = frame_of(scene, 5)
+    right, left = replace(frame, frame_index=1), frame
+
+    def kept(rule: LeaveOneOutRule, *frames: Frame) -> list[bool]:
+        return rule.select(scene, frames, CONTEXT)["background"].keep.tolist()
+
+    beside = LeaveOneOutRule(0.0, beside=2.0)
+    assert kept(LeaveOneOutRule(0.0), right, left) == [True, False, False]
+    assert kept(beside, right) == [True, True, False]
+    assert kept(beside, left) == [True, False, True]
+    assert kept(beside, right, left) == [True, True, True]
+
+
+def test_a_change_beside_the_path_costs_what_it_costs_in_the_whole_image():
+    scene = scene_of([0.5], [2.0])
+    people = torch.zeros(7, 9, dtype=torch.bool)
+    people[:3] = True
+    frame = replace(frame_of(scene, 20), human=people)
+    costs = LeaveOneOutRule(0.0, noticeable=0.0).costs(scene, [frame], CONTEXT)["background"]
+    # 0.001 m beside the disc looks the same. Recorded, it counts twice: as image and as people.
+    both = LeaveOneOutRule(0.0, noticeable=0.0, beside=0.001).costs(scene, [frame], CONTEXT)["background"]
+    torch.testing.assert_close(both, 1.5 * costs, rtol=1e-3, atol=0.0)
+
+
 def _selection(scene: SceneGraph, frame: Frame, rule: PruningRule) -> Selection:
     return rule.select(scene, [frame], CONTEXT)["background"]
 
@@ -264,3 +294,8 @@ def test_a_number_of_the_whole_scene_goes_whatever_nodes_it_may_take_from(remove
 def test_bad_settings_are_refused(allowed_db, noticeable):
     with pytest.raises(ValueError, match="must be >= 0"):
         LeaveOneOutRule(allowed_db, noticeable)
+
+
+def test_views_beside_the_path_are_not_on_it():
+    with pytest.raises(ValueError, match=r"beside must be above 0 m, got 0\.0"):
+        LeaveOneOutRule(0.1, beside=0.0)

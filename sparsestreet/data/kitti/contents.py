@@ -37,8 +37,13 @@ class Pixels:
         camera = self.rig[shot.camera]
         masks = {} if self.shipped is None else dict(self.shipped(shot))
         if self.given is not None:
-            sizes = {"recorded_size": self.recorded_sizes[shot.camera], "size": camera.size}
-            masks |= self.given.read(camera.name, shot.stem, **sizes)
+            masks |= self.given.read(
+                camera.name,
+                shot.stem,
+                recorded_size=self.recorded_sizes[shot.camera],
+                size=camera.size,
+                undistortion=camera.undistortion,
+            )
         return masks
 
 

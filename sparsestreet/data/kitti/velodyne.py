@@ -28,7 +28,7 @@ def read_points(path: Path) -> Float64[Tensor, "n 3"]:
         rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
     except OSError as error:
         raise fault(path, f"the file cannot be read ({error})", _REMEDY) from error
-    points = torch.from_numpy(rows[:, :3].astype(np.float64))
+    points = torch.from_numpy(rows[:, :3].copy()).double()
     check_points(points, path, remedy=_REMEDY)
     return points[points.norm(dim=-1) >= OWN_CAR]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 
 from sparsestreet.data.kitti.text import numbers
 from sparsestreet.data.problems import LogError, Problem, fault
@@ -28,6 +28,11 @@ CLASSES = {
 """The XML counts classes otherwise than the label images do (kitti360Scripts, labels.py: kittiId). Buildings, poles and
 whatever else cannot move are passed over."""
 _STATIC = -1
+_SEEN = 150.0
+"""Meters from the car within which a box that stands still is read. A sequence has thousands over kilometers."""
+_AROUND = 300
+"""Frames before and after those of its part of the street: the car sees it from afar, but a sequence that comes back
+minutes later may find it gone."""
 _LARGEST = 1 << 31
 """Bytes; read piece by piece."""
 _SHEAR = 1e-3
@@ -45,11 +50,15 @@ class _Object:
     sizes: dict[int, Float64[np.ndarray, "3"]] = field(default_factory=dict)
 
 
-def read_boxes(path: Path, frames: list[int]) -> list[Boxes]:
-    """The objects at the frames, which are counted by their place in the list; raises LogError with all at fault.
+def read_boxes(path: Path, frames: Int[np.ndarray, " f"], positions: Float64[np.ndarray, "f 3"]) -> list[Boxes]:
+    """The objects at the frames, which are counted by their place; raises LogError with all at fault.
 
-    A moving object has its boxes at frames of its own. One that stands still has its box at all of the frames, if it
-    was annotated in a part of the street that they touch.
+    A moving object has its boxes at frames of its own. One that stands still has its box at all frames that are near.
+
+    Args:
+        path: of the XML.
+        frames: that are read, increasing.
+        positions: of the car at them, in the world.
     """
     objects: dict[str, _Object] = {}
     problems: list[Problem] = []
@@ -62,8 +71,7 @@ def read_boxes(path: Path, frames: list[int]) -> list[Boxes]:
             problems += error.problems
     if problems:
         raise LogError(problems)
-    places = {frame: place for place, frame in enumerate(frames)}
-    found = (_boxes(name, one, places, path) for name, one in objects.items())
+    found = (_boxes(name, one, frames, positions, path) for name, one in objects.items())
     return [boxes for boxes in found if boxes is not None]
 
 
@@ -106,15 +114,18 @@ def _decomposed(
     return pose, size
 
 
-def _boxes(name: str, one: _Object, places: dict[int, int], path: Path) -> Boxes | None:
-    moving = {frame: frame for frame in one.poses if frame != _STATIC}
-    if moving:
-        sources = {frame: frame for frame in sorted(moving) if frame in places}
+def _boxes(
+    name: str, one: _Object, frames: Int[np.ndarray, " f"], positions: Float64[np.ndarray, "f 3"], path: Path
+) -> Boxes | None:
+    if one.poses.keys() == {_STATIC}:
+        start, end = one.window
+        near = np.linalg.norm(positions - one.poses[_STATIC][:3, 3], axis=1) <= _SEEN
+        places = np.flatnonzero(near & (frames >= start - _AROUND) & (frames <= end + _AROUND))
+        sources = [_STATIC] * len(places)
     else:
-        near = any(one.window[0] <= frame <= one.window[1] for frame in places)
-        sources = dict.fromkeys(places, _STATIC) if near else {}
+        places = np.flatnonzero(np.isin(frames, [stamp for stamp in one.poses if stamp != _STATIC]))
+        sources = frames[places].tolist()
     if not sources:
         return None
-    poses = np.stack([one.poses[source] for source in sources.values()])
-    sizes = np.stack([one.sizes[source] for source in sources.values()])
-    return Boxes(name, one.class_name, np.array([places[frame] for frame in sources]), poses, sizes, path)
+    poses = np.stack([one.poses[source] for source in sources])
+    return Boxes(name, one.class_name, places, poses, np.stack([one.sizes[source] for source in sources]), path)

@@ -39,7 +39,7 @@ class SequenceFolders:
         return next((path for path in paths if path.is_file()), None)
 
     def image(self, camera: str, frame: int) -> Path:
-        return self._images(camera) / "data_rect" / f"{frame:010d}.png"
+        return images_of(self._images(camera)) / f"{frame:010d}.png"
 
     def stamps(self, camera: str) -> Path:
         return self._images(camera) / "timestamps.txt"
@@ -66,9 +66,14 @@ def find_sequence(root: Path, sequence: int | str, cameras: Sequence[str] | None
         found = sorted(path.name[-9:-5] for path in root.glob("data_2d_raw/2013_05_28_drive_*_sync"))
         there = f"there are sequences {', '.join(found)}" if found else "root must be the folder of data_2d_raw"
         raise fault(images, f"the sequence is not there; {there}", "set data.root and data.log.sequence")
-    if fisheye := [camera for camera in cameras or () if camera in FISHEYE]:
-        raise ValueError(f"{', '.join(fisheye)} are fisheye cameras, which are not read: take {', '.join(RECTIFIED)}")
-    on_disk = [camera for camera in RECTIFIED if (images / camera / "data_rect").is_dir()]
-    if not on_disk:
-        raise fault(images, "it holds neither image_00/data_rect nor image_01/data_rect", "unpack data_2d_perspective")
-    return SequenceFolders(root, name, chosen_cameras(on_disk, cameras, root))
+    on_disk = [camera for camera in (*RECTIFIED, *FISHEYE) if images_of(images / camera).is_dir()]
+    usual = [camera for camera in RECTIFIED if camera in on_disk]
+    if not on_disk or not (usual or cameras):
+        message = "it holds neither image_00/data_rect nor image_01/data_rect"
+        raise fault(images, message, "unpack the perspective images")
+    return SequenceFolders(root, name, chosen_cameras(on_disk, usual if cameras is None else cameras, root))
+
+
+def images_of(camera: Path) -> Path:
+    """The folder of a camera's images: rectified ones, or as the fisheye recorded them."""
+    return camera / ("data_rgb" if camera.name in FISHEYE else "data_rect")

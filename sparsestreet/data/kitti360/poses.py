@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from torch import Tensor
 
 from sparsestreet.data.kitti.calibration import RectifiedCamera, rectified_camera, rectifying_rotation, rigid
 from sparsestreet.data.kitti.text import keyed_numbers, numbers, read_keyed, read_lines
+from sparsestreet.data.kitti360.fisheye import FisheyeCamera, read_fisheye
+from sparsestreet.data.kitti360.layout import FISHEYE
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.geometry.transforms import inverse
@@ -24,7 +27,7 @@ class Calibration360:
     """The IMU has x forward, y right, z down; the lidar x forward, y left, z up."""
     imu_from_camera: Mapping[str, Float64[Tensor, "4 4"]]
     """After rectification."""
-    cameras: Mapping[str, RectifiedCamera]
+    cameras: Mapping[str, RectifiedCamera | FisheyeCamera]
 
 
 def read_poses(path: Path) -> dict[int, Float64[Tensor, "4 4"]]:
@@ -57,30 +60,36 @@ def check_pose(pose: Float64[Tensor, "4 4"], frame: int, path: Path) -> None:
 
 
 def read_calibration(folder: Path, cameras: Sequence[str]) -> Calibration360:
-    """Raises LogError with all that is wrong in the three files.
+    """Raises LogError with all that is wrong in the files.
 
-    imu_from_camera = cam_to_pose R_rect^-1: the files place the cameras as they are before rectification.
+    imu_from_camera = cam_to_pose R_rect^-1: the files place the cameras as they are before rectification. Fisheyes stay
+    as they are.
     """
-    places, lidar, perspective = (
-        folder / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt", "perspective.txt")
-    )
     problems: list[Problem] = []
+    places, lidar = folder / "calib_cam_to_pose.txt", folder / "calib_cam_to_velo.txt"
     mounts = attempt(problems, lambda: read_keyed(places)) or {}
-    table = attempt(problems, lambda: read_keyed(perspective)) or {}
-    found: dict[str, RectifiedCamera] = {}
+    found: dict[str, RectifiedCamera | FisheyeCamera] = {}
     imu_from_camera = {}
-    for name in cameras if mounts and table else ():
-        number = name[-2:]
-        camera = attempt(problems, lambda number=number: rectified_camera(table, number, perspective))
-        turn = attempt(problems, lambda number=number: rectifying_rotation(table, number, perspective))
-        mount = attempt(problems, lambda name=name: _mount(mounts, name, places))
-        if camera is not None and turn is not None and mount is not None:
-            found[name], imu_from_camera[name] = camera, mount @ inverse(turn)
-    lidar_from_first = attempt(problems, lambda: _single(lidar))
-    first = attempt(problems, lambda: _mount(mounts, "image_00", places)) if mounts else None
+    for name in cameras if mounts else ():
+        camera = attempt(problems, partial(_camera, folder, name))
+        mount = attempt(problems, partial(_mount, mounts, name, places))
+        if camera is not None and mount is not None:
+            found[name], turn = camera
+            imu_from_camera[name] = mount @ inverse(turn)
+    lidar_from_first = attempt(problems, partial(_single, lidar))
+    first = attempt(problems, partial(_mount, mounts, "image_00", places)) if mounts else None
     if problems or lidar_from_first is None or first is None:
-        raise LogError(problems)
+        raise LogError(list(dict.fromkeys(problems)))
     return Calibration360(first @ inverse(lidar_from_first), imu_from_camera, found)
+
+
+def _camera(folder: Path, name: str) -> tuple[RectifiedCamera | FisheyeCamera, Float64[Tensor, "4 4"]]:
+    """A camera and the rotation that rectified it."""
+    if name in FISHEYE:
+        return read_fisheye(folder / f"{name}.yaml"), torch.eye(4, dtype=torch.float64)
+    path = folder / "perspective.txt"
+    table = read_keyed(path)
+    return rectified_camera(table, name[-2:], path), rectifying_rotation(table, name[-2:], path)
 
 
 def _mount(table: Mapping[str, str], name: str, path: Path) -> Float64[Tensor, "4 4"]:

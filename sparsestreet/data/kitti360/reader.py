@@ -6,6 +6,7 @@ from itertools import pairwise, product
 from pathlib import Path
 from statistics import median_low
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -18,14 +19,15 @@ from sparsestreet.data.kitti.contents import Masks, Pixels, check_recording
 from sparsestreet.data.kitti.text import read_stamps
 from sparsestreet.data.kitti.velodyne import point_stamps, read_points
 from sparsestreet.data.kitti360.boxes import read_boxes
-from sparsestreet.data.kitti360.layout import SequenceFolders, find_sequence
+from sparsestreet.data.kitti360.fisheye import FisheyeCamera
+from sparsestreet.data.kitti360.layout import FISHEYE, SequenceFolders, find_sequence
 from sparsestreet.data.kitti360.poses import Calibration360, check_pose, read_calibration, read_poses
 from sparsestreet.data.kitti360.semantics import KINDS, read_semantics
 from sparsestreet.data.motion import PosePath, untwisted
-from sparsestreet.data.poses import RIGIDITY_TOLERANCE
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE, are_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.data.rig import RigCamera, lens_camera, rig_camera
 from sparsestreet.geometry.transforms import rigidity_error, transform_points
 
 _TURN = 103_300_000
@@ -50,7 +52,7 @@ class _Parts:
 
 @dataclass(frozen=True, kw_only=True)
 class Kitti360Reader(RecordedReader):
-    """Frames of a sequence of KITTI-360 that have poses, of the rectified cameras image_00 and image_01.
+    """Frames of a sequence of KITTI-360 that have poses; by default of the rectified cameras image_00 and image_01.
 
     ``first_frame`` and ``last_frame`` are the data set's own numbers. Cameras and lidar share the instant of their
     frame, for which the images' stamps stand. The world is that of the shipped poses.
@@ -58,6 +60,9 @@ class Kitti360Reader(RecordedReader):
 
     sequence: int | str
     """0, 2 to 10 or 18."""
+    pinhole_fov: float | None = None
+    """Degrees that the pinholes see which the fisheyes are resampled to (``rig.lens_camera``); None: by their
+    resolution."""
 
     def recording(self) -> Recording:
         sequence, parts = self._sequence(), self._parts()
@@ -86,7 +91,8 @@ class Kitti360Reader(RecordedReader):
         """Those of the chosen frames and cameras, lidar too where it is not wanted."""
         sequence = self._sequence()
         frames = self._window(sequence, read_poses(sequence.poses))
-        names = ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt", "perspective.txt")
+        names = ["calib_cam_to_pose.txt", "calib_cam_to_velo.txt", "perspective.txt"]
+        names += [f"{camera}.yaml" for camera in FISHEYE if camera in sequence.cameras]
         described = [sequence.poses, *(sequence.calibration / name for name in names)]
         described += [sequence.stamps(sequence.cameras[0]), *([sequence.boxes] if sequence.boxes else [])]
         recorded = [sequence.image(camera, frame) for frame, camera in product(frames, sequence.cameras)]
@@ -116,13 +122,15 @@ class Kitti360Reader(RecordedReader):
         if self.masks is not None:
             stems = product(sequence.cameras, (sequence.image("", frame).stem for frame in frames))
             problems += GivenMasks(Path(self.masks)).check(stems)
-        for frame in frames:
-            attempt(problems, partial(check_pose, poses[frame], frame, sequence.poses))
+        if not are_rigid(torch.stack([poses[frame] for frame in frames])):
+            for frame in frames:
+                attempt(problems, partial(check_pose, poses[frame], frame, sequence.poses))
         problems += check_extent([(sequence.poses, poses[frame][:3, 3]) for frame in frames])
         calibration = attempt(problems, lambda: read_calibration(sequence.calibration, sequence.cameras))
         lines = attempt(problems, lambda: read_stamps(sequence.stamps(sequence.cameras[0]))) or []
         stamps = attempt(problems, lambda: _stamps(sequence, lines, frames)) if lines else None
-        boxes = attempt(problems, lambda: None if (xml := sequence.boxes) is None else read_boxes(xml, list(frames)))
+        path, positions = sequence.boxes, torch.stack([poses[frame][:3, 3] for frame in frames]).numpy()
+        boxes = None if path is None else attempt(problems, lambda: read_boxes(path, np.array(frames), positions))
         if problems or calibration is None or stamps is None:
             raise LogError(problems)
         turn = _turn(lines, frames)
@@ -131,6 +139,16 @@ class Kitti360Reader(RecordedReader):
 
     def _rig_camera(self, calibration: Calibration360, index: int, name: str) -> RigCamera[str]:
         camera = calibration.cameras[name]
+        if isinstance(camera, FisheyeCamera):
+            return lens_camera(
+                name,
+                index,
+                lens=camera.lens,
+                recorded_size=camera.size,
+                width=self.width,
+                min_lens_shift=self.min_lens_shift,
+                pinhole_fov=self.pinhole_fov,
+            )
         return rig_camera(
             name,
             index,
@@ -215,7 +233,7 @@ def _read_sweep(sequence: SequenceFolders, parts: _Parts, place: int) -> Float64
 def _labeled(sequence: SequenceFolders, frames: tuple[int, ...]) -> set[tuple[str, Path]]:
     """Cameras and files of the images of labels that are there."""
     found = set()
-    for camera in sequence.cameras:
+    for camera in (name for name in sequence.cameras if name not in FISHEYE):
         folder = sequence.semantics(camera)
         there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
         names = (f"{frame:010d}.png" for frame in frames)

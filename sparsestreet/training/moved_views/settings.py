@@ -11,7 +11,7 @@ class MovedViews:
     sees, the less they weigh.
     """
 
-    every: int = 5
+    every: int = 4
     """Steps from one moved view to the next."""
     start: float = 0.1
     stop: float = 0.9

@@ -105,7 +105,7 @@ def write_oxts(folder: Path, plan: Plan) -> None:
     scale = MEAN_RADIUS * np.cos(np.radians(LATITUDE))
     start = np.log(np.tan(np.pi * (90 + LATITUDE) / 360))
     # A car on a curve turns and drives by the same motion all the time, seen from itself.
-    twist = logm(np.linalg.inv(poses[0]) @ poses[1]).real / (plan.period / 1e9)
+    twist = np.real(np.asarray(logm(np.linalg.inv(poses[0]) @ poses[1]))) / (plan.period / 1e9)
     for frame, world_from_imu in enumerate(poses):
         east, north, up = world_from_imu[:3, 3] - poses[0, :3, 3]
         values = np.zeros(30)

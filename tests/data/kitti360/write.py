@@ -16,6 +16,8 @@ VEHICLE_FROM_IMU = np.diag([1.0, -1, -1, 1])
 PARKED = pose(turned(0.7), (4150.0, -2350.0, 31.8))
 PARKED_SIZE = (4.0, 1.7, 1.5)
 LABELED = (0, 1, 4)
+SIDEWAYS = pose(turned(np.pi / 2) @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (0.7, 0.3, 1.8))
+"""vehicle_from_camera of image_02, a fisheye that looks to the left."""
 
 
 def write_kitti360(root: Path, plan: Plan = PLAN) -> Path:
@@ -95,3 +97,22 @@ def write_labels(folder: Path, plan: Plan) -> None:
     labels[:10], labels[20:, :8], labels[20:, 24:28], labels[20:, 28:] = 23, 26, 25, 24
     for frame in LABELED:
         Image.fromarray(labels).save(folder / f"{frame:010d}.png")
+
+
+def write_fisheye(root: Path, plan: Plan = PLAN) -> None:
+    """Adds image_02: black, with a white dot where a lens of xi = 1 shows the direction (0.6, 0, 0.8).
+
+    x = 0.6 / (0.8 + xi) = 1 / 3, so that the dot lies gamma1 / 3 = 8 pixels right of u0.
+    """
+    folder = root / "data_2d_raw" / SEQUENCE / "image_02" / "data_rgb"
+    folder.mkdir(parents=True)
+    pixels = np.zeros((24, 32, 3), np.uint8)
+    pixels[11, 16] = 255
+    for frame in range(plan.num_frames):
+        Image.fromarray(pixels).save(folder / f"{frame:010d}.png")
+    shape = "mirror_parameters:\n   xi:1.0\ndistortion_parameters:\n   k1:0.0\n   k2:0.0\n   p1:0.0\n   p2:0.0\n"
+    place = "projection_parameters:\n   gamma1:24.0\n   gamma2:24.0\n   u0:8.0\n   v0:11.0\n"
+    head = "%YAML:1.0\n---\nmodel_type:MEI\ncamera_name:image_02\nimage_width:32\nimage_height:24\n"
+    (root / "calibration" / "image_02.yaml").write_text(head + shape + place)
+    with (root / "calibration" / "calib_cam_to_pose.txt").open("a") as file:
+        file.write(f"image_02: {numbers((VEHICLE_FROM_IMU @ SIDEWAYS)[:3])}\n")

@@ -141,6 +141,17 @@ def test_a_field_of_view_tells_the_focal_length(written):
     torch.testing.assert_close(view.camera.intrinsics, expected, rtol=1e-6, atol=0)
 
 
+def test_a_frames_own_numbers_come_before_those_of_all(written):
+    folder, content = written
+    content |= {"fl_x": 99.0, "w": 7, "camera_model": "OPENCV_FISHEYE", "k1": 0.5}
+    for frame in content["frames"]:
+        frame["k1"] = 0.0
+    write_json(folder, content)
+    view = NerfstudioReader(root=folder).read().views[0]
+    assert view.camera.intrinsics[0, 0] == PLAN.cameras[0].intrinsics[0, 0]
+    assert (view.camera.width, view.camera.distortion) == (32, None)
+
+
 def test_blenders_names_have_no_ending(written):
     folder, content = written
     for frame in content["frames"]:

@@ -72,6 +72,9 @@ def test_points_of_the_log_count_where_they_are_seen():
     shared = max(0, 3 - abs(middle[0] - 10)) * max(0, 3 - abs(middle[1] - 10))
     assert coverage(returned) == Coverage(lidar=9 / 475, images=(11 - shared) / 475)
     assert shared > 0
+    # A triangulated point far from both.
+    both = replace(data, image_points=StreetPoints(triangulated([[0.0] * 3], [(0, 0, 20.5, 15.5)]), {}))
+    assert coverage(both) == Coverage(lidar=0.0, images=20 / 475)
 
 
 @pytest.mark.parametrize("frames", [[frame()], [frame([(1, 1)], sky_rows=HEIGHT)], []], ids=["bare", "sky", "no view"])

@@ -11,9 +11,10 @@ from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.planes import fit_planes
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
+from sparsestreet.scene.initialize.sources.images import pixel_sizes
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
-from sparsestreet.types import SparsePoints, Sweep
+from sparsestreet.types import SparsePoints, Sweep, View
 from tests.scene.street import frame_at, rigid_settings, street_log, training_data, triangulated
 from tests.typed import there
 
@@ -115,6 +116,18 @@ def test_points_of_the_log_are_points_from_images():
     assert len({len(choice) for choice in choices}) == 1
     assert len(choices) > 2
     assert len(drawn(ImagePoints(voxel=100.0), 9, alone)) == 1
+
+
+def test_a_pixel_is_as_large_as_the_nearest_camera_sees_it():
+    """Cameras at x = 0 and x = 10, the second with twice the focal length."""
+    near, far = training_data().views[0].camera, training_data().views[0].camera
+    pose = far.camera_from_world.clone()
+    pose[:3, 3] -= pose[:3, :3] @ torch.tensor([10.0, 0, 0])
+    zoomed = replace(far, camera_from_world=pose, intrinsics=torch.diag(torch.tensor([2.0, 2, 1])) @ far.intrinsics)
+    views = [View(near, 0.0), View(zoomed, 1.0)]
+    at = torch.stack((near.position + torch.tensor([0, 0, 4.0]), zoomed.position + torch.tensor([0, 0, 6.0])))
+    focal = float(near.intrinsics[0, 0])
+    torch.testing.assert_close(pixel_sizes(at, views), torch.tensor([4 / focal, 3 / focal]))
 
 
 def test_a_run_without_points_from_images_gives_none():

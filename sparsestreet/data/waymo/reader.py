@@ -1,0 +1,226 @@
+"""From a segment of Waymo's Open Dataset to a recording."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+from torch import Tensor
+
+from sparsestreet.data.extent import check_extent
+from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.lidar import check_points
+from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
+from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
+from sparsestreet.data.waymo.boxes import read_boxes
+from sparsestreet.data.waymo.find import find_segment
+from sparsestreet.data.waymo.images import camera_at, middle, shutter
+from sparsestreet.data.waymo.lidar import SPIN, check_returns, world_points
+from sparsestreet.data.waymo.notes import segment_notes
+from sparsestreet.data.waymo.pixels import decode_image, decode_masks
+from sparsestreet.data.waymo.segment import REMEDY, ImageMotion, Segment
+from sparsestreet.data.waymo.spool import Spool
+from sparsestreet.data.window import chosen_cameras, frame_window
+
+_USUAL = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT")
+_HALF = SPIN // 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class WaymoReader(RecordedReader):
+    """A segment of version 1 (TFRecord) or 2 (parquet), as the files of ``root`` tell; ``cameras`` are Waymo's names.
+
+    The world is Waymo's. An instant is a spin of the lidar TOP, its stamp that of half of the spin, which the pose of
+    the frame is of. Each image has the pose and the stamp of the middle of its readout.
+    """
+
+    scene: str | int | None = None
+    """Name of a segment, or its place in ``scenes``, from 0; None: the only one."""
+    scenes: Path | str | None = None
+    """A file with the name of a segment a line, such as the list that DriveStudio counts in."""
+
+    def recording(self) -> Recording:
+        segment, frames, cameras = self._segment, self._frames, self._cameras
+        rig, shots, boxes, notes = self._rig(), *self._placed()
+        given = None if self.masks is None else GivenMasks(Path(self.masks))
+        if given is not None and (missing := given.check((cameras[shot.camera], shot.stem) for shot in shots)):
+            raise LogError(missing)
+        labelled = segment.labelled & {shot.key for shot in shots if given is None}
+        kinds = frozenset({"sky", "human", "vehicle"} if labelled else ())
+        return Recording(
+            name=segment.name,
+            rig=rig,
+            shots=shots,
+            read_image=partial(_read_image, segment, rig),
+            read_masks=partial(_read_masks, segment, rig, labelled, given),
+            mask_kinds=kinds if given is None else given.kinds,
+            # Behind the last image there are no frames.
+            frame_stamps=tuple(_instant(segment, frame) for frame in frames)[: 1 + shots[-1].frame],
+            sweeps=self._sweeps() if self.lidar else None,
+            boxes=boxes,
+            notes=(*segment_notes(segment, frames, cameras, shots, len(labelled)), *notes),
+        )
+
+    def _placed(self) -> tuple[list[Shot], list[Boxes] | None, tuple[str, ...]]:
+        """Images, boxes, and what has to be said about these. Raises LogError with all that is wrong with them."""
+        segment, frames, problems = self._segment, self._frames, []
+        motions = {frame: attempt(problems, partial(segment.images, frame)) or {} for frame in frames}
+        boxes, notes = None, ()
+        if segment.has_boxes:
+            boxes, notes = attempt(problems, partial(read_boxes, segment, frames.start)) or (None, ())
+        for frame in frames:
+            attempt(problems, partial(segment.world_from_vehicle, frame))
+        if problems:
+            raise LogError(_once(problems))
+        shots = _shots(segment, frames, self._cameras, motions)
+        if not shots:
+            raise fault(segment.image_file, f"there are no images of {', '.join(self._cameras)}", REMEDY)
+        cameras = [(segment.image_file, shot.world_from_camera[:3, 3]) for shot in shots]
+        objects = [(one.path, torch.from_numpy(place)) for one in boxes or () for place in one.poses[:, :3, 3]]
+        if far := check_extent(cameras + objects):
+            raise LogError(far)
+        return shots, boxes, notes
+
+    def check_contents(self) -> list[Problem]:
+        recording, problems = self.recording(), self._segment.check_files()
+        for shot in recording.shots:
+            attempt(problems, partial(recording.read_image, shot))
+            attempt(problems, partial(recording.read_masks, shot))
+        for sweep in (recording.sweeps or {}).values():
+            attempt(problems, sweep.read)
+        return _once(problems)
+
+    def files(self) -> LogFiles:
+        """All components of the segment, lidar too where it is not wanted."""
+        return self._segment.files()
+
+    @cached_property
+    def _segment(self) -> Segment:
+        """Tables and places of records are the same for a check and a read."""
+        scenes = None if self.scenes is None else Path(self.scenes)
+        segment = find_segment(self.folder, self.scene, scenes)
+        late = np.flatnonzero(np.diff(np.array(segment.stamps)) <= 0)
+        if len(late):
+            raise fault(segment.source, f"the stamps of frames {late[0]} and {late[0] + 1} do not increase", REMEDY)
+        return segment
+
+    @property
+    def _frames(self) -> range:
+        return frame_window(len(self._segment.stamps), self.first_frame, self.last_frame, self.folder)
+
+    @property
+    def _cameras(self) -> tuple[str, ...]:
+        found = list(self._segment.cameras)
+        wanted = [name for name in _USUAL if name in found] if self.cameras is None else self.cameras
+        return chosen_cameras(found, wanted, self.folder)
+
+    def _rig(self) -> list[RigCamera[str]]:
+        rig = []
+        for index, name in enumerate(self._cameras):
+            calibration = self._segment.cameras[name]
+            f_u, f_v, c_u, c_v, *lens = calibration.intrinsic
+            # Counted from the left and upper edge of the image, as here: pixel centers are at +0.5.
+            intrinsics = torch.tensor([[f_u, 0, c_u], [0, f_v, c_v], [0, 0, 1]], dtype=torch.float64)
+            distortion = torch.tensor(lens, dtype=torch.float64)
+            check_lens(self._segment.calibration_file, intrinsics, distortion, calibration.size)
+            rig.append(
+                rig_camera(
+                    name,
+                    index,
+                    intrinsics=intrinsics,
+                    distortion=distortion,
+                    recorded_size=calibration.size,
+                    width=self.width,
+                    min_lens_shift=self.min_lens_shift,
+                )
+            )
+        return rig
+
+    def _sweeps(self) -> dict[int, LidarSweep] | None:
+        segment, frames, spool = self._segment, self._frames, Spool()
+        found = {
+            index: LidarSweep(partial(_read_points, segment, spool, frame), _instant(segment, frame))
+            for index, frame in enumerate(frames)
+            if segment.has_returns(frame)
+        }
+        return found or None
+
+
+def _instant(segment: Segment, frame: int) -> int:
+    return 1000 * segment.stamps[frame] + _HALF
+
+
+def _shots(
+    segment: Segment, frames: range, cameras: Sequence[str], motions: Mapping[int, Mapping[str, ImageMotion]]
+) -> list[Shot]:
+    shots = []
+    for index, frame in enumerate(frames):
+        for place, name in enumerate(cameras):
+            if name not in motions[frame]:
+                continue
+            motion, calibration = motions[frame][name], segment.cameras[name]
+            stamp = middle(motion)
+            shots.append(
+                Shot(
+                    index,
+                    place,
+                    camera_at(motion, calibration, stamp),
+                    (frame, name),
+                    f"{frame:03d}",
+                    stamp,
+                    shutter(motion, calibration),
+                    motion.exposure,
+                )
+            )
+    return shots
+
+
+def _read_image(segment: Segment, rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+    camera = rig[shot.camera]
+    frame = int(shot.stem)
+    data, recorded = segment.jpeg(frame, camera.name), segment.cameras[camera.name].size
+    return decode_image(data, recorded, camera.size, segment.image_file, f"the image of {camera.name} at frame {frame}")
+
+
+def _read_masks(
+    segment: Segment,
+    rig: Sequence[RigCamera[str]],
+    labelled: frozenset[tuple[int, str]],
+    given: GivenMasks | None,
+    shot: Shot,
+) -> Mapping[str, Bool[Tensor, "h w"]]:
+    """Those that somebody made for all images, or else those that Waymo had made for some."""
+    camera, frame = rig[shot.camera], int(shot.stem)
+    recorded = segment.cameras[camera.name].size
+    if given is not None:
+        return given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
+    if (frame, camera.name) not in labelled:
+        return {}
+    data, divisor = segment.panoptic(frame, camera.name)
+    what = f"the panoptic label of {camera.name} at frame {frame}"
+    return decode_masks(data, divisor, recorded, camera.size, segment.label_file, what)
+
+
+def _read_points(segment: Segment, spool: Spool, frame: int) -> Float64[Tensor, "n 3"]:
+    """Points of the world, decoded once: they are kept as float32 from where the vehicle was, exact to 0.01 mm."""
+    pose = segment.world_from_vehicle(frame)
+    if frame not in spool:
+        parts = [np.zeros((0, 3))]
+        for returns in segment.returns(frame):
+            calibration = check_returns(returns, segment.lidars.get(returns.lidar), segment.lidar_file, frame)
+            parts.append(world_points(returns, calibration, pose))
+        near = torch.from_numpy(np.concatenate(parts)) - pose[:3, 3]
+        check_points(near, segment.lidar_file, remedy=REMEDY)
+        spool.put(frame, near.float().numpy().tobytes())
+    near = np.frombuffer(spool.get(frame), np.float32).reshape(-1, 3)
+    return torch.from_numpy(near.astype(np.float64)) + pose[:3, 3]
+
+
+def _once(problems: Sequence[Problem]) -> list[Problem]:
+    """Equal problems said once, in their order."""
+    return list(dict.fromkeys(problems))

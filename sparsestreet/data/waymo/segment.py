@@ -1,0 +1,253 @@
+"""What a segment of Waymo's Open Dataset holds, in Waymo's own axes and units, whichever release it is read from.
+
+The vehicle's axes, and a camera's, are x forward, y left, z up. The world is Waymo's global one: east, north, up.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int64
+from torch import Tensor
+
+from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.poses import check_rigid
+from sparsestreet.data.problems import Problem, fault
+
+CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
+LIDARS = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
+CLASSES = {1: "Vehicle", 2: "Pedestrian", 3: "Sign", 4: "Cyclist"}
+REMEDY = "download the file again from Waymo"
+_LARGEST_SIDE = 16_384
+"""Pixels: ten times what the cameras have."""
+_LONGEST_EXPOSURE = 0.5
+"""Seconds from the trigger to the end of the readout: ten times what was seen."""
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """What is the same in all images of a camera."""
+
+    intrinsic: tuple[float, ...]
+    """f_u, f_v, c_u, c_v in pixels from the left and upper edge, then k1, k2, p1, p2, k3 as OpenCV has them."""
+    vehicle_from_camera: Float64[Tensor, "4 4"]
+    size: tuple[int, int]
+    """Width, height, pixels."""
+    direction: int
+    """In which order pixels are read: 1 rows from the top, 2 columns from the left, 3 rows from below, 4 columns from
+    the right, 5 all at once, 0 not known."""
+
+
+@dataclass(frozen=True)
+class LidarCalibration:
+    """Where a lidar's rays point."""
+
+    vehicle_from_lidar: Float64[Tensor, "4 4"]
+    inclinations: tuple[float, ...]
+    """Of the rows, radians, from the lowest to the highest; empty: evenly spread within ``limits``."""
+    limits: tuple[float, float]
+    """Least and greatest inclination, radians."""
+
+
+@dataclass(frozen=True)
+class ImageMotion:
+    """Where the vehicle was, and how it moved, when an image was taken. Times are seconds of Waymo's clock."""
+
+    world_from_vehicle: Float64[Tensor, "4 4"]
+    """At ``pose_time``, which is near the image's own instant, not equal to it."""
+    linear: Float64[Tensor, "3"]
+    """m/s along the world's axes."""
+    angular: Float64[Tensor, "3"]
+    """rad/s about the vehicle's axes."""
+    pose_time: float
+    exposure: float
+    """Seconds that a row or column is exposed."""
+    trigger: float
+    readout_done: float
+
+
+@dataclass(frozen=True)
+class BoxLabel:
+    """A box of a frame, in the vehicle's frame at the frame's pose."""
+
+    name: str
+    kind: int
+    """A key of CLASSES."""
+    box: tuple[float, ...]
+    """Center x, y, z, length, width, height in meters, heading in radians from x to y."""
+    seen_box: tuple[float, ...] | None = None
+    """The box at the instant when ``seen_by`` saw it (``camera_synced_box``); None: not seen, or an older file."""
+    seen_by: str | None = None
+
+
+@dataclass(frozen=True)
+class Returns:
+    """The returns of one lidar in one frame; both returns of a pixel are rows of their own."""
+
+    lidar: str
+    shape: tuple[int, int]
+    """Rows and columns of the range image."""
+    pixels: Int64[np.ndarray, " n"]
+    """row * columns + column of each."""
+    ranges: Float[np.ndarray, " n"]
+    """Meters."""
+    poses: Float[np.ndarray, "h w 6"] | None = None
+    """Of the lidar TOP: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel's own instant."""
+
+
+class Segment(ABC):
+    """About 20 s of a drive, from the files of one release. All methods raise LogError for broken files."""
+
+    name: str
+    stamps: Sequence[int]
+    """Microseconds at which the spin of each frame began."""
+    cameras: Mapping[str, CameraCalibration]
+    lidars: Mapping[str, LidarCalibration]
+    source: Path
+    """The file of the frames' poses."""
+    calibration_file: Path
+    """Of cameras."""
+    image_file: Path
+    box_file: Path
+    lidar_file: Path
+    label_file: Path
+    """Of panoptic labels."""
+    notes: tuple[str, ...] = ()
+
+    @abstractmethod
+    def world_from_vehicle(self, frame: int) -> Float64[Tensor, "4 4"]:
+        """The pose that the frame's boxes and returns refer to, of half of the spin."""
+
+    @abstractmethod
+    def images(self, frame: int) -> Mapping[str, ImageMotion]:
+        """The images that the frame has, by camera."""
+
+    @abstractmethod
+    def jpeg(self, frame: int, camera: str) -> bytes:
+        """An image as it is stored."""
+
+    @abstractmethod
+    def boxes(self, frame: int) -> Sequence[BoxLabel]: ...
+
+    @property
+    @abstractmethod
+    def has_boxes(self) -> bool: ...
+
+    @property
+    @abstractmethod
+    def labelled(self) -> frozenset[tuple[int, str]]:
+        """Frames and cameras whose pixels were labelled by hand."""
+
+    @abstractmethod
+    def panoptic(self, frame: int, camera: str) -> tuple[bytes, int]:
+        """A PNG of class * divisor + instance, and the divisor."""
+
+    @abstractmethod
+    def has_returns(self, frame: int) -> bool: ...
+
+    @abstractmethod
+    def returns(self, frame: int) -> Sequence[Returns]:
+        """Of each lidar that the frame has."""
+
+    @abstractmethod
+    def files(self) -> LogFiles: ...
+
+    @abstractmethod
+    def check_files(self) -> list[Problem]:
+        """What is wrong with the files as such, all bytes of which are read."""
+
+
+def transform(values: Sequence[float] | np.ndarray, path: Path, what: str) -> Float64[Tensor, "4 4"]:
+    """A rigid transform from its 16 numbers, row by row. Raises LogError for other ones, naming the file."""
+    if len(values) != 16:
+        raise fault(path, f"{what} has {len(values)} numbers, not 16", REMEDY)
+    matrix = torch.from_numpy(np.array(values, dtype=np.float64).reshape(4, 4))
+    check_rigid(matrix, path, what)
+    return matrix
+
+
+def camera_calibration(
+    intrinsic: Sequence[float],
+    extrinsic: Sequence[float] | np.ndarray,
+    size: tuple[int, int],
+    direction: int,
+    path: Path,
+    name: str,
+) -> CameraCalibration:
+    """Checked: nine finite intrinsics, a size that an image can have, a direction of Waymo's six."""
+    what = f"the calibration of camera {name}"
+    if len(intrinsic) != 9 or not np.isfinite(intrinsic).all() or min(intrinsic[:2]) <= 0:
+        message = f"{what} has the intrinsics {[float(value) for value in intrinsic][:12]}"
+        raise fault(path, f"{message}, not nine numbers with focal lengths above 0", REMEDY)
+    if not all(0 < side <= _LARGEST_SIDE for side in size):
+        raise fault(path, f"{what} has images of {size[0]}x{size[1]} pixels", REMEDY)
+    if direction not in range(6):
+        raise fault(path, f"{what} has the rolling_shutter_direction {direction}, not one of 0 to 5", REMEDY)
+    mount = transform(extrinsic, path, f"{what}: extrinsic")
+    return CameraCalibration(tuple(map(float, intrinsic)), mount, size, direction)
+
+
+def lidar_calibration(
+    extrinsic: Sequence[float] | np.ndarray,
+    inclinations: Sequence[float] | np.ndarray,
+    limits: tuple[float, float],
+    path: Path,
+    name: str,
+) -> LidarCalibration:
+    """Checked: finite inclinations within a quarter turn, that ascend."""
+    what = f"the calibration of lidar {name}"
+    angles = np.array([*inclinations, *limits], dtype=np.float64)
+    if not (np.abs(angles) <= np.pi / 2 + 1e-6).all() or not (np.diff(inclinations) > 0).all() or limits[0] > limits[1]:
+        raise fault(path, f"{what} has inclinations that are no ascending angles up to a quarter turn", REMEDY)
+    mount = transform(extrinsic, path, f"{what}: extrinsic")
+    return LidarCalibration(mount, tuple(map(float, inclinations)), limits)
+
+
+def image_motion(
+    pose: Sequence[float] | np.ndarray,
+    velocity: Sequence[float],
+    times: tuple[float, float, float, float],
+    path: Path,
+    what: str,
+) -> ImageMotion:
+    """Checked: finite velocities, and times in an order that a camera can have.
+
+    ``velocity``: linear, then angular; ``times``: pose_timestamp, shutter, camera_trigger_time,
+    camera_readout_done_time.
+    """
+    pose_time, exposure, trigger, done = times
+    if not np.isfinite(velocity).all() or not np.isfinite(times).all() or min(pose_time, trigger) < 0:
+        raise fault(path, f"{what} has velocities or times that are NaN, infinite or negative", REMEDY)
+    if not (0 <= exposure <= done - trigger <= _LONGEST_EXPOSURE and abs(pose_time - trigger) <= _LONGEST_EXPOSURE):
+        message = (
+            f"{what} was triggered at {trigger:.6f} s, exposed {exposure:g} s, read out by {done:.6f} s, its pose is "
+            f"of {pose_time:.6f} s: no camera takes an image so"
+        )
+        raise fault(path, message, REMEDY)
+    linear, angular = torch.tensor(velocity, dtype=torch.float64).view(2, 3)
+    return ImageMotion(transform(pose, path, f"{what}: pose"), linear, angular, *times)
+
+
+def box_label(
+    name: str,
+    kind: int,
+    box: Sequence[float],
+    path: Path,
+    what: str,
+    *,
+    seen_box: Sequence[float] | None = None,
+    seen_by: str | None = None,
+) -> BoxLabel:
+    """Checked: a name, a class of Waymo's, finite boxes."""
+    if not name:
+        raise fault(path, f"a box of {what} has no id", REMEDY)
+    if kind not in CLASSES:
+        raise fault(path, f"box {name} of {what} has the type {kind}, not one of {CLASSES}", REMEDY)
+    for one in (box, seen_box):
+        if one is not None and not (np.isfinite(one).all() and np.abs(one[:3]).max() < 1000 and min(one[3:6]) > 0):
+            message = f"box {name} of {what} has the center, size and heading {[round(float(v), 3) for v in one]}"
+            raise fault(path, f"{message}: no box can be so", REMEDY)
+    return BoxLabel(name, kind, tuple(box), None if seen_box is None else tuple(seen_box), seen_by)

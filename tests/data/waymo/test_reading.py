@@ -1,0 +1,171 @@
+"""What is read of a drive in either version equals the plan that it was written from."""
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.data.waymo import WaymoReader
+from sparsestreet.geometry import quaternions as quat
+from tests.data.plan import moved
+from tests.data.waymo import records
+from tests.data.waymo.drive import EXPOSURE, HALF_SPIN, LENS, READOUT, Drive
+from tests.typed import there
+
+CLOCK = 240
+"""Nanoseconds: doubles of 1.5e9 seconds are so far apart."""
+PLACE = 3e-6
+"""Meters: what the car drives in that time."""
+
+
+def test_poses_and_stamps(root, drive):
+    recording = WaymoReader(root=root).recording()
+    assert [(shot.frame, shot.camera) for shot in recording.shots] == [(f, c) for f in range(4) for c in range(2)]
+    assert recording.frame_stamps == tuple(drive.stamps.tolist())
+    for shot in recording.shots:
+        camera = drive.cameras[shot.camera]
+        assert abs(shot.stamp - drive.image_stamp(shot.frame, camera)) <= CLOCK
+        expected = drive.world_from_camera(shot.frame, camera)
+        # float32 velocities of a pose at the same instant change nothing.
+        np.testing.assert_allclose(shot.world_from_camera.numpy(), expected, rtol=0, atol=PLACE)
+        assert shot.exposure == pytest.approx(EXPOSURE / 1e9)
+
+
+def test_a_pose_of_another_instant_is_moved_to_the_middle_of_the_readout(tmp_path):
+    drive = Drive(pose_delays={"front": 4_400_000, "left": -3_100_000}, yaw_rate=0.6)
+    records.write_drive(tmp_path, drive)
+    errors, turns = [], []
+    for shot in WaymoReader(root=tmp_path).recording().shots:
+        expected = torch.from_numpy(drive.world_from_camera(shot.frame, drive.cameras[shot.camera]))
+        errors.append((shot.world_from_camera[:3, 3] - expected[:3, 3]).norm())
+        turns.append((shot.world_from_camera[:3, :3] - expected[:3, :3]).abs().max())
+    # On a circle v dt leaves v w dt^2 / 2 = 58 micrometers; a velocity of the wrong axes turns by 0.03 w dt = 8e-5.
+    assert max(errors) < 70e-6
+    # The angular velocity is constant in the vehicle's frame, so only the clock's rounding is left.
+    assert max(turns) < 1e-6
+
+
+def test_shutters_against_finite_differences_of_the_plan(root, drive):
+    for shot in WaymoReader(root=root).recording().shots:
+        camera, middle = drive.cameras[shot.camera], drive.image_stamp(shot.frame, drive.cameras[shot.camera])
+        ends = [middle - READOUT // 2, middle + READOUT // 2]
+        begin, end = torch.from_numpy(drive.world_from_vehicle(np.array(ends)) @ camera.vehicle_from_camera)
+        now = torch.from_numpy(drive.world_from_camera(shot.frame, camera))[:3, :3]
+        translation = now.T @ (end[:3, 3] - begin[:3, 3])
+        rotation = quat.to_rotation_vector(quat.from_matrix(now.T @ end[:3, :3] @ begin[:3, :3].T @ now))
+        # Both ends of the readout are rounded by the clock; an arc of 0.0088 rad differs from its chord by 1.4e-6 m.
+        torch.testing.assert_close(shot.shutter.translation.double(), translation, rtol=0, atol=2 * PLACE)
+        torch.testing.assert_close(shot.shutter.rotation.double(), rotation, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("direction", range(6))
+def test_the_declared_side_is_read_first(direction, tmp_path):
+    drive = Drive(num_frames=1, directions={"front": direction, "left": 2}, synced=False)
+    records.write_drive(tmp_path, drive)
+    recording = WaymoReader(root=tmp_path).recording()
+    front, left = (shot.shutter for shot in recording.shots)
+    sides = {1: "top", 2: "left", 3: "bottom", 4: "right"}
+    assert left.direction == "left"
+    assert (front.direction if front else None) == sides.get(direction)
+
+
+def test_points_come_back_to_a_millimeter(root, drive):
+    sweeps = there(WaymoReader(root=root).recording().sweeps)
+    assert sorted(sweeps) == [0, 1, 2, 3]
+    for frame, sweep in sweeps.items():
+        points = sweep.read().numpy()
+        assert sweep.stamp == drive.stamps[frame]
+        # float32 poses of a world 4 km away are rounded to 0.24 mm an axis.
+        np.testing.assert_allclose(points, drive.points(frame), rtol=0, atol=1e-3)
+
+
+def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
+    """As ``lidar_camera_projection`` does: each point by the column that shows it, on images of 1,920 x 1,440."""
+    drive = Drive(scale=60, num_frames=1, labelled=())
+    records.write_drive(tmp_path, drive)
+    recording = WaymoReader(root=tmp_path).recording()
+    points, seen, errors, still = recording.sweeps[0].read().numpy(), 0, [], []
+    for shot in recording.shots:
+        camera, pose = drive.cameras[shot.camera], shot.world_from_camera.numpy()
+        sign = {"left": 1, "right": -1}[shot.shutter.direction]
+        ahead = moved(np.linalg.inv(pose), points)[:, 2]
+        for point in points[ahead > 2][::3]:
+            _, truth = drive.read_at(0, camera, lambda stamp, point=point: point)
+            if not (0 < truth[0] < camera.width and 0 < truth[1] < camera.height):
+                continue
+            tau = sign * (truth[0] / camera.width - 0.5)
+            turn = quat.to_matrix(quat.from_rotation_vector(tau * shot.shutter.rotation.double())).numpy()
+            then = pose.copy()
+            then[:3, 3] += pose[:3, :3] @ shot.shutter.translation.double().numpy() * tau
+            then[:3, :3] = pose[:3, :3] @ turn
+            errors.append(np.linalg.norm(drive.pixels(camera, then, point[None])[0] - truth))
+            still.append(np.linalg.norm(drive.pixels(camera, pose, point[None])[0] - truth))
+            seen += 1
+    # Points are good to 0.4 mm, 0.4 pixels at 2 m.
+    assert seen > 15
+    assert max(errors) < 0.5
+    assert max(still) > 5
+
+
+@pytest.mark.parametrize("direction", [2, 4])
+def test_boxes_are_at_their_own_instants(direction, tmp_path):
+    drive = Drive(directions={"front": direction, "left": 4})
+    records.write_drive(tmp_path, drive)
+    (car,) = there(WaymoReader(root=tmp_path).recording().boxes)
+    assert (car.name, car.class_name, car.frames.tolist()) == ("car-1", "Vehicle", [0, 1, 2, 3])
+    np.testing.assert_allclose(car.sizes, np.tile(drive.box_size, (4, 1)), rtol=1e-12)
+    for frame, (stamp, pose) in enumerate(zip(there(car.stamps), car.poses, strict=True)):
+        # The camera's clock is rounded, and it is moved on by a velocity for up to half of its readout.
+        assert abs(stamp - drive.seen_stamp(frame)) < 1000
+        np.testing.assert_allclose(pose[:3, 3], drive.world_from_box(drive.seen_stamp(frame))[:3, 3], atol=1e-9)
+        # A box turns about the vehicle's axis alone, which leans by 0.03: 0.03 * 0.06 are left of the plan's.
+        np.testing.assert_allclose(pose[:3, :3], drive.world_from_box(stamp)[:3, :3], atol=3e-3)
+
+
+def test_both_versions_have_the_same_boxes(roots):
+    if 2 not in roots:
+        pytest.skip("version 2 needs pyarrow: pip install 'sparsestreet[parquet]'")
+    (one,), (other,) = (there(WaymoReader(root=root).recording().boxes) for root in roots.values())
+    assert one.stamps == other.stamps
+    assert np.array_equal(one.poses, other.poses)
+
+
+def test_boxes_of_the_lidar_are_of_the_instant_when_the_beam_crossed_them(tmp_path):
+    drive = Drive(synced=False)
+    records.write_drive(tmp_path, drive)
+    (car,) = there(WaymoReader(root=tmp_path).recording().boxes)
+    for frame, (stamp, pose) in enumerate(zip(there(car.stamps), car.poses, strict=True)):
+        assert abs(stamp - drive.box_stamp(frame)) <= 1
+        assert abs(stamp - drive.begin(frame) - HALF_SPIN) < 5_000_000
+        np.testing.assert_allclose(pose[:3, 3], drive.world_from_box(stamp)[:3, 3], atol=1e-7)
+
+
+def test_the_log_has_images_lenses_and_masks(root, drive):
+    log = WaymoReader(root=root, min_lens_shift=0.0).read()
+    assert (log.num_frames, log.num_cameras, len(log.sweeps), len(log.tracks)) == (4, 2, 4, 1)
+    for frame in log.frames:
+        index, place = frame.indices
+        camera = drive.cameras[place]
+        assert np.array_equal(frame.image.numpy(), drive.image(index, camera))
+        np.testing.assert_allclose(frame.camera.intrinsics.numpy(), camera.intrinsics, rtol=1e-7)
+        np.testing.assert_allclose(frame.camera.distortion.numpy(), LENS, rtol=1e-7)
+        assert (frame.sky is not None) == ((index, place) == (1, 0))
+    labelled = log.frames[2]
+    assert labelled.sky.float().sum() == 6 * 32
+    assert labelled.vehicle.float().sum() == 4 * 5
+    assert labelled.human.float().sum() == 4 * 3
+    assert "1 of 8 images have masks" in " ".join(log.notes)
+
+
+def test_a_window_a_camera_and_a_width(root, drive):
+    log = WaymoReader(root=root, cameras=["FRONT_LEFT"], first_frame=1, last_frame=2, width=16, lidar=False).read()
+    assert [view.indices for view in log.views] == [(0, 0), (1, 0)]
+    assert log.frames[0].image.shape == (12, 16, 3)
+    assert len(log.sweeps) == 0
+    assert abs(log.views[0].stamp - drive.image_stamp(1, drive.cameras[1])) <= CLOCK
+    assert log.tracks[0].frames.tolist() == [0, 1]
+
+
+def test_a_sound_drive_has_no_problems_and_a_hash(root):
+    reader = WaymoReader(root=root)
+    assert reader.check() == []
+    assert reader.data_hash() == WaymoReader(root=root).data_hash()
