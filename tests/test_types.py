@@ -11,7 +11,7 @@ import sparsestreet
 from sparsestreet.types import Camera, Rendering, Track
 from tests.scene.street import view_at
 
-CHANGING = {"BodyWriter", "StreetWriter", "TrainSchema", "_Made", "_Named"}
+CHANGING = {"BodyWriter", "StreetWriter", "TrainSchema", "Made", "Named", "_OpenFile"}
 """Dataclasses whose fields are filled as they go."""
 
 

@@ -18,6 +18,7 @@ problems     what is wrong with a log on disk, all at once, with remedies
 check        what `sparsestreet data check` prints
 images       pixels and masks from files
 given_masks  masks that somebody made for a data set
+ego          rows of images that show the recording car
 numbers      numbers from text files
 json_tree    values of JSON files that know where they stand
 ply          points from .ply files
@@ -25,6 +26,8 @@ lidar        colors that points take from images, depth that pixels take from po
 formats      data sets as they are published, to be named where they must be converted first
 nuscenes     reader of nuScenes as it is published: tables of JSON, images, sweeps
 drivestudio  reader of DriveStudio's processed layout
+argoverse2   reader of Argoverse 2's sensor data set
+pandaset     reader of PandaSet
 nerfstudio   reader of transforms.json
 colmap       reader of sparse models
 rig_json     reader of a rig that somebody describes by hand

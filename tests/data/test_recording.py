@@ -72,6 +72,8 @@ def test_a_declared_shutter_arrives_at_the_view():
         Shot(frame, 0, torch.eye(4, dtype=torch.float64), key=None, stem="", shutter=shutter)
         for frame, shutter in enumerate((rolling, None))
     ]
-    recording = Recording("a", [camera(FLAT)], shots, lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8), dict)
+    recording = Recording(
+        "a", [camera(FLAT)], shots, lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8), lambda shot: {}
+    )
     log = log_of(recording, cache_bytes=0, check=list)
     assert [view.camera.shutter for view in log.views] == [rolling, None]

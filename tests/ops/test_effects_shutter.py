@@ -281,7 +281,7 @@ def test_gradient_of_each_field(backend, field, lens):
 
 # test_cpu_effects.py compares the gradients of the reference with those of the C++ backend.
 @pytest.mark.parametrize(("direction", "lens"), [("bottom", None), ("left", LENS), ("right", None)])
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", ["means", "quaternions", "scales"])
 def test_gradient_of_each_field_in_other_directions(field, direction, lens):
     check_gradient("reference", field, lens, direction)
 

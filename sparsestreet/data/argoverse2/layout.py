@@ -52,11 +52,14 @@ class Layout:
         return self.root / "sensors" / "cameras" / camera
 
 
-def find_log(root: Path, scene: str | None) -> Layout:
+def find_log(root: Path, scene: str | int | float | None) -> Layout:
     """The log whose name begins with ``scene``, at the root or at most two folders below.
 
-    Raises ValueError where there is none, or more than one.
+    Raises ValueError where there is none, or more than one, or for a scene that is no text: 7e128381 is a number.
     """
+    if isinstance(scene, float):
+        raise ValueError(f"data.log.scene is the number {scene}: put the name of the log into quotes")
+    scene = None if scene is None else str(scene)
     found = sorted({path.parent for folder in _FOLDERS for path in root.glob(f"{folder}/{POSES}")})
     if not found:
         raise ValueError(f"no log of Argoverse 2 is in {root}: a log's folder holds {POSES}")

@@ -29,8 +29,8 @@ class Argoverse2Reader(RecordedReader):
     The world is the city's. Pinholes, whose images are shipped without the lens, with global shutters.
     """
 
-    scene: str | None = None
-    """First characters of the log's name; None: the only log below the root."""
+    scene: str | int | float | None = None
+    """First characters of the log's name (a command line may take them for a whole number); None: the only one."""
 
     def recording(self) -> Recording:
         chosen = self._selection()

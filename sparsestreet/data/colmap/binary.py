@@ -25,7 +25,7 @@ _OBSERVATION, _TRACK_ELEMENT = 24, 8
 
 
 @dataclass
-class _Table:
+class _OpenFile:
     """A file and how much of it is left."""
 
     file: BinaryIO
@@ -75,7 +75,7 @@ class _Table:
 
 def camera_rows(path: Path) -> Iterator[CameraRow]:
     with path.open("rb") as file:
-        table = _Table(file, path, path.stat().st_size)
+        table = _OpenFile(file, path, path.stat().st_size)
         for _ in range(table.count(_CAMERA.size, "cameras")):
             number, model, width, height = table.take(_CAMERA, "a camera")
             if not 0 <= model < len(MODELS):
@@ -88,7 +88,7 @@ def camera_rows(path: Path) -> Iterator[CameraRow]:
 
 def image_rows(path: Path) -> Iterator[ImageRow]:
     with path.open("rb") as file:
-        table = _Table(file, path, path.stat().st_size)
+        table = _OpenFile(file, path, path.stat().st_size)
         for _ in range(table.count(_IMAGE.size + 1 + _COUNT.size, "images")):
             number, *pose, camera = table.take(_IMAGE, "an image")
             what = f"image {number}"
@@ -101,7 +101,7 @@ def image_rows(path: Path) -> Iterator[ImageRow]:
 def points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions n x 3 in float64 and RGB n x 3 in uint8."""
     with path.open("rb") as file:
-        table = _Table(file, path, path.stat().st_size)
+        table = _OpenFile(file, path, path.stat().st_size)
         count = table.count(_POINT.size, "points")
         positions, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
         for row in range(count):

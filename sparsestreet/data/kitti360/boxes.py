@@ -1,6 +1,6 @@
 """Annotated objects of a sequence that can move, from its XML of cuboids."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -40,7 +40,7 @@ _SHEAR = 1e-3
 _REMEDY = "copy it again from the published archive, or remove it to read the sequence without boxes"
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Object:
     class_name: str
     window: tuple[int, int]
@@ -86,7 +86,7 @@ def _add(objects: dict[str, _Object], item: Element, path: Path, what: str) -> N
     pose, size = _decomposed(_matrix(item, path, what), path, what)
     name = f"{CLASSES[semantic]}-{instance}"
     found = objects.setdefault(name, _Object(CLASSES[semantic], (start, end)))
-    found.window = min(start, found.window[0]), max(end, found.window[1])
+    found = objects[name] = replace(found, window=(min(start, found.window[0]), max(end, found.window[1])))
     found.poses[stamp], found.sizes[stamp] = pose, size
 
 

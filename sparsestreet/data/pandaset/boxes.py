@@ -29,7 +29,7 @@ class Objects:
     """Cuboids left out because the one before is not earlier."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Object:
     label: str
     stationary: bool

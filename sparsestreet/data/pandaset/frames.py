@@ -18,7 +18,7 @@ from sparsestreet.safe_pickle import Made, array_of_numbers, unpickled
 
 LARGEST = 64_000_000
 """Bytes of a decompressed table. A sweep of 200,000 returns takes 10 MB."""
-MOST_STEPS = 1_000_000
+MOST_STEPS = 200_000
 """Of the unpickler. Text takes two a cell: 20 a cuboid, of which an instant has some hundred."""
 _FRAME, _MANAGER = "pandas.core.frame.DataFrame", "pandas.core.internals.managers.BlockManager"
 _BLOCK, _SLICES = "pandas._libs.internals._unpickle_block", ("builtins.slice", "__builtin__.slice")
@@ -79,7 +79,7 @@ def _wanted(table: Any, columns: Mapping[str, type]) -> Iterator[tuple[str, np.n
         yield name, _cells(name, found[name], kind)
 
 
-def _parts(table: Any) -> tuple[list[str], list[tuple[Made, range | np.ndarray]]]:
+def _parts(table: Any) -> tuple[list[str], list[tuple[Any, range | np.ndarray]]]:
     """Names of the columns, and each block's values with the places of its columns."""
     state = _made(table, _FRAME).state
     manager = _made(state["_mgr"] if "_mgr" in state else state["_data"], _MANAGER)

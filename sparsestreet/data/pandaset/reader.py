@@ -215,7 +215,7 @@ def _read_masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: S
 def _notes(objects: Objects | None, spin: Spin | None, *, lidar: bool) -> tuple[str, ...]:
     """What a user should know about how it was read."""
     notes = [
-        "images are read out row by row, which the data set does not declare: all rows are taken at the stamp",
+        "images seem to be read row by row, which the data set does not declare: all rows are taken at the stamp",
         "the calibration names no lens: cameras are pinholes, although their images are slightly distorted",
     ]
     if lidar:

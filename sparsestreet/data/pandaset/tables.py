@@ -93,7 +93,7 @@ def read_intrinsics(path: Path) -> Float64[Tensor, "3 3"]:
     """Pixels; raises LogError. Where pixel centers lie is not documented: the numbers are taken as they are."""
     entry = _json(path)
     found = [entry.get(name) for name in ("fx", "fy", "cx", "cy")] if isinstance(entry, dict) else []
-    numbers = [float(number) for number in found if type(number) in (int, float) and 0 < number < 1e6]
+    numbers = [float(number) for number in found if isinstance(number, int | float) and 0 < number < 1e6]
     if len(numbers) < 4:
         raise fault(path, f"fx, fy, cx, cy must be positive pixels, they are {str(found)[:100]}", _REMEDY)
     fx, fy, cx, cy = numbers
@@ -121,7 +121,7 @@ def read_cuboids(path: Path) -> Cuboids:
     front = table["cuboids.sensor_id"] == _FRONT_LIDAR
     kept: dict[str, int] = {}
     for row in np.argsort(front, kind="stable").tolist():
-        name, sibling = table["uuid"][row], table["cuboids.sibling_id"][row]
+        name, sibling = str(table["uuid"][row]), table["cuboids.sibling_id"][row]
         if name in kept:
             raise fault(path, f"object {name} has two boxes", "keep one box of an object at an instant")
         if not sibling or sibling not in kept:

@@ -50,9 +50,10 @@ class Lens(ABC):
     def project(self, directions: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 2"]:
         """Pixels, inside of the image or not; NaN for directions beyond ``reach``.
 
-        >>> lens = Fisheye(fx=100.0, fy=100.0, cx=50.0, cy=50.0)
-        >>> lens.project(torch.tensor([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]], dtype=torch.float64))[:, 0].tolist()
-        [50.0, 207.07...]
+        >>> from sparsestreet.geometry.lenses import Fisheye
+        >>> rays = torch.tensor([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+        >>> Fisheye(fx=100.0, fy=100.0, cx=50.0, cy=50.0).project(rays)[:, 0].round(decimals=2).tolist()
+        [50.0, 207.08]
         """
         seen = angles_from_axis(directions) <= self.reach
         return torch.where(seen[..., None], self.image(directions), torch.nan)

@@ -217,6 +217,18 @@ def test_a_bomb_is_refused_before_memory_is_taken(log, monkeypatch):
         read_columns(log / SWEEP, dict.fromkeys("xyz", float))
 
 
+def test_text_that_lies_outside_of_its_buffer_is_refused(tmp_path):
+    path = tmp_path / "t.feather"
+    write_table(path, {"name": ["abc", "def"]}, compression="uncompressed")
+    assert read_columns(path, {"name": str})["name"].tolist() == ["abc", "def"]
+    data = path.read_bytes()
+    ends = struct.pack("<3i", 0, 3, 6)
+    assert data.count(ends) == 1
+    path.write_bytes(data.replace(ends, struct.pack("<3i", 0, 3, 2**30)))
+    with pytest.raises(LogError, match="no whole feather file"):
+        read_columns(path, {"name": str})
+
+
 def test_thrown_bytes_are_an_error_or_a_table(sound, tmp_path):
     """300 files with some bytes thrown: nothing else is raised, and what is read has rows of one number."""
     data, dice = (sound / POSES).read_bytes(), random.Random(0)

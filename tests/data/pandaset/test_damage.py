@@ -1,0 +1,313 @@
+"""What can be wrong with a sequence of PandaSet: one clear error each; and pickles that would do harm do none."""
+
+import gzip
+import json
+import os
+import pickle
+import random
+import shutil
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sparsestreet.data.pandaset import PandaSetReader, frames
+from sparsestreet.data.pandaset.frames import read_columns
+from sparsestreet.data.problems import LogError
+from tests.conftest import unchecked
+from tests.data.pandaset.pickles import Call, Global, pickled, table, write
+from tests.data.pandaset.write import PandaPlan, cuboids, sweep, write_sequence
+
+PLAN = PandaPlan()
+CAMERA = "camera/front_camera"
+POSES, STAMPS, LENS = (f"{CAMERA}/{name}.json" for name in ("poses", "timestamps", "intrinsics"))
+SWEEP, BOXES, IMAGE = "lidar/01.pkl.gz", "annotations/cuboids/01.pkl.gz", f"{CAMERA}/01.jpg"
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    return write_sequence(tmp_path_factory.mktemp("pandaset"))
+
+
+@pytest.fixture
+def sequence(sound, tmp_path) -> Path:
+    return shutil.copytree(sound, tmp_path / sound.name)
+
+
+def void(value: object) -> None:
+    """Takes what a damage returns."""
+
+
+def remove(file: str) -> Callable[[Path], None]:
+    return lambda root: (root / file).unlink()
+
+
+def text(file: str, content: str) -> Callable[[Path], None]:
+    return lambda root: void((root / file).write_text(content))
+
+
+def entry(file: str, edit: Callable[[Any], Any]) -> Callable[[Path], None]:
+    def change(root: Path) -> None:
+        content = json.loads((root / file).read_text())
+        edit(content)
+        (root / file).write_text(json.dumps(content))
+
+    return change
+
+
+def content(file: str, edit: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    return lambda root: void((root / file).write_bytes(edit((root / file).read_bytes())))
+
+
+def anew(file: str, **changes: Any) -> Callable[[Path], None]:
+    """The table of a file with other columns; None takes one out."""
+
+    def change(root: Path) -> None:
+        columns = (sweep if file == SWEEP else cuboids)(PLAN, 1) | changes
+        write(root / file, table({name: values for name, values in columns.items() if values is not None}))
+
+    return change
+
+
+def cell(file: str, name: str, value: Any) -> Callable[[Path], None]:
+    def change(root: Path) -> None:
+        columns: dict[str, Any] = (sweep if file == SWEEP else cuboids)(PLAN, 1)
+        columns[name][1] = value
+        write(root / file, table(columns))
+
+    return change
+
+
+def value(file: str, thing: Any) -> Callable[[Path], None]:
+    return lambda root: write(root / file, thing)
+
+
+def truncated_block(root: Path) -> None:
+    made = table(sweep(PLAN, 1))
+    blocks = made.state["_data"].state[3]["0.14.1"]["blocks"]
+    (several,) = (block for block in blocks if len(block["values"]) > 1)
+    several["values"] = several["values"][:1]
+    write(root / SWEEP, made)
+
+
+def places_beyond(root: Path) -> None:
+    made = table(sweep(PLAN, 1))
+    made.state["_data"].state[3]["0.14.1"]["blocks"][0]["mgr_locs"] = np.array([0, 1, 2, 3, 99])
+    write(root / SWEEP, made)
+
+
+DAMAGES: dict[str, tuple[Callable[[Path], None], str, str]] = {
+    "no poses": (remove(POSES), "", "no sequence of PandaSet"),
+    "no stamps": (remove(STAMPS), STAMPS, "missing"),
+    "no intrinsics": (remove(LENS), LENS, "missing"),
+    "no image": (remove(IMAGE), IMAGE, "missing"),
+    "no sweep": (remove(SWEEP), SWEEP, "missing"),
+    "no cuboids": (remove(BOXES), BOXES, "missing"),
+    "no JSON": (text(POSES, "position: 1"), POSES, "no JSON"),
+    "half a JSON": (content(POSES, lambda data: data[:400]), POSES, "no JSON"),
+    "lists with no end": (text(LENS, "[" * 100_000), LENS, "no JSON (RecursionError"),
+    "no axis": (entry(POSES, lambda poses: poses[1]["position"].pop("z")), POSES, "no list of position"),
+    "text for a number": (entry(POSES, lambda poses: poses[1]["heading"].update(w="up")), POSES, "no list of position"),
+    "no list": (text(POSES, "3"), POSES, "no list of position"),
+    "a pose of infinity": (entry(POSES, lambda poses: poses[1]["position"].update(x=1e999)), POSES, "NaN or infinity"),
+    "no rotation": (entry(POSES, lambda poses: poses[2]["heading"].update(w=3)), POSES, "frame 2 has a quaternion"),
+    "a far pose": (entry(POSES, lambda poses: poses[2]["position"].update(x=1e6)), POSES, "float32 can hold"),
+    "a pose too few": (entry(POSES, lambda poses: poses.pop()), POSES, "it has 3 entries, the front camera has 4"),
+    "stamps that fall": (entry(STAMPS, lambda stamps: stamps.reverse()), STAMPS, "stamps must increase"),
+    "no stamp": (entry(STAMPS, lambda stamps: stamps.append(None)), STAMPS, "stamp 4 is no number of seconds"),
+    "a late stamp": (text(STAMPS, "[1e999999999]"), STAMPS, "stamp 0 is no number of seconds"),
+    "no stamps in it": (text(STAMPS, "{}"), STAMPS, "no list of seconds"),
+    "no focal length": (entry(LENS, lambda lens: lens.update(fx=0)), LENS, "positive pixels"),
+    "a list of a lens": (text(LENS, "[1, 2, 3, 4]"), LENS, "positive pixels"),
+    "a torn image": (content(IMAGE, lambda data: data[:300]), IMAGE, "cannot be decoded"),
+    "a small image": (lambda root: Image.new("RGB", (8, 8)).save(root / IMAGE), IMAGE, "the image is 8x8"),
+    "no gzip": (content(SWEEP, gzip.decompress), SWEEP, "cannot be decompressed"),
+    "half a gzip": (content(SWEEP, lambda data: data[: len(data) // 2]), SWEEP, "cannot be decompressed"),
+    "empty": (content(BOXES, lambda data: b""), BOXES, "no pickled table"),
+    "half a pickle": (
+        content(SWEEP, lambda data: gzip.compress(gzip.decompress(data)[:3000])),
+        SWEEP,
+        "no pickled table of plain columns",
+    ),
+    "no table": (value(SWEEP, {"x": [1.0]}), SWEEP, "it holds a dict, not a pandas.core.frame.DataFrame"),
+    "an array": (value(SWEEP, np.zeros((5, 6))), SWEEP, "it holds a numpy._core.multiarray._reconstruct, not a"),
+    "no column": (anew(SWEEP, t=None), SWEEP, "it has no column t, but x, y, z, i, d"),
+    "text for numbers": (anew(BOXES, yaw=["a", "b", "c"]), BOXES, "column yaw holds a str"),
+    "numbers for text": (anew(BOXES, label=np.arange(3)), BOXES, "column label holds int64"),
+    "numbers for flags": (anew(BOXES, stationary=np.zeros(3)), BOXES, "column stationary holds float64"),
+    "a block of one column": (truncated_block, SWEEP, "columns has the shape (1, "),
+    "places beyond": (places_beyond, SWEEP, "are none of the table's"),
+    "a point of NaN": (cell(SWEEP, "x", np.nan), SWEEP, "1 of"),
+    "a box twice": (anew(BOXES, uuid=["a", "a", "b"], **{"cuboids.sibling_id": [""] * 3}), BOXES, "has two boxes"),
+    "a box of no size": (cell(BOXES, "dimensions.x", 0.0), "annotations/cuboids", "smallest length, width, height"),
+    "a box of NaN": (cell(BOXES, "yaw", np.nan), BOXES, "NaN or infinity"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damage_is_one_error_that_names_the_file(name, sequence):
+    damage, file, said = DAMAGES[name]
+    damage(sequence)
+    if not file:
+        with pytest.raises(ValueError, match=said):
+            PandaSetReader(root=sequence).check()
+        return
+    (problem,) = PandaSetReader(root=sequence).check()
+    assert said in problem.message
+    assert file in str(problem.path)
+    assert problem.remedy
+
+
+HARM = {
+    "os.system": Call(Global("os", "system"), ("touch ran",)),
+    "builtins.eval": Call(Global("builtins", "eval"), ("open('ran', 'w')",)),
+    "subprocess.Popen": Call(Global("subprocess", "Popen"), (["touch", "ran"],)),
+    "pandas.io.pickle.read_pickle": Call(Global("pandas.io.pickle", "read_pickle"), ("/etc/passwd",)),
+    "torch.storage._load_from_bytes": Call(Global("torch.storage", "_load_from_bytes"), (b"",)),
+    "numpy.lib._datasource.open": Call(Global("numpy.lib._datasource", "open"), ("ran", "w")),
+}
+
+
+@pytest.mark.parametrize("name", HARM)
+def test_a_pickle_that_would_do_harm_is_refused_by_name(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for place in (HARM[name], table({"x": [HARM[name], 1.0]})):
+        write(tmp_path / "00.pkl.gz", place)
+        with pytest.raises(LogError, match=f"it asks for {name}"):
+            read_columns(tmp_path / "00.pkl.gz", {"x": float})
+    assert os.listdir(tmp_path) == ["00.pkl.gz"]
+
+
+def _doubled(depth: int) -> bytes:
+    """A list of the list before, twice, ``depth`` times: 2^depth entries in 6 bytes each."""
+    steps = b"]" + b"".join(b"q" + bytes([n]) + b"]h" + bytes([n]) + b"ah" + bytes([n]) + b"a" for n in range(depth))
+    return b"\x80\x02" + steps + b"."
+
+
+def _bytearray(length: int) -> bytes:
+    return b"\x80\x05\x96" + length.to_bytes(8, "little") + b"."
+
+
+BOMBS: dict[str, tuple[bytes, str]] = {
+    "empty sets": (b"\x80\x04(" + b"\x8f" * 3_000_000 + b"l.", "more steps than any file of its kind"),
+    "a list of lists": (_doubled(60), "it holds a list"),
+    "bytes that are not there": (_bytearray(10**13), "cut short"),
+    "text that is not there": (b"\x80\x04\x8d" + (2**62).to_bytes(8, "little") + b".", "no pickled table"),
+    "a number of a million digits": (b"I" + b"9" * 1_000_000 + b"\n.", "no pickled table"),
+    "a frame that is not there": (b"\x80\x04\x95" + (2**62).to_bytes(8, "little") + b".", "no pickled table"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_what_would_take_time_or_memory_is_refused_first(name, tmp_path, monkeypatch):
+    # Checks of types make a step take a hundred times as long here.
+    monkeypatch.setattr(frames, "MOST_STEPS", 2000)
+    data, said = BOMBS[name]
+    path = tmp_path / "00.pkl.gz"
+    path.write_bytes(gzip.compress(data, 1))
+    assert path.stat().st_size < 100_000
+    started = time.process_time()
+    with pytest.raises(LogError, match=said):
+        read_columns(path, {"x": float})
+    assert time.process_time() - started < 2
+
+
+def test_lists_with_no_end_are_not_walked_through_where_a_table_has_them(tmp_path):
+    """As names of columns, as cells, as shapes, as bytes and as a type of an array."""
+    endless: list[Any] = [1]
+    for _ in range(60):
+        endless = [endless, endless]
+    reconstruct, dtype = Global("numpy.core.multiarray", "_reconstruct"), Global("numpy", "dtype")
+    start = (Global("numpy", "ndarray"), (0,), b"b")
+    double = Call(dtype, ("f8", False, True))
+    arrays = {
+        "shape": Call(reconstruct, start, (1, endless, double, False, b"")),
+        "bytes": Call(reconstruct, start, (1, (1, 1), double, False, endless)),
+        "kind": Call(reconstruct, start, (1, (1, 1), Call(dtype, (endless, False, True)), False, b"12345678")),
+        "cells": Call(reconstruct, start, (1, (1, 1), Call(dtype, ("O8", False, True)), False, [endless])),
+        "object shape": Call(reconstruct, start, (1, endless, Call(dtype, ("O8", False, True)), False, [1.0])),
+    }
+    for array in (*arrays.values(), endless):
+        made = table({"x": np.zeros(1)})
+        made.state["_data"].state[3]["0.14.1"]["blocks"][0]["values"] = array
+        write(tmp_path / "00.pkl", made)
+        with pytest.raises(LogError, match="no pickled table of plain columns"):
+            read_columns(tmp_path / "00.pkl", {"x": float})
+    made = table({"x": np.zeros(1)})
+    made.state["_data"].state[3]["0.14.1"]["axes"][0] = endless
+    write(tmp_path / "00.pkl", made)
+    with pytest.raises(LogError, match="it holds a list"):
+        read_columns(tmp_path / "00.pkl", {"x": float})
+
+
+def test_a_gzip_bomb_is_unpacked_no_further_than_a_sweep(tmp_path, monkeypatch):
+    monkeypatch.setattr(frames, "LARGEST", 2_000_000)
+    path = tmp_path / "00.pkl.gz"
+    path.write_bytes(gzip.compress(b"\0" * 50_000_000, 9))
+    assert path.stat().st_size < 60_000
+    tracemalloc.start()
+    with pytest.raises(LogError, match="takes more than 2 MB"):
+        read_columns(path, {"x": float})
+    assert tracemalloc.get_traced_memory()[1] < 8_000_000
+    tracemalloc.stop()
+
+
+def test_thrown_bytes_are_an_error_or_a_table(tmp_path):
+    """300 pickles with some bytes thrown: nothing else is raised, and what is read has rows of one number."""
+    columns = {name: values[:5] for name, values in sweep(PLAN, 0).items()} | {"uuid": ["a", "b", "c", None, "e"]}
+    sound = [pickled(table(columns, era), protocol) for era in ("old", "new") for protocol in range(2, 6)]
+    dice, read = random.Random(0), 0
+    with unchecked():
+        for number in range(300):
+            thrown = bytearray(sound[number % len(sound)])
+            for _ in range(dice.randint(1, 4)):
+                thrown[dice.randrange(len(thrown))] = dice.randrange(256)
+            (tmp_path / "00.pkl").write_bytes(thrown)
+            try:
+                found = read_columns(tmp_path / "00.pkl", {"x": float, "d": int, "uuid": str})
+            except LogError:
+                continue
+            read += 1
+            assert len(found["x"]) == len(found["d"]) == len(found["uuid"])
+    assert 10 < read < 290
+
+
+def test_tables_of_every_protocol_and_order(tmp_path):
+    """As NumPy writes arrays by row and by column, and numbers of their own among objects."""
+    columns = {"x": np.linspace(0, 1, 3), "y": np.array([1.5, 2.5, 3.5]), "n": np.arange(3)}
+    mixed = {"uuid": ["a", None, float("nan")], "t": [np.float64(0.5), 1, 2.0], "flag": [True, np.bool_(False), True]}
+    kinds = {"x": float, "y": float, "n": int, "uuid": str, "t": float, "flag": bool}
+    for era in ("old", "new"):
+        for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
+            made = table(columns | mixed, era)
+            write(tmp_path / "00.pkl", made, protocol)
+            found = read_columns(tmp_path / "00.pkl", kinds)
+            np.testing.assert_array_equal(found["x"], columns["x"])
+            np.testing.assert_array_equal(found["y"], columns["y"])
+            assert (found["n"].tolist(), found["uuid"].tolist()) == ([0, 1, 2], ["a", "", ""])
+            assert (found["t"].tolist(), found["flag"].tolist()) == ([0.5, 1.0, 2.0], [True, False, True])
+
+
+@pytest.mark.parametrize("era", ["old", "new"])
+def test_pandas_reads_the_tables_of_these_tests_as_we_do(era, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    path = tmp_path / "01.pkl.gz"
+    for columns in (sweep(PLAN, 1), cuboids(PLAN, 1)):
+        write(path, table(columns, era))
+        theirs = pandas.read_pickle(path)
+        kinds = {name: {"f": float, "i": int, "b": bool}.get(theirs[name].dtype.kind, str) for name in columns}
+        ours = read_columns(path, kinds)
+        assert list(theirs.columns) == list(columns)
+        for name, kind in kinds.items():
+            expected = theirs[name].fillna("") if kind is str else theirs[name]
+            np.testing.assert_array_equal(ours[name], expected.to_numpy())
+        if pandas.__version__ < "3":
+            theirs.to_pickle(path)
+            again = read_columns(path, kinds)
+            for name in kinds:
+                np.testing.assert_array_equal(again[name], ours[name])
