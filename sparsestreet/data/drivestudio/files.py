@@ -34,6 +34,7 @@ def hashed_files(layout: Layout) -> LogFiles:
     layout = replace(layout, has_lidar=layout.sweep(0).parent.is_dir(), has_bodies=layout.bodies.parent.is_dir())
     described = [*(layout.intrinsics(camera) for camera in layout.cameras), *pose_files(layout)]
     described += [layout.instances, layout.frame_instances, layout.bodies, layout.timestamps]
+    described += [layout.image_timestamps(camera) for camera in layout.cameras]
     recorded = _pixel_files(layout) + [path for camera in layout.cameras if (path := layout.ego_mask(camera))]
     if layout.has_lidar:
         recorded += [layout.sweep(frame) for frame in layout.frames]

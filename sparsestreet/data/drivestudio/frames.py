@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
-from sparsestreet.data.drivestudio.poses import read_intrinsics, world_from_camera
+from sparsestreet.data.drivestudio.poses import read_image_stamps, read_intrinsics, world_from_camera
 from sparsestreet.data.images import image_size, read_image, read_mask
 from sparsestreet.data.poses import recentered
 from sparsestreet.data.rig import RigCamera, rig_camera
@@ -40,11 +40,12 @@ def read_views(
     layout: Layout, rig: Sequence[RigCamera[int]], origin: Float64[Tensor, "3"], clock: LogClock
 ) -> list[View]:
     """Every view of the window, in the re-centered world; raises LogError for a broken pose."""
-    views = []
+    views, stamps = [], read_image_stamps(layout)
     for index, frame in enumerate(layout.frames):
         for mounted in rig:
             camera = mounted.at(recentered(world_from_camera(layout, frame, mounted.name), origin))
-            views.append(clock.view(camera, index, mounted.index))
+            own = stamps.get(mounted.name)
+            views.append(clock.view(camera, index, mounted.index, None if own is None else own[index]))
     return views
 
 

@@ -74,6 +74,10 @@ class Layout:
         """Seconds of each frame, one a line, by any clock."""
         return self.root / "timestamps.txt"
 
+    def image_timestamps(self, camera: int) -> Path:
+        """Seconds of each image of a camera, one a line, by the same clock; absent: those of the frames."""
+        return self.root / f"timestamps_{camera}.txt"
+
     @property
     def has_clock(self) -> bool:
         return self.timestamps.exists()

@@ -1,5 +1,6 @@
 """Poses and intrinsics from text files."""
 
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -57,6 +58,25 @@ def first_pose(layout: Layout) -> Float64[Tensor, "4 4"]:
 
 def read_clock(layout: Layout) -> LogClock:
     """The times of the frames of the window; raises LogError for stamps that cannot be those of the folder's frames."""
-    stamps = read_stamps(layout.timestamps, layout.num_frames_on_disk) if layout.has_clock else None
-    window = layout.frames
-    return LogClock(len(window), None if stamps is None else stamps[window.start : window.stop])
+    stamps = _in_window(layout, layout.timestamps) if layout.has_clock else None
+    return LogClock(len(layout.frames), stamps, tuple(chain.from_iterable(read_image_stamps(layout).values())))
+
+
+def read_image_stamps(layout: Layout) -> dict[int, tuple[int, ...]]:
+    """Camera number -> stamps of its images in the window, where they are not those of their frames.
+
+    Raises LogError for stamps that cannot be those of the camera's images, and where images have no poses of their own.
+    """
+    paths = {camera: layout.image_timestamps(camera) for camera in layout.cameras}
+    own = {camera: path for camera, path in paths.items() if path.exists()}
+    for path in own.values():
+        if not layout.has_clock:
+            raise fault(path, "there is no timestamps.txt of the frames beside it", "write it, by the same clock")
+        if layout.flavor.mounted:
+            message = f"images have instants, but no poses of their own (flavor {layout.flavor.name})"
+            raise fault(path, message, "write extrinsics/TTT_C.txt, a pose for each image, as the nuScenes flavor has")
+    return {camera: _in_window(layout, path) for camera, path in own.items()}
+
+
+def _in_window(layout: Layout, path: Path) -> tuple[int, ...]:
+    return read_stamps(path, layout.num_frames_on_disk)[layout.frames.start : layout.frames.stop]

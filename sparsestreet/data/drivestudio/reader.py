@@ -39,7 +39,8 @@ class DriveStudioReader(LogReader):
     start, cameras by their place in ``cameras``. Without a clock time is frame / (frames - 1), 0 in a log of one frame.
 
     A file ``timestamps.txt`` beside the folders is the clock: the seconds of each frame, one a line, by any zero. All
-    cameras and the lidar share the stamp of their frame.
+    cameras and the lidar share the stamp of their frame. A file ``timestamps_C.txt`` (not DriveStudio's) has those of
+    the images of camera C, where each has a pose of its own.
     """
 
     marks = Marks(("images/[0-9][0-9][0-9]_[0-9].jpg", "extrinsics/*.txt"))

@@ -71,18 +71,25 @@ class Instant:
 
 
 def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFrame:
-    """Renders all images and the lidar of frame ``index``."""
+    """Renders all images, each at its own instant, and the lidar and boxes of frame ``index``."""
     time = index / settings.frame_rate
     instant = Instant.at(world, time)
     ego = world.ego.pose(time)
-    cameras = [street_camera(settings, camera, ego) for camera in range(settings.num_cameras)]
     return StreetFrame(
         index=index,
         world_from_ego=ego,
-        images=tuple(render_image(settings, instant, camera) for camera in cameras),
+        images=tuple(_render_camera(settings, world, instant, index, camera) for camera in range(settings.num_cameras)),
         sweep=sweep(settings, instant.scene, ego, index),
         actor_poses=tuple(pose for pose, _ in instant.actors),
     )
+
+
+def _render_camera(settings: StreetSettings, world: World, instant: Instant, frame: int, camera: int) -> StreetImage:
+    """Renders what a camera records of a frame, at its own instant; ``instant`` is the frame's."""
+    time = settings.image_time(frame, camera)
+    if time != frame / settings.frame_rate:
+        instant = Instant.at(world, time)
+    return render_image(settings, instant, street_camera(settings, camera, world.ego.pose(time)))
 
 
 def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:

@@ -34,6 +34,12 @@ class StreetSettings:
     """Horizontal field of view of every camera, degrees; a lens changes it and keeps the focal length."""
     lens: Sequence[float | int] = ()
     """Brown-Conrady k1, k2, p1, p2, k3 of every camera, in OpenCV's order; empty: pinholes."""
+    delays: Sequence[float | int] = ()
+    """Seconds from the stamp of a frame to the image of each camera, less than a frame; negative: before. The lidar and
+    the boxes have the stamp of the frame. Empty: all cameras fire at it."""
+    delays_known: bool = True
+    """False: the street's files say of every image that it was taken at the pose and the stamp of its frame. It is the
+    control of readers that heed the instants of cameras."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -68,7 +74,15 @@ class StreetSettings:
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
-        # Equal lenses compare equal, whatever type of sequence or number they were given as.
+        # Equal values compare equal, whatever type of sequence or number they were given as.
+        object.__setattr__(self, "delays", tuple(float(value) for value in self.delays))
+        if self.delays and (
+            len(self.delays) != self.num_cameras or not all(abs(one) * self.frame_rate < 1 for one in self.delays)
+        ):
+            raise ValueError(
+                f"StreetSettings.delays must be empty or one for each of {self.num_cameras} cameras, shorter than a "
+                f"frame of {1 / self.frame_rate:g} s, but is {list(self.delays)}"
+            )
         object.__setattr__(self, "lens", tuple(float(value) for value in self.lens))
         if self.lens and not (len(self.lens) == 5 and self._sees_every_pixel()):
             raise ValueError(
@@ -80,6 +94,16 @@ class StreetSettings:
     def duration(self) -> float:
         """Seconds from the first frame to the last."""
         return (self.num_frames - 1) / self.frame_rate
+
+    @property
+    def recorded(self) -> tuple[float, float]:
+        """Seconds, from time 0 of the street, of the first and the last stamp of its files."""
+        delays = self.delays if self.delays_known else ()
+        return min((0.0, *delays)), self.duration + max((0.0, *delays))
+
+    def image_time(self, frame: int, camera: int) -> float:
+        """Seconds at which a camera takes its image of a frame."""
+        return frame / self.frame_rate + (self.delays[camera] if self.delays else 0.0)
 
     def _sees_every_pixel(self) -> bool:
         """Whether every place in the image has a ray that the polynomial describes, before its fold."""

@@ -75,7 +75,12 @@ def _holds_street(root: Path, settings: StreetSettings) -> bool:
 
 def _label(settings: StreetSettings) -> dict:
     """Returns the content of street.json, converted by JSON so that tuples compare as the lists they become."""
-    return json.loads(json.dumps({"generator": GENERATOR, "settings": dataclasses.asdict(settings)}))
+    said = dataclasses.asdict(settings)
+    # Streets of cameras that fire together keep the name that they had before cameras could do otherwise.
+    for name, usual in (("delays", ()), ("delays_known", True)):
+        if said[name] == usual:
+            del said[name]
+    return json.loads(json.dumps({"generator": GENERATOR, "settings": said}))
 
 
 def _write(settings: StreetSettings, folder: Path, progress: Callable[[int, int], None] | None) -> None:

@@ -24,7 +24,7 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
     ``annotation_range`` from the camera, annotated or not. A view's lens is applied; its shutter is ignored, because
     streets have none.
     """
-    world = build_world(settings)
+    world, (first, last) = build_world(settings), settings.recorded
     instant_at = lru_cache(maxsize=1)(lambda seconds: Instant.at(world, seconds))
 
     def truth(view: View) -> Frame | None:
@@ -37,7 +37,7 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
             camera.height,
             () if camera.distortion is None else tuple(camera.distortion.tolist()),
         )
-        instant = instant_at(view.time * settings.duration)
+        instant = instant_at(first + view.time * (last - first))
         if instant.inside_an_actor(traced):
             return None
         image = render_image(settings, instant, traced)

@@ -1,7 +1,7 @@
 """Writes frames of a street in DriveStudio's processed layout (nuScenes flavor), together with the exact truth."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int16
 from PIL import Image
 
 from sparsestreet.data.synthetic.bodies import BodyWriter
+from sparsestreet.data.synthetic.cameras import street_camera
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -39,6 +40,8 @@ class StreetWriter:
         self._bodies = BodyWriter(self.settings, self.world, MINIMUM_PIXELS)
 
     def write_frame(self, frame: StreetFrame) -> None:
+        if not self.settings.delays_known:
+            frame = replace(frame, images=tuple(self._claimed(frame, number) for number in range(len(frame.images))))
         annotated = self._annotate(frame)
         for camera, image in enumerate(frame.images):
             self._write_image(image, f"{frame.index:03d}_{camera}", annotated)
@@ -52,8 +55,17 @@ class StreetWriter:
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
         self._bodies.write(self.root / "humanpose" / "smpl.pkl")
+        frames = range(self.settings.num_frames)
         times = np.arange(self.settings.num_frames) / self.settings.frame_rate
         np.savetxt(self.root / "timestamps.txt", times, fmt="%.9f")
+        if self.settings.delays and self.settings.delays_known:
+            for camera in range(self.settings.num_cameras):
+                own = [self.settings.image_time(frame, camera) for frame in frames]
+                np.savetxt(self.root / f"timestamps_{camera}.txt", own, fmt="%.9f")
+
+    def _claimed(self, frame: StreetFrame, camera: int) -> StreetImage:
+        """The image with the pose that its camera has at the frame's instant."""
+        return replace(frame.images[camera], camera=street_camera(self.settings, camera, frame.world_from_ego))
 
     def _file(self, folder: str, name: str) -> Path:
         (self.root / folder).mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,9 @@ from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.scene.body.template import BodyTemplate
 from sparsestreet.types import BodyPoses, Track
 
+_LEAST_STEP = 1e-9
+"""Of normalized time, far below that from one frame to the next."""
+
 
 @dataclass(frozen=True)
 class People:
@@ -87,7 +90,7 @@ def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
     known, rotations = times[usable], rotations[usable]
     upper = torch.searchsorted(known, times).clamp(max=len(known) - 1)
     lower = (torch.searchsorted(known, times, right=True) - 1).clamp(min=0)
-    step = torch.where(upper > lower, known[upper] - known[lower], 1)
+    step = (known[upper] - known[lower]).clamp(min=1 if track.times is None else _LEAST_STEP)
     fraction = ((times - known[lower]) / step).clamp(0, 1).float()
     return quat.slerp(rotations[lower], rotations[upper], fraction[:, None].expand(-1, 24))
 

@@ -107,10 +107,10 @@ def write_common(root: Path, frames: int, cameras: int, offset: np.ndarray) -> N
     write_stamps(root, [FIRST_STAMP + frame * STEP for frame in range(frames)])
 
 
-def write_stamps(root: Path, stamps: list[int]) -> None:
+def write_stamps(root: Path, stamps: list[int], name: str = "timestamps.txt") -> None:
     """Nanoseconds as decimal seconds; no float in between rounds them."""
     lines = [f"{stamp // 10**9}.{stamp % 10**9:09d}\n" for stamp in stamps]
-    (root / "timestamps.txt").write_text("".join(lines))
+    (root / name).write_text("".join(lines))
 
 
 def write_matrix(path: Path, matrix: np.ndarray) -> None:

@@ -396,3 +396,40 @@ def test_depth_takes_the_nearest_of_the_points_in_a_pixel(make, tmp_path):
     depth = DriveStudioReader(make(tmp_path)).read().frames[0].depth
     assert depth[HEIGHT // 2, WIDTH // 2] == pytest.approx(10.0, abs=1e-5)
     assert int((depth > 0).sum()) == 3
+
+
+def test_images_may_have_stamps_of_their_own(tmp_path):
+    """The second camera fires 30 ms after the frames, and 20 before the last."""
+    make_nuscenes(tmp_path)
+    own = [FIRST_STAMP + 30_000_000, FIRST_STAMP + STEP + 30_000_000, FIRST_STAMP + 2 * STEP - 20_000_000]
+    before = DriveStudioReader(tmp_path).data_hash()
+    write_stamps(tmp_path, own, "timestamps_1.txt")
+    assert DriveStudioReader(tmp_path).check() == []
+    assert DriveStudioReader(tmp_path).data_hash() != before
+    log = DriveStudioReader(tmp_path).read()
+    assert [view.stamp for view in log.views[1::2]] == own
+    assert [view.time for view in log.views] == [0.0, 0.15, 0.5, 0.65, 1.0, 0.9]
+    assert [sweep.time for sweep in log.sweeps] == [0.0, 0.5, 1.0]
+    (track,) = log.tracks
+    assert (there(track.times).tolist(), track.span) == ([0.0, 0.5, 1.0], (0.0, 1.0))
+    second = DriveStudioReader(tmp_path, cameras=[1], first_frame=1).read()
+    assert [view.stamp for view in second.views] == own[1:]
+    assert second.views[0].time == pytest.approx(0.3)  # 30 ms of 100: the box of the last frame is the last thing
+    assert DriveStudioReader(tmp_path, cameras=[0]).data_hash() == make_again(tmp_path)
+
+
+def make_again(root) -> str:
+    """The hash of the first camera, without the second one's stamps."""
+    (root / "timestamps_1.txt").unlink()
+    return DriveStudioReader(root, cameras=[0]).data_hash()
+
+
+def test_own_stamps_need_own_poses_and_a_clock(tmp_path):
+    write_stamps(make_waymo(tmp_path / "waymo"), [1, 2, 3], "timestamps_0.txt")
+    write_stamps(make_nuscenes(tmp_path / "clockless"), [1, 2, 3], "timestamps_0.txt")
+    (tmp_path / "clockless/timestamps.txt").unlink()
+    write_stamps(make_nuscenes(tmp_path / "short"), [1, 2], "timestamps_0.txt")
+    for name, said in (("waymo", "no poses of their own"), ("clockless", "no timestamps.txt"), ("short", "got 2")):
+        (problem,) = DriveStudioReader(tmp_path / name).check()
+        assert problem.path == tmp_path / name / "timestamps_0.txt"
+        assert said in problem.message

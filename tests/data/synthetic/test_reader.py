@@ -44,12 +44,15 @@ def test_a_street_opens_as_a_log(tmp_path):
 def test_every_setting_has_a_folder_of_its_own_and_the_seed_comes_last():
     folders = {}
     others = {"lidar": replace(SETTINGS.lidar, dropout=0.5), "num_cameras": 3, "lens": (-0.3, 0.1, 0.0, 0.0, 0.0)}
+    others |= {"delays": (0.0, 0.01), "delays_known": False}
     for field in fields(StreetSettings):
         changed = others[field.name] if field.name in others else getattr(SETTINGS, field.name) + 1
         folders[field.name] = StreetReader(replace(SETTINGS, **{field.name: changed})).folder
     plain = StreetReader(SETTINGS).folder
     assert len({plain, *folders.values()}) == len(folders) + 1
     assert re.fullmatch(r"outputs/streets/64x40x2_[0-9a-f]{8}_seed1", str(plain))
+    # As it was before cameras could fire on their own: recorded results name it.
+    assert StreetReader(StreetSettings()).folder.name == "320x192x40_191593c5_seed0"
     # What a report needs to see that two streets differ in nothing but the seed.
     assert str(folders["seed"]) == str(plain).removesuffix("1") + "2"
 
