@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.motion import PosePath
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem, fault
@@ -103,6 +104,9 @@ class Recording:
     """Instant -> its sweep; None: no lidar."""
     boxes: Sequence[Boxes] | None = None
     """None: the data set has no annotations."""
+    annotated: frozenset[int] | None = None
+    """Instants that the data set annotates, also those outside of the window; None: all. In between an object is on its
+    way from one to the next if both have it; boxes need stamps then."""
     sparse_points: Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]] | None = None
     """Positions in the data set's own world and RGB in [0, 1] of points that came with it, such as COLMAP's."""
     notes: tuple[str, ...] = ()
@@ -167,6 +171,7 @@ def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[P
     """
     num_frames = 1 + max(shot.frame for shot in recording.shots)
     origin = recording.shots[0].world_from_camera[:3, 3]
+    recording = replace(recording, boxes=_filled(recording))
     boxes = [_checked(each) for each in recording.boxes or ()]
     clock = _clock(recording, num_frames)
     views = [_view(shot, recording.rig, origin, clock) for shot in recording.shots]
@@ -221,6 +226,38 @@ def _box_stamps(recording: Recording, num_frames: int) -> dict[str, list[int]]:
         for each in recording.boxes or ()
         if each.stamps is not None
     }
+
+
+def _filled(recording: Recording) -> Sequence[Boxes] | None:
+    """The boxes, and those at instants of the window that are not annotated."""
+    if recording.annotated is None or recording.frame_stamps is None:
+        return recording.boxes
+    return [_with_boxes_between(each, recording.annotated, recording.frame_stamps) for each in recording.boxes or ()]
+
+
+def _with_boxes_between(boxes: Boxes, annotated: frozenset[int], frame_stamps: tuple[int, ...]) -> Boxes:
+    """Centers on a line, rotations on the shorter arc, sizes of the box before."""
+    assert boxes.stamps is not None  # as Recording.annotated demands
+    place, order = {int(frame): row for row, frame in enumerate(boxes.frames)}, sorted(annotated)
+    new = [
+        (frame, place[before])
+        for before, behind in pairwise(order)
+        if before in place and behind in place
+        for frame in range(max(before + 1, 0), min(behind, len(frame_stamps)))
+    ]
+    if not new:
+        return boxes
+    path = PosePath(torch.tensor(boxes.stamps), torch.from_numpy(boxes.poses))
+    at = [frame_stamps[frame] for frame, _ in new]
+    frames = np.concatenate((boxes.frames, [frame for frame, _ in new]))
+    rows = np.argsort(frames, kind="stable")
+    return replace(
+        boxes,
+        frames=frames[rows],
+        poses=np.concatenate((boxes.poses, path.at(torch.tensor(at)).numpy()))[rows],
+        sizes=np.concatenate((boxes.sizes, boxes.sizes[[row for _, row in new]]))[rows],
+        stamps=tuple((*boxes.stamps, *at)[row] for row in rows),
+    )
 
 
 def _checked(boxes: Boxes) -> Track:

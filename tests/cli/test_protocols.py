@@ -72,7 +72,7 @@ def test_a_protocol_is_a_sweep_over_scenes_and_a_choice_for_one(name):
 SPLITS = {"omnire": (10, 10), "streetgs": (4, 4), "pvg": (4, 3), "neurad": (2, 1)}
 
 
-@pytest.mark.parametrize("name", SPLITS.keys() & set(PROTOCOLS))
+@pytest.mark.parametrize("name", sorted(SPLITS.keys() & set(PROTOCOLS)))
 def test_what_is_held_out(name):
     split = composed([f"protocol={name}", "data.root=x"]).split
     assert (split.stride, split.offset) == SPLITS[name]

@@ -1,9 +1,13 @@
 """The log that follows from what a reader found: here, of a camera whose lens is taken out of its images."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from sparsestreet.data.recording import Recording, Shot, log_of
+from sparsestreet.data.recording import Boxes, Recording, Shot, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
 from sparsestreet.types import Shutter
@@ -77,3 +81,42 @@ def test_a_declared_shutter_arrives_at_the_view():
     )
     log = log_of(recording, cache_bytes=0, check=list)
     assert [view.camera.shutter for view in log.views] == [rolling, None]
+
+
+def moving(frames: list[int], stamps: list[int]) -> Boxes:
+    """1 m along x for each 10 ns, turning about z by 0.01 rad for each."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, 0, 3] = np.array(stamps) / 10
+    poses[:, :3, :3] = Rotation.from_rotvec([[0, 0, 0.01 * stamp] for stamp in stamps]).as_matrix()
+    return Boxes("car", "Car", np.array(frames), poses, np.ones((len(frames), 3)), Path("boxes"), tuple(stamps))
+
+
+@pytest.mark.parametrize(
+    ("frames", "annotated", "there"),
+    [
+        ([0, 4], {0, 4}, [0, 1, 2, 3, 4]),
+        ([0, 4], {0, 2, 4}, [0, 4]),  # seen to be absent at 2
+        ([0, 2], {0, 2, 4}, [0, 1, 2]),
+        ([-2, 2], {-2, 2, 6}, [0, 1, 2]),
+        ([2, 6], {-2, 2, 6}, [2, 3, 4]),
+        ([0, 4], None, [0, 4]),
+    ],
+)
+def test_an_object_is_on_its_way_between_annotated_instants(
+    frames: list[int], annotated: set[int] | None, there: list[int]
+):
+    stamps = [100, 110, 125, 130, 140]  # images do not come evenly
+    own = {-2: 80, 0: 100, 2: 121, 4: 141, 6: 160}  # nor are boxes where images are
+    shots = [Shot(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp) for frame, stamp in enumerate(stamps)]
+    boxes = moving(frames, [own[frame] for frame in frames])
+    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
+    recording = Recording(
+        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=tuple(stamps), boxes=[boxes],
+        annotated=None if annotated is None else frozenset(annotated),
+    )  # fmt: skip
+    (track,) = log_of(recording, cache_bytes=0, check=list).tracks
+    assert track.frames.tolist() == there
+    at = [own[frame] if frame in frames else stamps[frame] for frame in there]
+    assert track.world_from_object[:, 0, 3].tolist() == pytest.approx([stamp / 10 for stamp in at], abs=1e-9)
+    turned = Rotation.from_matrix(track.world_from_object[:, :3, :3].numpy()).as_rotvec()[:, 2]
+    assert turned == pytest.approx([0.01 * stamp for stamp in at], abs=1e-9)

@@ -80,6 +80,7 @@ class NuScenesReader(RecordedReader):
             frame_stamps=tuple(chosen.instants.stamps[instant] for instant in chosen.window)[: 1 + shots[-1].frame],
             sweeps=self._sweeps(),
             boxes=boxes,
+            annotated=frozenset(instant - chosen.window.start for instant in chosen.instants.of_samples.values()),
             notes=(*chosen.notes(), *notes),
         )
 

@@ -88,7 +88,9 @@ class Selection:
                 notes.append(f"keyframes alone are read, the {others} images between them with data.log.rate=all")
         else:
             samples, instants = len(self.instants.of_samples), len(self.instants.stamps)
-            notes.append(f"boxes are annotated at {samples} of {instants} instants: the others have none of their own")
+            notes.append(
+                f"boxes are annotated at {samples} of {instants} instants, and carried on between two with one"
+            )
         if self.instants.without_instant:
             notes.append(f"{self.instants.without_instant} images are left out: their instant has a nearer one")
         if absent := len(self.window) * len(self.cameras) - len(self.images):

@@ -123,7 +123,7 @@ def test_all_images_are_grouped_around_those_of_the_front_camera(sparse):
     (boxes,) = there(recording.boxes)
     assert boxes.frames.tolist() == [0, 3, 6]
     assert boxes.stamps == tuple(sweep_end(plan, frame) for frame in (0, 3, 6))
-    assert recording.notes[1] == "boxes are annotated at 3 of 8 instants: the others have none of their own"
+    assert recording.notes[1] == "boxes are annotated at 3 of 8 instants, and carried on between two with one"
 
 
 def test_a_window_keeps_boxes_outside_of_it_apart(sparse):
