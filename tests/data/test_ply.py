@@ -81,6 +81,7 @@ def test_a_file_that_is_missing(tmp_path):
         read_ply(tmp_path / "a.ply")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [{"text": True}, {"byte_order": "<"}], ids=["text", "binary"])
 def test_mutated_files_are_read_or_refused(form, tmp_path):
     path = tmp_path / "a.ply"

@@ -229,6 +229,7 @@ def test_text_that_lies_outside_of_its_buffer_is_refused(tmp_path):
         read_columns(path, {"name": str})
 
 
+@pytest.mark.slow
 def test_thrown_bytes_are_an_error_or_a_table(sound, tmp_path):
     """300 files with some bytes thrown: nothing else is raised, and what is read has rows of one number."""
     data, dice = (sound / POSES).read_bytes(), random.Random(0)

@@ -323,6 +323,7 @@ def test_a_folder_without_a_model(tmp_path):
     assert len(ColmapReader(root=tmp_path / "none").check()) == 1
 
 
+@pytest.mark.slow
 def test_mutated_files_are_read_or_refused(sound, tmp_path):
     """Nothing else is raised, whatever a few bytes are."""
     random, names = np.random.default_rng(0), ("cameras.bin", "images.bin", "points3D.bin")

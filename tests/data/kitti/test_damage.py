@@ -119,6 +119,7 @@ def test_whatever_is_not_there_is_said(whole, tmp_path):
         KittiReader(root=whole, drive=DRIVE, first_frame=2, last_frame=9).read()
 
 
+@pytest.mark.slow
 def test_nothing_but_problems_comes_of_random_bytes(whole, tmp_path):
     """Bytes changed, cut out and put in, in the two files that are no plain text: read, or one kind of error."""
     source = random.Random(24)

@@ -138,6 +138,7 @@ def test_whatever_is_not_there_is_said(whole, tmp_path):
         Kitti360Reader(root=whole, sequence=3, cameras=["image_03"]).read()
 
 
+@pytest.mark.slow
 def test_nothing_but_problems_comes_of_random_bytes(whole, tmp_path):
     source = random.Random(360)
     content = (whole / XML).read_bytes()

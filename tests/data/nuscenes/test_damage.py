@@ -234,6 +234,7 @@ def test_without_lidar_sweeps_may_be_missing(drive):
     assert NuScenesReader(root=drive.root, lidar=False).check() == []
 
 
+@pytest.mark.slow
 def test_tables_with_some_bytes_changed_are_read_or_refused(drive):
     """Never another exception, and never a hang."""
     generator = random.Random(0)

@@ -257,6 +257,7 @@ def test_a_gzip_bomb_is_unpacked_no_further_than_a_sweep(tmp_path, monkeypatch):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_thrown_bytes_are_an_error_or_a_table(tmp_path):
     """300 pickles with some bytes thrown: nothing else is raised, and what is read has rows of one number."""
     columns = {name: values[:5] for name, values in sweep(PLAN, 0).items()} | {"uuid": ["a", "b", "c", None, "e"]}

@@ -399,6 +399,7 @@ def test_damage_of_points_is_one_clear_error(damage, said, written):
         log.sweeps[2]
 
 
+@pytest.mark.slow
 def test_mutated_arrays_are_read_or_refused(root, tmp_path):
     path, random, refused = tmp_path / "a.npy", np.random.default_rng(0), 0
     sound = (root / "lidar/000.npy").read_bytes()

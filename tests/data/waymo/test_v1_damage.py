@@ -173,6 +173,7 @@ def test_a_bomb_takes_no_more_memory_than_a_range_image_may(messages, tmp_path):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_mutated_messages_are_read_or_refused(messages, tmp_path):
     """200 files with a few bytes changed, lengths right again: no other error than LogError."""
     generator, refused = np.random.default_rng(0), 0

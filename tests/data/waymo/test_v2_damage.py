@@ -124,6 +124,7 @@ CELLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CELLS)
 def test_a_damaged_cell(name, components, tmp_path):
     component, change, said = CELLS[name]
@@ -182,6 +183,7 @@ def test_an_optional_component_may_be_missing(component, components, tmp_path):
     assert said[component] in " ".join(reader.read().notes)
 
 
+@pytest.mark.slow
 def test_mutated_tables_are_read_or_refused(components, tmp_path):
     """200 tables with a few bytes changed: no other error than LogError."""
     generator, refused = np.random.default_rng(0), 0

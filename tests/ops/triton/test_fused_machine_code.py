@@ -39,7 +39,7 @@ STACK = {"interpolate": 32, "interpolate_backward": 32}
 
 
 SCOPES = [
-    pytest.param((90, False), id="largest, sm_90"),
+    pytest.param((90, False), id="largest, sm_90", marks=pytest.mark.slow),
     pytest.param((90, True), id="all, sm_90", marks=pytest.mark.slow),
     pytest.param((80, True), id="all, sm_80", marks=pytest.mark.slow),
 ]
