@@ -32,7 +32,9 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 
 # One thread a process: tests are small, and threads that wait for each other cost more than they bring. Files in the order
 # of their names: trainings (tests/cli) come early, where files of few tests would come last and leave a process idle.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+# Three processes where there are four cores or more: the types take one.
+PROCESSES ?= $(shell test "$$(getconf _NPROCESSORS_ONLN)" -gt 3 && echo 3 || echo 2)
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
 # Types take 40 s of one core: the targets that take minutes check them beside the tests, which leave a core idle, and
 # show what is wrong behind them. Either one fails the target.
