@@ -17,11 +17,12 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
+from sparsestreet.data.images import check_camera_images
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
-from sparsestreet.data.problems import LogError, Problem, fault
+from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.scene_folder import SceneFolder
@@ -144,9 +145,18 @@ class RecordedReader(LogReader):
         """What is in the files, nothing large decoded. Raises LogError with every problem found, ValueError where the
         wanted part is not there."""
 
-    @abstractmethod
     def check_contents(self) -> list[Problem]:
-        """What is wrong with pixels and points, all of which are decoded."""
+        """What is wrong with pixels and points, all of which are decoded; here of images whose keys are their paths."""
+        recording = self.recording()
+        problems: list[Problem] = []
+        for camera in recording.rig:
+            paths = [Path(str(shot.key)) for shot in recording.shots if shot.camera == camera.index]
+            problems += check_camera_images(camera.name, paths, (), decode=True)
+        for shot in recording.shots if recording.mask_kinds else ():
+            attempt(problems, partial(recording.read_masks, shot))
+        for sweep in (recording.sweeps or {}).values():
+            attempt(problems, sweep.read)
+        return problems
 
     def check(self) -> list[Problem]:
         try:

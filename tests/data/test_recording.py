@@ -1,13 +1,15 @@
 """The log that follows from what a reader found: here, of a camera whose lens is taken out of its images."""
 
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.data.recording import Boxes, Recording, Shot, log_of
+from sparsestreet.data.problems import fault
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
 from sparsestreet.types import Shutter
@@ -120,3 +122,25 @@ def test_an_object_is_on_its_way_between_annotated_instants(
     assert track.world_from_object[:, 0, 3].tolist() == pytest.approx([stamp / 10 for stamp in at], abs=1e-9)
     turned = Rotation.from_matrix(track.world_from_object[:, :3, :3].numpy()).as_rotvec()[:, 2]
     assert turned == pytest.approx([0.01 * stamp for stamp in at], abs=1e-9)
+
+
+class Broken(RecordedReader):
+    """One image, one mask and one sweep, of which none can be read."""
+
+    def recording(self) -> Recording:
+        where = Path(self.root)
+
+        def broken(what: str) -> NoReturn:
+            raise fault(where / what, "it is broken", "write it again")
+
+        shot = Shot(0, 0, torch.eye(4, dtype=torch.float64), where / "image.png", "image")
+        return Recording(
+            "a", [camera(FLAT)], [shot], lambda shot: broken("image.png"), lambda shot: broken("mask.png"),
+            mask_kinds=frozenset({"sky"}), sweeps={0: LidarSweep(lambda: broken("sweep.bin"))},
+        )  # fmt: skip
+
+
+def test_a_check_reads_images_masks_and_sweeps(tmp_path: Path):
+    (tmp_path / "image.png").write_bytes(b"no image")
+    found = {problem.path.name for problem in Broken(root=tmp_path).check_contents()}
+    assert found == {"image.png", "mask.png", "sweep.bin"}

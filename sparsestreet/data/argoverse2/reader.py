@@ -15,10 +15,10 @@ from sparsestreet.data.ego import bottom_rows
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, image_size, read_image
+from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath
-from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, rig_camera
 
@@ -65,16 +65,6 @@ class Argoverse2Reader(RecordedReader):
             boxes=boxes,
             notes=_notes(chosen, duplicates, homeless, len(shots)),
         )
-
-    def check_contents(self) -> list[Problem]:
-        recording = self.recording()
-        problems: list[Problem] = []
-        for camera in recording.rig:
-            paths = [Path(str(shot.key)) for shot in recording.shots if shot.camera == camera.index]
-            problems += check_camera_images(camera.name, paths, (), decode=True)
-        for sweep in (recording.sweeps or {}).values():
-            attempt(problems, sweep.read)
-        return problems
 
     def files(self) -> LogFiles:
         chosen = self._selection()

@@ -14,13 +14,13 @@ from sparsestreet.data.ego import bottom_rows
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, image_size, read_image
+from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.pandaset.boxes import Objects, read_objects
 from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR, EGO_ROWS, FRONT, USUAL_CAMERAS, Layout, find_sequence
 from sparsestreet.data.pandaset.spin import Spin, spin_of
 from sparsestreet.data.pandaset.tables import PER_SECOND, read_intrinsics, read_poses, read_returns, read_stamps
-from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.problems import LogError, Problem, fault, missing_files
 from sparsestreet.data.recording import LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.window import chosen_cameras, frame_window
@@ -68,16 +68,6 @@ class PandaSetReader(RecordedReader):
             boxes=None if objects is None else objects.boxes,
             notes=_notes(objects, spin, lidar=sweeps is not None),
         )
-
-    def check_contents(self) -> list[Problem]:
-        recording = self.recording()
-        problems: list[Problem] = []
-        for camera in recording.rig:
-            paths = [Path(str(shot.key)) for shot in recording.shots if shot.camera == camera.index]
-            problems += check_camera_images(camera.name, paths, (), decode=True)
-        for sweep in (recording.sweeps or {}).values():
-            attempt(problems, sweep.read)
-        return problems
 
     def files(self) -> LogFiles:
         chosen = self._selection()
