@@ -35,7 +35,7 @@ def train_with(overrides: Sequence[str], folder: Path) -> Callable[[Callback], S
         data = data_of(cfg)
         known = with_views(cfg, data)
         recipe = recipe_of(known)
-        system = build(recipe, data)
+        system = build(recipe, data, recipe.plan(data))
         # One recorder at a time.
         callbacks = [callback for callback in recipe.callbacks.values() if not isinstance(callback, PhaseTimes)]
         fit(system, data, [*callbacks, watch], trainer_of(known), folder, max_steps=known.trainer.max_steps)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from sparsestreet.records.configuration import Setting
+from sparsestreet.records.effects import EffectDecision
 from sparsestreet.records.file import JsonFile
 from sparsestreet.records.strict_json import EXACT, version
 
@@ -83,6 +84,8 @@ class RunDescription:
     """Noise during training; None if unknown."""
     caps: dict[str, int]
     """Name of each node that reached its ``max_gaussians`` at least once -> that limit."""
+    effects: tuple[EffectDecision, ...] = ()
+    """The plan of effects, in the order in which they act on an image; empty: the record is older."""
     machine: Machine
     source: CodeVersion
 

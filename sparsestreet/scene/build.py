@@ -9,7 +9,8 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import Assignment, assign_tracks
-from sparsestreet.scene.effects import Effect, EffectSettings
+from sparsestreet.scene.effects import Effect
+from sparsestreet.scene.effects.plan import EffectPlan, PlannedEffect
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -25,7 +26,7 @@ def build_scene(
     train_frames: Frames,
     held_out: frozenset[int],
     nodes: Mapping[str, NodeSettings],
-    effects: Mapping[str, EffectSettings],
+    plan: EffectPlan,
     seed: int,
     image_points: ImagePointSettings | None = None,
 ) -> SceneGraph:
@@ -37,18 +38,14 @@ def build_scene(
         held_out: integer frames whose sweeps and boxes must not be used.
         nodes: name of the node class -> what is said about it. A class without any instance is left out, and the
             program's log says so.
-        effects: name of the effect -> what is said about it, in the order in which they act on an image. The program's
-            log says which the scene has, and why.
+        plan: which effects the scene is seen through. The program's log says why.
         seed: each node and effect draws from its own stream, so a change of one leaves the others as they are.
         image_points: how points are triangulated from the views; None: no node gets any.
 
-    Raises ValueError where two nodes claim one track, a node has nothing to start from, or an effect is asked for that
-    the log cannot support.
+    Raises ValueError where two nodes claim one track, or a node has nothing to start from.
     """
     assignment = assign_tracks(log.tracks, nodes)
     _report(assignment)
-    # Before the points, which take long: an effect that the log cannot support is an error.
-    seen_through = _effects(effects, TrainingData(log, train_frames, held_out), seed)
     moving = without_frames(assignment.claimed, held_out)
     with stage("points"):
         points = None if image_points is None else cached_street_points(train_frames, moving, image_points)
@@ -61,21 +58,26 @@ def build_scene(
         else:
             _log.info("node %r starts with %d Gaussians", name, len(node.rows))
             built[name] = node
-    return SceneGraph(built, seen_through)
+    return SceneGraph(built, _effects(plan, TrainingData(log, train_frames, held_out), seed))
 
 
-def _effects(effects: Mapping[str, EffectSettings], data: TrainingData, seed: int) -> dict[str, Effect]:
-    """Those that are asked for or called for; what stands in the place of one that is off."""
-    built = {}
-    for name, settings in effects.items():
-        if settings.when == "off":
+def _effects(plan: EffectPlan, data: TrainingData, seed: int) -> dict[str, Effect]:
+    """Those that are on; what stands in the place of one that is off."""
+    built: dict[str, Effect | None] = {}
+    for planned in plan.effects:
+        name, settings = planned.name, planned.settings
+        if planned.on:
+            built[name] = settings.build(data, planned.finding, named_generator(seed, name))
+        elif settings.when == "off":
             built[name] = settings.left_out()
-            continue
-        finding = settings.detect(data)
-        wanted = finding.called_for or settings.when == "on"
-        built[name] = settings.build(data, finding, named_generator(seed, name)) if wanted else None
-        _log.info("effect %r is %s: %s", name, "on" if wanted else "not needed", finding.reason)
+        _log.info("effect %r is %s: %s", name, _word(planned), planned.finding.reason)
     return {name: effect for name, effect in built.items() if effect is not None}
+
+
+def _word(planned: PlannedEffect) -> str:
+    if planned.settings.when == "auto":
+        return "on" if planned.on else "not needed"
+    return f"forced {planned.settings.when}"
 
 
 def _report(assignment: Assignment) -> None:

@@ -71,9 +71,12 @@ def from_another_camera(
 
 
 def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options: RenderOptions) -> SceneRendering:
+    gaussians = placed.gaussians
+    for effect in scene.effects.values():
+        gaussians = effect.gaussians(gaussians, placed.view)
     with phase("splat"):
         splats = splat(
-            placed.gaussians,
+            gaussians,
             placed.view.camera,
             settings=options.settings,
             backend=options.backend,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.records.configuration import Setting, config_hash
+from sparsestreet.records.effects import EffectDecision
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.records.run import RunDescription
 from sparsestreet.training.recipe import Recipe
@@ -28,7 +29,9 @@ class RunIdentity:
     command: str = "python"
     """What was typed to train."""
 
-    def describe(self, recipe: Recipe, data: StreetData, max_steps: int) -> RunDescription:
+    def describe(
+        self, recipe: Recipe, data: StreetData, max_steps: int, effects: tuple[EffectDecision, ...] = ()
+    ) -> RunDescription:
         """The run before its first step, for ``RunFiles``, which says at the end how training went."""
         return RunDescription(
             method=self.method,
@@ -49,6 +52,7 @@ class RunIdentity:
             training_seconds=None,
             noise=None,
             caps={},
+            effects=effects,
             machine=this_machine(),
             source=this_source(),
         )

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field
 from lightning import Callback
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.records.effects import EffectDecision
 from sparsestreet.scene.build import build_scene
-from sparsestreet.scene.effects import EffectSettings
+from sparsestreet.scene.effects import EffectPlan, EffectSettings, plan_effects
+from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes import NodeSettings
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
@@ -70,12 +72,22 @@ class Recipe:
         if found := self.problems():
             raise ValueError("; ".join(found))
 
-    def build(self, data: StreetData) -> StreetSystem:
+    def plan(self, data: StreetData) -> EffectPlan:
+        """Which effects the training part of the data calls for.
+
+        Raises ValueError for an effect that is forced on and that the log cannot support.
+        """
+        return plan_effects(self.effects, _training_data(data))
+
+    def decisions(self, plan: EffectPlan, data: StreetData) -> tuple[EffectDecision, ...]:
+        """The plan as records have it, with costs in a scene of as many Gaussians as the nodes' limits allow."""
+        rows = sum(settings.max_gaussians or 0 for settings in self.nodes.values())
+        return plan.decisions(_training_data(data), rows)
+
+    def build(self, data: StreetData, plan: EffectPlan) -> StreetSystem:
         """Start the scene from the training part of the data, and wrap it for training."""
         log, split = data.driving_log, data.split
-        scene = build_scene(
-            log, split.train, split.held_out_indices, self.nodes, self.effects, self.seed, self.image_points
-        )
+        scene = build_scene(log, split.train, split.held_out_indices, self.nodes, plan, self.seed, self.image_points)
         return StreetSystem(
             scene,
             self.losses,
@@ -91,3 +103,7 @@ class Recipe:
 
     def _has(self, kind: type[Callback]) -> bool:
         return any(isinstance(callback, kind) for callback in self.callbacks.values())
+
+
+def _training_data(data: StreetData) -> TrainingData:
+    return TrainingData(data.driving_log, data.split.train, data.split.held_out_indices)

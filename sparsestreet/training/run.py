@@ -23,6 +23,7 @@ from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.result import result_lines
+from sparsestreet.scene.effects import EffectPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks import (
@@ -103,7 +104,11 @@ def train(
     identity, extra = identity or RunIdentity(label=out.name), extra or ExtraMetrics()
     checkpoint = resume if resume is None or resume.is_file() else newest_checkpoint(resume)
     with stages or StageRecorder() as stages:
-        system = build(recipe, data)
+        recipe.check()
+        with stage("effects"):
+            plan = recipe.plan(data)
+        system = build(recipe, data, plan)
+        effects = recipe.decisions(plan, data)
 
         clock, stop = Clock(), GracefulStop()
         callbacks = [
@@ -113,7 +118,7 @@ def train(
             Pace(stages, minutes, extra.timing),
             HeldOutCurve(out, clock),
             TrainingProgress(),
-            RunFiles(out, identity.describe(recipe, data, max_steps), clock),
+            RunFiles(out, identity.describe(recipe, data, max_steps, effects), clock),
             Checkpoints(out / "checkpoints", checkpoint_every),
             stop,  # the last: a signal ends training when the others are done with the step
         ]
@@ -140,8 +145,8 @@ def train(
     return summary
 
 
-def build(recipe: Recipe, data: StreetData) -> StreetSystem:
-    """The scene as it starts, from what training may see, ready for ``fit``.
+def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
+    """The scene as it starts, from what training may see and through the effects of ``recipe.plan``, ready for ``fit``.
 
     Raises ValueError for parts of the recipe that do not fit together, or that have nothing to start from.
     """
@@ -150,7 +155,7 @@ def build(recipe: Recipe, data: StreetData) -> StreetSystem:
     for note in data.driving_log.notes:
         log.info(note)
     with stage("initialize"):
-        return recipe.build(data)
+        return recipe.build(data, plan)
 
 
 def fit(

@@ -11,6 +11,7 @@ from sparsestreet.cli.assemble import recipe_of
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Sweeps
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.scene.effects import EffectPlan
 from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.state import SceneState
@@ -40,7 +41,8 @@ def system_on(log: DrivingLog, method: str = "omnire", stride: int = 4, offset: 
     """With masks, as a run would start it."""
     cfg = composed(f"method={method}", "sparsify=masks", *SMALL, *SIZES.get(method, ()))
     data = StreetData(log, stride=stride, offset=offset)
-    return recipe_of(cfg).build(data)
+    recipe = recipe_of(cfg)
+    return recipe.build(data, recipe.plan(data))
 
 
 def trains(system: StreetSystem, log: DrivingLog) -> dict[str, int]:
@@ -135,7 +137,7 @@ def test_nothing_to_start_from_is_an_error_of_one_sentence(method: str):
     log = replace(with_tracks(), sweeps=Sweeps.of(()))
     recipe = recipe_of(composed(f"method={method}", *SMALL, "node.background.num_points=0"))
     with pytest.raises(ValueError, match="has nothing to start from: none of num_points=0"):
-        recipe.build(StreetData(log, stride=4, offset=2))
+        recipe.build(StreetData(log, stride=4, offset=2), EffectPlan(()))
 
 
 def test_two_people_in_one_box_keep_their_own_rows():

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from sparsestreet.scene.build import build_scene
-from sparsestreet.scene.effects import SkySettings
+from sparsestreet.scene.effects import EffectPlan, SkySettings, plan_effects
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.triangulation import ImagePointSettings, StreetPoints
-from tests.scene.street import background_settings, rigid_settings, street_log, triangulated, view_at
+from tests.scene.street import background_settings, rigid_settings, street_log, training_data, triangulated, view_at
 
 BACKGROUND = background_settings(lidar=30, near=10, far=10)
 CARS = rigid_settings()
@@ -15,7 +15,8 @@ CARS = rigid_settings()
 
 def build(nodes: dict, effects: dict | None = None, seed: int = 0) -> SceneGraph:
     log = street_log()
-    return build_scene(log, log.frames, frozenset({3}), nodes, effects or {}, seed)
+    plan = plan_effects(effects or {}, training_data(log, frozenset({3})))
+    return build_scene(log, log.frames, frozenset({3}), nodes, plan, seed)
 
 
 def test_all_parts():
@@ -78,10 +79,10 @@ def test_points_from_images_are_made_once_of_what_training_sees(monkeypatch):
     frames = log.frames.where(lambda view: view.frame_index != 3)
     nodes = {"background": background_settings(images=7), "cars": CARS}
     settings = ImagePointSettings()
-    scene = build_scene(log, frames, frozenset({3}), nodes, {}, 0, settings)
+    scene = build_scene(log, frames, frozenset({3}), nodes, EffectPlan(()), 0, settings)
     assert asked == [([0, 1, 2, 4], ["driving"], settings)]
     assert scene.counts() == {"background": 7, "cars": 5000}
-    build_scene(log, frames, frozenset({3}), {"cars": CARS}, {}, 0)
+    build_scene(log, frames, frozenset({3}), {"cars": CARS}, EffectPlan(()), 0)
     assert len(asked) == 1
 
 

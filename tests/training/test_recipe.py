@@ -49,10 +49,10 @@ def test_every_part_reaches_the_scene_or_the_system(monkeypatch):
         seed=5,
         image_points=ImagePointSettings(),
     )
-    system = parts.build(data)
-    ((*places, nodes, effects, seed, points),) = given
+    system = parts.build(data, parts.plan(data))
+    ((*places, nodes, plan, seed, points),) = given
     assert places == [log, data.split.train, frozenset({1, 4})]
-    assert (nodes, effects, seed, points) == (parts.nodes, parts.effects, 5, parts.image_points)
+    assert (nodes, plan, seed, points) == (parts.nodes, parts.plan(data), 5, parts.image_points)
     assert system.scene is scene
     assert system.losses == parts.losses
     assert (system.optimizer_settings, system.options) == (parts.optimizer, parts.options)

@@ -5,16 +5,19 @@ splats, the affine map one of their colors; lens and shutter are what a camera b
 """
 
 from sparsestreet.scene.effects.affine import Affine, AffineSettings
-from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
+from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
 from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
 from sparsestreet.scene.effects.sky import Sky, SkySettings
 
 __all__ = [
     "Affine",
     "AffineSettings",
+    "Cost",
     "Effect",
+    "EffectPlan",
     "EffectSettings",
     "Finding",
     "Lens",
@@ -25,4 +28,5 @@ __all__ = [
     "Sky",
     "SkySettings",
     "linearized",
+    "plan_effects",
 ]

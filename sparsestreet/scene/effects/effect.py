@@ -17,7 +17,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Rendering, View
+from sparsestreet.types import Gaussians, Rendering, View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +33,31 @@ class Finding:
     """Of the value and its threshold."""
     threshold: float | None = None
     """Value from which the effect is called for."""
+    noise: float | None = None
+    """Standard error of the value; None: it is counted, or declared without one."""
+    declared: bool = False
+    """Whether the log's files say the value; False: it is measured from images, points and boxes."""
+    missing: str | None = None
+    """What the log lacks for the effect to be simulated, one sentence with the remedy; None: nothing."""
+    gain: float | None = None
+    """Predicted gain in PSNR over the images, dB; None: there is no prediction."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """What an effect is predicted to cost: numbers that are stored, and time of a frame by pixels and rows.
+
+    Times are those of two threads of the machine that docs/effects.md names; another machine scales all alike.
+    """
+
+    numbers: int = 0
+    """Learned or stored, float32."""
+    ns_per_pixel: float = 0.0
+    ns_per_row: float = 0.0
+
+    def ms(self, pixels: int, rows: int) -> float:
+        """Milliseconds of a rendered frame of so many pixels, of a scene of so many Gaussians."""
+        return 1e-6 * (self.ns_per_pixel * pixels + self.ns_per_row * rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +76,21 @@ class EffectSettings(ABC):
 
     @abstractmethod
     def detect(self, data: TrainingData) -> Finding:
-        """Whether the log calls for the effect; asked only where ``when`` is not off."""
+        """Whether the log calls for the effect: from its files, its training views and their sweeps, in seconds.
+
+        Not asked where ``when`` is off.
+        """
+
+    def cost(self, data: TrainingData) -> Cost:
+        """What the effect would cost if the scene had it; by default nothing."""
+        return Cost()
 
     @abstractmethod
-    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Effect":
-        """Make the effect. Raises ValueError, saying what is missing, where the data cannot support it."""
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Effect | None":
+        """Make the effect; None where it is a matter of the log alone and the scene needs no part of it.
+
+        Not asked where the finding says that something is ``missing``: the plan raises before.
+        """
 
     @abstractmethod
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Effect":
@@ -85,6 +120,10 @@ class Effect(nn.Module, ABC):
     def view(self, view: View, state: SceneState) -> View:
         """The view as nodes and splats see it."""
         return view
+
+    def gaussians(self, gaussians: Gaussians, view: View) -> Gaussians:
+        """The Gaussians as the op gets them: the same values, of which gradients reach what the effect learns."""
+        return gaussians
 
     def image(
         self, rgb: Float[Tensor, "h w 3"], splats: Rendering, view: View, options: RenderOptions

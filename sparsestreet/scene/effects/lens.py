@@ -25,14 +25,11 @@ class LensSettings(EffectSettings):
             value=float(len(cameras)),
             unit="cameras",
             threshold=1.0,
+            declared=True,
+            missing=None if cameras else "give the log their coefficients or lower data.log.min_lens_shift",
         )
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Lens":
-        if not finding.called_for:
-            raise ValueError(
-                f"the lens is on, but {finding.reason}: give the log their coefficients, lower "
-                "data.log.min_lens_shift, or say auto"
-            )
         return Lens(self)
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Lens":

@@ -25,14 +25,11 @@ class ShutterSettings(EffectSettings):
             value=float(len(cameras)),
             unit="cameras",
             threshold=1.0,
+            declared=True,
+            missing=None if cameras else "read the log with a reader that knows how long its cameras take for an image",
         )
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "RollingShutter":
-        if not finding.called_for:
-            raise ValueError(
-                f"the shutter is on, but {finding.reason}: read the log with a reader that knows how long its cameras "
-                "take for an image, or say auto"
-            )
         return RollingShutter(self)
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "RollingShutter":

@@ -11,7 +11,15 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.scene.build import build_scene
-from sparsestreet.scene.effects import Effect, EffectSettings, LensSettings, ShutterSettings, Sky, SkySettings
+from sparsestreet.scene.effects import (
+    Effect,
+    EffectSettings,
+    LensSettings,
+    ShutterSettings,
+    Sky,
+    SkySettings,
+    plan_effects,
+)
 from sparsestreet.scene.effects.lens import Pinhole
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -52,7 +60,9 @@ def log_through(lens: bool = False, shutter: bool = False) -> DrivingLog:
 
 def built(effects: dict[str, EffectSettings], log: DrivingLog) -> dict[str, Effect]:
     nodes = {"road": background_settings(lidar=5)}
-    return dict(build_scene(log, log.frames, frozenset(), nodes, effects, 0).effects.items())
+    return dict(
+        build_scene(log, log.frames, frozenset(), nodes, plan_effects(effects, training_data(log)), 0).effects.items()
+    )
 
 
 def scene_of(**effects: Effect) -> SceneGraph:
@@ -109,7 +119,7 @@ def test_effects_act_in_the_order_of_the_configuration():
     ("name", "lacks"), [("lens", "0 of 1 cameras of hand-made have a lens"), ("shutter", "shutter")]
 )
 def test_what_the_log_cannot_support_is_an_error_that_says_what_is_missing(name: str, lacks: str):
-    with pytest.raises(ValueError, match=rf"the {name} is on, but .*{lacks}.*or say auto"):
+    with pytest.raises(ValueError, match=rf"effects.{name} is on, but .*{lacks}.*or say auto"):
         built({name: replace(ALL[name], when="on")}, street_log())
 
 
