@@ -24,6 +24,7 @@ from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
 from sparsestreet.records.configuration import config_hash
 from sparsestreet.records.costs import COSTS
+from sparsestreet.records.effects import EffectDecision
 from sparsestreet.records.run import RUN, CodeVersion, Machine
 from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
 from sparsestreet.records.summary import SUMMARY
@@ -272,7 +273,7 @@ def test_a_training_hands_on_what_it_is_given(tmp_path, monkeypatch):
     told = {"max_steps": 9, "make_trainer": TRAINER, "logger": False, "identity": identity, "extra": extra}
     told["minutes"] = 0.5
     assert train(parts, frames, tmp_path / "o", **told, resume=checkpoint, stages=stages) is summary
-    assert called["build"] == ((parts, frames), {})
+    assert called["build"] == ((parts, frames, parts.plan(frames)), {})
     (one, of, callbacks, make, out), how = called["fit"]
     assert (one, of, make, out) == (system, frames, TRAINER, tmp_path / "o")
     assert how == {"max_steps": 9, "logger": False, "start": checkpoint}
@@ -310,11 +311,16 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
     monkeypatch.setattr(identity_module, "this_source", lambda: source)
     config = {"seed": 4, "a": 1}
     who = RunIdentity(label="l", method="m", sparsify="s", config=config, data_hash="h", command="c")
-    found = who.describe(Recipe(nodes={}, seed=6), data(), 17)
+    sky = EffectDecision(
+        name="sky", on=True, source="measured", reason="r", value=1.0, unit="", threshold=None, noise=None, numbers=6,
+        ms=0.1, gain=None,
+    )  # fmt: skip
+    found = who.describe(Recipe(nodes={}, seed=6), data(), 17, (sky,))
     expected = {"label": "l", "method": "m", "sparsify": "s", "config": config, "data_hash": "h", "command": "c"}
     expected |= {"config_hash": config_hash(config), "scene": "five", "seed": 6, "split": "every 2th frame from 1"}
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}
+    expected |= {"effects": (sky,)}
     assert vars(found) == expected
 
 
