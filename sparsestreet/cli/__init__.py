@@ -22,13 +22,14 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
   sparsestreet data check DIR                         everything that is wrong with a log, at once
   sparsestreet data make seed=1                       write a synthetic street to disk
+  sparsestreet effects data=auto data.root=DIR        which effects of cameras and light a log calls for, and why
   sparsestreet presets streetgs                       our presets beside DriveStudio's settings, key by key
   sparsestreet bench                                  what the splat op costs in time, memory and accuracy
 
 Every command takes --help. Options of train are Hydra overrides; `sparsestreet train --cfg job` prints them all.
 """
 
-COMMANDS = ("demo", "train", "evaluate", "report", "render", "export", "data", "presets", "bench")
+COMMANDS = ("demo", "train", "evaluate", "report", "render", "export", "data", "effects", "presets", "bench")
 
 
 READER_GONE = 128 + 13

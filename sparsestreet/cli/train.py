@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
+from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
@@ -33,7 +34,7 @@ def train(arguments: list[str]) -> int:
         try:
             problem = flag_problem(arguments)
             if problem is None:
-                arguments, found = with_found_data(resumed_overrides(arguments))
+                arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments)))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
                 arguments = _shown(as_sweep(arguments))

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
+from sparsestreet.evaluation.effect_gains import measure_effect_gains
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
 from sparsestreet.evaluation.node_costs import measure_scene_costs
 from sparsestreet.evaluation.predictions import Predictions
@@ -97,6 +98,8 @@ def evaluate_scene(
         latency = measure_latency(scene, frames.views, options, warmup=timing.warmup, repeats=timing.repeats)
     with stage("costs"):
         costs = measure_scene_costs(scene, frames.views, options, repeats=timing.rounds)
+    with stage("gains"):
+        gains = measure_effect_gains(scene, frames, quality[main], options)
     summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent)
     with stage("pictures"):
         chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
@@ -106,7 +109,7 @@ def evaluate_scene(
     for split, images in quality.items():
         QUALITY[split].write(out, images)
     LATENCY.write(out, clock_rows(latency))
-    update_costs(out, **vars(costs))
+    update_costs(out, **vars(costs), gains=gains)
     SUMMARY.write(out, summary)
     return summary
 

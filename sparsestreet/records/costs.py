@@ -6,7 +6,7 @@ Training and evaluation each write their own part and keep the other's.
 import statistics
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sparsestreet.records.file import JsonFile
@@ -44,6 +44,21 @@ class NodeCost:
     can make it negative. Nodes that hide each other cost less together than the sum of both."""
 
 
+@dataclass(frozen=True)
+class EffectGain:
+    """PSNR of renders with an effect less that of the same renders without it, dB: the mean over the images.
+
+    The scene was trained with the effect, so this is what it does in the finished scene; a scene that was trained
+    without it would have made up for a part.
+    """
+
+    full: float
+    vehicle: float | None
+    """On the pixels of vehicles; None: no image shows one."""
+    human: float | None
+    images: int
+
+
 @dataclass(frozen=True, kw_only=True)
 class CostRecord:
     """The content of ``cost.json``. Raises ValueError if the phases do not add up to the wall clock."""
@@ -53,8 +68,8 @@ class CostRecord:
     """Seconds of the whole ``train`` command and of the interrupted commands that it continued. They include torch's
     import, but not the interpreter's own start (0.2 s). None until a command has ended."""
     phases: dict[str, float]
-    """Part of the command (start, data, points, initialize, train, validate, prune, save, evaluate, latency, costs,
-    novel, presets, pictures, other) -> seconds. Each second belongs to one part."""
+    """Part of the command (start, data, effects, points, initialize, train, validate, prune, save, evaluate, latency,
+    costs, gains, novel, presets, pictures, other) -> seconds. Each second belongs to one part."""
     step_ms: dict[str, float]
     """Part of a training step -> median milliseconds over the noted steps that have it; empty if no step was noted."""
     passes: dict[str, float]
@@ -68,6 +83,8 @@ class CostRecord:
     nodes: dict[str, NodeCost]
     effects: dict[str, float]
     """Name of an effect of the scene, or "masks" -> additional milliseconds of a frame with it."""
+    gains: dict[str, EffectGain] = field(default_factory=dict)
+    """Name of an effect of the scene -> what it brings; empty: the record is older."""
     noise: Noise | None = None
     """Noise while ``frame_ms``, ``nodes`` and ``effects`` were measured."""
 

@@ -1,7 +1,6 @@
 """Which effects a scene has and why, as ``run.json`` says it."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -10,8 +9,9 @@ class EffectDecision:
 
     name: str
     on: bool
-    source: Literal["declared", "measured", "forced"]
-    """Who decided: the log's files, a measurement on its images, points or boxes, or the configuration."""
+    source: str
+    """Who decided: "declared" by the log's files, "measured" on its images, points or boxes, "forced" by the
+    configuration."""
     reason: str
     """One sentence, without a full stop."""
     value: float | None

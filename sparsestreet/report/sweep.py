@@ -13,6 +13,7 @@ from sparsestreet.report.collect import RunRecord, check_definitions, collect
 from sparsestreet.report.comparison import comparison_data
 from sparsestreet.report.costs import what_arms_cost
 from sparsestreet.report.curves import time_to_quality
+from sparsestreet.report.effects import what_effects_cost
 from sparsestreet.report.figures import PARETO_COSTS, pareto
 from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
 from sparsestreet.report.grid import Grid, comma_separated, latex, markdown
@@ -81,6 +82,7 @@ def _grids(
     grids = [
         paper_table(found, failures, protocol, name),
         what_arms_cost(found),
+        what_effects_cost(found),
         differences(found, protocol),
         matched_quality(found, protocol),
         matched_budget(found, protocol),

@@ -19,6 +19,7 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene
 from sparsestreet.phases import StageRecorder, stage
+from sparsestreet.pictures.effects import draw_effects
 from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import RunSummary
@@ -227,4 +228,5 @@ def evaluate(
     extra.measure(scene, data, options, out=out, command=command, say=say)
     with stage("pictures"):
         draw_history(out)
+        draw_effects(out)
     return summary

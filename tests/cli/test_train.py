@@ -107,7 +107,7 @@ def test_phases_are_the_wall_clock_of_the_command(brief):
 def test_costs_of_a_run(finished):
     costs, summary = COSTS.read(finished), SUMMARY.read(finished)
     stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "save"}
-    assert set(costs.phases) == stages | {"evaluate", "latency", "costs", "pictures", "other"}
+    assert set(costs.phases) == stages | {"effects", "evaluate", "latency", "costs", "gains", "pictures", "other"}
     assert all(seconds > 0 for seconds in costs.phases.values())
     assert list(costs.passes) == [f"LeaveOneOutRule at step {step}" for step in (24, 30, 36)]
     assert sum(costs.passes.values()) == pytest.approx(costs.phases["prune"], rel=1e-4)  # six digits each

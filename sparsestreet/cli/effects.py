@@ -1,0 +1,88 @@
+"""``sparsestreet effects``: which effects a log calls for, and why, before anything is trained."""
+
+import sys
+import textwrap
+import time
+from collections.abc import Iterator, Sequence
+
+from omegaconf import DictConfig
+
+from sparsestreet.cli.auto import with_found_data
+from sparsestreet.cli.checks import config_problem
+from sparsestreet.cli.compose import composed, override_problem
+from sparsestreet.cli.effect_words import with_effect_keys
+from sparsestreet.records.effects import EffectDecision
+
+USAGE = """\
+sparsestreet effects [data=... data.root=DIR] [effects.NAME=on|off] [other options of train]
+    print the plan of effects: what the log declares, what was measured on its images, lidar and boxes, the
+    threshold, the decision and its reason, and the predicted cost; trains nothing and takes seconds
+
+  sparsestreet effects                                         of the embedded synthetic street
+  sparsestreet effects data=auto data.root=DIR                 of a drive of your own
+  sparsestreet effects data.log.settings.lens=[-0.15,0,0,0,0]  of a street that is seen through a lens
+"""
+WIDTH = 120
+
+
+def effects(arguments: list[str]) -> int:
+    """Print the plan; 2 on wrong options, 1 where the log is broken or cannot support what is forced."""
+    if "--help" in arguments or "-h" in arguments:
+        print(USAGE)
+        return 0
+    try:
+        overrides, found = with_found_data(with_effect_keys(arguments))
+        problem = override_problem(overrides) or config_problem(composed(overrides))
+        if problem:
+            raise ValueError(problem)
+    except ValueError as error:
+        print(f"sparsestreet effects: {error}", file=sys.stderr)
+        return 2
+    if found:
+        print(found)
+    try:
+        print("\n".join(_plan(composed(overrides))))
+    except BrokenPipeError:
+        raise  # somebody reads no more of our output
+    except (ValueError, OSError) as error:
+        print(f"sparsestreet effects: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _plan(cfg: DictConfig) -> Iterator[str]:
+    from sparsestreet.cli.assemble import data_of, recipe_of, with_views
+
+    started = time.perf_counter()
+    data = data_of(cfg)
+    recipe = recipe_of(with_views(cfg, data))
+    opened = time.perf_counter()
+    decisions = recipe.decisions(recipe.plan(data), data)
+    planned = time.perf_counter()
+    log = data.driving_log
+    yield f"{log.name}: {len(data.split.train)} training images of {log.num_cameras} cameras"
+    yield from plan_lines(decisions)
+    yield f"\nread in {opened - started:.1f} s, planned in {planned - opened:.1f} s"
+
+
+def plan_lines(decisions: Sequence[EffectDecision]) -> Iterator[str]:
+    """A paragraph for each effect: its state, its number beside the threshold, the reason, the predicted cost."""
+    for decision in decisions:
+        yield f"\n{decision.name:<14}{'on' if decision.on else 'off':<5}{decision.source:<10}{_number(decision)}"
+        yield from textwrap.wrap(decision.reason, WIDTH, initial_indent=" " * 14, subsequent_indent=" " * 14)
+        yield f"{'':<14}{_cost(decision)}"
+
+
+def _number(decision: EffectDecision) -> str:
+    if decision.value is None:
+        return ""
+    noise = "" if decision.noise is None else f" ± {decision.noise:.2g}"
+    limit = "" if decision.threshold is None else f" (on from {decision.threshold:g})"
+    return f"{decision.value:.3g}{noise} {decision.unit}{limit}"
+
+
+def _cost(decision: EffectDecision) -> str:
+    would = "costs" if decision.on else "would cost"
+    size = f"{4e-6 * decision.numbers:.3g} MB" if decision.numbers else "no memory"
+    gain = "" if decision.gain is None else f"; predicted gain {decision.gain:+.2f} dB"
+    return f"{would} {size}, {decision.ms:.2f} ms a frame{gain}"

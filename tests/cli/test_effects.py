@@ -1,0 +1,30 @@
+"""``sparsestreet effects`` prints a plan without training."""
+
+import pytest
+
+from sparsestreet.cli.effects import effects
+
+
+def test_the_plan_of_a_street(tiny_street, capsys):
+    assert effects([*tiny_street, "effects.affine=on"]) == 0
+    said = capsys.readouterr().out
+    assert "of 2 cameras" in said
+    assert "lens          off  declared  0 cameras (on from 1)" in said
+    assert "affine        on   forced" in said
+    assert "planned in" in said
+
+
+def test_what_cannot_be_forced_is_one_line(tiny_street, capsys):
+    assert effects([*tiny_street, "effects.lens=on"]) == 1
+    assert capsys.readouterr().err.startswith("sparsestreet effects: effects.lens is on, but 0 of 2 cameras")
+
+
+@pytest.mark.parametrize("wrong", ["effects.lens=maybe", "lenz=1", "data=auto"])
+def test_wrong_words(wrong: str, capsys):
+    assert effects([wrong]) == 2
+    assert capsys.readouterr().err.startswith("sparsestreet effects: ")
+
+
+def test_help(capsys):
+    assert effects(["--help"]) == 0
+    assert "trains nothing" in capsys.readouterr().out
