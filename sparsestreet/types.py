@@ -82,6 +82,10 @@ class Shutter:
     """Rotation vector of the camera over the whole readout, radians, in the camera frame."""
     direction: Side = "top"
     """The side of the image that is read first: rows from "top" or "bottom", columns from "left" or "right"."""
+    seconds: float = 0.0
+    """How long the readout takes; 0: not known, and objects are taken to stand still meanwhile."""
+    span: float = 0.0
+    """The same in the log's normalized time; 0 in a log without a clock."""
 
     @property
     def reads_columns(self) -> bool:

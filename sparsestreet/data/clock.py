@@ -1,7 +1,7 @@
 """When the frames of a log were recorded: normalized time, and seconds and stamps where the log has a clock."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +36,8 @@ class LogClock:
     def view(self, camera: Camera, frame_index: int, camera_index: int, stamp: int | None = None) -> View:
         """A recorded view; ``stamp`` is that of the image, where it is not its frame's."""
         time = self.time(frame_index, stamp)
+        if camera.shutter is not None and self.stamps is not None:
+            camera = replace(camera, shutter=replace(camera.shutter, span=self._span(camera.shutter.seconds)))
         return View(camera, time, frame_index, camera_index, *self.moment(frame_index, stamp))
 
     def time(self, frame_index: int, stamp: int | None = None) -> float:
@@ -50,6 +52,11 @@ class LogClock:
         if not first <= stamp <= last:
             raise ValueError(f"stamp {stamp} lies outside of the clock's {first} to {last}: name it in LogClock.others")
         return (stamp - first) / max(last - first, 1)
+
+    def _span(self, seconds: float) -> float:
+        """Normalized time that so many seconds are; 0 in a log of one instant."""
+        first, last = self._reach
+        return seconds * _PER_SECOND / (last - first) if last > first else 0.0
 
     @cached_property
     def _reach(self) -> tuple[int, int]:

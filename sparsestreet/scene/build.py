@@ -68,7 +68,7 @@ def _effects(plan: EffectPlan, data: TrainingData, seed: int) -> dict[str, Effec
         name, settings = planned.name, planned.settings
         if planned.on:
             built[name] = settings.build(data, planned.finding, named_generator(seed, name))
-        elif settings.when == "off":
+        elif settings.when == "off" or planned.finding.value:  # it is in the cameras, and is taken from them
             built[name] = settings.left_out()
         _log.info("effect %r is %s: %s", name, _word(planned), planned.finding.reason)
     return {name: effect for name, effect in built.items() if effect is not None}

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, MutableMapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import torch
@@ -68,7 +68,15 @@ class SceneGraph(nn.Module):
         for name, part in parts.items():
             spans[name] = slice(start, start + len(part))
             start += len(part)
-        return SceneGaussians(activate(list(parts.values()), sh_degree=state.sh_degree), spans, parts, view)
+        gaussians = activate(list(parts.values()), sh_degree=state.sh_degree)
+        if view.camera.shutter is not None and view.camera.shutter.span > 0:
+            gaussians = replace(gaussians, displacements=self._displacements(view, parts, view.camera.shutter.span))
+        return SceneGaussians(gaussians, spans, parts, view)
+
+    @torch.no_grad()
+    def _displacements(self, view: View, parts: Mapping[str, RawGaussians], span: float) -> Float[Tensor, "n 3"]:
+        moves = {name: self.nodes[name].displacements_over(span, view, part) for name, part in parts.items()}
+        return torch.cat([torch.zeros_like(parts[name].means) if one is None else one for name, one in moves.items()])
 
     def counts(self) -> dict[str, int]:
         """Number of rows of every node, absent instances included."""

@@ -57,6 +57,8 @@ class _Entry:
     shutter_rotation: Numbers | None = field(default=None, metadata=EXACT)
     shutter_direction: str | None = None
     """None with a shutter: "top", the only direction of files without this key."""
+    shutter_seconds: float = field(default=0.0, metadata=EXACT)
+    shutter_span: float = field(default=0.0, metadata=EXACT)
     seconds: float | None = field(default=None, metadata=EXACT)
     stamp: int | None = None
 
@@ -126,6 +128,8 @@ def _entry(split: str, view: View) -> _Entry:
         shutter_translation=None if camera.shutter is None else _numbers(camera.shutter.translation),
         shutter_rotation=None if camera.shutter is None else _numbers(camera.shutter.rotation),
         shutter_direction=None if camera.shutter is None else camera.shutter.direction,
+        shutter_seconds=0.0 if camera.shutter is None else camera.shutter.seconds,
+        shutter_span=0.0 if camera.shutter is None else camera.shutter.span,
         seconds=view.seconds,
         stamp=view.stamp,
     )
@@ -138,6 +142,8 @@ def _view(entry: _Entry, where: str) -> View:
             _tensor(entry.shutter_translation, (3,), where, "shutter_translation"),
             _tensor(entry.shutter_rotation, (3,), where, "shutter_rotation"),
             _direction(entry.shutter_direction, where),
+            entry.shutter_seconds,
+            entry.shutter_span,
         )
     camera = Camera(
         _tensor(entry.camera_from_world, (4, 4), where, "camera_from_world"),

@@ -11,7 +11,7 @@ from sparsestreet.data.clock import LogClock, read_stamps
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
-from sparsestreet.types import Frame, View
+from sparsestreet.types import Frame, Shutter, View
 from tests.data.streets import make_log
 from tests.typed import there
 
@@ -149,3 +149,15 @@ def test_a_log_in_part_without_stamps_or_of_one_frame_has_no_rate():
     assert (log.frame_rate, log.stamps, log.seconds) == (None, {}, {})
     assert make_log(3).frame_rate is None
     assert make_log(1).frame_rate is None
+
+
+def test_a_readout_takes_its_part_of_normalized_time():
+    """30 ms of a log of 0.6 s, whose last image was taken 0.1 s after the last frame."""
+    clock = LogClock(3, (0, 250_000_000, 500_000_000), others=(600_000_000,))
+    shutter = Shutter(torch.zeros(3), torch.zeros(3), "left", 0.03)
+    camera = replace(make_log(1).views[0].camera, shutter=shutter)
+    read = there(clock.view(camera, 1, 0).camera.shutter)
+    assert read.span == pytest.approx(0.05)
+    assert (read.seconds, read.direction) == (0.03, "left")
+    assert there(LogClock(3).view(camera, 1, 0).camera.shutter).span == 0  # no clock says how long a frame is
+    assert there(LogClock(1, (5,)).view(camera, 0, 0).camera.shutter).span == 0

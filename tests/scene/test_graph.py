@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from jaxtyping import Bool
@@ -8,6 +10,7 @@ from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Shutter
 from tests.scene.street import (
     background,
     background_settings,
@@ -140,3 +143,29 @@ def test_a_lone_node_left_out_has_no_rows_and_no_mask():
     left = scene.without("road").nodes["road"]
     assert (len(left.rows), left.mask) == (0, None)
     assert (len(scene.nodes["road"].rows), scene.nodes["road"].mask) == (4, MASK)
+
+
+def rolling(time: float, span: float):
+    """A view whose readout takes a normalized time."""
+    view = view_at(time)
+    shutter = Shutter(torch.tensor([0.1, 0.0, 0.0]), torch.zeros(3), span=span)
+    return replace(view, camera=replace(view.camera, shutter=shutter))
+
+
+def test_rows_of_objects_move_while_an_image_is_read_out():
+    """A car that drives 4 m and turns by 90 degrees from time 0 to 1: its rows' places at both ends, by their poses."""
+    rows = random_rows(6, 1, instances=torch.zeros(6, dtype=torch.int64))
+    path = keyframes([track("car", [0, 1], [pose(0, (5.0, 0, 0)), pose(90, (9.0, 0, 0))])], 2)
+    scene = SceneGraph({"road": background(random_rows(4, 0)), "cars": rigid(rows, path, max_gap=1.0)})
+    moved = there(scene.gaussians_at(rolling(0.4, span=0.1)).gaussians.displacements)
+    ends = [scene.gaussians_at(view_at(time)).gaussians.means for time in (0.35, 0.45)]
+    torch.testing.assert_close(moved, (ends[1] - ends[0]).detach())
+    assert (moved[:4] == 0).all()
+    assert (moved[4:].norm(dim=1) > 0.1).all()
+    assert not moved.requires_grad
+
+
+def test_nothing_is_asked_for_its_motion_where_nothing_is_read_out_in_turn():
+    scene = SceneGraph({"cars": cars(3)})
+    for view in (view_at(0.4), rolling(0.4, span=0.0)):
+        assert scene.gaussians_at(view).gaussians.displacements is None

@@ -18,6 +18,8 @@ from sparsestreet.data.rig_json.sweeps import read_sweep
 from sparsestreet.data.rig_json.table import CameraEntry, FrameEntry, ImageEntry, RigTable
 from sparsestreet.types import Shutter
 
+_PER_SECOND = 1e9
+
 
 @dataclass(frozen=True)
 class Part:
@@ -104,7 +106,7 @@ def _shutter(camera: CameraEntry, drive: PosePath | None, image: ImageEntry, sta
         raise image.where.fault("has a shutter, but nothing tells how the camera moves", remedy)
     path = replace(drive, poses=drive.poses @ camera.vehicle_from_camera)
     try:
-        return Shutter(*path.motion_during(stamp, camera.readout), camera.side)
+        return Shutter(*path.motion_during(stamp, camera.readout), camera.side, camera.readout / _PER_SECOND)
     except ValueError as error:
         remedy = "give the frames poses around it, or leave the image out"
         raise image.where.fault(f"is read out where no pose is known: {error}", remedy) from error

@@ -65,4 +65,4 @@ def shutter(motion: ImageMotion, camera: CameraCalibration) -> Shutter | None:
     camera_from_world = pose[:3, :3].T
     translation = camera_from_world @ (motion.linear + lever) * duration
     rotation = camera_from_world @ vehicle[:3, :3] @ motion.angular * duration
-    return Shutter(translation.float(), rotation.float(), _SIDES[camera.direction])
+    return Shutter(translation.float(), rotation.float(), _SIDES[camera.direction], duration)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sparsestreet.evidence.shear import readout_shear
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
@@ -15,18 +16,34 @@ from sparsestreet.types import View
 
 @dataclass(frozen=True, kw_only=True)
 class ShutterSettings(EffectSettings):
-    """Called for where a view of the log has a rolling shutter. Nothing is learned."""
+    """Called for where what stands still is sheared while an image is read out. Nothing is learned."""
+
+    min_shear: float = 1.0
+    """Pixels, of the images as they are read, that static points cross during the readout (95th percentile)."""
 
     def detect(self, data: TrainingData) -> Finding:
         cameras = {view.camera_index for view in data.log.views if view.camera.shutter is not None}
+        if not cameras:
+            return Finding(
+                called_for=False,
+                reason=f"no camera of {data.log.name} declares how long its readout takes",
+                threshold=self.min_shear,
+                unit="px",
+                declared=True,
+                missing="read the log with a reader that knows how its cameras are read out",
+            )
+        found = readout_shear(data.frames.views, data.sweeps)
         return Finding(
-            called_for=bool(cameras),
-            reason=f"{len(cameras)} of {data.log.num_cameras} cameras of {data.log.name} have a rolling shutter",
-            value=float(len(cameras)),
-            unit="cameras",
-            threshold=1.0,
+            called_for=found.pixels >= self.min_shear,
+            reason=(
+                f"{len(cameras)} of {data.log.num_cameras} cameras declare a rolling shutter; 5 % of {found.points:,} "
+                f"static points in {found.views} images move by {found.pixels:.2f} px or more while these are read out"
+            ),
+            value=found.pixels,
+            unit="px",
+            threshold=self.min_shear,
+            noise=found.error,
             declared=True,
-            missing=None if cameras else "read the log with a reader that knows how long its cameras take for an image",
         )
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "RollingShutter":

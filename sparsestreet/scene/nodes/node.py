@@ -202,6 +202,13 @@ class Node(nn.Module, ABC):
         A view without frame and camera index is novel, and only its time counts.
         """
 
+    def displacements_over(self, span: float, view: View, raw: RawGaussians) -> Float[Tensor, "n 3"] | None:
+        """How far each row moves in the world, in meters, during a normalized time around the view's; None: not at all.
+
+        ``raw`` is what the node answered for the view. Asked for views with a rolling shutter alone, without gradients.
+        """
+        return None
+
     def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
         """Returns the node's Gaussians in the world, activated, with the mask applied."""
         return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops.poses import poses_at
@@ -200,6 +201,14 @@ class Tracked(Node):
     def pose_at(self, time: float) -> Poses:
         """Returns pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
+
+    def displacements_over(self, span: float, view: View, raw: RawGaussians) -> Float[Tensor, "n 3"]:
+        """Returns the motion of the rows' boxes; a body that walks meanwhile, or a network's change, is left out."""
+        table = self.keyframes, self.rotation_deltas, self.translation_deltas
+        before, after = (poses_at(*table, view.time + side * span / 2, self.max_gap) for side in (-1, 1))
+        turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
+        shift, instances = after.translations - before.translations, self.rows.instances
+        return (turn[instances] @ raw.means[:, :, None]).squeeze(-1) + shift[instances]
 
     def regularizers(
         self, view: View, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState

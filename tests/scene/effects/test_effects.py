@@ -116,7 +116,7 @@ def test_effects_act_in_the_order_of_the_configuration():
 
 
 @pytest.mark.parametrize(
-    ("name", "lacks"), [("lens", "0 of 1 cameras of hand-made have a lens"), ("shutter", "shutter")]
+    ("name", "lacks"), [("lens", "0 of 1 cameras of hand-made have a lens"), ("shutter", "readout")]
 )
 def test_what_the_log_cannot_support_is_an_error_that_says_what_is_missing(name: str, lacks: str):
     with pytest.raises(ValueError, match=rf"effects.{name} is on, but .*{lacks}.*or say auto"):

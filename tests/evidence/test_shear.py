@@ -1,0 +1,58 @@
+"""Shear of a readout, against cases that are computed by hand."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.data.lazy import Sweeps
+from sparsestreet.evidence.shear import readout_shear
+from sparsestreet.types import Camera, Shutter, Sweep, View
+
+INTRINSICS = torch.tensor([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
+CAMERA = Camera(torch.eye(4), INTRINSICS, 80, 60)
+
+
+def view(shutter: Shutter | None, frame: int = 0) -> View:
+    return View(replace(CAMERA, shutter=shutter), 0.0, frame, 0)
+
+
+def shutter(*translation: float, rotation: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Shutter:
+    return Shutter(torch.tensor(translation), torch.tensor(rotation))
+
+
+def sweep(*points: tuple[float, float, float], index: int = 0) -> Sweep:
+    count = len(points)
+    return Sweep(index, 0.0, torch.tensor(points), torch.zeros(count, 3), torch.zeros(count, dtype=torch.bool))
+
+
+def test_a_camera_that_moves_aside():
+    """100 px of focal length, 0.3 m: 3 px at 10 m. Points behind the camera and beside the image do not count."""
+    points = sweep((0.0, 0.0, 10.0), (1.0, 0.5, 10.0), (0.0, 0.0, -1.0), (50.0, 0.0, 10.0))
+    found = readout_shear([view(shutter(0.3, 0.0, 0.0)), view(None)], Sweeps.of((points,)))
+    assert found.pixels == pytest.approx(3.0, abs=1e-4)
+    assert (found.views, found.points) == (1, 2)
+
+
+def test_a_camera_that_turns():
+    """Radians times the focal length, at any distance, where a point is on the axis."""
+    turning = shutter(0.0, 0.0, 0.0, rotation=(0.0, 0.02, 0.0))
+    found = readout_shear([view(turning)], Sweeps.of((sweep((0.0, 0.0, 7.0), (0.0, 0.0, 70.0)),)))
+    assert found.pixels == pytest.approx(2.0, rel=1e-3)  # tan x = x + x^3 / 3
+
+
+def test_without_lidar_points_are_ten_meters_away():
+    assert readout_shear([view(shutter(0.3, 0.0, 0.0))], Sweeps.of(())).pixels == pytest.approx(3.0, rel=1e-3)
+
+
+def test_the_error_is_that_of_the_mean_over_views():
+    views = [view(shutter(0.2 + 0.1 * frame, 0.0, 0.0), frame) for frame in range(3)]
+    sweeps = Sweeps.of(tuple(sweep((0.0, 0.0, 10.0), index=frame) for frame in range(3)))
+    found = readout_shear(views, sweeps)
+    assert found.pixels == pytest.approx(3.0, abs=1e-3)  # 2, 3 and 4 px
+    assert found.error == pytest.approx(3**-0.5, abs=1e-3)
+
+
+def test_without_a_shutter_there_is_none():
+    with pytest.raises(ValueError, match="no view has one"):
+        readout_shear([view(None)], Sweeps.of(()))
