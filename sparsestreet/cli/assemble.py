@@ -45,7 +45,8 @@ def _render_options(cfg: DictConfig) -> RenderOptions:
 def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out."""
     log = instantiate(cfg.data.log, _convert_="all").read()
-    return StreetData(log, **cfg.split, seed=cfg.seed)
+    hood = cfg.effects.hood if cfg.effects and "hood" in cfg.effects and cfg.effects.hood.when != "off" else None
+    return StreetData(log, **cfg.split, seed=cfg.seed, hood=None if hood is None else hood.min_share)
 
 
 def with_views(cfg: DictConfig, data: StreetData) -> DictConfig:

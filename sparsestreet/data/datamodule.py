@@ -9,8 +9,9 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
+from sparsestreet.data.hood import find_hoods, with_hoods
 from sparsestreet.data.lazy import Frames, spread
-from sparsestreet.data.log import DrivingLog, split
+from sparsestreet.data.log import DrivingLog, Split, split
 from sparsestreet.data.recolored import recolored
 from sparsestreet.phases import phase
 from sparsestreet.types import Frame
@@ -106,6 +107,7 @@ class StreetData(LightningDataModule):
         seed: int = 0,
         val_frames: int | None = None,
         with_replacement: bool = False,
+        hood: float | None = None,
     ) -> None:
         """
         Args:
@@ -116,11 +118,18 @@ class StreetData(LightningDataModule):
             seed: of the order of the training frames.
             val_frames: images that each validation looks at, spread over the held-out ones; None: all.
             with_replacement: as in ``ShuffledFrames``.
+            hood: what is found of the recording car joins the ``ego`` pixels of all frames of a camera that shows at
+                least this share of it; None: it is not looked for.
         """
         super().__init__()
         if val_frames is not None and val_frames < 1:
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
         self.split = split(log, stride=stride, offset=offset, cameras=cameras)
+        if hood is not None:
+            hoods = find_hoods(self.split.train)
+            seen = {camera: found for camera, found in hoods.items() if found.share >= hood}
+            log = replace(log, frames=with_hoods(log.frames, seen), hoods=hoods)
+            self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))
         # Colors of a sweep are those of images, so a camera that is held out gives none.
         self.driving_log = replace(log, sweeps=recolored(log, self.split.train)) if cameras else log
         instants = [f"every {stride}th frame from {offset}"] if stride else []

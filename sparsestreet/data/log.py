@@ -1,7 +1,7 @@
 """A driving log as the rest of the package sees it, whatever data set it came from."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.data.hood import Hood
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.types import Frame, SparsePoints, Track, View
@@ -61,6 +62,9 @@ class DrivingLog:
     sparse_points: Callable[[], SparsePoints] | None = None
     """Reads points that came with the log, where it has any. Gaussians start from them, and without lidar the scene's
     box lies around them; they are no returns, so they give no depth."""
+
+    hoods: Mapping[int, Hood] = field(default_factory=dict)
+    """Camera index -> what it was found to see of the car that carries it (``hood.find_hoods``)."""
 
     @property
     def views(self) -> tuple[View, ...]:

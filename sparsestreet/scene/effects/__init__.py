@@ -6,6 +6,7 @@ splats, the affine map one of their colors; lens and shutter are what a camera b
 
 from sparsestreet.scene.effects.affine import Affine, AffineSettings
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
 from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
@@ -20,6 +21,7 @@ __all__ = [
     "EffectPlan",
     "EffectSettings",
     "Finding",
+    "HoodSettings",
     "Lens",
     "LensSettings",
     "LinearizedEffects",

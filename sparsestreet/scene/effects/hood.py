@@ -1,0 +1,55 @@
+"""The recording car in its own images: no part of the scene, but pixels that nothing is learned from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sparsestreet.data.hood import LEAST_DRIVE
+from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.initialize.training_data import TrainingData
+
+
+@dataclass(frozen=True, kw_only=True)
+class HoodSettings(EffectSettings):
+    """Called for where rows at the bottom of a camera's images never change.
+
+    The log's frames have its pixels in ``Frame.ego`` then (``StreetData``), which losses, seeds, depth and metrics
+    leave out; the scene has no part of it.
+    """
+
+    min_share: float = 0.002
+    """Of an image's pixels."""
+
+    def detect(self, data: TrainingData) -> Finding:
+        hoods, log = data.log.hoods, data.log
+        if not hoods:
+            return Finding(
+                called_for=False,
+                reason=f"no camera of {log.name} moves by {LEAST_DRIVE:g} m, so what never changes may be the street",
+                unit="of an image",
+                threshold=self.min_share,
+                missing="read a longer drive, or give masks of the car (data.log.masks)",
+            )
+        camera, largest = max(hoods.items(), key=lambda item: item[1].share)
+        seen = [camera for camera, hood in hoods.items() if hood.share >= self.min_share]
+        return Finding(
+            called_for=bool(seen),
+            reason=(
+                f"{len(seen)} of {log.num_cameras} cameras see unchanging rows at the lower border below an unchanging "
+                f"edge; camera {camera} sees most of them"
+            ),
+            value=largest.share,
+            unit="of an image",
+            threshold=self.min_share,
+            noise=largest.error,
+            missing=None if largest.share > 0 else "give masks of the car (data.log.masks), if the images show it",
+        )
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> None:
+        return None
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
+        raise ValueError("a scene file holds no hood: it is a matter of the log; train the scene again")

@@ -1,0 +1,97 @@
+"""The recording car is found in images of a moving camera, and only there."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.hood import find_hoods, with_hoods
+from sparsestreet.data.lazy import Frames
+from sparsestreet.types import Camera, Frame
+from tests.data.streets import make_log
+
+HEIGHT, WIDTH, COUNT = 24, 40, 12
+HOOD = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+HOOD[-5:, 4:] = True
+FOUND = HOOD.clone()
+FOUND[-6, 4:] = True  # the row in which a pixel may show both
+
+
+def frames(hood: torch.Tensor | None, step: float = 3.0, noise: int = 2, camera: int = 0) -> Frames:
+    """A camera that drives through noise, behind a dark hood whose pixels have a little noise of their own."""
+    random = torch.Generator().manual_seed(camera)
+    made = []
+    for index in range(COUNT):
+        image = torch.randint(120, 250, (HEIGHT, WIDTH, 3), generator=random, dtype=torch.uint8)
+        if hood is not None:
+            dark = torch.randint(20, 20 + noise, (HEIGHT, WIDTH, 1), generator=random, dtype=torch.uint8)
+            image = torch.where(hood[..., None], dark.expand(-1, -1, 3), image)
+        pose = torch.eye(4)
+        pose[2, 3] = -step * index
+        made.append(Frame(Camera(pose, torch.eye(3), WIDTH, HEIGHT), index / COUNT, index, camera, image=image))
+    return Frames.of(made)
+
+
+def shares(found: Frames) -> dict[int, float]:
+    return {camera: hood.share for camera, hood in find_hoods(found).items()}
+
+
+def test_every_pixel_of_a_hood_and_no_other():
+    hood = find_hoods(frames(HOOD))[0]
+    assert torch.equal(hood.mask, FOUND)
+    assert hood.share == pytest.approx(6 * 36 / (HEIGHT * WIDTH))
+    assert hood.error < 0.002  # six images each, of which noise alone hides the edge of a column or two
+
+
+@pytest.mark.parametrize("hood", [None, HOOD & (torch.arange(WIDTH) < 12)])
+def test_nothing_and_what_is_narrow_is_no_hood(hood):
+    assert shares(frames(hood)) == {0: 0.0}
+
+
+def test_columns_without_an_edge_lie_between_others():
+    """A reflection of the street in three columns."""
+    hood = HOOD.clone()
+    hood[-5:-2, 20:23] = False
+    assert torch.equal(find_hoods(frames(hood))[0].mask[:, 20:23], FOUND[:, 20:23])
+
+
+def test_a_camera_that_stands_says_nothing():
+    assert shares(frames(HOOD, step=1.5)) == {}  # 16.5 m
+
+
+def test_what_stays_dark_without_an_edge_is_no_hood():
+    """A shadow that gets darker towards the border by less than the least edge."""
+    found = frames(HOOD)
+    ramp = torch.linspace(250, 20, 60)[:, None, None].expand(-1, WIDTH, 3).byte()
+
+    def shaded(frame: Frame) -> Frame:
+        return Frame.of(frame, image=torch.cat((frame.image[:0], ramp[-HEIGHT:])))
+
+    assert shares(Frames.of([shaded(frame) for frame in found])) == {0: 0.0}
+
+
+def test_frames_get_it_beside_their_own_masks():
+    own = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    own[0, 0] = True
+    first, second = frames(HOOD), frames(None, camera=1)
+    masked = Frames.of([Frame.of(frame, image=frame.image, ego=own) for frame in first])
+    every: Sequence[Frame] = (*masked, *second)
+    hoods = find_hoods(Frames.of(every))
+    seen = with_hoods(Frames.of(every), hoods)
+    assert torch.equal(seen[0].ego, own | FOUND)
+    assert seen[COUNT].ego is None  # the other camera shows none
+
+
+def test_training_and_held_out_frames_lose_its_pixels():
+    log = make_log(COUNT)
+    moving = Frames.of([Frame.of(frame, image=frame.image) for frame in frames(HOOD)])
+    log = replace(log, frames=moving, num_frames=COUNT, num_cameras=1)
+    data = StreetData(log, stride=4, offset=2, hood=0.002)
+    for part in (data.split.train, data.split.held_out, data.driving_log.frames):
+        assert torch.equal(part[0].ego, FOUND)
+    assert data.driving_log.hoods[0].share > 0.1
+    # Less than what is asked for, and not asked for at all.
+    for hood in (0.5, None):
+        assert StreetData(log, stride=4, offset=2, hood=hood).split.train[0].ego is None
