@@ -8,6 +8,7 @@
 4. One instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
    ``lidar``). ``render`` makes pictures and truth, ``write`` writes frames to disk, and ``truth`` shows what a camera
    next to the path would have seen.
+5. What a camera does to a recorded image: its ``exposure``.
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader

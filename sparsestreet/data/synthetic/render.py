@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int16, UInt8
 
 from sparsestreet.data.synthetic.cameras import StreetCamera, street_camera
+from sparsestreet.data.synthetic.exposure import recorded_gains
 from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
 from sparsestreet.data.synthetic.parts import BACKGROUND, Pose
 from sparsestreet.data.synthetic.scene import Scene, SunView
@@ -89,10 +90,13 @@ def _render_camera(settings: StreetSettings, world: World, instant: Instant, fra
     time = settings.image_time(frame, camera)
     if time != frame / settings.frame_rate:
         instant = Instant.at(world, time)
-    return render_image(settings, instant, street_camera(settings, camera, world.ego.pose(time)))
+    mounted = street_camera(settings, camera, world.ego.pose(time))
+    return render_image(settings, instant, mounted, recorded_gains(settings, frame, camera))
 
 
-def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:
+def render_image(
+    settings: StreetSettings, instant: Instant, camera: StreetCamera, gains: Float32[np.ndarray, "3"] | None = None
+) -> StreetImage:
     """Renders what a camera sees at an instant; of the settings it uses only the number of rays per pixel."""
     samples = settings.supersampling
     scene = instant.scene
@@ -106,4 +110,4 @@ def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamer
     sky = center_hits.parts == NOTHING
     depth = np.where(sky, 0, center_hits.distances * camera.axis_cosines()).astype(np.float32)
     objects = np.where(sky, BACKGROUND, scene.object_indices[center_hits.parts]).astype(np.int16)
-    return StreetImage(camera, to_srgb(linear), depth, objects, sky)
+    return StreetImage(camera, to_srgb(linear, gains), depth, objects, sky)

@@ -40,6 +40,12 @@ class StreetSettings:
     delays_known: bool = True
     """False: the street's files say of every image that it was taken at the pose and the stamp of its frame. It is the
     control of readers that heed the instants of cameras."""
+    exposure_walk: float = 0.0
+    """Standard deviation over the drive of each camera's exposure, EV, which walks smoothly around 0. One EV doubles
+    what an image stores."""
+    white_balance: float = 0.0
+    """Relative standard deviation, over cameras and channels, of the constant gains of each camera's channels. They
+    change no camera's brightness, and cancel over the cameras."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -66,12 +72,17 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
+            "exposure_walk", "white_balance",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
         if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
+        if self.white_balance and self.num_cameras == 1:
+            raise ValueError(
+                "StreetSettings.white_balance needs two cameras: the constant gains of one are colors of the street"
+            )
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
         # Equal values compare equal, whatever type of sequence or number they were given as.

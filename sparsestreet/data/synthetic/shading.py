@@ -93,10 +93,17 @@ def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Sc
     return colors
 
 
-def to_srgb(linear: Float32[np.ndarray, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping."""
+def to_srgb(
+    linear: Float32[np.ndarray, "3 h w"], gains: Float32[np.ndarray, "3"] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping.
+
+    ``gains`` multiply the stored values of red, green and blue, before these are rounded and cut off at white.
+    """
     exposed = np.maximum(linear * np.float32(_EXPOSURE), 0)
     exposed = exposed * (1 + exposed / 4) / (1 + exposed)
     exposed = np.clip(exposed * np.float32(1.45), 0, 1)
     encoded = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
+    if gains is not None:
+        encoded = np.minimum(encoded * gains[:, None, None], 1)
     return np.ascontiguousarray(np.round(encoded * 255).astype(np.uint8).transpose(1, 2, 0))
