@@ -8,7 +8,7 @@
 4. One instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
    ``lidar``). ``render`` makes pictures and truth, ``write`` writes frames to disk, and ``truth`` shows what a camera
    next to the path would have seen.
-5. What a camera does to a recorded image: its ``exposure``.
+5. What a camera does to a recorded image: its ``exposure``. What its files say wrongly: ``errors`` of poses.
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader

@@ -59,6 +59,12 @@ class StreetSettings:
     num_cyclists: int = 2
     body_pose_noise: float = 3.0
     """Error of a pedestrian's body pose in each frame: root mean square over the joints, degrees."""
+    pose_noise: Sequence[float | int] = ()
+    """Meters and degrees, root mean square: each image's pose in the files is off by a random rigid motion of its own.
+    Empty: poses are exact."""
+    box_noise: Sequence[float | int] = ()
+    """Meters, and degrees of heading, root mean square: each box of a frame is off by a random motion of its own.
+    Empty: boxes are exact."""
     lidar: LidarSensor = WAYMO_TOP
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, meters."""
@@ -94,6 +100,11 @@ class StreetSettings:
                 f"StreetSettings.delays must be empty or one for each of {self.num_cameras} cameras, shorter than a "
                 f"frame of {1 / self.frame_rate:g} s, but is {list(self.delays)}"
             )
+        for name in ("pose_noise", "box_noise"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+            noise = getattr(self, name)
+            if noise and not (len(noise) == 2 and all(0 <= value < math.inf for value in noise)):
+                raise ValueError(f"StreetSettings.{name} must be empty or [meters, degrees] but is {list(noise)}")
         object.__setattr__(self, "lens", tuple(float(value) for value in self.lens))
         if self.lens and not (len(self.lens) == 5 and self._sees_every_pixel()):
             raise ValueError(

@@ -10,6 +10,7 @@ from PIL import Image
 
 from sparsestreet.data.synthetic.bodies import BodyWriter
 from sparsestreet.data.synthetic.cameras import street_camera
+from sparsestreet.data.synthetic.errors import noisy_box, noisy_camera
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -44,7 +45,7 @@ class StreetWriter:
             frame = replace(frame, images=tuple(self._claimed(frame, number) for number in range(len(frame.images))))
         annotated = self._annotate(frame)
         for camera, image in enumerate(frame.images):
-            self._write_image(image, f"{frame.index:03d}_{camera}", annotated)
+            self._write_image(image, frame.index, camera, annotated)
             if frame.index == 0:
                 self._write_intrinsics(image, camera)
         frame.sweep.points.tofile(self._file("lidar", f"{frame.index:03d}.bin"))
@@ -97,14 +98,16 @@ class StreetWriter:
         blank = {"id": actor.name, "class_name": actor.model.class_name, "frame_annotations": empty}
         notes = self._instances.setdefault(key, blank)["frame_annotations"]
         notes["frame_idx"].append(frame)
-        notes["obj_to_world"].append(pose.tolist())
+        notes["obj_to_world"].append(noisy_box(self.settings, pose, actor.name, frame).tolist())
         notes["box_size"].append(list(actor.model.size))
 
-    def _write_image(self, image: StreetImage, name: str, annotated: list[int]) -> None:
+    def _write_image(self, image: StreetImage, frame: int, camera: int, annotated: list[int]) -> None:
+        name = f"{frame:03d}_{camera}"
         picture = Image.fromarray(image.rgb)
         # 4:4:4, because halved color would smear edges, for which a 320-pixel image has few pixels.
         picture.save(self._file("images", f"{name}.jpg"), quality=97, subsampling=0)
-        np.savetxt(self._file("extrinsics", f"{name}.txt"), image.camera.world_from_camera)
+        said = noisy_camera(self.settings, image.camera.world_from_camera, frame, camera)
+        np.savetxt(self._file("extrinsics", f"{name}.txt"), said)
         _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)
         classes = {index: self.world.actors[index].model.class_name for index in annotated}
         for folder, members in (

@@ -45,7 +45,7 @@ def test_images_are_stored_values_times_gains(effects):
 
 def test_white_stays_white():
     linear = np.full((3, 1, 1), 9.0, np.float32)  # far beyond what an image stores
-    assert to_srgb(linear, np.array([0.5, 1.0, 2.0], np.float32)).tolist() == [[[128, 255, 255]]]
+    assert to_srgb(linear, np.array([0.4, 1.0, 2.0], np.float32)).tolist() == [[[102, 255, 255]]]
 
 
 def test_a_walk_is_smooth_and_each_cameras_own():
