@@ -3,11 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import torch
 
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
 from sparsestreet.geometry.distortion import fold_radius_squared, undistort
+from sparsestreet.types import Side
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
 """Front, front left, front right. With 60 degrees of view each, neighbors overlap by 10."""
@@ -46,6 +48,13 @@ class StreetSettings:
     white_balance: float = 0.0
     """Relative standard deviation, over cameras and channels, of the constant gains of each camera's channels. They
     change no camera's brightness, and cancel over the cameras."""
+    readout: float = 0.0
+    """Seconds from the first row or column of an image to the last: a rolling shutter. An image's stamp and pose are
+    those of the middle. 0: all pixels at once."""
+    readout_direction: Side = "top"
+    """The side of every image that is read first."""
+    readout_known: bool = True
+    """False: the street's files are silent on the readout."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -78,13 +87,19 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
-            "exposure_walk", "white_balance",
+            "exposure_walk", "white_balance", "readout",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
         if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
+        if self.readout * self.frame_rate >= 1:
+            frame = f"a frame of {1 / self.frame_rate:g} s"
+            raise ValueError(f"StreetSettings.readout must be shorter than {frame} but is {self.readout}")
+        if self.readout_direction not in get_args(Side):
+            sides = ", ".join(get_args(Side))
+            raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
         if self.white_balance and self.num_cameras == 1:
             raise ValueError(
                 "StreetSettings.white_balance needs two cameras: the constant gains of one are colors of the street"

@@ -19,7 +19,12 @@ from sparsestreet.data.synthetic.write import StreetWriter
 GENERATOR = 3
 """Version of the generator; raised whenever equal settings would give another street."""
 _WORKERS = 2
-_LATER = frozenset({"delays", "delays_known", "exposure_walk", "white_balance", "pose_noise", "box_noise"})
+_LATER = frozenset(
+    {
+        "delays", "delays_known", "exposure_walk", "white_balance", "pose_noise", "box_noise", "readout",
+        "readout_direction", "readout_known",
+    }
+)  # fmt: skip
 """Settings that came after ``GENERATOR``; at their defaults a street is as it was without them."""
 
 

@@ -10,6 +10,7 @@ from PIL import Image
 
 from sparsestreet.data.synthetic.bodies import BodyWriter
 from sparsestreet.data.synthetic.cameras import street_camera
+from sparsestreet.data.synthetic.declared import write_declared
 from sparsestreet.data.synthetic.errors import noisy_box, noisy_camera
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
@@ -55,6 +56,7 @@ class StreetWriter:
         """Writes the files about the whole drive."""
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
+        write_declared(self.settings, self.world, self.root)
         self._bodies.write(self.root / "humanpose" / "smpl.pkl")
         frames = range(self.settings.num_frames)
         times = np.arange(self.settings.num_frames) / self.settings.frame_rate
