@@ -8,8 +8,8 @@
 4. One ``instant``: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
    ``lidar``). ``render`` makes pictures and truth, ``write`` writes frames to disk, and ``truth`` shows what a camera
    next to the path would have seen.
-5. What a camera does to a recorded image: how rows are read (``capture``), and its ``exposure``. What the files say:
-   the cameras' motion (``declared``), and ``errors`` of poses.
+5. What a camera does to a recorded image: how rows are read (``capture``), its ``exposure``, and the ``hood`` in front
+   of it. What the files say: the cameras' motion (``declared``), and ``errors`` of poses.
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader

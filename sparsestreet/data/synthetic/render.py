@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float32, Int16, UInt8
 from sparsestreet.data.synthetic.cameras import StreetCamera, street_camera
 from sparsestreet.data.synthetic.capture import captured
 from sparsestreet.data.synthetic.exposure import recorded_gains
+from sparsestreet.data.synthetic.hood import behind_hood, hood_coverage
 from sparsestreet.data.synthetic.instant import Instant, Sight
 from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
 from sparsestreet.data.synthetic.parts import Pose
@@ -66,8 +67,12 @@ def _recorded(
     def camera_at(seconds: float) -> StreetCamera:
         return street_camera(settings, camera, world.ego.pose(time + seconds))
 
+    mounted = camera_at(0.0)
     sight = captured(settings, lambda seconds: instant_at(time + seconds), camera_at)
-    return developed(camera_at(0.0), sight, recorded_gains(settings, frame, camera))
+    coverage = hood_coverage(settings, camera)
+    if coverage is not None:
+        sight = behind_hood(sight, coverage, mounted, world.weather)
+    return developed(mounted, sight, recorded_gains(settings, frame, camera))
 
 
 def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
+from typing import Literal, get_args
 
 import torch
 
@@ -55,6 +55,12 @@ class StreetSettings:
     """The side of every image that is read first."""
     readout_known: bool = True
     """False: the street's files are silent on the readout."""
+    hood: float = 0.0
+    """Share of an image that the hood of the recording car covers, at its bottom: dark, with the sky mirrored in it."""
+    hood_cameras: Literal["front", "all"] = "front"
+    """Whose images it covers."""
+    hood_known: bool = False
+    """True: the street's files have masks of it."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -87,7 +93,7 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
-            "exposure_walk", "white_balance", "readout",
+            "exposure_walk", "white_balance", "readout", "hood",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
@@ -100,6 +106,10 @@ class StreetSettings:
         if self.readout_direction not in get_args(Side):
             sides = ", ".join(get_args(Side))
             raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
+        if self.hood > 0.5:
+            raise ValueError(f"StreetSettings.hood must be a share of the image up to 0.5 but is {self.hood}")
+        if self.hood_cameras not in ("front", "all"):
+            raise ValueError(f"StreetSettings.hood_cameras must be front or all but is {self.hood_cameras}")
         if self.white_balance and self.num_cameras == 1:
             raise ValueError(
                 "StreetSettings.white_balance needs two cameras: the constant gains of one are colors of the street"

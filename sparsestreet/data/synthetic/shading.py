@@ -60,7 +60,7 @@ def _shade(
     lit = sunlit(scene, view, points, normals, index)
     slope = (normals * view.sun[:, None]).sum(0) * lit
     light = weather.ambient(normals) + column(SUNLIGHT) * slope
-    return appearance.albedo * light + _mirrored(weather, directions, normals, appearance.gloss, lit)
+    return appearance.albedo * light + mirrored(weather, directions, normals, appearance.gloss, lit)
 
 
 def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vectors:
@@ -75,7 +75,7 @@ def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vecto
     return radius * np.sqrt(np.maximum(1 - 2 * normals * ratio + ratio * ratio, 0))
 
 
-def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
+def mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
     """Returns sky and sun mirrored in glossy surfaces (Schlick's Fresnel term); below roofs, the street's far side."""
     colors = np.zeros_like(directions)
     shiny = np.flatnonzero(gloss > 0.01)

@@ -12,6 +12,7 @@ from sparsestreet.data.synthetic.bodies import BodyWriter
 from sparsestreet.data.synthetic.cameras import street_camera
 from sparsestreet.data.synthetic.declared import write_declared
 from sparsestreet.data.synthetic.errors import noisy_box, noisy_camera
+from sparsestreet.data.synthetic.hood import hood_coverage
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -57,6 +58,7 @@ class StreetWriter:
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
         write_declared(self.settings, self.world, self.root)
+        self._write_hood()
         self._bodies.write(self.root / "humanpose" / "smpl.pkl")
         frames = range(self.settings.num_frames)
         times = np.arange(self.settings.num_frames) / self.settings.frame_rate
@@ -65,6 +67,12 @@ class StreetWriter:
             for camera in range(self.settings.num_cameras):
                 own = [self.settings.image_time(frame, camera) for frame in frames]
                 np.savetxt(self.root / f"timestamps_{camera}.txt", own, fmt="%.9f")
+
+    def _write_hood(self) -> None:
+        for camera in range(self.settings.num_cameras if self.settings.hood_known else 0):
+            coverage = hood_coverage(self.settings, camera)
+            if coverage is not None:
+                _write_mask(self._file("ego_masks", f"{camera}.png"), coverage > 0)
 
     def _claimed(self, frame: StreetFrame, camera: int) -> StreetImage:
         """The image with the pose that its camera has at the frame's instant."""
