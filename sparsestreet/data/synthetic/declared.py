@@ -31,17 +31,19 @@ def write_declared(settings: StreetSettings, world: World, root: Path) -> None:
         (root / _FILE).write_text(json.dumps(said))
 
 
-def with_declared(log: DrivingLog, root: Path) -> DrivingLog:
+def with_declared(log: DrivingLog, settings: StreetSettings, root: Path) -> DrivingLog:
     """Returns the log whose views have what the street's file declares; the log itself if there is none."""
     path = root / _FILE
     if not path.is_file():
         return log
     said = json.loads(path.read_text())
+    first, last = settings.recorded
+    span = said["readout"] / (last - first) if last > first else 0.0
 
     def told(view: AnyView) -> AnyView:
         frame, camera = view.indices
         numbers = torch.tensor(said["motion"][camera][frame])
-        shutter = Shutter(numbers[:3], numbers[3:], said["direction"])
+        shutter = Shutter(numbers[:3], numbers[3:], said["direction"], said["readout"], span)
         return replace(view, camera=replace(view.camera, shutter=shutter))
 
     load = log.frames.load

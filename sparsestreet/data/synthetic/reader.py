@@ -49,7 +49,7 @@ class StreetReader(LogReader):
         return self._made().check()
 
     def read(self) -> DrivingLog:
-        log = with_declared(self._made().read(), self.folder)
+        log = with_declared(self._made().read(), self.settings, self.folder)
         return replace(log, truth=street_truth(self.settings, log.dataset_from_world))
 
     def data_hash(self) -> str:

@@ -28,22 +28,23 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
     what the view's own pose sees, so at a recorded view whose pose is noisy it is not the recorded image.
 
     It returns None if the camera is inside an annotated object. Masks hold people and vehicles up to
-    ``annotation_range`` from the camera, annotated or not. A view's lens is applied, and its shutter's motion over the
-    street's ``readout``.
+    ``annotation_range`` from the camera, annotated or not. A view's lens is applied, and its shutter's motion if that
+    has its ``seconds``.
     """
     world, (first, last) = build_world(settings), settings.recorded
     instant_at = lru_cache(maxsize=64)(lambda seconds: Instant.at(world, seconds))
 
     def truth(view: View) -> Frame | None:
         middle = first + view.time * (last - first)
-        camera_at = partial(_camera_at, settings, view.camera, street_from_world)
+        camera_at = partial(_camera_at, view.camera, street_from_world)
         camera, instant = camera_at(0.0), instant_at(middle)
         if instant.inside_an_actor(camera):
             return None
-        if view.camera.shutter is None or not settings.readout:
+        shutter = view.camera.shutter
+        if shutter is None or not shutter.seconds:
             sight = instant.seen_by(camera, settings.supersampling)
         else:
-            reading = replace(settings, readout_direction=view.camera.shutter.direction)
+            reading = replace(settings, readout=shutter.seconds, readout_direction=shutter.direction)
             sight = captured(reading, lambda seconds: instant_at(middle + seconds), camera_at)
         image = developed(camera, sight)
         near = instant.actors_within(settings.annotation_range, camera)
@@ -63,13 +64,11 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
     return truth
 
 
-def _camera_at(
-    settings: StreetSettings, camera: Camera, street_from_world: Float64[Tensor, "4 4"], seconds: float
-) -> StreetCamera:
+def _camera_at(camera: Camera, street_from_world: Float64[Tensor, "4 4"], seconds: float) -> StreetCamera:
     """Returns the camera where its shutter moves it to within ``seconds`` from the middle of the readout."""
     world_from_camera = (street_from_world @ inverse(camera.camera_from_world.double())).numpy()
     if camera.shutter is not None and seconds:
-        motion, share = np.eye(4), seconds / settings.readout
+        motion, share = np.eye(4), seconds / camera.shutter.seconds
         motion[:3, :3] = Rotation.from_rotvec(share * camera.shutter.rotation.double().numpy()).as_matrix()
         motion[:3, 3] = share * camera.shutter.translation.double().numpy()
         world_from_camera = world_from_camera @ motion

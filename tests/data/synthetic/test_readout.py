@@ -76,7 +76,8 @@ def test_a_log_declares_how_its_cameras_move(folder, log):
         torch.testing.assert_close(shutter.translation, translation, rtol=0, atol=1e-6)
         torch.testing.assert_close(shutter.rotation, rotation, rtol=0, atol=1e-6)
         assert shutter.translation.norm() > 0.7
-        assert shutter.direction == "top"
+        # Two frames at 10 Hz are a tenth of a second.
+        assert (shutter.direction, shutter.seconds, shutter.span) == ("top", 0.06, pytest.approx(0.6))
         assert there(log.frames[2 * frame + camera].camera.shutter).direction == "top"
 
 
@@ -84,7 +85,7 @@ def test_a_log_declares_how_its_cameras_move(folder, log):
 def test_files_can_be_silent_on_it(tmp_path, log):
     write_declared(replace(SETTINGS, readout_known=False), build_world(SETTINGS), tmp_path)
     assert not list(tmp_path.iterdir())
-    assert with_declared(log, tmp_path) is log
+    assert with_declared(log, SETTINGS, tmp_path) is log
 
 
 @pytest.mark.lengthy
