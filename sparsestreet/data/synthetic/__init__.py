@@ -5,9 +5,11 @@
 2. The world: places and motions of all things (``world``, ``layout``, ``motion``), things built from parts
    (``models``, ``parts``), and convex solids (``shapes``).
 3. Its look: ``textures`` with ``coverage`` and ``noise``, and light (``sky``, ``shading``).
-4. One instant: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
+4. One ``instant``: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,
    ``lidar``). ``render`` makes pictures and truth, ``write`` writes frames to disk, and ``truth`` shows what a camera
    next to the path would have seen.
+5. What a camera does to a recorded image: how rows are read (``capture``), its ``exposure``, and the ``hood`` in front
+   of it. What the files say: the cameras' motion (``declared``), and ``errors`` of poses.
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader

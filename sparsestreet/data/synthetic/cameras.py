@@ -18,6 +18,11 @@ _MOUNT = (1.6, 0.0, 1.65)
 """Camera position on the ego car, meters."""
 
 
+Window = tuple[slice, slice]
+"""Rows and columns of an image, pixels."""
+EVERYWHERE: Window = (slice(None), slice(None))
+
+
 @dataclass(frozen=True)
 class StreetCamera:
     """A camera at an instant."""
@@ -29,26 +34,22 @@ class StreetCamera:
     distortion: tuple[float, ...] = ()
     """Brown-Conrady k1, k2, p1, p2, k3; empty: a pinhole."""
 
-    def rays(self, supersampling: int) -> Rays:
+    def rays(self, supersampling: int, window: Window = EVERYWHERE) -> Rays:
         """Returns supersampling x supersampling evenly spread rays per pixel; a single ray goes through its center."""
-        local = self._directions(supersampling)
+        local = self._directions(supersampling, window)
         world = np.einsum("ij,jhw->ihw", self.world_from_camera[:3, :3], local)
         return Rays(self.world_from_camera[:3, 3].astype(np.float32), np.ascontiguousarray(world, np.float32))
 
-    def axis_cosines(self) -> Float64[np.ndarray, "h w"]:
+    def axis_cosines(self, window: Window = EVERYWHERE) -> Float64[np.ndarray, "h w"]:
         """Returns the depth along the optical axis per meter along the ray through each pixel's center."""
-        return self._directions(1)[2]
+        return self._directions(1, window)[2]
 
-    def _directions(self, supersampling: int) -> Float64[np.ndarray, "3 a b"]:
-        x = (np.arange(self.width * supersampling) + 0.5) / supersampling - self.intrinsics[0, 2]
-        y = (np.arange(self.height * supersampling) + 0.5) / supersampling - self.intrinsics[1, 2]
-        x, y = x / self.intrinsics[0, 0], y / self.intrinsics[1, 1]
-        if self.distortion:
-            x, y = _undistorted(tuple(x.tolist()), tuple(y.tolist()), self.distortion)
-        else:
-            y, x = np.meshgrid(y, x, indexing="ij")
-        directions = np.stack((x, y, np.ones_like(x)))
-        return directions / np.linalg.norm(directions, axis=0)
+    def _directions(self, supersampling: int, window: Window) -> Float64[np.ndarray, "3 a b"]:
+        k = self.intrinsics
+        focal_and_center = (float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+        rows, columns = (range(size)[part] for size, part in zip((self.height, self.width), window, strict=True))
+        within = tuple(slice(part.start * supersampling, part.stop * supersampling) for part in (rows, columns))
+        return _directions(self.width, self.height, focal_and_center, self.distortion, supersampling)[:, *within]
 
 
 def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) -> StreetCamera:
@@ -62,13 +63,21 @@ def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) ->
 
 
 @lru_cache(maxsize=4)
-def _undistorted(
-    columns: tuple[float, ...], rows: tuple[float, ...], distortion: tuple[float, ...]
-) -> Float64[np.ndarray, "2 a b"]:
-    """Returns x and y at which a pinhole images what the lens images in these columns and rows, all normalized.
+def _directions(
+    width: int, height: int, focal_and_center: tuple[float, ...], distortion: tuple[float, ...], supersampling: int
+) -> Float64[np.ndarray, "3 a b"]:
+    """Returns unit vectors in the camera frame.
 
     The result is cached because all frames of a rig share it: Newton's method takes as long as tracing the rays.
     """
-    y, x = np.meshgrid(rows, columns, indexing="ij")
-    imaged = torch.from_numpy(np.stack((x, y), -1))
-    return undistort(imaged, torch.tensor(distortion, dtype=torch.float64)).movedim(-1, 0).numpy()
+    fx, fy, cx, cy = focal_and_center
+    x = ((np.arange(width * supersampling) + 0.5) / supersampling - cx) / fx
+    y = ((np.arange(height * supersampling) + 0.5) / supersampling - cy) / fy
+    y, x = np.meshgrid(y, x, indexing="ij")
+    if distortion:
+        imaged = torch.from_numpy(np.stack((x, y), -1))
+        x, y = undistort(imaged, torch.tensor(distortion, dtype=torch.float64)).movedim(-1, 0).numpy()
+    directions = np.stack((x, y, np.ones_like(x)))
+    directions /= np.linalg.norm(directions, axis=0)
+    directions.flags.writeable = False
+    return directions

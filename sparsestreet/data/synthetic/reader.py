@@ -9,6 +9,7 @@ from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
+from sparsestreet.data.synthetic.declared import with_declared
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import make_street, street_name
 from sparsestreet.data.synthetic.truth import street_truth
@@ -48,7 +49,7 @@ class StreetReader(LogReader):
         return self._made().check()
 
     def read(self) -> DrivingLog:
-        log = self._made().read()
+        log = with_declared(self._made().read(), self.settings, self.folder)
         return replace(log, truth=street_truth(self.settings, log.dataset_from_world))
 
     def data_hash(self) -> str:

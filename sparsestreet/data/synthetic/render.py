@@ -1,18 +1,21 @@
-"""Renders one instant of the street: pictures, exact truth per pixel, and the lidar's turn."""
+"""Renders one frame of the street: pictures, exact truth per pixel, and the lidar's turn."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int16, UInt8
 
 from sparsestreet.data.synthetic.cameras import StreetCamera, street_camera
+from sparsestreet.data.synthetic.capture import captured
+from sparsestreet.data.synthetic.exposure import recorded_gains
+from sparsestreet.data.synthetic.hood import behind_hood, hood_coverage
+from sparsestreet.data.synthetic.instant import Instant, Sight
 from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
-from sparsestreet.data.synthetic.parts import BACKGROUND, Pose
-from sparsestreet.data.synthetic.scene import Scene, SunView
+from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.settings import StreetSettings
-from sparsestreet.data.synthetic.shading import radiance, to_srgb
-from sparsestreet.data.synthetic.sky import Weather
-from sparsestreet.data.synthetic.tracer import NOTHING, first_hits
+from sparsestreet.data.synthetic.shading import to_srgb
 from sparsestreet.data.synthetic.world import World
 
 
@@ -39,71 +42,44 @@ class StreetFrame:
     """World from object of every actor of the world."""
 
 
-@dataclass(frozen=True)
-class Instant:
-    """The street at a time, with its light."""
-
-    scene: Scene
-    sunlit: SunView
-    weather: Weather
-    actors: tuple[tuple[Pose, tuple[float, float, float]], ...]
-    """World from object and the size of the box, meters, of every actor of the world."""
-
-    @staticmethod
-    def at(world: World, time: float) -> "Instant":
-        """Returns the street at ``time``, seconds."""
-        scene = Scene.of(world.parts_at(time))
-        actors = tuple((actor.pose(time), actor.model.size) for actor in world.actors)
-        return Instant(scene, SunView.of(scene, world.weather.sun), world.weather, actors)
-
-    def inside_an_actor(self, camera: StreetCamera, margin: float = 0.3) -> bool:
-        """Whether the camera lies in, or within ``margin`` meters of, the box of an annotated object."""
-        for pose, size in self.actors:
-            local = np.linalg.inv(pose) @ camera.world_from_camera[:, 3]
-            if (np.abs(local[:3]) < np.array(size) / 2 + margin).all():
-                return True
-        return False
-
-    def actors_within(self, meters: float, camera: StreetCamera) -> list[int]:
-        """Returns positions in World.actors of actors at most ``meters`` from the camera, seen from above."""
-        here = camera.world_from_camera[:2, 3]
-        return [at for at, (pose, _) in enumerate(self.actors) if np.linalg.norm(pose[:2, 3] - here) <= meters]
-
-
 def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFrame:
     """Renders all images, each at its own instant, and the lidar and boxes of frame ``index``."""
     time = index / settings.frame_rate
-    instant = Instant.at(world, time)
-    ego = world.ego.pose(time)
+    # Cameras that fire together share the instants of their strips.
+    instant_at = lru_cache(maxsize=64)(lambda seconds: Instant.at(world, seconds))
+    instant, ego = instant_at(time), world.ego.pose(time)
+    images = (_recorded(settings, world, instant_at, index, camera) for camera in range(settings.num_cameras))
     return StreetFrame(
         index=index,
         world_from_ego=ego,
-        images=tuple(_render_camera(settings, world, instant, index, camera) for camera in range(settings.num_cameras)),
+        images=tuple(images),
         sweep=sweep(settings, instant.scene, ego, index),
         actor_poses=tuple(pose for pose, _ in instant.actors),
     )
 
 
-def _render_camera(settings: StreetSettings, world: World, instant: Instant, frame: int, camera: int) -> StreetImage:
-    """Renders what a camera records of a frame, at its own instant; ``instant`` is the frame's."""
+def _recorded(
+    settings: StreetSettings, world: World, instant_at: Callable[[float], Instant], frame: int, camera: int
+) -> StreetImage:
+    """Returns what a camera records of a frame, at its own instant."""
     time = settings.image_time(frame, camera)
-    if time != frame / settings.frame_rate:
-        instant = Instant.at(world, time)
-    return render_image(settings, instant, street_camera(settings, camera, world.ego.pose(time)))
+
+    def camera_at(seconds: float) -> StreetCamera:
+        return street_camera(settings, camera, world.ego.pose(time + seconds))
+
+    mounted = camera_at(0.0)
+    sight = captured(settings, lambda seconds: instant_at(time + seconds), camera_at)
+    coverage = hood_coverage(settings, camera)
+    if coverage is not None:
+        sight = behind_hood(sight, coverage, mounted, world.weather)
+    return developed(mounted, sight, recorded_gains(settings, frame, camera))
 
 
 def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:
     """Renders what a camera sees at an instant; of the settings it uses only the number of rays per pixel."""
-    samples = settings.supersampling
-    scene = instant.scene
-    center_rays = camera.rays(1)
-    center_hits = first_hits(scene, center_rays)
-    rays = center_rays if samples == 1 else camera.rays(samples)
-    hits = center_hits if samples == 1 else first_hits(scene, rays)
-    pixel = 1 / float(camera.intrinsics[0, 0]) / samples
-    linear = radiance(scene, instant.sunlit, instant.weather, rays, hits, pixel)
-    linear = linear.reshape(3, camera.height, samples, camera.width, samples).mean((2, 4))
-    sky = center_hits.parts == NOTHING
-    depth = np.where(sky, 0, center_hits.distances * camera.axis_cosines()).astype(np.float32)
-    objects = np.where(sky, BACKGROUND, scene.object_indices[center_hits.parts]).astype(np.int16)
-    return StreetImage(camera, to_srgb(linear), depth, objects, sky)
+    return developed(camera, instant.seen_by(camera, settings.supersampling))
+
+
+def developed(camera: StreetCamera, sight: Sight, gains: Float32[np.ndarray, "3"] | None = None) -> StreetImage:
+    """Returns the picture of what a camera saw."""
+    return StreetImage(camera, to_srgb(sight.linear, gains), sight.depth, sight.object_indices, sight.sky)

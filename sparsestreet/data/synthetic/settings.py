@@ -3,11 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
 from sparsestreet.geometry.distortion import fold_radius_squared, undistort
+from sparsestreet.types import Side
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
 """Front, front left, front right. With 60 degrees of view each, neighbors overlap by 10."""
@@ -40,6 +42,25 @@ class StreetSettings:
     delays_known: bool = True
     """False: the street's files say of every image that it was taken at the pose and the stamp of its frame. It is the
     control of readers that heed the instants of cameras."""
+    exposure_walk: float = 0.0
+    """Standard deviation over the drive of each camera's exposure, EV, which walks smoothly around 0. One EV doubles
+    what an image stores."""
+    white_balance: float = 0.0
+    """Relative standard deviation, over cameras and channels, of the constant gains of each camera's channels. They
+    change no camera's brightness, and cancel over the cameras."""
+    readout: float = 0.0
+    """Seconds from the first row or column of an image to the last: a rolling shutter. An image's stamp and pose are
+    those of the middle. 0: all pixels at once."""
+    readout_direction: Side = "top"
+    """The side of every image that is read first."""
+    readout_known: bool = True
+    """False: the street's files are silent on the readout."""
+    hood: float = 0.0
+    """Share of an image that the hood of the recording car covers, at its bottom: dark, with the sky mirrored in it."""
+    hood_cameras: Literal["front", "all"] = "front"
+    """Whose images it covers."""
+    hood_known: bool = False
+    """True: the street's files have masks of it."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -53,6 +74,12 @@ class StreetSettings:
     num_cyclists: int = 2
     body_pose_noise: float = 3.0
     """Error of a pedestrian's body pose in each frame: root mean square over the joints, degrees."""
+    pose_noise: Sequence[float | int] = ()
+    """Meters and degrees, root mean square: each image's pose in the files is off by a random rigid motion of its own.
+    Empty: poses are exact."""
+    box_noise: Sequence[float | int] = ()
+    """Meters, and degrees of heading, root mean square: each box of a frame is off by a random motion of its own.
+    Empty: boxes are exact."""
     lidar: LidarSensor = WAYMO_TOP
     annotation_range: float = 60.0
     """Objects farther from the ego car than this are not annotated, meters."""
@@ -66,12 +93,27 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
+            "exposure_walk", "white_balance", "readout", "hood",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
         if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
+        if self.readout * self.frame_rate >= 1:
+            frame = f"a frame of {1 / self.frame_rate:g} s"
+            raise ValueError(f"StreetSettings.readout must be shorter than {frame} but is {self.readout}")
+        if self.readout_direction not in get_args(Side):
+            sides = ", ".join(get_args(Side))
+            raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
+        if self.hood > 0.5:
+            raise ValueError(f"StreetSettings.hood must be a share of the image up to 0.5 but is {self.hood}")
+        if self.hood_cameras not in ("front", "all"):
+            raise ValueError(f"StreetSettings.hood_cameras must be front or all but is {self.hood_cameras}")
+        if self.white_balance and self.num_cameras == 1:
+            raise ValueError(
+                "StreetSettings.white_balance needs two cameras: the constant gains of one are colors of the street"
+            )
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
         # Equal values compare equal, whatever type of sequence or number they were given as.
@@ -83,6 +125,11 @@ class StreetSettings:
                 f"StreetSettings.delays must be empty or one for each of {self.num_cameras} cameras, shorter than a "
                 f"frame of {1 / self.frame_rate:g} s, but is {list(self.delays)}"
             )
+        for name in ("pose_noise", "box_noise"):
+            object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+            noise = getattr(self, name)
+            if noise and not (len(noise) == 2 and all(0 <= value < math.inf for value in noise)):
+                raise ValueError(f"StreetSettings.{name} must be empty or [meters, degrees] but is {list(noise)}")
         object.__setattr__(self, "lens", tuple(float(value) for value in self.lens))
         if self.lens and not (len(self.lens) == 5 and self._sees_every_pixel()):
             raise ValueError(

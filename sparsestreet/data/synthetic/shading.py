@@ -60,7 +60,7 @@ def _shade(
     lit = sunlit(scene, view, points, normals, index)
     slope = (normals * view.sun[:, None]).sum(0) * lit
     light = weather.ambient(normals) + column(SUNLIGHT) * slope
-    return appearance.albedo * light + _mirrored(weather, directions, normals, appearance.gloss, lit)
+    return appearance.albedo * light + mirrored(weather, directions, normals, appearance.gloss, lit)
 
 
 def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vectors:
@@ -75,7 +75,7 @@ def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vecto
     return radius * np.sqrt(np.maximum(1 - 2 * normals * ratio + ratio * ratio, 0))
 
 
-def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
+def mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
     """Returns sky and sun mirrored in glossy surfaces (Schlick's Fresnel term); below roofs, the street's far side."""
     colors = np.zeros_like(directions)
     shiny = np.flatnonzero(gloss > 0.01)
@@ -93,10 +93,17 @@ def _mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Sc
     return colors
 
 
-def to_srgb(linear: Float32[np.ndarray, "3 h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping."""
+def to_srgb(
+    linear: Float32[np.ndarray, "3 h w"], gains: Float32[np.ndarray, "3"] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping.
+
+    ``gains`` multiply the stored values of red, green and blue, before these are rounded and cut off at white.
+    """
     exposed = np.maximum(linear * np.float32(_EXPOSURE), 0)
     exposed = exposed * (1 + exposed / 4) / (1 + exposed)
     exposed = np.clip(exposed * np.float32(1.45), 0, 1)
     encoded = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
+    if gains is not None:
+        encoded = np.minimum(encoded * gains[:, None, None], 1)
     return np.ascontiguousarray(np.round(encoded * 255).astype(np.uint8).transpose(1, 2, 0))

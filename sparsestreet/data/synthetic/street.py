@@ -19,6 +19,13 @@ from sparsestreet.data.synthetic.write import StreetWriter
 GENERATOR = 3
 """Version of the generator; raised whenever equal settings would give another street."""
 _WORKERS = 2
+_LATER = frozenset(
+    {
+        "delays", "delays_known", "exposure_walk", "white_balance", "pose_noise", "box_noise", "readout",
+        "readout_direction", "readout_known", "hood", "hood_cameras", "hood_known",
+    }
+)  # fmt: skip
+"""Settings that came after ``GENERATOR``; at their defaults a street is as it was without them."""
 
 
 def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, int], None] | None = None) -> Path:
@@ -75,11 +82,9 @@ def _holds_street(root: Path, settings: StreetSettings) -> bool:
 
 def _label(settings: StreetSettings) -> dict:
     """Returns the content of street.json, converted by JSON so that tuples compare as the lists they become."""
-    said = dataclasses.asdict(settings)
-    # Streets of cameras that fire together keep the name that they had before cameras could do otherwise.
-    for name, usual in (("delays", ()), ("delays_known", True)):
-        if said[name] == usual:
-            del said[name]
+    # Streets without an effect keep the name that they had before streets could have it.
+    usual = {field.name: field.default for field in dataclasses.fields(settings) if field.name in _LATER}
+    said = {name: value for name, value in dataclasses.asdict(settings).items() if value != usual.get(name, ...)}
     return json.loads(json.dumps({"generator": GENERATOR, "settings": said}))
 
 

@@ -10,6 +10,9 @@ from PIL import Image
 
 from sparsestreet.data.synthetic.bodies import BodyWriter
 from sparsestreet.data.synthetic.cameras import street_camera
+from sparsestreet.data.synthetic.declared import write_declared
+from sparsestreet.data.synthetic.errors import noisy_box, noisy_camera
+from sparsestreet.data.synthetic.hood import hood_coverage
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.render import StreetFrame, StreetImage
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -44,7 +47,7 @@ class StreetWriter:
             frame = replace(frame, images=tuple(self._claimed(frame, number) for number in range(len(frame.images))))
         annotated = self._annotate(frame)
         for camera, image in enumerate(frame.images):
-            self._write_image(image, f"{frame.index:03d}_{camera}", annotated)
+            self._write_image(image, frame.index, camera, annotated)
             if frame.index == 0:
                 self._write_intrinsics(image, camera)
         frame.sweep.points.tofile(self._file("lidar", f"{frame.index:03d}.bin"))
@@ -54,6 +57,8 @@ class StreetWriter:
         """Writes the files about the whole drive."""
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
+        write_declared(self.settings, self.world, self.root)
+        self._write_hood()
         self._bodies.write(self.root / "humanpose" / "smpl.pkl")
         frames = range(self.settings.num_frames)
         times = np.arange(self.settings.num_frames) / self.settings.frame_rate
@@ -62,6 +67,12 @@ class StreetWriter:
             for camera in range(self.settings.num_cameras):
                 own = [self.settings.image_time(frame, camera) for frame in frames]
                 np.savetxt(self.root / f"timestamps_{camera}.txt", own, fmt="%.9f")
+
+    def _write_hood(self) -> None:
+        for camera in range(self.settings.num_cameras if self.settings.hood_known else 0):
+            coverage = hood_coverage(self.settings, camera)
+            if coverage is not None:
+                _write_mask(self._file("ego_masks", f"{camera}.png"), coverage > 0)
 
     def _claimed(self, frame: StreetFrame, camera: int) -> StreetImage:
         """The image with the pose that its camera has at the frame's instant."""
@@ -97,14 +108,16 @@ class StreetWriter:
         blank = {"id": actor.name, "class_name": actor.model.class_name, "frame_annotations": empty}
         notes = self._instances.setdefault(key, blank)["frame_annotations"]
         notes["frame_idx"].append(frame)
-        notes["obj_to_world"].append(pose.tolist())
+        notes["obj_to_world"].append(noisy_box(self.settings, pose, actor.name, frame).tolist())
         notes["box_size"].append(list(actor.model.size))
 
-    def _write_image(self, image: StreetImage, name: str, annotated: list[int]) -> None:
+    def _write_image(self, image: StreetImage, frame: int, camera: int, annotated: list[int]) -> None:
+        name = f"{frame:03d}_{camera}"
         picture = Image.fromarray(image.rgb)
         # 4:4:4, because halved color would smear edges, for which a 320-pixel image has few pixels.
         picture.save(self._file("images", f"{name}.jpg"), quality=97, subsampling=0)
-        np.savetxt(self._file("extrinsics", f"{name}.txt"), image.camera.world_from_camera)
+        said = noisy_camera(self.settings, image.camera.world_from_camera, frame, camera)
+        np.savetxt(self._file("extrinsics", f"{name}.txt"), said)
         _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)
         classes = {index: self.world.actors[index].model.class_name for index in annotated}
         for folder, members in (
