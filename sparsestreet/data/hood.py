@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames, spread
+from sparsestreet.data.lazy import Frames, Sweeps, spread
+from sparsestreet.geometry.cameras import project
 from sparsestreet.types import Frame
 
 MOST_FRAMES = 40
@@ -24,6 +25,12 @@ _EDGE = 8.0
 """Gray levels across the hood's upper edge, in the median image."""
 _SAME = 0.7
 """Share of the edges of single images that the median image keeps; a moving edge is blurred."""
+_PAIRS = 20
+"""Images of a camera that are compared with the next one."""
+_FEWEST_RETURNS = 100
+_HOOD_CHANGES = 0.7
+"""Change of the gray level at a return's old place, over that at its new one: above this it is street. Smooth road has
+about 1, a hood less than 0.3."""
 
 
 @dataclass(frozen=True)
@@ -40,16 +47,52 @@ class Hood:
         return float(self.mask.float().mean())
 
 
-def find_hoods(frames: Frames) -> dict[int, Hood]:
-    """Camera index -> what it sees of its car, of the cameras that moved; an empty mask where it sees nothing of it."""
+def find_hoods(frames: Frames, sweeps: Sweeps) -> dict[int, Hood]:
+    """Camera index -> what it sees of its car, of the cameras that moved; an empty mask where it sees nothing of it.
+
+    Smooth road below a straight curb stays the same too. So what stays the same is no hood where the lidar's returns in
+    it look like the street that moves by.
+    """
     found = {}
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.indices[1] == camera)
         if _driven(own) >= LEAST_DRIVE:
             gray = torch.stack([own[place].image.float().mean(-1) for place in spread(len(own), MOST_FRAMES)])
+            mask = _below_a_still_edge(gray)
+            if mask.any() and _is_street(mask, own, sweeps):
+                found[camera] = Hood(torch.zeros_like(mask), 0.0)
+                continue
             shares = [float(_below_a_still_edge(part).float().mean()) for part in (gray[::2], gray[1::2])]
-            found[camera] = Hood(_below_a_still_edge(gray), abs(shares[0] - shares[1]) / 2)
+            found[camera] = Hood(mask, abs(shares[0] - shares[1]) / 2)
     return found
+
+
+def _is_street(mask: Bool[Tensor, "h w"], frames: Frames, sweeps: Sweeps) -> bool:
+    """Whether returns within the mask keep their gray level on their way through the images.
+
+    They are followed to the next image. There the street has the level at the return's new place, a hood at the old.
+    Where the lidar does not reach, nothing speaks against a hood.
+    """
+    places = {index: place for place, index in enumerate(sweeps.indices)}
+    moved, stayed = [], []
+    for place in spread(len(frames) - 1, _PAIRS):
+        first, second = frames[place], frames[place + 1]
+        if first.indices[0] not in places:
+            continue
+        points = sweeps[places[first.indices[0]]].points
+        here, _, seen = project(first.camera, points)
+        there, _, still_seen = project(second.camera, points)
+        both = seen & still_seen
+        old, new = (pixels[both].long().clamp(min=0).unbind(1) for pixels in (here, there))
+        within = mask[old[1], old[0]]
+        old, new = (tuple(axis[within] for axis in pixels) for pixels in (old, new))
+        before, after = (frame.image.float().mean(-1) for frame in (first, second))
+        level = before[old[1], old[0]]
+        moved.append((after[new[1], new[0]] - level).abs())
+        stayed.append((after[old[1], old[0]] - level).abs())
+    if sum(map(len, moved)) < _FEWEST_RETURNS:
+        return False
+    return float(torch.cat(stayed).mean()) > _HOOD_CHANGES * float(torch.cat(moved).mean())
 
 
 def with_hoods(frames: Frames, hoods: dict[int, Hood]) -> Frames:
@@ -74,21 +117,24 @@ def _driven(frames: Frames) -> float:
 
 
 def _below_a_still_edge(gray: Float[Tensor, "f h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels that stay the same down to the lower border, below an edge that stays as well, where it is wide enough."""
+    """Pixels that stay the same down to the lower border, below an edge that stays as well, where it is wide enough.
+
+    Of several such edges in a column (smooth road above the hood stays the same too) the steepest counts.
+    """
     middle = gray.median(0).values
     still = (gray - middle).abs().median(0).values < _STILL
     rows = still.flip(0).cumprod(0).flip(0).bool()  # still, and all pixels below
-    edge = torch.zeros_like(rows)
-    slope = (middle[2:] - middle[:-2]).abs()
-    edge[1:-1] = (slope > _EDGE) & (slope > _SAME * (gray[:, 2:] - gray[:, :-2]).abs().median(0).values)
+    rows[:-1] |= rows[1:].clone()  # an edge lies between two rows, of which the upper one changes
+    slope = (middle[1:] - middle[:-1]).abs()
+    stays = (slope > _EDGE) & (slope > _SAME * (gray[:, 1:] - gray[:, :-1]).abs().median(0).values)
+    slope = torch.where(stays & rows[:-1], slope, 0.0)
+    steepest, tops = slope.max(0)
     height, width = rows.shape
-    tops, columns = height - rows.sum(0), torch.arange(width)
-    near = torch.stack([edge[(tops + offset).clamp(0, height - 1), columns] for offset in (-1, 0, 1, 2)])
-    ends = near.any(0) & (tops < height - 1) & (tops > 1)
+    ends, columns = steepest > 0, torch.arange(width)
     if float(ends.float().mean()) < LEAST_WIDTH:
         return torch.zeros_like(rows)
     # A column whose reflection or road hides the edge is like its neighbors; the row of the edge itself is half street.
     found = columns[ends].numpy()
-    line = median_filter(np.interp(columns.numpy(), found, tops[ends].numpy()), max(width // 20, 9), mode="nearest")
+    line = median_filter(np.interp(columns.numpy(), found, tops[ends].numpy()), max(width // 8, 9), mode="nearest")
     inside = (columns >= int(found[0])) & (columns <= int(found[-1]))
-    return (torch.arange(height)[:, None] >= torch.from_numpy(line).floor() - 1) & inside
+    return (torch.arange(height)[:, None] >= torch.from_numpy(line).floor()) & inside

@@ -8,13 +8,14 @@ import torch
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.hood import find_hoods, with_hoods
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.types import Camera, Frame
 from tests.data.streets import make_log
 
 HEIGHT, WIDTH, COUNT = 24, 40, 12
 HOOD = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
 HOOD[-5:, 4:] = True
+NO_LIDAR = Sweeps.of(())
 FOUND = HOOD.clone()
 FOUND[-6, 4:] = True  # the row in which a pixel may show both
 
@@ -35,11 +36,11 @@ def frames(hood: torch.Tensor | None, step: float = 3.0, noise: int = 2, camera:
 
 
 def shares(found: Frames) -> dict[int, float]:
-    return {camera: hood.share for camera, hood in find_hoods(found).items()}
+    return {camera: hood.share for camera, hood in find_hoods(found, NO_LIDAR).items()}
 
 
 def test_every_pixel_of_a_hood_and_no_other():
-    hood = find_hoods(frames(HOOD))[0]
+    hood = find_hoods(frames(HOOD), NO_LIDAR)[0]
     assert torch.equal(hood.mask, FOUND)
     assert hood.share == pytest.approx(6 * 36 / (HEIGHT * WIDTH))
     assert hood.error < 0.002  # six images each, of which noise alone hides the edge of a column or two
@@ -54,7 +55,7 @@ def test_columns_without_an_edge_lie_between_others():
     """A reflection of the street in three columns."""
     hood = HOOD.clone()
     hood[-5:-2, 20:23] = False
-    assert torch.equal(find_hoods(frames(hood))[0].mask[:, 20:23], FOUND[:, 20:23])
+    assert torch.equal(find_hoods(frames(hood), NO_LIDAR)[0].mask[:, 20:23], FOUND[:, 20:23])
 
 
 def test_a_camera_that_stands_says_nothing():
@@ -78,7 +79,7 @@ def test_frames_get_it_beside_their_own_masks():
     first, second = frames(HOOD), frames(None, camera=1)
     masked = Frames.of([Frame.of(frame, image=frame.image, ego=own) for frame in first])
     every: Sequence[Frame] = (*masked, *second)
-    hoods = find_hoods(Frames.of(every))
+    hoods = find_hoods(Frames.of(every), NO_LIDAR)
     seen = with_hoods(Frames.of(every), hoods)
     assert torch.equal(seen[0].ego, own | FOUND)
     assert seen[COUNT].ego is None  # the other camera shows none
@@ -88,7 +89,7 @@ def test_training_and_held_out_frames_lose_its_pixels():
     log = make_log(COUNT)
     moving = Frames.of([Frame.of(frame, image=frame.image) for frame in frames(HOOD)])
     log = replace(log, frames=moving, num_frames=COUNT, num_cameras=1)
-    data = StreetData(log, stride=4, offset=2, hood=0.002)
+    data = StreetData(log, stride=4, offset=2, hood=0.02)
     for part in (data.split.train, data.split.held_out, data.driving_log.frames):
         assert torch.equal(part[0].ego, FOUND)
     assert data.driving_log.hoods[0].share > 0.1

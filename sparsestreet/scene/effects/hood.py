@@ -20,7 +20,7 @@ class HoodSettings(EffectSettings):
     leave out; the scene has no part of it.
     """
 
-    min_share: float = 0.002
+    min_share: float = 0.02
     """Of an image's pixels."""
 
     def detect(self, data: TrainingData) -> Finding:
