@@ -55,6 +55,10 @@ class StreetSettings:
     """The side of every image that is read first."""
     readout_known: bool = True
     """False: the street's files are silent on the readout."""
+    shutter_time: float = 0.0
+    """Seconds of exposure: light is averaged over them, so what moves is blurred. 0: images are sharp."""
+    shutter_time_known: bool = True
+    """False: the street's files are silent on it."""
     hood: float = 0.0
     """Share of an image that the hood of the recording car covers, at its bottom: dark, with the sky mirrored in it."""
     hood_cameras: Literal["front", "all"] = "front"
@@ -93,16 +97,17 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
-            "exposure_walk", "white_balance", "readout", "hood",
+            "exposure_walk", "white_balance", "readout", "shutter_time", "hood",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
         if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
-        if self.readout * self.frame_rate >= 1:
-            frame = f"a frame of {1 / self.frame_rate:g} s"
-            raise ValueError(f"StreetSettings.readout must be shorter than {frame} but is {self.readout}")
+        for name in ("readout", "shutter_time"):
+            if getattr(self, name) * self.frame_rate >= 1:
+                frame = f"a frame of {1 / self.frame_rate:g} s"
+                raise ValueError(f"StreetSettings.{name} must be shorter than {frame} but is {getattr(self, name)}")
         if self.readout_direction not in get_args(Side):
             sides = ", ".join(get_args(Side))
             raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
