@@ -76,6 +76,8 @@ class StreetSettings:
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
     num_pedestrians: int = 6
     num_cyclists: int = 2
+    tunnel: bool = False
+    """Whether the street runs through a tunnel, with lamps, tiles and doors instead of houses: no sky is seen."""
     body_pose_noise: float = 3.0
     """Error of a pedestrian's body pose in each frame: root mean square over the joints, degrees."""
     pose_noise: Sequence[float | int] = ()
