@@ -65,6 +65,8 @@ class StreetSettings:
     """Whose images it covers."""
     hood_known: bool = False
     """True: the street's files have masks of it."""
+    jpeg: int = 97
+    """Quality of the images' files, 1 to 100, without halved colors."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -113,6 +115,8 @@ class StreetSettings:
         if self.readout_direction not in get_args(Side):
             sides = ", ".join(get_args(Side))
             raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
+        if not 1 <= self.jpeg <= 100:
+            raise ValueError(f"StreetSettings.jpeg must be a quality from 1 to 100 but is {self.jpeg}")
         if self.hood > 0.5:
             raise ValueError(f"StreetSettings.hood must be a share of the image up to 0.5 but is {self.hood}")
         if self.hood_cameras not in ("front", "all"):
