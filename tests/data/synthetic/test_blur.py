@@ -32,7 +32,7 @@ def test_an_image_is_the_mean_light_of_its_exposure():
     with unchecked():
         blurred, sharp = (render_frame(one, world, 1).images[1] for one in (BLURRED, SHARP))
         light = [Instant.at(world, t).light(street_camera(SHARP, 1, world.ego.pose(t)), 1) for t in times]
-    expected = to_srgb(np.mean(light, 0, np.float64).astype(np.float32)).astype(float)
+    expected = to_srgb(np.stack(light).mean(0, np.float64).astype(np.float32)).astype(float)
     stored = np.mean([to_srgb(one) for one in light], 0)
     assert np.abs(blurred.rgb - expected).mean() < 0.5 * np.abs(sharp.rgb - expected).mean()
     assert np.abs(blurred.rgb - expected).mean() < np.abs(blurred.rgb - stored).mean()
@@ -52,7 +52,7 @@ def test_a_row_that_is_read_late_is_exposed_late():
         image, sharp = (render_frame(one, world, 1).images[0] for one in (both, rolling))
         moments = time + 0.04 * ((np.arange(12) + 0.5) / 12 - 0.5)
         light = [Instant.at(world, t).light(street_camera(low, 0, world.ego.pose(t)), 1) for t in moments]
-    row = to_srgb(np.mean(light, 0, np.float64).astype(np.float32))[8].astype(float)
+    row = to_srgb(np.stack(light).mean(0, np.float64).astype(np.float32))[8].astype(float)
     assert np.abs(image.rgb[8] - row).mean() < 0.6 * np.abs(sharp.rgb[8] - row).mean()
     np.testing.assert_array_equal(image.depth, sharp.depth)
 

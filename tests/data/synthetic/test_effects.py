@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.JpegImagePlugin import JpegImageFile
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
@@ -85,6 +86,7 @@ def test_images_have_the_quality_that_is_asked_for(tmp_path, quality, step):
     with unchecked():
         StreetReader(settings, tmp_path / "one").read()
     with Image.open(tmp_path / "one/images/000_0.jpg") as image:
+        assert isinstance(image, JpegImageFile)
         assert image.quantization[0][0] == step
         assert [layer[1:3] for layer in image.layer] == [(1, 1)] * 3  # no halved color
 

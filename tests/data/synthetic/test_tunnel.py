@@ -43,7 +43,7 @@ def test_the_sun_shines_nowhere(world):
     instant = Instant.at(world, 0.0)
     rng = np.random.default_rng(0)
     points = rng.uniform((-35, -9, 0), (120, 14, 0), (500, 3)).T.astype(np.float32)
-    up = np.repeat(np.float32([[0], [0], [1]]), 500, axis=1)
+    up = np.repeat(np.array([[0], [0], [1]], np.float32), 500, axis=1)
     with unchecked():
         assert not sunlit(instant.scene, instant.sunlit, points, up, 0).any()
         open_street = Instant.at(build_world(replace(SETTINGS, tunnel=False)), 0.0)
