@@ -78,6 +78,8 @@ class StreetSettings:
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
     num_pedestrians: int = 6
     num_cyclists: int = 2
+    limp: float = 0.0
+    """Share by which a pedestrian's right leg and arm swing less than the left ones; 1: not at all."""
     tunnel: bool = False
     """Whether the street runs through a tunnel, with lamps, tiles and doors instead of houses: no sky is seen."""
     body_pose_noise: float = 3.0
@@ -115,6 +117,8 @@ class StreetSettings:
         if self.readout_direction not in get_args(Side):
             sides = ", ".join(get_args(Side))
             raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
+        if not 0 <= self.limp <= 1:
+            raise ValueError(f"StreetSettings.limp must be a share from 0 to 1 but is {self.limp}")
         if not 1 <= self.jpeg <= 100:
             raise ValueError(f"StreetSettings.jpeg must be a quality from 1 to 100 but is {self.jpeg}")
         if self.hood > 0.5:

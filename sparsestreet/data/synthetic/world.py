@@ -202,7 +202,9 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
         speed = float(rng.uniform(0.9, 1.6)) * (1 if rng.random() < 0.5 else -1)
         share = (number + float(rng.uniform(0.2, 0.8))) / settings.num_pedestrians
         path = Path(start=6 + share * (end + 18.0), y=y, speed=speed)
-        actors.append(Actor(f"pedestrian_{number:02d}", random_pedestrian(rng), path, layout.CURB_HEIGHT))
+        actors.append(
+            Actor(f"pedestrian_{number:02d}", random_pedestrian(rng, settings.limp), path, layout.CURB_HEIGHT)
+        )
     return actors
 
 
