@@ -110,6 +110,8 @@ class Camera:
     """Brown-Conrady k1, k2, p1, p2, k3, in OpenCV's order; None: a pinhole, which costs nothing."""
     shutter: Shutter | None = None
     """None: all pixels are exposed at once, which costs nothing."""
+    exposure: float = 0.0
+    """Seconds that light falls on a pixel; 0: not known."""
 
     @property
     def position(self) -> Float[Tensor, "3"]:

@@ -283,7 +283,8 @@ def _checked(boxes: Boxes) -> Track:
 
 
 def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
-    camera = replace(rig[shot.camera].at(recentered(shot.world_from_camera, origin)), shutter=shot.shutter)
+    camera = rig[shot.camera].at(recentered(shot.world_from_camera, origin))
+    camera = replace(camera, shutter=shot.shutter, exposure=shot.exposure or 0.0)
     return clock.view(camera, shot.frame, shot.camera, shot.stamp)
 
 

@@ -59,6 +59,7 @@ class _Entry:
     """None with a shutter: "top", the only direction of files without this key."""
     shutter_seconds: float = field(default=0.0, metadata=EXACT)
     shutter_span: float = field(default=0.0, metadata=EXACT)
+    exposure: float = field(default=0.0, metadata=EXACT)
     seconds: float | None = field(default=None, metadata=EXACT)
     stamp: int | None = None
 
@@ -130,6 +131,7 @@ def _entry(split: str, view: View) -> _Entry:
         shutter_direction=None if camera.shutter is None else camera.shutter.direction,
         shutter_seconds=0.0 if camera.shutter is None else camera.shutter.seconds,
         shutter_span=0.0 if camera.shutter is None else camera.shutter.span,
+        exposure=camera.exposure,
         seconds=view.seconds,
         stamp=view.stamp,
     )
@@ -152,6 +154,7 @@ def _view(entry: _Entry, where: str) -> View:
         entry.height,
         None if entry.distortion is None else _tensor(entry.distortion, (5,), where, "distortion"),
         shutter,
+        entry.exposure,
     )
     return View(camera, entry.time, entry.frame_index, entry.camera_index, entry.seconds, entry.stamp)
 

@@ -20,9 +20,8 @@ def odd_view(frame: int = 3) -> View:
         return torch.randn(*shape, generator=generator) * torch.logspace(-6, 6, shape[-1])
 
     direction = ("top", "bottom", "left", "right")[frame]
-    camera = Camera(
-        numbers(4, 4), numbers(3, 3), 97, 61, numbers(5), Shutter(numbers(3), numbers(3), direction, 0.044, 0.1 / 7)
-    )
+    shutter = Shutter(numbers(3), numbers(3), direction, 0.044, 0.1 / 7)
+    camera = Camera(numbers(4, 4), numbers(3, 3), 97, 61, numbers(5), shutter, exposure=0.1 / 7)
     return View(camera, frame / 7, frame, 2, frame / 9.7, 1_532_402_927_600_000_251 + 99_999_997 * frame)
 
 
@@ -47,6 +46,7 @@ def test_views_come_back_bit_for_bit(tmp_path):
     assert views.held_out[0].camera.shutter is None
     for written, read in zip(odd, views.training, strict=True):
         assert torch.equal(there(written.camera.distortion), there(read.camera.distortion))
+        assert written.camera.exposure == read.camera.exposure
         assert torch.equal(written.camera.shutter.translation, read.camera.shutter.translation)
         assert torch.equal(written.camera.shutter.rotation, read.camera.shutter.rotation)
         for name in ("direction", "seconds", "span"):

@@ -2,7 +2,7 @@
 
 1. The request: ``settings``, with the lidar's ``sensor``. ``reader`` makes a street when it is first needed, and
    ``street`` writes it whole or not at all.
-2. The world: places and motions of all things (``world``, ``layout``, ``motion``), things built from parts
+2. The world: places and motions of all things (``world``, ``layout``, ``motion``, ``tunnel``), things built from parts
    (``models``, ``parts``), and convex solids (``shapes``).
 3. Its look: ``textures`` with ``coverage`` and ``noise``, and light (``sky``, ``shading``).
 4. One ``instant``: parts as arrays (``scene``), first hits of rays (``tracer``), the rig and the lidar (``cameras``,

@@ -1,9 +1,9 @@
-"""What a street declares of its cameras and DriveStudio's layout has no room for: readout and motion."""
+"""What a street declares of its cameras and DriveStudio's layout has no room for: exposure, readout and motion."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,12 +22,14 @@ AnyView = TypeVar("AnyView", bound=View)
 
 def write_declared(settings: StreetSettings, world: World, root: Path) -> None:
     """Writes the file if the settings have something to declare, and let it be known."""
+    said: dict[str, Any] = {}
     if settings.readout and settings.readout_known:
-        cameras = range(settings.num_cameras)
-        motion = [
-            [_motion(settings, world, frame, camera) for frame in range(settings.num_frames)] for camera in cameras
-        ]
-        said = {"readout": settings.readout, "direction": settings.readout_direction, "motion": motion}
+        cameras, frames = range(settings.num_cameras), range(settings.num_frames)
+        motion = [[_motion(settings, world, frame, camera) for frame in frames] for camera in cameras]
+        said |= {"readout": settings.readout, "direction": settings.readout_direction, "motion": motion}
+    if settings.shutter_time and settings.shutter_time_known:
+        said["exposure"] = settings.shutter_time
+    if said:
         (root / _FILE).write_text(json.dumps(said))
 
 
@@ -38,13 +40,15 @@ def with_declared(log: DrivingLog, settings: StreetSettings, root: Path) -> Driv
         return log
     said = json.loads(path.read_text())
     first, last = settings.recorded
-    span = said["readout"] / (last - first) if last > first else 0.0
+
+    def shutter(frame: int, camera: int) -> Shutter:
+        numbers, seconds = torch.tensor(said["motion"][camera][frame]), said["readout"]
+        span = seconds / (last - first) if last > first else 0.0
+        return Shutter(numbers[:3], numbers[3:], said["direction"], seconds, span)
 
     def told(view: AnyView) -> AnyView:
-        frame, camera = view.indices
-        numbers = torch.tensor(said["motion"][camera][frame])
-        shutter = Shutter(numbers[:3], numbers[3:], said["direction"], said["readout"], span)
-        return replace(view, camera=replace(view.camera, shutter=shutter))
+        read = shutter(*view.indices) if "readout" in said else None
+        return replace(view, camera=replace(view.camera, shutter=read, exposure=said.get("exposure", 0.0)))
 
     load = log.frames.load
     return replace(log, frames=Frames(map(told, log.views), lambda view: told(load(view))))

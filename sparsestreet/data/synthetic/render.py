@@ -68,7 +68,7 @@ def _recorded(
         return street_camera(settings, camera, world.ego.pose(time + seconds))
 
     mounted = camera_at(0.0)
-    sight = captured(settings, lambda seconds: instant_at(time + seconds), camera_at)
+    sight = captured(settings, lambda seconds: instant_at(time + seconds), camera_at, settings.shutter_time)
     coverage = hood_coverage(settings, camera)
     if coverage is not None:
         sight = behind_hood(sight, coverage, mounted, world.weather)

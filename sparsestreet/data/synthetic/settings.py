@@ -55,12 +55,18 @@ class StreetSettings:
     """The side of every image that is read first."""
     readout_known: bool = True
     """False: the street's files are silent on the readout."""
+    shutter_time: float = 0.0
+    """Seconds of exposure: light is averaged over them, so what moves is blurred. 0: images are sharp."""
+    shutter_time_known: bool = True
+    """False: the street's files are silent on it."""
     hood: float = 0.0
     """Share of an image that the hood of the recording car covers, at its bottom: dark, with the sky mirrored in it."""
     hood_cameras: Literal["front", "all"] = "front"
     """Whose images it covers."""
     hood_known: bool = False
     """True: the street's files have masks of it."""
+    jpeg: int = 97
+    """Quality of the images' files, 1 to 100, without halved colors."""
     supersampling: int = 2
     """Rays per pixel and axis; a pixel's color is the mean of supersampling^2 rays."""
     frame_rate: float = 10.0
@@ -72,6 +78,10 @@ class StreetSettings:
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
     num_pedestrians: int = 6
     num_cyclists: int = 2
+    limp: float = 0.0
+    """Share by which a pedestrian's right leg and arm swing less than the left ones; 1: not at all."""
+    tunnel: bool = False
+    """Whether the street runs through a tunnel, with lamps, tiles and doors instead of houses: no sky is seen."""
     body_pose_noise: float = 3.0
     """Error of a pedestrian's body pose in each frame: root mean square over the joints, degrees."""
     pose_noise: Sequence[float | int] = ()
@@ -93,19 +103,24 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
-            "exposure_walk", "white_balance", "readout", "hood",
+            "exposure_walk", "white_balance", "readout", "shutter_time", "hood",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
         if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
             raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
-        if self.readout * self.frame_rate >= 1:
-            frame = f"a frame of {1 / self.frame_rate:g} s"
-            raise ValueError(f"StreetSettings.readout must be shorter than {frame} but is {self.readout}")
+        for name in ("readout", "shutter_time"):
+            if getattr(self, name) * self.frame_rate >= 1:
+                frame = f"a frame of {1 / self.frame_rate:g} s"
+                raise ValueError(f"StreetSettings.{name} must be shorter than {frame} but is {getattr(self, name)}")
         if self.readout_direction not in get_args(Side):
             sides = ", ".join(get_args(Side))
             raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
+        if not 0 <= self.limp <= 1:
+            raise ValueError(f"StreetSettings.limp must be a share from 0 to 1 but is {self.limp}")
+        if not 1 <= self.jpeg <= 100:
+            raise ValueError(f"StreetSettings.jpeg must be a quality from 1 to 100 but is {self.jpeg}")
         if self.hood > 0.5:
             raise ValueError(f"StreetSettings.hood must be a share of the image up to 0.5 but is {self.hood}")
         if self.hood_cameras not in ("front", "all"):

@@ -22,7 +22,8 @@ _WORKERS = 2
 _LATER = frozenset(
     {
         "delays", "delays_known", "exposure_walk", "white_balance", "pose_noise", "box_noise", "readout",
-        "readout_direction", "readout_known", "hood", "hood_cameras", "hood_known",
+        "readout_direction", "readout_known", "shutter_time", "shutter_time_known", "hood", "hood_cameras",
+        "hood_known", "tunnel", "jpeg", "limp",
     }
 )  # fmt: skip
 """Settings that came after ``GENERATOR``; at their defaults a street is as it was without them."""

@@ -24,7 +24,7 @@ from sparsestreet.types import Camera, Frame, View
 def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]) -> Truth:
     """Returns a function: a camera and a time in the log's world -> what the street's camera would record there.
 
-    What belongs to a recorded image alone is left out: its exposure, white balance and hood. It is
+    What belongs to a recorded image alone is left out: its exposure, white balance, blur, hood and compression. It is
     what the view's own pose sees, so at a recorded view whose pose is noisy it is not the recorded image.
 
     It returns None if the camera is inside an annotated object. Masks hold people and vehicles up to

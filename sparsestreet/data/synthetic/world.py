@@ -16,6 +16,7 @@ from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.shapes import box
 from sparsestreet.data.synthetic.sky import Weather, random_weather
 from sparsestreet.data.synthetic.textures.ground import Asphalt, Footway, Lines
+from sparsestreet.data.synthetic.tunnel import tunnel, tunnel_light
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,16 @@ class World:
 def build_world(settings: StreetSettings) -> World:
     ego = EgoDrive(settings.ego_speed)
     end = settings.ego_speed * settings.duration
-    scenery = [*_ground(settings.seed, end), *_houses(settings.seed, end), *_footway_things(settings.seed, end)]
+    seed = settings.seed
+    beside = tunnel(seed, end) if settings.tunnel else [*_houses(seed, end), *_footway_things(seed, end)]
+    weather = tunnel_light(seed) if settings.tunnel else random_weather(seed)
     actors = [
         *_parked_cars(settings, end),
         *_moving_cars(settings, ego),
         *_pedestrians(settings, end),
         *_cyclists(settings),
     ]
-    return World(ego, tuple(scenery), tuple(actors), random_weather(settings.seed))
+    return World(ego, (*_ground(seed, end), *beside), tuple(actors), weather)
 
 
 def _ground(seed: int, end: float) -> list[Part]:
@@ -199,7 +202,9 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
         speed = float(rng.uniform(0.9, 1.6)) * (1 if rng.random() < 0.5 else -1)
         share = (number + float(rng.uniform(0.2, 0.8))) / settings.num_pedestrians
         path = Path(start=6 + share * (end + 18.0), y=y, speed=speed)
-        actors.append(Actor(f"pedestrian_{number:02d}", random_pedestrian(rng), path, layout.CURB_HEIGHT))
+        actors.append(
+            Actor(f"pedestrian_{number:02d}", random_pedestrian(rng, settings.limp), path, layout.CURB_HEIGHT)
+        )
     return actors
 
 

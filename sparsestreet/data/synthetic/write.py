@@ -115,7 +115,7 @@ class StreetWriter:
         name = f"{frame:03d}_{camera}"
         picture = Image.fromarray(image.rgb)
         # 4:4:4, because halved color would smear edges, for which a 320-pixel image has few pixels.
-        picture.save(self._file("images", f"{name}.jpg"), quality=97, subsampling=0)
+        picture.save(self._file("images", f"{name}.jpg"), quality=self.settings.jpeg, subsampling=0)
         said = noisy_camera(self.settings, image.camera.world_from_camera, frame, camera)
         np.savetxt(self._file("extrinsics", f"{name}.txt"), said)
         _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)

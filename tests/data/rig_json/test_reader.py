@@ -137,6 +137,9 @@ def test_a_declared_shutter_follows_the_drive(written):
         # 0.2 rad/s about the world's z axis, which climbs by 0.03.
         turn = at[:3, :3].T @ np.array([0, 0, 0.2 * 0.04])
         assert np.abs(shutter.rotation.numpy() - turn).max() < 1e-5
+    assert [view.camera.exposure for view in RigJsonReader(root=folder).read().views[:2]] == [
+        0.003 if PLAN.cameras[index].name == "left" else 0.0 for index in range(2)
+    ]
 
 
 def test_without_a_clock_images_are_at_the_frames_pose(written):

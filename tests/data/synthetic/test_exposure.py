@@ -13,6 +13,7 @@ from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.synthetic.shading import to_srgb
 from sparsestreet.data.synthetic.world import build_world
 from tests.conftest import unchecked
+from tests.typed import there
 
 CLEAN = StreetSettings(
     seed=3, num_frames=2, width=48, height=30, num_cameras=2, supersampling=1, num_parked_cars=2, num_moving_cars=1,
@@ -61,11 +62,11 @@ def test_a_walk_is_smooth_and_each_cameras_own():
 
 def test_tints_cancel_over_cameras_and_do_not_brighten():
     settings = replace(CLEAN, num_cameras=3, white_balance=0.04)
-    gains = np.log([recorded_gains(settings, 0, camera) for camera in range(3)])
+    gains = np.log([there(recorded_gains(settings, 0, camera)) for camera in range(3)])
     np.testing.assert_allclose(gains.sum(0), 0, atol=1e-6)
     np.testing.assert_allclose(gains.sum(1), 0, atol=1e-6)
     np.testing.assert_allclose(gains.std(), 0.04, rtol=1e-5)
-    np.testing.assert_array_equal(gains, np.log([recorded_gains(settings, 1, camera) for camera in range(3)]))
+    np.testing.assert_array_equal(gains, np.log([there(recorded_gains(settings, 1, camera)) for camera in range(3)]))
     assert recorded_gains(CLEAN, 0, 0) is None
     np.testing.assert_array_equal(recorded_gains(replace(CLEAN, num_frames=1, exposure_walk=0.2), 0, 0), 1)
 

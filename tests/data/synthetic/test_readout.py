@@ -107,6 +107,7 @@ def test_the_truth_is_read_as_the_views_camera_is(folder, log):
     ("wrong", "said"),
     [
         ({"readout": -0.01}, "readout must not be negative"),
+        ({"shutter_time": 0.1}, r"shutter_time must be shorter than a frame of 0\.1 s but is 0\.1"),
         ({"readout": 0.1}, r"readout must be shorter than a frame of 0\.1 s but is 0\.1"),
         ({"readout_direction": "up"}, "readout_direction must be one of top, bottom, left, right but is up"),
     ],

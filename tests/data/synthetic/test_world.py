@@ -129,3 +129,20 @@ def test_seeds_give_other_streets_and_counts_can_be_zero():
 def test_settings_name_what_is_wrong(field, value):
     with pytest.raises(ValueError, match=rf"StreetSettings\.{field} .*{value}"):
         StreetSettings(**{field: value})
+
+
+def test_who_limps_swings_the_right_limbs_less():
+    """Over a stride of 1.4 m: feet and hands keep their middle, and the right ones a fourth of their reach."""
+    walked = np.linspace(0, 1.4, 29)
+    reach = {}
+    for limp in (0.0, 0.75):
+        person = Pedestrian(1.75, CLOTHES, limp=limp)
+        for side in (-1, 1):
+            feet, hands = (np.array([limb(side, s)[2][0] for s in walked]) for limb in (person.leg, person.arm))
+            reach[limp, side] = np.ptp(feet), np.ptp(hands)
+    np.testing.assert_allclose(reach[0.75, -1], np.array(reach[0.0, -1]) / 4, rtol=1e-9)
+    assert reach[0.75, 1] == reach[0.0, 1] == pytest.approx(reach[0.0, -1])
+    walkers = [actor.model for actor in build_world(StreetSettings(limp=0.75)).actors]
+    assert {model.limp for model in walkers if isinstance(model, Pedestrian)} == {0.75}
+    with pytest.raises(ValueError, match="limp must be a share from 0 to 1"):
+        StreetSettings(limp=1.5)

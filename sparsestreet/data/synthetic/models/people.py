@@ -47,6 +47,8 @@ class Pedestrian:
     clothes: Clothes
     stride: float = 1.4
     """Length of one full gait cycle (two steps), meters."""
+    limp: float = 0.0
+    """Share by which the right leg and arm swing less than the left ones."""
 
     class_name = "Pedestrian"
 
@@ -92,8 +94,8 @@ class Pedestrian:
 
     def _swing(self, side: int, traveled: float) -> tuple[float, float]:
         """Returns how far a leg is ahead and how high it is lifted, both from -1 to 1."""
-        gait = 2 * np.pi * traveled / self.stride
-        return float(np.sin(gait)) * side, float(np.cos(gait)) * side
+        gait, reach = 2 * np.pi * traveled / self.stride, 1.0 if side > 0 else 1 - self.limp
+        return float(np.sin(gait)) * side * reach, float(np.cos(gait)) * side * reach
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,8 @@ def random_clothes(rng: np.random.Generator) -> Clothes:
     return Clothes(*chosen)
 
 
-def random_pedestrian(rng: np.random.Generator) -> Pedestrian:
-    return Pedestrian(float(rng.uniform(1.58, 1.90)), random_clothes(rng))
+def random_pedestrian(rng: np.random.Generator, limp: float = 0.0) -> Pedestrian:
+    return Pedestrian(float(rng.uniform(1.58, 1.90)), random_clothes(rng), limp=limp)
 
 
 def random_cyclist(rng: np.random.Generator) -> Cyclist:
