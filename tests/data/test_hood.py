@@ -43,7 +43,7 @@ def test_every_pixel_of_a_hood_and_no_other():
     hood = find_hoods(frames(HOOD), NO_LIDAR)[0]
     assert torch.equal(hood.mask, FOUND)
     assert hood.share == pytest.approx(6 * 36 / (HEIGHT * WIDTH))
-    assert hood.error < 0.002  # six images each, of which noise alone hides the edge of a column or two
+    assert hood.error < 0.01  # six images each, of which noise alone hides or adds an edge in a column or two
 
 
 @pytest.mark.parametrize("hood", [None, HOOD & (torch.arange(WIDTH) < 12)])
