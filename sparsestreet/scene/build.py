@@ -58,6 +58,8 @@ def build_scene(
         else:
             _log.info("node %r starts with %d Gaussians", name, len(node.rows))
             built[name] = node
+    for planned in plan.effects:
+        planned.settings.prepare(built.values(), planned.on)
     return SceneGraph(built, _effects(plan, TrainingData(log, train_frames, held_out), seed))
 
 

@@ -5,6 +5,8 @@ splats, the affine map one of their colors; lens and shutter are what a camera b
 """
 
 from sparsestreet.scene.effects.affine import Affine, AffineSettings
+from sparsestreet.scene.effects.box_poses import BoxPosesSettings
+from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
@@ -16,6 +18,9 @@ from sparsestreet.scene.effects.sky import Sky, SkySettings
 __all__ = [
     "Affine",
     "AffineSettings",
+    "BoxPosesSettings",
+    "CameraPoses",
+    "CameraPosesSettings",
     "Cost",
     "Effect",
     "EffectPlan",

@@ -5,7 +5,7 @@ log calls for, by name; one that it does not have is not built and costs nothing
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of
+from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Gaussians, Rendering, View
@@ -84,6 +85,10 @@ class EffectSettings(ABC):
     def cost(self, data: TrainingData) -> Cost:
         """What the effect would cost if the scene had it; by default nothing."""
         return Cost()
+
+    def prepare(self, nodes: Iterable[Node], on: bool) -> None:
+        """Tells nodes that are built what the plan says, where the effect is a matter of theirs; by default nothing."""
+        return None
 
     @abstractmethod
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Effect | None":

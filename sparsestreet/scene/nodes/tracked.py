@@ -194,6 +194,13 @@ class Tracked(Node):
         self.rotation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
         self.translation_deltas = nn.Parameter(torch.zeros_like(keyframes.translations))
 
+    def fix_boxes(self) -> None:
+        """Ends learning of the boxes' corrections: they stay what they are, and the optimizer has none of them."""
+        for name in ("rotation_deltas", "translation_deltas"):
+            values = getattr(self, name).detach()
+            delattr(self, name)
+            self.register_buffer(name, values)
+
     def placed(self, view: View) -> RawGaussians:
         """Returns the stored rows, each placed by its instance's box at the view's time; opacity 0 if it is absent."""
         return replace(self.stored(view), placement=Placement(self.pose_at(view.time), self.rows.instances))

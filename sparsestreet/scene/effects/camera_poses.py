@@ -1,0 +1,203 @@
+"""Camera poses: a learned rigid correction of the pose of each training image.
+
+Values follow the corrected camera, which everything in a frame sees. Its gradient does not come from the op: to a
+camera that moves, the world moves rigidly the other way, so the gradients of the Gaussians have it. This costs two
+small sums over the rows in the backward pass, and nothing in the forward pass.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor, nn
+
+from sparsestreet.evidence.poses import pose_noise
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.boxes import without_frames
+from sparsestreet.geometry.cameras import exact_position
+from sparsestreet.geometry.displacement import displacement
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.recorded_poses import RecordedPoses
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import LearningRate, Rates
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Camera, Gaussians, View
+
+_MOVES = 0.5
+"""Meters that an object must get before its points do not count."""
+_SHARED = 4.0
+"""Of the threshold: what all images of a camera share is worth a word from here on. Streets without errors have up to
+0.9 px of it, because little says where a whole camera is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraPosesSettings(EffectSettings):
+    """Threshold, regularizer and rates. Raises ValueError for a negative weight or threshold."""
+
+    threshold: float = 0.5
+    """Pixels that poses move the median image by, from one image to the next (``evidence.poses``)."""
+    weight: float = 1e-5
+    """Of the squares of a step's correction, in centimeters and milliradians; it also decides where the world is, which
+    images alone do not."""
+    learning_rates: Rates = field(
+        default_factory=lambda: {"translations": LearningRate(2e-3, 2e-4), "rotations": LearningRate(2e-4, 2e-5)}
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.weight >= 0 and self.threshold >= 0):
+            raise ValueError(f"weight and threshold must be >= 0, got {self.weight} and {self.threshold}")
+
+    def detect(self, data: TrainingData) -> Finding:
+        """Measures images of a few stretches of the drive (``evidence.poses``)."""
+        tracks = [track for track in data.log.tracks if displacement(track) > _MOVES]
+        found = pose_noise(data.frames, without_frames(tracks, data.held_out))
+        if found is None:
+            reason = f"no image of {data.log.name} shares enough points with others to tell whether its pose is off"
+            return Finding(called_for=False, reason=reason, unit="px", threshold=self.threshold)
+        reason = (
+            f"rays of {found.points} points meet if poses of {found.images} images move them by {found.value:.2f} px"
+        )
+        if found.constant >= _SHARED * self.threshold:
+            reason += f", besides {found.constant:.2f} px that all images of a camera share: check its calibration"
+        return Finding(
+            called_for=found.value >= self.threshold,
+            reason=reason,
+            value=found.value,
+            unit="px",
+            threshold=self.threshold,
+            noise=None if math.isnan(found.error) else found.error,
+        )
+
+    def cost(self, data: TrainingData) -> Cost:
+        return Cost(numbers=6 * len(data.views))
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "CameraPoses":
+        views = data.views
+        poses = torch.stack([view.camera.camera_from_world for view in views])
+        return CameraPoses(self, RecordedPoses([view.indices for view in views], [view.time for view in views], poses))
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "CameraPoses":
+        indices = [(frame, camera) for frame, camera in tensors["indices"].tolist()]
+        return CameraPoses(self, RecordedPoses(indices, tensors["times"].tolist(), tensors["poses"]))
+
+
+class CameraPoses(Effect):
+    """Corrections of the recorded poses, zero at the start, in the frame of each camera.
+
+    The camera of a training image gets its own, that of another recorded image what its neighbors say
+    (``RecordedPoses.predicted``). A view that nobody recorded is seen from where it says: so are views beside the path,
+    also those that a training step makes of a recorded one.
+    """
+
+    settings: CameraPosesSettings
+    indices: Tensor
+    times: Tensor
+    poses: Tensor
+
+    def __init__(self, settings: CameraPosesSettings, recorded: RecordedPoses) -> None:
+        super().__init__(settings)
+        self.recorded = recorded
+        count = len(recorded.indices)
+        self.translations = nn.Parameter(torch.zeros(count, 3))
+        self.rotations = nn.Parameter(torch.zeros(count, 3))
+        self.register_buffer("indices", torch.tensor(recorded.indices, dtype=torch.int64).reshape(-1, 2))
+        self.register_buffer("times", torch.tensor(recorded.times, dtype=torch.float64))
+        self.register_buffer("poses", recorded.poses)
+
+    def view(self, view: View, state: SceneState) -> View:
+        place = self.recorded.place(view)
+        if place is not None:
+            as_recorded = torch.equal(self.recorded.poses[place], view.camera.camera_from_world)
+            return replace(view, camera=self._corrected(place, view.camera)) if as_recorded else view
+        if view.frame_index is None:
+            return view
+        predicted = self.recorded.predicted(view, self.corrections())
+        return view if predicted is None else replace(view, camera=_moved(view.camera, predicted))
+
+    def gaussians(self, gaussians: Gaussians, view: View) -> Gaussians:
+        place = self.recorded.place(view)
+        if place is None or not torch.is_grad_enabled():
+            return gaussians
+        recorded = self.recorded.poses[place]
+        as_recorded = replace(view.camera, camera_from_world=recorded)
+        if not torch.equal(self._corrected(place, as_recorded).camera_from_world, view.camera.camera_from_world):
+            return gaussians
+        rotation = quat.to_matrix(quat.from_rotation_vector(self.rotations[place]))
+        motion = torch.cat((rotation, self.translations[place, :, None]), 1)
+        center = exact_position(as_recorded)
+        means, quaternions = _SeenRigidly.apply(
+            gaussians.means, gaussians.quaternions, motion, recorded[:, :3].to(motion), center.to(motion)
+        )
+        return replace(gaussians, means=means, quaternions=quaternions)
+
+    def corrections(self) -> Float64[Tensor, "n 6"]:
+        """Translations (m) and rotation vectors (rad) of all training images, on the host."""
+        return torch.cat((self.translations, self.rotations), 1).detach().cpu().double()
+
+    def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """Returns ``correction``, of the view's own pose, where it has a weight and the view is a training image."""
+        place = self.recorded.place(view)
+        if place is None or not self.settings.weight > 0:
+            return {}
+        centimeters, milliradians = 100 * self.translations[place], 1000 * self.rotations[place]
+        return {"correction": self.settings.weight * (centimeters.square().sum() + milliradians.square().sum())}
+
+    def _corrected(self, place: int, camera: Camera) -> Camera:
+        correction = torch.cat((self.translations[place], self.rotations[place])).detach().cpu().double()
+        return _moved(camera, correction)
+
+
+def _moved(camera: Camera, correction: Float64[Tensor, "6"]) -> Camera:
+    recorded = camera.camera_from_world
+    pose = recorded.detach().double().clone()
+    pose[:3] = quat.to_matrix(quat.from_rotation_vector(correction[3:])) @ pose[:3]
+    pose[:3, 3] += correction[:3]
+    return replace(camera, camera_from_world=pose.to(recorded.dtype))
+
+
+class _SeenRigidly(torch.autograd.Function):
+    """Means and quaternions as they are; ``motion`` [R | t] gets the gradient of a camera that is moved by it.
+
+    A point x in the world is R y + t to the corrected camera, with y = R_0 (x - c) to the recorded one. With g the
+    gradient at x and A = R R_0, A g is that at R y + t, and
+
+        dL/dt = A sum g,    dL/dR = A (sum g (x - c)^T) R_0^T + [A tau]_x R / 2
+
+    The last term turns the Gaussians themselves. A turn of the world by a small vector d changes a quaternion q by
+    (0, d) q / 2, so tau = sum vec(h q*) / 2 with h the gradient at q. [a]_x R / 2 is the matrix whose product with
+    every [d]_x R is a . d.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Float[Tensor, "n 3"],
+        quaternions: Float[Tensor, "n 4"],
+        motion: Float[Tensor, "3 4"],
+        recorded: Float[Tensor, "4 3"],
+        center: Float[Tensor, "3"],
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+        ctx.save_for_backward(means, quaternions, motion, recorded, center)
+        return means.view_as(means), quaternions.view_as(quaternions)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, None, None]:
+        means, quaternions, motion, recorded, center = ctx.saved_tensors
+        by_mean, by_quaternion = gradients
+        rotation, first = motion[:, :3], recorded[:3]
+        seen = rotation @ first
+        offsets = torch.nn.functional.pad(means - center, (0, 1), value=1.0)
+        sums = seen @ (by_mean.T @ offsets).to(seen)
+        torque = seen @ _torque((by_quaternion.T @ quaternions).to(seen))
+        turned = sums[:, :3] @ first.T + 0.5 * torch.linalg.cross(torque[:, None].expand(3, 3), rotation, dim=0)
+        return by_mean, by_quaternion, torch.cat((turned, sums[:, 3:]), 1), None, None
+
+
+def _torque(products: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
+    """sum vec(h q*) / 2 of the sums of h_i q_j."""
+    odd = products - products.T
+    return 0.5 * torch.stack((odd[1, 0] + odd[3, 2], odd[2, 0] + odd[1, 3], odd[3, 0] + odd[2, 1]))

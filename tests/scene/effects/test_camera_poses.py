@@ -1,0 +1,220 @@
+"""Gradients of camera poses against finite differences, and which views a correction reaches."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.evidence.poses import PoseNoise
+from sparsestreet.geometry.cameras import moved
+from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.scene.effects import camera_poses
+from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
+from sparsestreet.scene.effects.recorded_poses import RecordedPoses
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.state import FINISHED
+from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
+from sparsestreet.types import Camera, Gaussians, Shutter, View
+from tests.scene.street import background, camera_at, random_rows, training_data
+
+SETTINGS = CameraPosesSettings(weight=0.01)
+PLAIN = replace(camera_at(-6.0, width=17, height=11), intrinsics=torch.tensor([[9.0, 0, 8], [0, 9, 5], [0, 0, 1]]))
+BENT = replace(PLAIN, distortion=torch.tensor([-0.2, 0.05, 0.01, 0.0, 0.0]))
+ROLLING = replace(PLAIN, shutter=Shutter(torch.tensor([0.3, 0.0, 0.1]), torch.tensor([0.0, 0.1, 0.02])))
+
+
+def doubled(camera: Camera) -> Camera:
+    lens = None if camera.distortion is None else camera.distortion.double()
+    shutter = camera.shutter
+    if shutter is not None:
+        shutter = replace(shutter, translation=shutter.translation.double(), rotation=shutter.rotation.double())
+    pose = camera.camera_from_world.double()
+    return replace(
+        camera, camera_from_world=pose, intrinsics=camera.intrinsics.double(), distortion=lens, shutter=shutter
+    )
+
+
+def gaussians(degree: int) -> Gaussians:
+    draw = torch.Generator().manual_seed(3)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=draw, dtype=torch.float64)
+
+    sh = 0.3 * normal(12, (degree + 1) ** 2, 3)
+    # Away from the origin: the pivot is the camera's center, and long quaternions turn like short ones.
+    return Gaussians(
+        normal(12, 3) + torch.tensor([0.0, 0.0, 1.5]),
+        2 * normal(12, 4),
+        torch.rand(12, 3, generator=draw).double() * 0.5 + 0.2,
+        torch.full((12,), 0.6, dtype=torch.float64),
+        sh,
+    )
+
+
+def effect(camera: Camera, *, indices=((0, 0),), times=(0.5,), dtype=torch.float64) -> CameraPoses:
+    """Corrections of images that one camera took, with values."""
+    poses = camera.camera_from_world.repeat(len(indices), 1, 1)
+    made = CameraPoses(SETTINGS, RecordedPoses(indices, times, poses)).to(dtype)
+    with torch.no_grad():
+        made.translations.copy_(torch.linspace(-0.2, 0.3, 3 * len(indices)).reshape(-1, 3))
+        made.rotations.copy_(torch.linspace(0.15, -0.1, 3 * len(indices)).reshape(-1, 3))
+    return made
+
+
+def loss_of(poses: CameraPoses, rows: Gaussians, view: View, settings: SplatSettings, *, wrapped: bool) -> torch.Tensor:
+    """A random combination of all pixels of color, alpha and depth."""
+    seen = poses.view(view, FINISHED)
+    drawn = splat(poses.gaussians(rows, seen) if wrapped else rows, seen.camera, settings=settings, backend="reference")
+    draw = torch.Generator().manual_seed(5)
+    images = drawn.rgb, drawn.alpha, drawn.alpha * drawn.depth  # a depth of almost nothing jumps
+    return sum((image * torch.randn(image.shape, generator=draw, dtype=torch.float64)).sum() for image in images)
+
+
+def both_gradients(camera: Camera, degree: int, settings: SplatSettings) -> tuple[torch.Tensor, torch.Tensor]:
+    """(backward, central differences) of translation and rotation."""
+    camera = doubled(camera)
+    poses, view = effect(camera), View(camera, 0.5, 0, 0)
+    rows = gaussians(degree)
+    rows = replace(rows, means=rows.means.requires_grad_(), quaternions=rows.quaternions.requires_grad_())
+    loss_of(poses, rows, view, settings, wrapped=True).backward()
+    found = torch.cat((poses.translations.grad[0], poses.rotations.grad[0]))
+    differences, step = [], 1e-6
+    with torch.no_grad():
+        for parameter in (poses.translations, poses.rotations):
+            for axis in range(3):
+                ends = []
+                for sign in (1, -1):
+                    parameter[0, axis] += sign * step
+                    ends.append(loss_of(poses, rows, view, settings, wrapped=False))
+                    parameter[0, axis] -= sign * step
+                differences.append((ends[0] - ends[1]) / (2 * step))
+    return found, torch.stack(differences)
+
+
+SMOOTH = SplatSettings(alpha_min=1e-9, transmittance_min=1e-12)
+"""Without jumps at the cut-offs, which differences see and derivatives do not."""
+
+
+@pytest.mark.parametrize("camera", [PLAIN, BENT, ROLLING], ids=["pinhole", "lens", "shutter"])
+def test_the_gradient_is_that_of_a_camera_that_moves(camera: Camera):
+    found, differences = both_gradients(camera, 0, SMOOTH)
+    assert differences.abs().min() > 1e-3
+    # Differences of 1e-6 in float64 are good to about 1e-9 of the loss, which is about 10.
+    torch.testing.assert_close(found, differences, rtol=1e-5, atol=1e-6)
+
+
+def test_colors_that_depend_on_the_direction_bias_turns_alone():
+    found, differences = both_gradients(PLAIN, 3, SMOOTH)
+    torch.testing.assert_close(found[:3], differences[:3], rtol=1e-5, atol=1e-6)
+    # Rows whose harmonics of all degrees are equally large: far more than a street has.
+    assert 1e-3 < float((found[3:] - differences[3:]).norm() / differences[3:].norm()) < 0.1
+
+
+def corrected(poses: CameraPoses, view: View) -> torch.Tensor:
+    return poses.view(view, FINISHED).camera.camera_from_world
+
+
+def test_an_image_has_its_own_correction_and_other_views_have_none():
+    poses = effect(PLAIN, indices=((0, 0), (2, 0)), times=(0.0, 1.0), dtype=torch.float32)
+    with torch.no_grad():
+        poses.rotations.zero_()
+        poses.translations.copy_(torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]]))
+    pose = PLAIN.camera_from_world
+    for frame, time, shift in ((0, 0.0, [0.1, 0.0, 0.0]), (2, 1.0, [0.0, 0.2, 0.0]), (1, 0.25, [0.075, 0.05, 0.0])):
+        got = corrected(poses, View(PLAIN, time, frame, 0)) - pose
+        torch.testing.assert_close(got[:3, 3], torch.tensor(shift))
+    beside = moved(PLAIN, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    # A view beside the path is where it says, also one that a step makes of a training image; so is another camera's.
+    for view in (View(beside, 0.0, 0, 0), View(PLAIN, 0.0), View(PLAIN, 0.0, None, 0), View(PLAIN, 0.5, 1, 7)):
+        assert poses.view(view, FINISHED) is view
+
+
+def test_a_view_beside_the_path_moves_no_pose():
+    poses = effect(doubled(PLAIN))
+    beside = doubled(moved(PLAIN, torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)))
+    rows = gaussians(0)
+    rows = replace(rows, means=rows.means.requires_grad_())
+    seen = poses.view(View(beside, 0.5, 0, 0), FINISHED)
+    assert poses.gaussians(rows, seen) is rows
+    own = poses.view(View(doubled(PLAIN), 0.5, 0, 0), FINISHED)
+    assert poses.gaussians(rows, own).means.grad_fn is not None
+    with torch.no_grad():
+        assert poses.gaussians(rows, own) is rows
+
+
+def along(errors: list[float]) -> tuple[RecordedPoses, torch.Tensor]:
+    """A camera that drives evenly to its right, recorded with errors; with the corrections that undo them."""
+    views = [moved(PLAIN, torch.tensor([0.0, -float(x) - e, 0.0], dtype=torch.float64)) for x, e in enumerate(errors)]
+    corrections = torch.zeros(len(errors), 6, dtype=torch.float64)
+    corrections[:, 0] = torch.tensor(errors, dtype=torch.float64)
+    poses = torch.stack([camera.camera_from_world for camera in views])
+    return RecordedPoses([(x, 0) for x in range(len(errors))], [x / 8 for x in range(len(errors))], poses), corrections
+
+
+@pytest.mark.parametrize(
+    ("errors", "held_out"),
+    [
+        ([0.1, -0.05, 0.08, -0.1, 0.02, 0.07, -0.09, 0.05, -0.03], 4),  # each image is off on its own
+        ([0.1, 0.11, 0.12, 0.13, 0.14, 0.15, 0.16, 0.17, 0.18], 4),  # errors that drift
+    ],
+    ids=["jumps", "drift"],
+)
+def test_neighbors_say_the_correction_of_a_held_out_image(errors: list[float], held_out: int):
+    recorded, corrections = along(errors)
+    kept = [place for place in range(len(errors)) if place != held_out]
+    known = RecordedPoses(
+        [recorded.indices[place] for place in kept], [recorded.times[place] for place in kept], recorded.poses[kept]
+    )
+    view = View(replace(PLAIN, camera_from_world=recorded.poses[held_out]), recorded.times[held_out], held_out, 0)
+    found = known.predicted(view, corrections[kept])
+    assert found is not None
+    # Poses are float32: a meter has 1e-7 of it.
+    torch.testing.assert_close(found, corrections[held_out], rtol=0, atol=1e-6)
+
+
+def test_two_images_of_one_camera_and_frame_are_an_error():
+    with pytest.raises(ValueError, match="every image has a frame and a camera of its own"):
+        RecordedPoses([(0, 0), (0, 0)], [0.0, 0.0], torch.eye(4).repeat(2, 1, 1))
+
+
+def test_the_term_is_that_of_the_image_of_the_step():
+    poses, view = effect(PLAIN, dtype=torch.float32), View(PLAIN, 0.5, 0, 0)
+    with torch.no_grad():
+        poses.translations.fill_(0.01)
+        poses.rotations.fill_(0.002)
+    torch.testing.assert_close(poses.regularizers(view, FINISHED)["correction"], torch.tensor(0.01 * (3 * 1 + 3 * 4)))
+    assert poses.regularizers(View(PLAIN, 0.5, 3, 0), FINISHED) == {}
+    assert CameraPoses(replace(SETTINGS, weight=0.0), poses.recorded).regularizers(view, FINISHED) == {}
+
+
+def test_corrections_come_back_from_a_file(tmp_path: Path):
+    poses = effect(PLAIN, indices=((0, 0), (2, 0)), times=(0.0, 1.0), dtype=torch.float32)
+    scene = SceneGraph({"road": background(random_rows(9, 0))}, {"poses": poses})
+    save_scene(tmp_path / "scene.safetensors", StoredScene(scene, RenderOptions(), "x", 3))
+    again = load_scene(tmp_path).scene.effects["poses"]
+    for frame in (0, 1, 2):
+        view = View(PLAIN, frame / 2, frame, 0)
+        assert torch.equal(again.view(view, FINISHED).camera.camera_from_world, corrected(poses, view))
+
+
+def test_the_log_calls_for_it_where_images_say_that_poses_are_off(monkeypatch: pytest.MonkeyPatch):
+    for value, constant, called_for in ((0.6, 0.1, True), (0.4, 3.0, False)):
+        found = PoseNoise(value, 0.1, constant, 9, 50, np.zeros(9), np.zeros((9, 2), np.int64))
+        monkeypatch.setattr(camera_poses, "pose_noise", lambda *_, found=found: found)
+        finding = SETTINGS.detect(training_data())
+        assert (finding.called_for, finding.value, finding.noise) == (called_for, value, 0.1)
+        assert ("share: check its calibration" in finding.reason) == (constant > 2)
+    monkeypatch.setattr(camera_poses, "pose_noise", lambda *_: None)
+    finding = SETTINGS.detect(training_data())
+    assert (finding.called_for, finding.value, finding.missing) == (False, None, None)
+    assert SETTINGS.cost(training_data()).numbers == 6 * 5
+    assert len(SETTINGS.build(training_data(), finding, torch.Generator()).translations) == 5
+
+
+@pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"threshold": -1.0}])
+def test_negative_numbers_are_errors(wrong: dict[str, float]):
+    with pytest.raises(ValueError, match="must be >= 0"):
+        CameraPosesSettings(**wrong)
