@@ -1,7 +1,7 @@
 """How far the camera poses of single images are off: corrections that make the rays of tracked points meet."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from sparsestreet.geometry.distortion import undistort
 from sparsestreet.triangulation import ImagePointSettings, street_points
 from sparsestreet.triangulation.points import TriangulatedPoints
 from sparsestreet.triangulation.rays import Observations
-from sparsestreet.types import Track, View
+from sparsestreet.types import Frame, Track, View
 
 BLOCKS, INSTANTS = 3, 6
 """Stretches of the drive that are looked at, and the instants of each."""
@@ -50,7 +50,7 @@ class PoseNoise:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """Images between two others of their camera, and half a stretch's corrections."""
+    """Images between two others of their camera, and what all of the stretch are corrected by."""
 
     indices: Int[np.ndarray, "i 2"]
     squares: Float64[np.ndarray, " i"]
@@ -114,7 +114,7 @@ def _constant(stretches: Sequence[_Stretch]) -> float:
 
 
 def _stretch(frames: Frames, moving: Sequence[Track]) -> _Stretch | None:
-    found = street_points(frames, moving, POINTS).static
+    found = street_points(_without_car(frames), moving, POINTS).static
     if not len(found):
         return None
     bundle = adjust(_observations(found, frames.views), found.views, len(frames))
@@ -151,6 +151,19 @@ def _stretches(views: Sequence[View]) -> list[list[int]]:
     return [
         [place for instant in instants[start : start + INSTANTS] for place in by_instant[instant]] for start in starts
     ]
+
+
+def _without_car(frames: Frames) -> Frames:
+    """The recording car stands still in every image, so its pixels count as those of the sky: for nothing."""
+    places = {view.indices: place for place, view in enumerate(frames.views)}
+
+    def load(view: View) -> Frame:
+        frame = frames[places[view.indices]]
+        if frame.ego is None:
+            return frame
+        return replace(frame, sky=frame.ego if frame.sky is None else frame.sky | frame.ego)
+
+    return Frames(frames.views, load)
 
 
 def _observations(points: TriangulatedPoints, views: Sequence[View]) -> Observations:

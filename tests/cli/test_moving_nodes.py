@@ -65,6 +65,7 @@ def test_objects_deformed_by_a_network(tiny_street, tmp_path):
         "node.deformable.deform_from=0.5",
         "node.deformable.points_per_instance=100",
         "node.deformable.min_gaussians=60",
+        "effects.box_poses.when=on",
     )
     node = as_a(Deformable, scene.nodes["deformable"])
     losses = of_steps(curves, "train/photometric")
@@ -87,6 +88,7 @@ def test_people_on_skeletons(tiny_street, tmp_path):
         "node.smpl.neighbor_weight=1e-3",
         "node.smpl.scale_weight=0.05",
         "node.smpl.min_gaussians=60",
+        "effects.box_poses.when=on",
         "schedule.mask_feature_rate=0.25",
         "schedule.lambda_m=3e6",
     )

@@ -43,7 +43,7 @@ class CameraPosesSettings(EffectSettings):
     """Of the squares of a step's correction, in centimeters and milliradians; it also decides where the world is, which
     images alone do not."""
     learning_rates: Rates = field(
-        default_factory=lambda: {"translations": LearningRate(2e-3, 2e-4), "rotations": LearningRate(2e-4, 2e-5)}
+        default_factory=lambda: {"translations": LearningRate(1e-2, 1e-4), "rotations": LearningRate(1e-3, 1e-5)}
     )
 
     def __post_init__(self) -> None:
