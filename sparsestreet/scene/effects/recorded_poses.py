@@ -71,7 +71,8 @@ class RecordedPoses:
         if low == high:
             return torch.zeros(6, dtype=torch.float64)
         ends = inverse(self.poses[[low, high]].double())
-        turned = quat.slerp(*quat.from_matrix(ends[:, :3, :3]), torch.tensor(fraction, dtype=torch.float64))
+        first, second = quat.from_matrix(ends[:, :3, :3])
+        turned = quat.slerp(first, second, torch.tensor(fraction, dtype=torch.float64))
         line = torch.eye(4, dtype=torch.float64)
         line[:3, :3] = quat.to_matrix(turned)
         line[:3, 3] = torch.lerp(ends[0, :3, 3], ends[1, :3, 3], fraction)
