@@ -75,6 +75,7 @@ class SceneFolder:
             self._views,
             lambda index: self._explained(lambda: self._sweep(index, points)),
             lambda index: self._explained(lambda: self._gray_sweep(index, points)),
+            {index: stamp for index in self._views if (stamp := self._moment(index)[1]) is not None},
         )
 
     def _frame(self, view: View) -> Frame:
@@ -116,8 +117,11 @@ class SceneFolder:
         return self._timed(points, torch.full_like(points.points, 0.5), seen)
 
     def _timed(self, points: CarriedPoints, colors: Float[Tensor, "n 3"], colored: Bool[Tensor, " n"]) -> Sweep:
-        moment = self._clock.moment(points.frame, self._sweep_stamps.get(points.frame))
-        return Sweep(points.frame, points.time, points.points, colors, colored, *moment)
+        return Sweep(points.frame, points.time, points.points, colors, colored, *self._moment(points.frame))
+
+    def _moment(self, index: int) -> tuple[float | None, int | None]:
+        """Seconds and stamp of a sweep."""
+        return self._clock.moment(index, self._sweep_stamps.get(index))
 
 
 def _count_bytes(frame: Frame) -> int:
