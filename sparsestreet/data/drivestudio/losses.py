@@ -20,7 +20,8 @@ def losses_of(log: DrivingLog) -> tuple[str, ...]:
 def _cameras(log: DrivingLog) -> Iterator[str]:
     numbers = tuple(map(str, range(log.num_cameras)))
     if log.camera_names and log.camera_names != numbers:
-        yield f"{log.num_cameras} cameras are numbers: {', '.join(log.camera_names)} become {', '.join(numbers)}"
+        names = ", ".join(log.camera_names)
+        yield f"names of cameras are lost ({log.num_cameras}): {names} become {', '.join(numbers)}"
 
 
 def _shutters(log: DrivingLog) -> Iterator[str]:
@@ -29,9 +30,10 @@ def _shutters(log: DrivingLog) -> Iterator[str]:
         shutters = [view.camera.shutter for view in rolling if view.camera.shutter is not None]
         moved = max(float(shutter.translation.norm()) for shutter in shutters)
         turned = max(float(shutter.rotation.norm()) for shutter in shutters)
+        cameras = ", ".join(map(str, sorted({view.indices[1] for view in rolling})))
         yield (
-            f"the rolling shutters of {len({view.camera_index for view in rolling})} cameras are lost: while an image "
-            f"is read out, its camera moves by up to {moved:.2g} m and turns by up to {turned:.2g} rad"
+            f"rolling shutters are lost (cameras {cameras}): while an image is read out, its camera moves by up to "
+            f"{moved:.2g} m and turns by up to {turned:.2g} rad"
         )
 
 
@@ -46,7 +48,7 @@ def _masks(log: DrivingLog) -> Iterator[str]:
             )
     if found.changing_ego:
         cameras = ", ".join(map(str, found.changing_ego))
-        yield f"masks of the recording car are lost for cameras {cameras}: there is one a camera, and theirs change"
+        yield f"masks of the recording car are lost (cameras {cameras}): there is one a camera, and theirs change"
 
 
 def _boxes(log: DrivingLog) -> Iterator[str]:
@@ -60,18 +62,18 @@ def _boxes(log: DrivingLog) -> Iterator[str]:
     ]
     longest = float(torch.cat(shifts).norm(dim=-1).max())
     yield (
-        f"the boxes of {len(late)} objects, up to {max(late.values()) / 1e6:.1f} ms from the stamps of their frames, "
-        f"are moved there, by up to {longest:.2g} m"
+        f"boxes are up to {max(late.values()) / 1e6:.1f} ms from the stamps of their frames (objects: {len(late)}), and "
+        f"moved there, by up to {longest:.2g} m"
     )
 
 
 def _names(log: DrivingLog) -> Iterator[str]:
     keys = object_keys(log)
     if renamed := [name for name, key in keys.items() if name != key]:
-        yield f"{len(renamed)} objects are numbers; their names are the ids in instances_info.json"
+        yield f"names of objects are lost ({len(renamed)}): they are the ids in instances_info.json"
     classes = Counter(track.class_name for track in log.tracks if track.class_name in CLASS_NAMES)
     for name, count in sorted(classes.items()):
-        yield f"the class {name} of {count} objects becomes {CLASS_NAMES[name]}, which data=drivestudio knows"
+        yield f"the class {name} becomes {CLASS_NAMES[name]}, which data=drivestudio knows (objects: {count})"
 
 
 def _others(log: DrivingLog) -> Iterator[str]:
