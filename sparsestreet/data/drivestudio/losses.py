@@ -62,8 +62,8 @@ def _boxes(log: DrivingLog) -> Iterator[str]:
     ]
     longest = float(torch.cat(shifts).norm(dim=-1).max())
     yield (
-        f"boxes are up to {max(late.values()) / 1e6:.1f} ms from the stamps of their frames (objects: {len(late)}), and "
-        f"moved there, by up to {longest:.2g} m"
+        f"boxes are up to {max(late.values()) / 1e6:.1f} ms from the stamps of their frames (objects: {len(late)}), "
+        f"and moved there, by up to {longest:.2g} m"
     )
 
 
