@@ -54,12 +54,13 @@ class DriveStudioWriter(LogWriter):
             assert frame.ego is not None  # as find_masks says
             yield _file(Path(EGO_MASKS, f"{camera}.png"), mask_png, frame.ego.numpy())
         for place, view in enumerate(log.views):
-            yield _file(layout.extrinsics(*view.indices), _pose, world_from_camera(log, view))
-            yield _file(layout.image(*view.indices), self._image, log, place)
+            frame, camera = view.indices
+            yield _file(layout.extrinsics(frame, camera), _pose, world_from_camera(log, view))
+            yield _file(layout.image(frame, camera), self._image, log, place)
             yield from _masks(log, place)
-        for frame in layout.frames if layout.has_lidar else ():
-            yield _file(layout.sweep_pose(frame), _pose, _dataset_from_lidar(log, frame))
-            yield _file(layout.sweep(frame), _points, log, frame)
+            if layout.has_lidar and camera == layout.cameras[-1]:  # its points are in memory for the depth of images
+                yield _file(layout.sweep_pose(frame), _pose, _dataset_from_lidar(log, frame))
+                yield _file(layout.sweep(frame), _points, log, frame)
 
     def losses(self, log: DrivingLog) -> tuple[str, ...]:
         return losses_of(log)
