@@ -43,7 +43,10 @@ CATEGORIES = frozenset(
     )
 )  # fmt: skip
 _OF_ROLES = {"vehicle": "REGULAR_VEHICLE", "cyclist": "BICYCLIST", "pedestrian": "PEDESTRIAN"}
+_CAMERA, _LIDAR = (1.6, 0.0, 1.65), (0.9, 0.0, 1.9)
+"""Where the first camera and the lidar are put: meters ahead, left and up, as on the embedded street."""
 _EARLIEST = 1_000_000_000
+"""Nanoseconds: names of files are positive stamps."""
 _HALF = SPIN // 2
 _STEP = 100_000_000
 """Nanoseconds between two poses, at most; the layout's own lie closer."""
@@ -83,7 +86,7 @@ class Drive:
 
     @cached_property
     def vehicle(self) -> Vehicle:
-        return vehicle_of(self.log, self.times, (1.6, 0.0, 1.65))
+        return vehicle_of(self.log, self.times, _CAMERA)
 
     @cached_property
     def stamps(self) -> tuple[int, ...]:
@@ -137,8 +140,11 @@ class Drive:
         }
 
     def mounts(self) -> dict[str, Any]:
-        poses = torch.stack([self.vehicle.mounts[index] for index in self.names])
-        return {"sensor_name": list(self.names.values())} | _transforms(poses)
+        """With two lidars, without which Argoverse's own library opens no sweep; no point depends on them."""
+        lidar = torch.eye(4, dtype=torch.float64)
+        lidar[:3, 3] = torch.tensor(_LIDAR, dtype=torch.float64)
+        poses = torch.stack([*(self.vehicle.mounts[index] for index in self.names), lidar, lidar])
+        return {"sensor_name": [*self.names.values(), "up_lidar", "down_lidar"]} | _transforms(poses)
 
     def sweep(self, frame: int) -> dict[str, Any]:
         """Intensities, lasers and offsets are 0: a log has none."""

@@ -176,7 +176,8 @@ def test_images_too_far_apart_for_one_sweep_are_counted(log):
 
 
 def test_conf_layout_says_what_the_writer_takes_by_itself():
-    config = dict(OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[3] / "conf/layout/argoverse2.yaml")))  # pyright: ignore
+    config = OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[3] / "conf/layout/argoverse2.yaml"))
+    assert isinstance(config, dict)
     assert config.pop("_target_") == "sparsestreet.data.argoverse2.Argoverse2Writer"
     assert config == vars(Argoverse2Writer())
 

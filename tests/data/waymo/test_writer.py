@@ -306,7 +306,8 @@ def by_name(log: DrivingLog) -> dict[str, Track]:
 @pytest.mark.parametrize("version", [1, 2])
 def test_conf_layout_says_what_the_writer_takes_by_itself(version):
     path = Path(__file__).parents[3] / "conf" / "layout" / f"waymo_v{version}.yaml"
-    config = dict(OmegaConf.to_container(OmegaConf.load(path)))  # pyright: ignore
+    config = OmegaConf.to_container(OmegaConf.load(path))
+    assert isinstance(config, dict)
     writer = get_class(str(config.pop("_target_")))
     assert writer is WRITERS[version]
     own = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(writer()).items()}
