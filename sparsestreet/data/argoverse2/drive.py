@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sparsestreet.data.argoverse2.layout import EGO_ROWS, SPIN, nearest_images
 from sparsestreet.data.argoverse2.tables import NEAR_DUPLICATE, QUATERNION, SIZE, TRANSLATION
-from sparsestreet.data.directions import names_by_direction
+from sparsestreet.data.directions import ego_losses, names_by_direction
 from sparsestreet.data.encoded import mask_png
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_times import LogTimes, stamps_of_frames
@@ -208,8 +208,7 @@ class Drive:
         off = [self._off(view) for view in self.log.views]
         if max(off) > 1e-4:
             yield f"each camera has one mount: poses of images are off by up to {max(off):.2g} m"
-        if marked := sorted(EGO_ROWS.keys() & self.names.values()):
-            yield f"readers take the lowest rows of {', '.join(marked)} for the recording car, unless given masks"
+        yield from ego_losses(self.placed, self.names, EGO_ROWS)
 
     def _off(self, view: View) -> float:
         found = self.path.at(torch.tensor([self.times.of_view(view)]))[0] @ self.vehicle.mounts[view.indices[1]]
