@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.data.problems import fault
-from sparsestreet.data.waymo.segment import Segment
+from sparsestreet.data.waymo.segment import Segment, canonical
 from sparsestreet.data.waymo.v1.segment import RecordSegment
 from sparsestreet.data.waymo.v2.segment import TableSegment
 
@@ -22,16 +22,6 @@ class Found:
 
     version: int
     places: Mapping[str, Path]
-
-
-def canonical(name: str) -> str:
-    """A segment's name without what files add to it.
-
-    >>> canonical("segment-1024_3580_000_3600_000_with_camera_labels.tfrecord")
-    '1024_3580_000_3600_000'
-    """
-    name = name.strip().removesuffix(".tfrecord").removesuffix(".parquet")
-    return name.removeprefix("segment-").removesuffix("_with_camera_labels")
 
 
 def find_segments(root: Path) -> Found:
