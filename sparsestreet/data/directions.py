@@ -38,4 +38,4 @@ def name_losses(placed: PlacedLog, found: Mapping[int, str]) -> list[str]:
     """A sentence of the cameras that a layout calls otherwise than the log; none where it has no other names."""
     own = dict(enumerate(placed.log.camera_names))
     other = [f"{own.get(index, index)} is {name}" for index, name in found.items() if own.get(index) != name]
-    return [f"{len(other)} cameras get names of the layout, by where they look: {', '.join(other)}"] if other else []
+    return [f"{len(other)} cameras get names of the layout: {', '.join(other)}"] if other else []

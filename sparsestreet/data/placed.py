@@ -10,7 +10,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_times import LogTimes
 from sparsestreet.data.vehicle import dataset_from_camera
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.boxes import box_at, inside_box
+from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import Sweep, Track, View
 
@@ -42,8 +42,13 @@ class PlacedLog:
             frame: self.times.stamp(time) for frame, time in zip(track.frames.tolist(), times.tolist(), strict=True)
         }
 
-    def points(self, sweep: Sweep) -> Float64[Tensor, "n 3"]:
-        return transform_points(self.log.dataset_from_world, sweep.points.double())
+    def points(self, sweep: Sweep, stamp: int | None = None) -> Float64[Tensor, "n 3"]:
+        """As measured; or those in boxes where the boxes are at a stamp, for layouts in which a frame has but one."""
+        points = sweep.points
+        if stamp is not None and stamp != self.sweep_stamp(sweep):
+            carried = CarriedPoints(points, sweep.time, sweep.index, self.log.tracks)
+            points = carried.at(self.times.time(stamp))
+        return transform_points(self.log.dataset_from_world, points.double())
 
     def box(self, track: Track, frame: int, stamp: int) -> Float64[Tensor, "4 4"]:
         """world_from_object at a stamp that belongs to one of the object's frames."""

@@ -90,8 +90,7 @@ def test_its_masks_lie_beside_it(log, root):
 def test_what_is_lost_of_it(log):
     assert EXACT.losses(log) == (
         "all stamps are 2 s later: the layout has none before 0",
-        "3 cameras get names of the layout, by where they look: "
-        "0 is CAM_FRONT, 1 is CAM_FRONT_LEFT, 2 is CAM_FRONT_RIGHT",
+        "3 cameras get names of the layout: 0 is CAM_FRONT, 1 is CAM_FRONT_LEFT, 2 is CAM_FRONT_RIGHT",
         "3 classes get names of the layout: Cyclist is vehicle.bicycle, Pedestrian is human.pedestrian.adult, "
         "Vehicle is vehicle.car",
         "the body poses of 1 objects are lost",
