@@ -74,6 +74,18 @@ def rig_of(log: DrivingLog) -> dict[int, Camera]:
     return rig
 
 
+def check_every_image(log: DrivingLog, layout: str) -> None:
+    """Raises ValueError, naming the layout, where a camera has no image at some frame."""
+    there = {view.indices for view in log.views}
+    wanted = [(frame, camera) for frame in range(log.num_frames) for camera in rig_of(log)]
+    if absent := [pair for pair in wanted if pair not in there]:
+        frame, camera = absent[0]
+        raise ValueError(
+            f"{layout} has an image of each camera at each frame, but {len(absent)} are absent, the first of camera "
+            f"{camera} at frame {frame}: leave such frames or cameras out (data.log.first_frame, .last_frame, .cameras)"
+        )
+
+
 def without_lens(frame: Frame, undistortion: Undistortion) -> Frame:
     """What a pinhole of the same intrinsics would have recorded; pixels that the lens did not record are the own car's,
     which no loss sees."""

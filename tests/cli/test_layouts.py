@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 CONF = Path(__file__).resolve().parents[2] / "conf" / "layout"
 
 
-@pytest.mark.parametrize("name", ["nuscenes", "kitti"])
+@pytest.mark.parametrize("name", ["nuscenes", "kitti", "pandaset"])
 def test_a_file_has_the_settings_of_its_writer(name):
     config = dict(OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml")))  # pyright: ignore
     writer = get_class(str(config.pop("_target_")))

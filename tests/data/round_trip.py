@@ -13,7 +13,7 @@ from sparsestreet.data.synthetic import StreetReader, StreetSettings, make_stree
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.writer import LogWriter
 from sparsestreet.geometry.transforms import inverse, transform_points
-from sparsestreet.types import Frame, Track
+from sparsestreet.types import Frame, Track, View
 from tests.conftest import unchecked
 from tests.shared import made_once
 
@@ -62,9 +62,12 @@ def check_cameras(log: DrivingLog, back: DrivingLog, pairs: list[tuple[Frame, Fr
     for one, other in pairs:
         torch.testing.assert_close(other.camera.intrinsics, one.camera.intrinsics, rtol=1e-6, atol=0)  # float32
         assert (other.camera.width, other.camera.height) == (one.camera.width, one.camera.height)
-        poses = [source.dataset_from_world @ inverse(frame.camera.camera_from_world.double())
-                 for source, frame in ((log, one), (back, other))]  # fmt: skip
-        torch.testing.assert_close(poses[1], poses[0], rtol=0, atol=atol)
+        torch.testing.assert_close(camera_pose(back, other), camera_pose(log, one), rtol=0, atol=atol)
+
+
+def camera_pose(log: DrivingLog, view: View) -> torch.Tensor:
+    """world_from_camera in the data set's own world."""
+    return log.dataset_from_world @ inverse(view.camera.camera_from_world.double())
 
 
 def check_stamps(pairs: list[tuple[Frame, Frame]], later: int = 0) -> None:

@@ -16,7 +16,7 @@ from sparsestreet.data.kitti.oxts import FASTEST, FASTEST_TURN
 from sparsestreet.data.kitti.velodyne import OWN_CAR
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_times import LogTimes
-from sparsestreet.data.pinhole_frames import rig_of
+from sparsestreet.data.pinhole_frames import check_every_image, rig_of
 from sparsestreet.data.placed import PlacedLog
 from sparsestreet.data.vehicle import Vehicle, vehicle_of
 from sparsestreet.geometry.quaternions import from_matrix, to_rotation_vector
@@ -70,9 +70,8 @@ class KittiDrive:
         names = known | dict(zip([index for index in parallel if index not in known], free, strict=False))
         lost = tuple(str(own.get(index, index)) for index in mounts if index not in names)
         kept = replace(log, frames=log.frames.where(lambda view: view.camera_index in names))
-        drive = KittiDrive(PlacedLog(kept, times), dict(sorted(names.items())), lost)
-        drive._check_complete()
-        return drive
+        check_every_image(kept, "KITTI")
+        return KittiDrive(PlacedLog(kept, times), dict(sorted(names.items())), lost)
 
     @property
     def log(self) -> DrivingLog:
@@ -195,17 +194,6 @@ class KittiDrive:
         """The first camera of the frame, from the view's."""
         leading = self._leading[view.indices[0]]
         return inverse(self.placed.world_from_camera(leading)) @ self.placed.world_from_camera(view)
-
-    def _check_complete(self) -> None:
-        there = {view.indices for view in self.log.views}
-        absent = [(at, index) for at in range(self.log.num_frames) for index in self.names if (at, index) not in there]
-        if absent:
-            frame, camera = absent[0]
-            raise ValueError(
-                f"KITTI has an image of each camera at each frame, but {len(absent)} are absent, the first of camera "
-                f"{camera} at frame {frame}: leave such frames or cameras out (data.log.first_frame, .last_frame, "
-                ".cameras)"
-            )
 
 
 def _angle(one: Float64[Tensor, "4 4"], other: Float64[Tensor, "4 4"]) -> float:
