@@ -39,3 +39,10 @@ def name_losses(placed: PlacedLog, found: Mapping[int, str]) -> list[str]:
     own = dict(enumerate(placed.log.camera_names))
     other = [f"{own.get(index, index)} is {name}" for index, name in found.items() if own.get(index) != name]
     return [f"{len(other)} cameras get names of the layout: {', '.join(other)}"] if other else []
+
+
+def ego_losses(placed: PlacedLog, found: Mapping[int, str], rows: Mapping[str, object]) -> list[str]:
+    """A sentence of the cameras whose lowest ``rows`` readers take for the recording car, although it was another."""
+    own = dict(enumerate(placed.log.camera_names))
+    names = [name for index, name in found.items() if name in rows and own.get(index) != name]
+    return [f"readers take the lowest rows of {', '.join(names)} for the recording car's"] if names else []

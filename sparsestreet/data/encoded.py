@@ -9,7 +9,7 @@ from PIL import Image
 
 
 def jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    """RGB, 4:4:4: halved color would smear edges."""
+    """RGB, 4:4:4, because halved color would smear edges, for which a small image has few pixels."""
     file = BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=quality, subsampling=0)
     return file.getvalue()

@@ -40,6 +40,10 @@ class KittiWriter(LogWriter):
     masks: bool = True
     """False: none are written."""
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.drive <= 9999:
+            raise ValueError(f"drive has four digits, got {self.drive}: say 1")
+
     def files(self, log: DrivingLog) -> Iterator[LogFile]:
         drive = KittiDrive.of(log)
         layout = self._layout(drive)

@@ -1,17 +1,19 @@
 """Writes a log as nuScenes is published: thirteen tables, and the images and sweeps that they name."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
 
-from sparsestreet.data.directions import name_losses, names_by_direction
+from sparsestreet.data.directions import ego_losses, name_losses, names_by_direction
 from sparsestreet.data.encoded import png
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_times import LogTimes
 from sparsestreet.data.losses import mask_losses, moved_boxes, object_losses, point_losses
+from sparsestreet.data.nuscenes.cameras import EGO_ROWS
 from sparsestreet.data.nuscenes.categories import category
 from sparsestreet.data.nuscenes.rows import MAP, MICROSECOND, Rows, SceneRows
 from sparsestreet.data.nuscenes.scene import CHANNELS
@@ -40,6 +42,12 @@ class NuScenesWriter(LogWriter):
     masks: bool = True
     """False: none are written."""
 
+    def __post_init__(self) -> None:
+        if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality lies in 1 to 100, got {self.jpeg_quality}: say 95, or null for PNGs")
+        if not re.fullmatch(r"v[\w.-]+", self.version):
+            raise ValueError(f"version is a folder whose name starts with v, got {self.version!r}: say v1.0-mini")
+
     def files(self, log: DrivingLog) -> Iterator[LogFile]:
         rows, frames = self._rows(log), PinholeFrames(log)
         for view in log.views:
@@ -60,6 +68,7 @@ class NuScenesWriter(LogWriter):
         rows = self._rows(log)
         returns, placed = rows.returns, rows.placed
         found = [*placed.time_losses(MICROSECOND), *name_losses(placed, rows.channels), *lens_losses(log)]
+        found += ego_losses(placed, rows.channels, EGO_ROWS)
         found += moved_boxes(placed, lambda _, frame: rows.sample_stamps.get(frame), MICROSECOND)
         found += [*object_losses(log, category), *point_losses(log), *(mask_losses(log) if self.masks else ())]
         if returns.near:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from sparsestreet.data.directions import name_losses
+from sparsestreet.data.directions import ego_losses, name_losses
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.losses import mask_losses, moved_boxes, object_losses, point_losses
 from sparsestreet.data.pandaset.labels import label
-from sparsestreet.data.pandaset.layout import OWN_CAR, Layout
+from sparsestreet.data.pandaset.layout import EGO_ROWS, OWN_CAR, Layout
 from sparsestreet.data.pandaset.pickled import pickled_table
 from sparsestreet.data.pandaset.sequence import WrittenSequence
 from sparsestreet.data.pandaset.tables import PER_SECOND
@@ -40,6 +40,12 @@ class PandaSetWriter(LogWriter):
     masks: bool = True
     """False: none are written."""
 
+    def __post_init__(self) -> None:
+        if not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality lies in 1 to 100, got {self.jpeg_quality}: say 95")
+        if not 0 <= self.scene <= 999:
+            raise ValueError(f"scene has three digits, got {self.scene}: say 1")
+
     def files(self, log: DrivingLog) -> Iterator[LogFile]:
         sequence = WrittenSequence.of(log)
         layout = Layout(Path(log.name if re.fullmatch(r"\d{3}", log.name) else f"{self.scene:03d}"))
@@ -64,6 +70,7 @@ class PandaSetWriter(LogWriter):
         sequence = WrittenSequence.of(log)
         placed = sequence.placed
         found = [*placed.time_losses(), *name_losses(placed, sequence.names), *lens_losses(log)]
+        found += ego_losses(placed, sequence.names, EGO_ROWS)
         found += moved_boxes(placed, lambda _, frame: sequence.stamps[frame])
         if (tilt := sequence.largest_tilt()) > _LEAST_TILT:
             found.append(f"boxes stand upright, while the log's lean by up to {tilt:.3g} degrees")

@@ -192,3 +192,18 @@ def test_returns_near_the_lidar_are_counted(log):
     losses = EXACT.losses(replace(log, sweeps=Sweeps.of((near, *others))))
     total = sum(len(one.points) for one in log.sweeps)
     assert any(loss.startswith(f"7 of {total} returns lie within 2.5 m of where the lidar is put") for loss in losses)
+
+
+def test_a_camera_that_looks_back_gets_rows_of_the_recording_car(log):
+    """Where it had another name before."""
+    turned = []
+    for frame in log.frames:
+        if frame.indices[1] == 2:
+            back = frame.camera.camera_from_world.clone()
+            first = next(one for one in log.views if one.indices == (frame.indices[0], 0)).camera.camera_from_world
+            back[:3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ first[:3, :3]
+            turned.append(replace(frame, camera=replace(frame.camera, camera_from_world=back)))
+        else:
+            turned.append(frame)
+    losses = EXACT.losses(replace(log, frames=Frames.of(turned)))
+    assert "readers take the lowest rows of CAM_BACK for the recording car's" in losses

@@ -227,3 +227,18 @@ def test_pandas_reads_them_too(tmp_path, root):
         np.testing.assert_array_equal(theirs[name].to_numpy(), np.array(values, theirs[name].dtype))
     assert len(pandas.read_pickle(root / "001/lidar/00.pkl.gz").query("d == 0")) > 1000
     assert (pandas.read_pickle(root / "001/annotations/cuboids/00.pkl.gz")["dimensions.y"] > 0.4).all()
+
+
+def test_a_camera_that_looks_back_gets_rows_of_the_recording_car(log):
+    """Where it had another name before."""
+    turned = []
+    for frame in log.frames:
+        if frame.indices[1] == 2:
+            back = frame.camera.camera_from_world.clone()
+            first = next(one for one in log.views if one.indices == (frame.indices[0], 0)).camera.camera_from_world
+            back[:3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ first[:3, :3]
+            turned.append(replace(frame, camera=replace(frame.camera, camera_from_world=back)))
+        else:
+            turned.append(frame)
+    losses = WRITER.losses(replace(log, frames=Frames.of(turned)))
+    assert "readers take the lowest rows of back_camera for the recording car's" in losses
