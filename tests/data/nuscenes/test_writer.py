@@ -207,3 +207,13 @@ def test_a_camera_that_looks_back_gets_rows_of_the_recording_car(log):
             turned.append(frame)
     losses = EXACT.losses(replace(log, frames=Frames.of(turned)))
     assert "readers take the lowest rows of CAM_BACK for the recording car's" in losses
+
+
+def test_stamps_are_rounded_to_microseconds(log, tmp_path):
+    frames = [replace(frame, stamp=(frame.stamp or 0) + 700 * (frame.indices[1] == 1)) for frame in log.frames]
+    late = replace(log, frames=Frames.of(frames), tracks=())
+    assert "the stamps of 3 of 9 images are rounded to whole 1000 ns" in EXACT.losses(late)
+    back = NuScenesReader(root=written(EXACT, late, tmp_path)).read()
+    assert {frame.indices: (frame.stamp or 0) % 1_000_000 for frame in back.frames} == {
+        frame.indices: 1000 * (frame.indices[1] == 1) for frame in late.frames
+    }

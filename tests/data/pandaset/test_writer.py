@@ -14,6 +14,7 @@ from sparsestreet.data.pandaset import PandaSetReader, PandaSetWriter
 from sparsestreet.data.pandaset.frames import read_columns
 from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR
 from sparsestreet.data.pandaset.pickled import pickled_table
+from sparsestreet.data.pandaset.spin import spin_of
 from sparsestreet.geometry.boxes import CarriedPoints, box_at
 from sparsestreet.geometry.transforms import inverse, transform_points
 from tests.data.pandaset.write import CAMERAS, PandaPlan, write_sequence
@@ -242,3 +243,10 @@ def test_a_camera_that_looks_back_gets_rows_of_the_recording_car(log):
             turned.append(frame)
     losses = WRITER.losses(replace(log, frames=Frames.of(turned)))
     assert "readers take the lowest rows of back_camera for the recording car's" in losses
+
+
+def test_points_of_one_instant_show_no_turn():
+    """However narrow what the lidar sees: here 30 degrees ahead."""
+    azimuths = np.linspace(-0.25, 0.25, 100)
+    assert spin_of(azimuths, np.zeros(100), 0.1) is None
+    assert spin_of(azimuths, azimuths / (2 * np.pi) * 0.1, 0.1) is not None
