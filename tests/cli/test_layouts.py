@@ -15,7 +15,7 @@ CONF = Path(__file__).resolve().parents[2] / "conf" / "layout"
 
 @pytest.mark.parametrize("name", ["nuscenes", "kitti", "pandaset"])
 def test_a_file_has_the_settings_of_its_writer(name):
-    config = dict(OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml")))  # pyright: ignore
+    config = {str(key): value for key, value in OmegaConf.load(CONF / f"{name}.yaml").items()}
     writer = get_class(str(config.pop("_target_")))
     assert config == vars(writer())
 
