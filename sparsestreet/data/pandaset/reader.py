@@ -75,7 +75,7 @@ class PandaSetReader(RecordedReader):
         tables = [layout.camera(name) / file for name in {FRONT, *chosen.cameras} for file in _TABLES]
         boxes = [layout.boxes(frame) for frame in chosen.frames]
         images = [layout.image(name, frame) for name in chosen.cameras for frame in chosen.frames]
-        points = [layout.sweep(frame) for frame in chosen.frames] if self.lidar else []
+        points = [layout.sweep(frame) for frame in chosen.frames] if self.lidar and layout.lidar.is_dir() else []
         return LogFiles((*tables, *boxes), (*images, *points))
 
     def _selection(self) -> "_Selection":
@@ -102,8 +102,8 @@ class PandaSetReader(RecordedReader):
     def _sweeps(
         self, chosen: "_Selection", stamps: Sequence[int], world_from_lidar: Float64[Tensor, "f 4 4"]
     ) -> tuple[dict[int, LidarSweep] | None, Spin | None]:
-        """The sweeps, and the turn of the lidar as the first of them shows it."""
-        if not self.lidar:
+        """The sweeps, and the turn of the lidar as the first of them shows it; None where there is no lidar."""
+        if not self.lidar or not chosen.layout.lidar.is_dir():
             return None, None
         paths = [chosen.layout.sweep(frame) for frame in chosen.frames]
         if absent := missing_files(paths):
