@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sparsestreet.data.drivestudio.flavors import Flavor, FlavorName, flavor_of, named_flavor
 from sparsestreet.data.problems import LogError, fault
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.data.window import chosen_cameras, frame_window, listed
 
 _FRAME = re.compile(r"(\d+)")
 _CAMERA = re.compile(r"(\d+)")
@@ -153,7 +153,8 @@ def _no_log(root: Path) -> LogError:
         return fault(root, "this is a file" if root.exists() else "nothing is there", f"name {wanted}")
     scenes = sorted(path.parent.name for path in root.glob("*/images"))
     if scenes:
-        return fault(root, f"the folder has no images/; it holds {len(scenes)} scenes", f"name one: {root / scenes[0]}")
+        message = f"the folder has no images/; it holds the scenes {listed(scenes)}"
+        return fault(root, message, f"name one: {root / scenes[0]}")
     remedy = f"name {wanted}, or say data=auto, which finds out whose files these are"
     return fault(root, "the folder has no images/", remedy)
 

@@ -56,8 +56,8 @@ class KittiReader(RecordedReader):
 
     marks = Marks(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
 
-    drive: str
-    """Such as 2011_09_26_drive_0001."""
+    drive: str | int | None = None
+    """Such as 2011_09_26_drive_0001; None: the only one."""
 
     def recording(self) -> Recording:
         drive, parts = self._drive(), self._parts()

@@ -61,8 +61,8 @@ class Kitti360Reader(RecordedReader):
 
     marks = Marks(("data_2d_raw/*_drive_*_sync",))
 
-    sequence: int | str
-    """0, 2 to 10 or 18."""
+    sequence: int | str | None = None
+    """0, 2 to 10 or 18; None: the only one."""
     pinhole_fov: float | None = None
     """Degrees that the pinholes see which the fisheyes are resampled to (``rig.lens_camera``); None: by their
     resolution."""

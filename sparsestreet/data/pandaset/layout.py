@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 
+from sparsestreet.data.window import listed
 from sparsestreet.geometry import quaternions as quat
 
 FRONT = "front_camera"
@@ -77,7 +78,7 @@ def find_sequence(root: Path, scene: str | int | None) -> Layout:
     fitting = [one for one in found if name is None or one.resolve().name == name]
     if len(fitting) == 1:
         return Layout(fitting[0])
-    names = ", ".join(one.name for one in (fitting or found)[:5]) + (", ..." if len(fitting or found) > 5 else "")
+    names = listed([one.name for one in fitting or found])
     which = f"{len(fitting)} of {len(found)} sequences are" if name else f"there are {len(found)} sequences"
     raise ValueError(f"{which}{f' {name}' if name else ''} in {root}: say data.log.scene=, one of {names}")
 

@@ -103,20 +103,31 @@ def test_a_broken_file_is_named(name, whole, tmp_path):
 
 
 def test_whatever_is_not_there_is_said(whole, tmp_path):
-    with pytest.raises(LogError, match="there is no such drive, but 2011_09_26_drive_0099"):
+    with pytest.raises(LogError, match=f"there is no such drive; the drives in {whole} are 2011_09_26_drive_0099;"):
         KittiReader(root=whole, drive="2011_09_26_drive_0001").read()
     with pytest.raises(LogError, match="must be the folder of the dates"):
         KittiReader(root=tmp_path, drive=DRIVE).read()
     (tmp_path / "2011_09_26" / f"{DRIVE}_extract").mkdir(parents=True)
     with pytest.raises(LogError, match="only the unsynchronized, distorted recording"):
         KittiReader(root=tmp_path, drive=DRIVE).read()
-    for name in ("../../etc", "2011_09_26", ""):
-        with pytest.raises(ValueError, match="a drive is named as 2011_09_26_drive_0001"):
+    # A command line takes 1 for a number.
+    for name in ("../../etc", "2011_09_26", "", 1):
+        with pytest.raises(ValueError, match=r"a drive is named as 2011_09_26_drive_0001, got .* are 2011_.*_0099:"):
             KittiReader(root=whole, drive=name).read()
     with pytest.raises(ValueError, match=r"cameras \['image_07'\] must be different ones"):
         KittiReader(root=whole, drive=DRIVE, cameras=["image_07"]).read()
     with pytest.raises(ValueError, match="frames 2 to 9 are not within the log's 0 to 3"):
         KittiReader(root=whole, drive=DRIVE, first_frame=2, last_frame=9).read()
+
+
+def test_the_only_drive_needs_no_name(whole, tmp_path):
+    assert KittiReader(root=whole).read().name == DRIVE
+    with pytest.raises(LogError, match="must be the folder of the dates"):
+        KittiReader(root=tmp_path).read()
+    for number in range(2):
+        (tmp_path / f"2011_09_26/2011_09_26_drive_000{number}_sync").mkdir(parents=True)
+    with pytest.raises(ValueError, match="are 2011_09_26_drive_0000, 2011_09_26_drive_0001: name one"):
+        KittiReader(root=tmp_path).read()
 
 
 @pytest.mark.slow

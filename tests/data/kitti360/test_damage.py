@@ -132,10 +132,20 @@ def test_whatever_is_not_there_is_said(whole, tmp_path):
     with pytest.raises(LogError, match="root must be the folder of data_2d_raw"):
         Kitti360Reader(root=tmp_path, sequence=4).read()
     for name in ("../3", "0003x", -1, ""):
-        with pytest.raises(ValueError, match="is a number from 0 to 18"):
+        with pytest.raises(ValueError, match=r"is a number from 0 to 18, got .*; there are sequences 0003: set"):
             Kitti360Reader(root=whole, sequence=name).read()
     with pytest.raises(ValueError, match=r"cameras \['image_03'\] must be different ones"):
         Kitti360Reader(root=whole, sequence=3, cameras=["image_03"]).read()
+
+
+def test_the_only_sequence_needs_no_number(whole, tmp_path):
+    assert Kitti360Reader(root=whole).read().name == "2013_05_28_drive_0003"
+    with pytest.raises(LogError, match="there is no sequence; root must be the folder of data_2d_raw"):
+        Kitti360Reader(root=tmp_path).read()
+    for number in (0, 18):
+        (tmp_path / f"data_2d_raw/2013_05_28_drive_{number:04d}_sync").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"there are sequences 0000, 0018 in .*: name one"):
+        Kitti360Reader(root=tmp_path).read()
 
 
 @pytest.mark.slow
