@@ -23,7 +23,7 @@ def recolored(log: DrivingLog, frames: Frames) -> Sweeps:
             return log.sweeps.load(index)
         sweep, seen = log.sweeps.load_gray(index), list(frames.at(places[index]))
         at = [carried(sweep).at(frame.time) for frame in seen]
-        colors, colored = color_points(sweep.points, [(frame.camera, frame.image) for frame in seen], at)
+        colors, colored = color_points(sweep.points, seen, at)
         return replace(sweep, colors=colors, colored=colored)
 
     def load_gray(index: int) -> Sweep:

@@ -93,7 +93,7 @@ class SceneFolder:
         frame = self._read_pixels(view)
         if self._points is None:
             return frame
-        return replace(frame, depth=depth_image(self._points(index).at(view.time), view.camera))
+        return replace(frame, depth=depth_image(self._points(index).at(view.time), view.camera, frame.ego))
 
     def _carried(self, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Callable[[int], CarriedPoints]:
         def carried(index: int) -> CarriedPoints:
@@ -106,7 +106,7 @@ class SceneFolder:
         frames = [self._frames(view.indices) for view in self._views[index]]
         points = read_points(index)
         places = [points.at(frame.time) for frame in frames]
-        colors, colored = color_points(points.points, [(frame.camera, frame.image) for frame in frames], places)
+        colors, colored = color_points(points.points, frames, places)
         return self._timed(points, colors, colored)
 
     def _gray_sweep(self, index: int, read_points: Callable[[int], CarriedPoints]) -> Sweep:
