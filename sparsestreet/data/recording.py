@@ -209,6 +209,7 @@ def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[P
         num_cameras=len(recording.rig),
         camera_names=tuple(str(camera.name) for camera in recording.rig),
         dataset_from_world=dataset_from_world(origin),
+        carried_without=folder.holding_out,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
     )

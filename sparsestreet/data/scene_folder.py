@@ -1,6 +1,7 @@
 """A log on disk: its views are known at once, its images and points are read when a frame or a sweep is asked for."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import TypeVar
 
@@ -12,7 +13,7 @@ from sparsestreet.data.clock import LogClock
 from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.problems import LogError, Problem
-from sparsestreet.geometry.boxes import CarriedPoints
+from sparsestreet.geometry.boxes import CarriedPoints, without_frames
 from sparsestreet.types import Frame, Sweep, Track, View
 
 T = TypeVar("T")
@@ -48,6 +49,7 @@ class SceneFolder:
             tracks: objects that carry points, with the times of their boxes.
             sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
         """
+        self._cache_bytes = cache_bytes
         self._views: dict[int, list[View]] = {}
         for view in views:
             self._views.setdefault(view.indices[0], []).append(view)
@@ -56,9 +58,22 @@ class SceneFolder:
         self._tracks = tuple(tracks)
         self._sweep_stamps = sweep_stamps or {}
         self._check = check
-        self._frames = RecentlyUsed(self._read_frame, _count_bytes, cache_bytes)
+        self._read_points = read_points
+        self._use(tracks, frozenset())
+
+    def _use(self, others: Sequence[Track], held_out: frozenset[int]) -> None:
+        """Sets the objects that carry points of frames which are not held out, and forgets what others carried."""
+        self._others, self._held_out = tuple(others), held_out
+        self._frames = RecentlyUsed(self._read_frame, _count_bytes, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
-        self._points = None if read_points is None else RecentlyUsed(self._carried(read_points), lambda points: 1, 1)
+        read = self._read_points
+        self._points = None if read is None else RecentlyUsed(self._carried(read), lambda points: 1, 1)
+
+    def holding_out(self, frames: frozenset[int]) -> tuple[Frames, Sweeps]:
+        """Frames and sweeps, of which those of other instants depend on no box of these frames."""
+        other = copy(self)
+        other._use(without_frames(self._tracks, frames), frames)
+        return other.frames, other.sweeps
 
     @property
     def frames(self) -> Frames:
@@ -98,7 +113,8 @@ class SceneFolder:
     def _carried(self, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Callable[[int], CarriedPoints]:
         def carried(index: int) -> CarriedPoints:
             time = self._clock.time(index, self._sweep_stamps.get(index))
-            return CarriedPoints(read_points(index), time, index, self._tracks)
+            tracks = self._tracks if index in self._held_out else self._others
+            return CarriedPoints(read_points(index), time, index, tracks)
 
         return carried
 

@@ -121,6 +121,7 @@ class DriveStudioReader(LogReader):
             num_cameras=len(rig),
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
+            carried_without=folder.holding_out,
             notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
         )

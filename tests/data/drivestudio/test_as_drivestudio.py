@@ -77,6 +77,7 @@ def test_lenses_are_taken_out_of_images_and_masks(bent, width):
 
 def test_lidar_meets_a_pinhole_where_the_lens_is_taken_out(bent):
     """(10, 2, 0.75) is 9 m ahead of camera 1 at frame 1, 1.5 m to its left and 0.75 m below it."""
+    (bent / "ego_masks/1.png").unlink()
     frame = DriveStudioReader(bent, undistort=True).read().frames[4]
     column, row = WIDTH / 2 - FOCAL * 1.5 / 9, HEIGHT / 2 + FOCAL * 0.75 / 9
     assert float(frame.depth[int(row), int(column)]) == pytest.approx(9.0)
