@@ -136,6 +136,13 @@ def test_a_choice_that_is_not_there_names_what_is(choice, said):
         scene_gaussians(stored_street(), 0.8, **choice)
 
 
+def test_an_object_that_is_there_between_two_even_frames_is_found():
+    stored = stored_street()
+    stored.scene.nodes["rigid"].spans[1] = torch.tensor([0.26, 0.37])
+    with pytest.raises(ValueError, match=r"it is there from 0\.260 to 0\.370"):
+        scene_gaussians(stored, 0.8, instances=["tram"])
+
+
 def test_time_lies_in_the_log():
     with pytest.raises(ValueError, match=r"time runs from 0 .* got 1\.2"):
         scene_gaussians(stored_street(), 1.2)
