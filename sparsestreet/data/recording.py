@@ -291,11 +291,9 @@ def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], cl
 def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
     shot = shots[view.indices]
     masks = dict(recording.read_masks(shot))
-    undistortion = recording.rig[shot.camera].undistortion
-    blank = None if undistortion is None else undistortion.blank
-    if blank is not None:  # a pinhole's pixels that the lens did not record
-        masks["ego"] = blank | masks["ego"] if "ego" in masks else blank
-    return Frame.of(view, image=recording.read_image(shot), **{kind: masks.get(kind) for kind in MASK_KINDS})
+    ego = recording.rig[shot.camera].not_of_the_street(masks.pop("ego", None))
+    others = {kind: masks.get(kind) for kind in MASK_KINDS if kind != "ego"}
+    return Frame.of(view, image=recording.read_image(shot), ego=ego, **others)
 
 
 def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], index: int) -> Float[Tensor, "n 3"]:
