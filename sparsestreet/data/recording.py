@@ -24,7 +24,7 @@ from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import LogReader
-from sparsestreet.data.rig import RigCamera
+from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.scene_folder import SceneFolder
 from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
 from sparsestreet.types import Frame, Shutter, SparsePoints, Track, View
@@ -157,6 +157,15 @@ class RecordedReader(LogReader):
         for sweep in (recording.sweeps or {}).values():
             attempt(problems, sweep.read)
         return problems
+
+    def pinhole(
+        self, name: str, index: int, intrinsics: Float64[Tensor, "3 3"], recorded_size: tuple[int, int]
+    ) -> RigCamera[str]:
+        """A camera whose images are shipped without a lens; arguments as in ``rig_camera``."""
+        none = torch.zeros(5, dtype=torch.float64)
+        return rig_camera(
+            name, index, intrinsics=intrinsics, distortion=none, recorded_size=recorded_size, width=self.width
+        )
 
     def check(self) -> list[Problem]:
         try:

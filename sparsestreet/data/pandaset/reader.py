@@ -22,7 +22,7 @@ from sparsestreet.data.pandaset.spin import Spin, spin_of
 from sparsestreet.data.pandaset.tables import PER_SECOND, read_intrinsics, read_poses, read_returns, read_stamps
 from sparsestreet.data.problems import LogError, Problem, fault, missing_files
 from sparsestreet.data.recording import LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.window import chosen_cameras, frame_window
 
 
@@ -90,14 +90,8 @@ class PandaSetReader(RecordedReader):
         folder = chosen.layout.camera(name)
         if absent := missing_files(chosen.layout.image(name, frame) for frame in chosen.frames):
             raise LogError(absent)
-        return rig_camera(
-            name,
-            index,
-            intrinsics=read_intrinsics(folder / "intrinsics.json"),
-            distortion=torch.zeros(5, dtype=torch.float64),
-            recorded_size=image_size(chosen.layout.image(name, chosen.frames[0])),
-            width=self.width,
-        )
+        size = image_size(chosen.layout.image(name, chosen.frames[0]))
+        return self.pinhole(name, index, read_intrinsics(folder / "intrinsics.json"), size)
 
     def _sweeps(
         self, chosen: "_Selection", stamps: Sequence[int], world_from_lidar: Float64[Tensor, "f 4 4"]

@@ -1,6 +1,5 @@
 """Broken sequences: one clear error that names the file, or a counted note."""
 
-import random
 import shutil
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 from sparsestreet.data.kitti360 import Kitti360Reader
 from sparsestreet.data.kitti360.boxes import read_boxes
 from sparsestreet.data.problems import LogError
-from tests.data.kitti.damage import (
+from tests.data.damage import (
     FETCHED,
     LAUGHS,
     assert_found,
@@ -20,6 +19,7 @@ from tests.data.kitti.damage import (
     line,
     long,
     png,
+    refusals,
     replaced,
     written,
 )
@@ -150,17 +150,8 @@ def test_the_only_sequence_needs_no_number(whole, tmp_path):
 
 @pytest.mark.slow
 def test_nothing_but_problems_comes_of_random_bytes(whole, tmp_path):
-    source = random.Random(360)
+    def read(path: Path) -> object:
+        return read_boxes(path, np.array([0, 1, 3]), np.zeros((3, 3)))
+
     content = (whole / XML).read_bytes()
-    path, refused = tmp_path / "boxes.xml", 0
-    for _ in range(200):
-        broken = bytearray(content)
-        for _ in range(source.randint(1, 6)):
-            at = source.randrange(len(broken))
-            broken[at : at + source.randint(0, 3)] = source.randbytes(source.randint(0, 3))
-        path.write_bytes(broken)
-        try:
-            read_boxes(path, np.array([0, 1, 3]), np.zeros((3, 3)))
-        except LogError:
-            refused += 1
-    assert 50 < refused < 200
+    assert 50 < refusals(read, tmp_path / "boxes.xml", content, count=200, seed=360) < 200
