@@ -30,12 +30,7 @@ def config_problem(cfg: DictConfig) -> str | None:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         return _in_one_line(error)
-    return (
-        limit_problem(cfg)
-        or next(_parts_without_keys(tree), None)
-        or next(_wrong_types(tree), None)
-        or _device_problem(cfg)
-    )
+    return limit_problem(cfg) or next(_parts_without_keys(tree), None) or type_problem(tree) or _device_problem(cfg)
 
 
 def unresolvable(cfg: DictConfig) -> str | None:
@@ -45,6 +40,11 @@ def unresolvable(cfg: DictConfig) -> str | None:
     except OmegaConfBaseException as error:
         return _in_one_line(error)
     return None
+
+
+def type_problem(tree: Tree) -> str | None:
+    """The first value of a wrong type, in one sentence; None where there is none."""
+    return next(_wrong_types(tree), None)
 
 
 def _in_one_line(error: OmegaConfBaseException) -> str:

@@ -1,22 +1,20 @@
-"""``sparsestreet data check`` and ``sparsestreet data make``."""
+"""``sparsestreet data``: logs are checked, converted and made."""
 
-import copy
 import sys
 from pathlib import Path
 
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
-
-from sparsestreet.cli.auto import AUTO, with_found_data
-from sparsestreet.cli.compose import composed, override_problem
+from sparsestreet.cli.convert import convert
+from sparsestreet.cli.named_log import UsageError, compose_data, configured_log, reader_of
 from sparsestreet.data.check import report_check
-from sparsestreet.data.reader import LogReader
 
 USAGE = """\
 sparsestreet data check DIR [data=nuscenes data.log.scene=scene-0061 data.log.last_frame=50 ...]
     print everything that is wrong with a log, or with the part that is chosen (exit status 1), or its summary;
     without data=... the folder's files tell which reader is asked
+sparsestreet data convert from=DIR to=DIR [data=... layout=drivestudio layout.jpeg_quality=95 ...]
+    write a log in the layout of a data set; the same command goes on where it was interrupted
+      sparsestreet data convert from=/data/nuscenes to=scene-0061 data.log.scene=scene-0061 data.log.width=960
+      sparsestreet data convert data=synthetic seed=3 to=street
 sparsestreet data make [seed=N] [data.log.settings.width=W ...]
     write a synthetic street, and print where it lies
 """
@@ -25,16 +23,14 @@ sparsestreet data make [seed=N] [data.log.settings.width=W ...]
 _NO_LOG = "no log is named: say sparsestreet data check DIR, DIR being the folder of a log"
 
 
-class _UsageError(ValueError):
-    """The command is not one that can be followed."""
-
-
 def data(arguments: list[str]) -> int:
     """Run the sub-command; 2 on wrong usage."""
     verb, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
-    if verb not in ("check", "make") or "--help" in rest:
+    if verb not in ("check", "convert", "make") or "--help" in rest:
         print(USAGE)
         return 0 if verb in ("-h", "--help") or "--help" in rest else 2
+    if verb == "convert":
+        return convert(rest)
     try:
         return _check(rest) if verb == "check" else _make(rest)
     except (ValueError, OSError) as error:
@@ -45,52 +41,20 @@ def data(arguments: list[str]) -> int:
 def _check(arguments: list[str]) -> int:
     folders = [text for text in arguments if "=" not in text and not text.startswith("-")]
     overrides = [text for text in arguments if text not in folders]
-    if not any(text.startswith("data=") for text in overrides):
-        overrides = [AUTO, *overrides]
+    one_log = f"one recorded log is checked at a time, got {' '.join(arguments)}: name one folder"
     if len(folders) > 1:
-        raise _UsageError(_one_log(arguments))
-    if AUTO in overrides and not folders and not any(text.startswith("data.root=") for text in overrides):
-        raise _UsageError(_NO_LOG)
-    overrides, found = with_found_data(overrides, Path(folders[0]) if folders else None)
-    cfg = _compose(overrides)
-    if folders and "root" not in set(cfg.data):
-        raise _UsageError(_one_log(arguments))
-    if folders:
-        # Not as an override: Hydra's grammar would want some characters of a path in quotes.
-        OmegaConf.update(cfg, "data.root", folders[0])
-    if OmegaConf.is_missing(cfg.data, "root"):
-        raise _UsageError(_NO_LOG)
-    if missing := sorted(OmegaConf.missing_keys(cfg.data.log)):
-        raise _UsageError(f"{missing[0]} has no value: give {missing[0]}=...")
+        raise UsageError(one_log)
+    cfg, found = configured_log(overrides, Path(folders[0]) if folders else None, no_log=_NO_LOG, one_log=one_log)
     if found:
         print(found)
-    return report_check(_reader(cfg))
-
-
-def _one_log(arguments: list[str]) -> str:
-    return f"one recorded log is checked at a time, got {' '.join(arguments)}: name one folder"
+    return report_check(reader_of(cfg))
 
 
 def _make(overrides: list[str]) -> int:
-    cfg = _compose(overrides)
+    cfg = compose_data(overrides)
     if "root" in set(cfg.data):
-        raise _UsageError("only data=synthetic can be made; a recorded drive is read as it is")
-    reader = _reader(cfg)
+        raise UsageError("only data=synthetic can be made; a recorded drive is read as it is")
+    reader = reader_of(cfg)
     log = reader.read()
     print(f"{reader.folder}: {log.num_frames} frames of {log.num_cameras} cameras")
     return 0
-
-
-def _compose(overrides: list[str]) -> DictConfig:
-    problem = override_problem(overrides)
-    if problem:
-        raise _UsageError(problem)
-    return copy.deepcopy(composed(overrides))
-
-
-def _reader(cfg: DictConfig) -> LogReader:
-    try:
-        return instantiate(cfg.data.log, _convert_="all")
-    except InstantiationException as error:
-        # Hydra's own words name the target; the cause says what to do.
-        raise error.__cause__ or error from None

@@ -124,6 +124,7 @@ class StreetData(LightningDataModule):
         super().__init__()
         if val_frames is not None and val_frames < 1:
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
+        log = log.holding_out(split(log, stride=stride, offset=offset, cameras=cameras).held_out_indices)
         self.split = split(log, stride=stride, offset=offset, cameras=cameras)
         if hood is not None:
             hoods = find_hoods(self.split.train, log.sweeps)
@@ -131,7 +132,7 @@ class StreetData(LightningDataModule):
             log = replace(log, frames=with_hoods(log.frames, seen), hoods=hoods)
             self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))
         # Colors of a sweep are those of images, so a camera that is held out gives none.
-        self.driving_log = replace(log, sweeps=recolored(log, self.split.train)) if cameras else log
+        self.driving_log = replace(log, sweeps=recolored(log, self.split)) if cameras else log
         instants = [f"every {stride}th frame from {offset}"] if stride else []
         held_out = instants + [f"camera {name}" for name in cameras]
         self.split_in_words = " and ".join(held_out) or "none"

@@ -1,7 +1,7 @@
 """Sequences whose items are read when they are asked for, and the memory that they may keep."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from sparsestreet.types import Frame, Sweep, View
@@ -72,11 +72,17 @@ class Sweeps(LazySequence):
     """Lidar sweeps, keyed by their integer frames. They are read, and colored from images, when one is indexed."""
 
     def __init__(
-        self, indices: Iterable[int], load: Callable[[int], Sweep], load_gray: Callable[[int], Sweep] | None = None
+        self,
+        indices: Iterable[int],
+        load: Callable[[int], Sweep],
+        load_gray: Callable[[int], Sweep] | None = None,
+        stamps: Mapping[int, int] | None = None,
     ) -> None:
-        """``load_gray`` makes the same sweep without its colors, where that is cheaper."""
+        """``load_gray`` makes the same sweep without its colors, where that is cheaper; ``stamps`` of the sweeps, by
+        their frames, are known without reading any."""
         super().__init__(indices, load)
         self.load_gray = load if load_gray is None else load_gray
+        self.stamps = {} if stamps is None else stamps
 
     @classmethod
     def of(cls, sweeps: "Sweeps | tuple[Sweep, ...]") -> "Sweeps":
@@ -88,7 +94,8 @@ class Sweeps(LazySequence):
             raise ValueError(
                 f"a log has one sweep an instant, got {[sweep.index for sweep in sweeps]}: join those of one instant"
             )
-        return cls(by_index, by_index.__getitem__)
+        stamps = {index: sweep.stamp for index, sweep in by_index.items() if sweep.stamp is not None}
+        return cls(by_index, by_index.__getitem__, stamps=stamps)
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -100,7 +107,7 @@ class Sweeps(LazySequence):
         return map(self.load_gray, self.keys)
 
     def _of(self, keys: Iterable[int]) -> "Sweeps":
-        return Sweeps(keys, self.load, self.load_gray)
+        return Sweeps(keys, self.load, self.load_gray, self.stamps)
 
 
 class RecentlyUsed(Generic[K, T]):

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from sparsestreet.data.problems import fault
 from sparsestreet.geometry.cameras import project
 from sparsestreet.metrics.definitions import LIDAR_REACH
-from sparsestreet.types import Camera
+from sparsestreet.types import Camera, Frame
 
 _FARTHEST = 1000.0
 """Meters: no street lidar reaches this far, so a point beyond it is not a point."""
@@ -27,21 +27,21 @@ def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "d
 
 def color_points(
     points: Float[Tensor, "n 3"],
-    views: Sequence[tuple[Camera, UInt8[Tensor, "_ _ 3"]]],
+    frames: Sequence[Frame],
     places: Sequence[Float[Tensor, "n 3"]] | None = None,
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
     """RGB in [0, 1] from the pixel each point falls into, and which points any camera sees; the others are gray.
 
-    ``places``: where the points are in each of the views; None: in all of them where they were measured. Where several
+    ``places``: where the points are in each of the frames; None: in all of them where they were measured. Where several
     cameras see a point the first one counts. As in DriveStudio nothing tests whether the camera's view
-    of the point is blocked: lidar and cameras sit close together.
+    of the point is blocked: lidar and cameras sit close together. But the recording car (``Frame.ego``) hides points.
     """
     colors = torch.full((points.shape[0], 3), 0.5)
     colored = torch.zeros(points.shape[0], dtype=torch.bool)
-    for (camera, image), seen in zip(views, places or [points] * len(views), strict=True):
-        rows, pixels, _ = visible_pixels(camera, seen)
+    for frame, seen in zip(frames, places or [points] * len(frames), strict=True):
+        rows, pixels, _ = visible_pixels(frame.camera, seen, frame.ego)
         new = ~colored[rows]
-        colors[rows[new]] = image.reshape(-1, 3)[pixels[new]].float() / 255
+        colors[rows[new]] = frame.image.reshape(-1, 3)[pixels[new]].float() / 255
         colored[rows] = True
     return colors, colored
 
@@ -49,16 +49,20 @@ def color_points(
 def seen_points(
     points: Float[Tensor, "n 3"], cameras: Sequence[Camera], places: Sequence[Float[Tensor, "n 3"]] | None = None
 ) -> Bool[Tensor, " n"]:
-    """Which points any of the cameras sees: those that ``color_points`` colors."""
+    """Which points lie in the image of any of the cameras: those that ``color_points`` colors where the recording car
+    hides none."""
     seen = torch.zeros(points.shape[0], dtype=torch.bool)
     for camera, place in zip(cameras, places or [points] * len(cameras), strict=True):
         seen[visible_pixels(camera, place)[0]] = True
     return seen
 
 
-def depth_image(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "h w"]:
-    """Depth along the optical axis in meters of the nearest point in each pixel; 0 where there is none."""
-    _, pixels, depths = visible_pixels(camera, points)
+def depth_image(
+    points: Float[Tensor, "n 3"], camera: Camera, ego: Bool[Tensor, "h w"] | None = None
+) -> Float[Tensor, "h w"]:
+    """Depth along the optical axis in meters of the nearest point in each pixel; 0 where there is none, and where the
+    recording car hides it."""
+    _, pixels, depths = visible_pixels(camera, points, ego)
     nearest = torch.full((camera.height * camera.width,), torch.inf)
     nearest.scatter_reduce_(0, pixels, depths.float(), "amin")
     return torch.where(nearest.isinf(), 0.0, nearest).view(camera.height, camera.width)
@@ -76,10 +80,17 @@ def near_returns(depth: Float[Tensor, "h w"], reach: float = LIDAR_REACH) -> Boo
 
 
 def visible_pixels(
-    camera: Camera, points: Float[Tensor, "n 3"]
+    camera: Camera, points: Float[Tensor, "n 3"], ego: Bool[Tensor, "h w"] | None = None
 ) -> tuple[Int[Tensor, " v"], Int[Tensor, " v"], Float[Tensor, " v"]]:
-    """For the points inside the image: their rows, the pixel (row-major) each falls into, and its depth in meters."""
+    """For the points inside the image: their rows, the pixel (row-major) each falls into, and its depth in meters.
+
+    ``ego``: pixels that show the recording car, which hides what falls into them.
+    """
     positions, depths, inside = project(camera, points)
     rows = torch.nonzero(inside).squeeze(-1)
     column, line = positions[rows].long().unbind(-1)
-    return rows, line * camera.width + column, depths[rows]
+    pixels = line * camera.width + column
+    if ego is not None:
+        shown = ~ego.flatten()[pixels]
+        rows, pixels = rows[shown], pixels[shown]
+    return rows, pixels, depths[rows]

@@ -62,6 +62,20 @@ class DrivingLog:
     sparse_points: Callable[[], SparsePoints] | None = None
     """Reads points that came with the log, where it has any. Gaussians start from them, and without lidar the scene's
     box lies around them; they are no returns, so they give no depth."""
+    carried_without: Callable[[frozenset[int]], tuple[Frames, Sweeps]] | None = None
+    """Makes frames and sweeps of which those of other instants depend on no box of the given ones; None: none depends
+    on a box of another instant anyway."""
+
+    def holding_out(self, frames: frozenset[int]) -> "DrivingLog":
+        """The log, where depth and colors of other frames depend on no box of these.
+
+        Images are taken at other times than sweeps, and a box on the way to the next one carries returns from one time
+        to the other (``geometry.boxes.box_at``).
+        """
+        if self.carried_without is None or not frames:
+            return self
+        kept, sweeps = self.carried_without(frames)
+        return replace(self, frames=kept, sweeps=sweeps)
 
     hoods: Mapping[int, Hood] = field(default_factory=dict)
     """Camera index -> what it was found to see of the car that carries it (``hood.find_hoods``)."""

@@ -24,7 +24,7 @@ from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import LogReader
-from sparsestreet.data.rig import RigCamera
+from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.scene_folder import SceneFolder
 from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
 from sparsestreet.types import Frame, Shutter, SparsePoints, Track, View
@@ -158,6 +158,15 @@ class RecordedReader(LogReader):
             attempt(problems, sweep.read)
         return problems
 
+    def pinhole(
+        self, name: str, index: int, intrinsics: Float64[Tensor, "3 3"], recorded_size: tuple[int, int]
+    ) -> RigCamera[str]:
+        """A camera whose images are shipped without a lens; arguments as in ``rig_camera``."""
+        none = torch.zeros(5, dtype=torch.float64)
+        return rig_camera(
+            name, index, intrinsics=intrinsics, distortion=none, recorded_size=recorded_size, width=self.width
+        )
+
     def check(self) -> list[Problem]:
         try:
             self.read()
@@ -209,6 +218,7 @@ def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[P
         num_cameras=len(recording.rig),
         camera_names=tuple(str(camera.name) for camera in recording.rig),
         dataset_from_world=dataset_from_world(origin),
+        carried_without=folder.holding_out,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
     )
@@ -291,11 +301,9 @@ def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], cl
 def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
     shot = shots[view.indices]
     masks = dict(recording.read_masks(shot))
-    undistortion = recording.rig[shot.camera].undistortion
-    blank = None if undistortion is None else undistortion.blank
-    if blank is not None:  # a pinhole's pixels that the lens did not record
-        masks["ego"] = blank | masks["ego"] if "ego" in masks else blank
-    return Frame.of(view, image=recording.read_image(shot), **{kind: masks.get(kind) for kind in MASK_KINDS})
+    ego = recording.rig[shot.camera].not_of_the_street(masks.pop("ego", None))
+    others = {kind: masks.get(kind) for kind in MASK_KINDS if kind != "ego"}
+    return Frame.of(view, image=recording.read_image(shot), ego=ego, **others)
 
 
 def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], index: int) -> Float[Tensor, "n 3"]:

@@ -49,6 +49,9 @@ def edge_shift(frames: Frames, sweeps: Sweeps) -> EdgeShift | None:
             continue
         frame = frames[place]
         positions, depths, inside = project(frame.camera, sweeps[places[index]].points)
+        if frame.ego is not None:
+            column, row = positions[inside].long().unbind(1)
+            inside[inside.clone()] = ~frame.ego[row, column]
         for axis in (0, 1):
             edges = _edges(positions[inside], depths[inside], axis, frame)
             slopes[axis] += _slopes(frame, edges, axis, shifts)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.problems import fault
@@ -43,6 +43,13 @@ class RigCamera(Generic[Name]):
     def at(self, world_from_camera: Float64[Tensor, "4 4"]) -> Camera:
         """The camera at a pose of the log's world."""
         return Camera(inverse(world_from_camera).float(), self.intrinsics, *self.size, self.distortion)
+
+    def not_of_the_street(self, ego: Bool[Tensor, "h w"] | None) -> Bool[Tensor, "h w"] | None:
+        """The mask of the recording car and of what the lens did not record, which is black without it; None: none."""
+        blank = None if self.undistortion is None else self.undistortion.blank
+        if ego is None or blank is None:
+            return blank if ego is None else ego
+        return blank | ego
 
 
 def rig_camera(

@@ -1,6 +1,7 @@
 """A log on disk: its views are known at once, its images and points are read when a frame or a sweep is asked for."""
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import TypeVar
 
@@ -12,7 +13,7 @@ from sparsestreet.data.clock import LogClock
 from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.problems import LogError, Problem
-from sparsestreet.geometry.boxes import CarriedPoints
+from sparsestreet.geometry.boxes import CarriedPoints, without_frames
 from sparsestreet.types import Frame, Sweep, Track, View
 
 T = TypeVar("T")
@@ -48,6 +49,7 @@ class SceneFolder:
             tracks: objects that carry points, with the times of their boxes.
             sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
         """
+        self._cache_bytes = cache_bytes
         self._views: dict[int, list[View]] = {}
         for view in views:
             self._views.setdefault(view.indices[0], []).append(view)
@@ -56,9 +58,22 @@ class SceneFolder:
         self._tracks = tuple(tracks)
         self._sweep_stamps = sweep_stamps or {}
         self._check = check
-        self._frames = RecentlyUsed(self._read_frame, _count_bytes, cache_bytes)
+        self._read_points = read_points
+        self._use(tracks, frozenset())
+
+    def _use(self, others: Sequence[Track], held_out: frozenset[int]) -> None:
+        """Sets the objects that carry points of frames which are not held out, and forgets what others carried."""
+        self._others, self._held_out = tuple(others), held_out
+        self._frames = RecentlyUsed(self._read_frame, _count_bytes, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
-        self._points = None if read_points is None else RecentlyUsed(self._carried(read_points), lambda points: 1, 1)
+        read = self._read_points
+        self._points = None if read is None else RecentlyUsed(self._carried(read), lambda points: 1, 1)
+
+    def holding_out(self, frames: frozenset[int]) -> tuple[Frames, Sweeps]:
+        """Frames and sweeps, of which those of other instants depend on no box of these frames."""
+        other = copy(self)
+        other._use(without_frames(self._tracks, frames), frames)
+        return other.frames, other.sweeps
 
     @property
     def frames(self) -> Frames:
@@ -75,6 +90,7 @@ class SceneFolder:
             self._views,
             lambda index: self._explained(lambda: self._sweep(index, points)),
             lambda index: self._explained(lambda: self._gray_sweep(index, points)),
+            {index: stamp for index in self._views if (stamp := self._moment(index)[1]) is not None},
         )
 
     def _frame(self, view: View) -> Frame:
@@ -92,12 +108,13 @@ class SceneFolder:
         frame = self._read_pixels(view)
         if self._points is None:
             return frame
-        return replace(frame, depth=depth_image(self._points(index).at(view.time), view.camera))
+        return replace(frame, depth=depth_image(self._points(index).at(view.time), view.camera, frame.ego))
 
     def _carried(self, read_points: Callable[[int], Float[Tensor, "n 3"]]) -> Callable[[int], CarriedPoints]:
         def carried(index: int) -> CarriedPoints:
             time = self._clock.time(index, self._sweep_stamps.get(index))
-            return CarriedPoints(read_points(index), time, index, self._tracks)
+            tracks = self._tracks if index in self._held_out else self._others
+            return CarriedPoints(read_points(index), time, index, tracks)
 
         return carried
 
@@ -105,7 +122,7 @@ class SceneFolder:
         frames = [self._frames(view.indices) for view in self._views[index]]
         points = read_points(index)
         places = [points.at(frame.time) for frame in frames]
-        colors, colored = color_points(points.points, [(frame.camera, frame.image) for frame in frames], places)
+        colors, colored = color_points(points.points, frames, places)
         return self._timed(points, colors, colored)
 
     def _gray_sweep(self, index: int, read_points: Callable[[int], CarriedPoints]) -> Sweep:
@@ -116,8 +133,11 @@ class SceneFolder:
         return self._timed(points, torch.full_like(points.points, 0.5), seen)
 
     def _timed(self, points: CarriedPoints, colors: Float[Tensor, "n 3"], colored: Bool[Tensor, " n"]) -> Sweep:
-        moment = self._clock.moment(points.frame, self._sweep_stamps.get(points.frame))
-        return Sweep(points.frame, points.time, points.points, colors, colored, *moment)
+        return Sweep(points.frame, points.time, points.points, colors, colored, *self._moment(points.frame))
+
+    def _moment(self, index: int) -> tuple[float | None, int | None]:
+        """Seconds and stamp of a sweep."""
+        return self._clock.moment(index, self._sweep_stamps.get(index))
 
 
 def _count_bytes(frame: Frame) -> int:

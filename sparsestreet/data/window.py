@@ -6,6 +6,21 @@ from typing import TypeVar
 
 Name = TypeVar("Name", str, int)
 
+_SHOWN = 8
+"""Names that an error lists."""
+
+
+def listed(names: Sequence[str]) -> str:
+    """What a choice can be, for the error of one that is not there: the first few names, and how many there are.
+
+    >>> listed(["a", "b"]), listed([])
+    ('a, b', 'none')
+    >>> listed(list("abcdefghij"))
+    'a, b, c, d, e, f, g, h, ... (10 in all)'
+    """
+    more = f", ... ({len(names)} in all)" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more or "none"
+
 
 def frame_window(num_frames: int, first_frame: int, last_frame: int, root: Path) -> range:
     """Frames first_frame .. last_frame, included; -1: to the end. Raises ValueError for frames that ``root`` lacks."""

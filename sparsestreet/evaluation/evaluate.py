@@ -106,12 +106,14 @@ def region_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
 
 
 def lidar_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
-    """Name -> pixels of the regions "near_lidar" and "beyond_lidar", in this order, without the sky where the frame
-    knows it; nothing where the log has no lidar."""
+    """Name -> pixels of the regions "near_lidar" and "beyond_lidar", in this order, without the sky and the recording
+    car where the frame knows them; nothing where the log has no lidar."""
     if frame.depth is None:
         return {}
     near = near_returns(frame.depth)
-    ground = torch.ones_like(near) if frame.sky is None else ~frame.sky
+    ground = torch.ones_like(near)
+    for mask in (frame.sky, frame.ego):
+        ground = ground if mask is None else ground & ~mask
     return {"near_lidar": near & ground, "beyond_lidar": ~near & ground}
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from sparsestreet.atomic import atomic_file
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.graph import SceneGaussians
-from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.nodes.node import Instances, Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians, View
@@ -107,16 +107,20 @@ def _rows_of_instances(
         for name in sorted(set(names) & set(objects.names)):
             rows = objects.ids == objects.names.index(name)
             if not bool((placed.gaussians.opacities[placed.spans[node_name]][rows] > 0).any()):
-                raise ValueError(f"{name} is not in the scene at time {time:g}: {_presence(stored, node, rows)}")
+                raise ValueError(
+                    f"{name} is not in the scene at time {time:g}: {_presence(stored, node, objects, name)}"
+                )
             keep[placed.spans[node_name]] |= rows
     return keep
 
 
-def _presence(stored: StoredScene, node: Node, rows: Bool[Tensor, " n"]) -> str:
-    """Says between which frames of the log some Gaussians have an opacity."""
-    last = max(stored.num_frames - 1, 1)
-    times = [frame / last for frame in range(stored.num_frames)]
-    seen = [time for time in times if bool((_at(node, time).opacities[rows] > 0).any())]
+def _presence(stored: StoredScene, node: Node, objects: Instances, name: str) -> str:
+    """Says between which times an object's Gaussians have an opacity: of even frames, and of the ends of its span."""
+    last, place = max(stored.num_frames - 1, 1), objects.names.index(name)
+    rows = objects.ids == place
+    ends = [] if objects.spans is None else objects.spans[place].tolist()
+    times = {*ends, *(frame / last for frame in range(stored.num_frames))}
+    seen = [time for time in sorted(times) if bool((_at(node, time).opacities[rows] > 0).any())]
     return f"it is there from {seen[0]:.3f} to {seen[-1]:.3f}" if seen else "it has no Gaussians"
 
 

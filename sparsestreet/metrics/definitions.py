@@ -25,8 +25,8 @@ PSNR_CAP = 100.0
 _MASKED = "the pixels of the {} mask; images without the mask, or where it is empty, are skipped in the mean"
 _LIDAR = (
     f"the pixels {{}} a lidar return of the same instant within {LIDAR_REACH:g} of the longer image side (a square "
-    "window), moving objects included, sky left out; without a sky mask the sky counts too, mostly as beyond; images "
-    "without lidar, or without such pixels, are skipped in the mean"
+    "window), moving objects included, sky and ego vehicle left out; without a mask of these they count too, mostly as "
+    "beyond; images without lidar, or without such pixels, are skipped in the mean"
 )
 _DOMAIN = {
     "full": "all pixels of the image, the ego vehicle included",

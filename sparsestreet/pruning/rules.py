@@ -141,10 +141,12 @@ class LeaveOneOutRule(PruningRule):
 
 
 def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
-    """Returns 1 where a pixel belongs to the whole image, to vehicles, to people."""
+    """Returns 1 where a pixel belongs to the whole image, to vehicles, to people; to none where it is of the recording
+    car, which training does not show to the scene."""
     everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool, device=frame.image.device)
+    everywhere = everywhere if frame.ego is None else ~frame.ego
     nowhere = torch.zeros_like(everywhere)
-    marked = [nowhere if mask is None else mask for mask in (frame.vehicle, frame.human)]
+    marked = [nowhere if mask is None else mask & everywhere for mask in (frame.vehicle, frame.human)]
     return torch.stack([everywhere, *marked]).float()
 
 

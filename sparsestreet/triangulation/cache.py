@@ -52,6 +52,8 @@ def _key(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) 
         digest.update(f"{frame.frame_index} {frame.camera_index} {camera.width} {camera.height}".encode())
         for tensor in (camera.camera_from_world, camera.intrinsics, camera.distortion, frame.image, frame.sky):
             digest.update(b"-" if tensor is None else tensor.numpy().tobytes())
+        if frame.ego is not None:
+            digest.update(frame.ego.numpy().tobytes())
     for track in moving:
         digest.update(track.name.encode())
         for tensor in (track.frames, track.world_from_object, track.size):

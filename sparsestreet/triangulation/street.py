@@ -86,11 +86,12 @@ def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
 
 
 def _sighting(view: View, frame: Frame, limit: int) -> Sighting:
-    """The features of a frame outside the sky, without the frame's pixels."""
+    """The features of a frame outside the sky and the recording car, without the frame's pixels."""
     image = frame.image.numpy()
     features = find_features(image, limit)
-    if frame.sky is not None:
-        features = features.where(~frame.sky.numpy()[_pixel(features, frame.camera)])
+    for mask in (frame.sky, frame.ego):
+        if mask is not None:
+            features = features.where(~mask.numpy()[_pixel(features, frame.camera)])
     return Sighting(
         view,
         frame.camera.camera_from_world.double().numpy(),

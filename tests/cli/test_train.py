@@ -7,17 +7,14 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
 import torch
-from lightning.fabric.strategies.launchers.subprocess_script import _hydra_subprocess_cmd
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet import load_scene
 from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.train import train
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
@@ -34,8 +31,6 @@ from tests.cli.recompute import recompute
 from tests.conftest import checked, unchecked
 from tests.metrics.networks import random_weights, write_weights
 from tests.typed import as_a, there
-
-# One process trains once for the tests that only look.
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -350,54 +345,3 @@ def test_masks_end_with_their_stage(finished):
 def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     out = run_train(tmp_path, "node.background.max_gaussians=2300", "node.background.density.grad_threshold=1e-6")
     assert RUN.read(out).caps["background"] == 2300
-
-
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (["schedule.max_step=5"], "schedule.max_steps"),
-        (["data=drivestudio"], "data.root has no value"),
-        (["schedule.max_steps=abc"], "must be a whole number, 1 or more, got 'abc'"),
-        (["resume=/nowhere/at/all"], "there is nothing"),
-    ],
-)
-def test_a_slip_is_one_line_before_hydra_sees_it(overrides, said, tmp_path, capsys):
-    assert train([*overrides, f"out={tmp_path / 'run'}"]) == 2
-    written = capsys.readouterr().err
-    assert said in written
-    assert written.count("\n") == 1
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
-    """It is found inside of Hydra, whose report of an error must not be seen."""
-    with pytest.raises(SystemExit) as ended:
-        train(["data=drivestudio", "data.root=/nowhere/at/all", f"out={tmp_path / 'run'}"])
-    assert ended.value.code == 1
-    written = capsys.readouterr().err
-    assert "/nowhere/at/all" in written
-    assert "Traceback" not in written
-    assert "Error in call" not in written
-    assert not (tmp_path / "run").exists()
-
-
-def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):
-    """By Lightning's launcher, which is asked for the words alone; of a sweep each job has its own."""
-    started = []
-
-    def ask(cfg: DictConfig, out: Path, started_at: float) -> float:
-        for module in (None, ModuleSpec("sparsestreet.__main__", None)):  # the installed script; python -m
-            monkeypatch.setattr(sys.modules["__main__"], "__spec__", module)
-            started.append(_hydra_subprocess_cmd(local_rank=1)[0])
-        return 0.0
-
-    monkeypatch.setattr("sparsestreet.cli.run.run", ask)
-    for check in ("override_problem", "_problem_of_values"):  # half of the test's time
-        monkeypatch.setattr(f"sparsestreet.cli.train.{check}", lambda words: None)
-    monkeypatch.setattr(sys, "argv", ["/there/bin/sparsestreet", "train", "-m"])
-    assert train(["method=3dgs", "seed=1", f"out={tmp_path / 'one'}"]) == 0
-    assert train(["-m", "method=3dgs", "seed=2,3", f"hydra.sweep.dir={tmp_path}"]) == 0
-    programs = [sys.executable, "/there/bin/sparsestreet"], [sys.executable, "-m", "sparsestreet.__main__"]
-    words = [command[: command.index("train") + 3] for command in started]
-    assert words == [[*program, "train", "method=3dgs", f"seed={seed}"] for seed in (1, 2, 3) for program in programs]
-    assert f'hydra.run.dir="{tmp_path / "one"}"' in started[0]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.recording import Boxes, LidarSweep, Recording, Shot, log_of
@@ -142,6 +143,27 @@ def test_returns_of_a_moving_car_have_depth_and_color_where_the_image_shows_them
         assert torch.equal(seen.points, (sweep(frame) - log.dataset_from_world[:3, 3]).float())
     for gray, seen in zip(log.sweeps.gray(), log.sweeps, strict=True):
         assert torch.equal(gray.colored, seen.colored)
+
+
+@pytest.mark.parametrize("cameras", [(), (LEFT.name,)], ids=["instants", "a camera too"])
+def test_no_training_view_depends_on_a_held_out_box(cameras: tuple[str, ...]):
+    """The image of frame 1 is taken on the way to the box of frame 2, which is held out."""
+    right, wrong = boxes(), boxes()
+    wrong.poses[2, 0, 3] += 2.0
+    logs = [StreetData(read(boxes=[each]), stride=4, offset=2, cameras=cameras) for each in (right, wrong)]
+    assert logs[0].split.held_out_indices == {2}
+    for part in ("train", "held_out"):
+        first, second = (getattr(data.split, part) for data in logs)
+        for one, other in zip(first, second, strict=True):
+            # A held-out view shows whatever its own box carries.
+            own = one.indices == (2, 0)
+            assert torch.equal(there(one.depth), there(other.depth)) == (not own)
+    for one, other in zip(logs[0].driving_log.sweeps, logs[1].driving_log.sweeps, strict=True):
+        if one.index != 2:
+            assert torch.equal(one.colors, other.colors)
+            assert torch.equal(one.colored, other.colored)
+        if one.index < 2:  # the last image does not show all of the car
+            assert (255 * one.colors[-len(ON_CAR) :]).round().int().tolist() == [list(RED)] * len(ON_CAR)
 
 
 def test_without_boxes_returns_stay_where_they_were_measured():

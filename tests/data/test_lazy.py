@@ -63,6 +63,15 @@ def test_a_part_of_the_sweeps_stays_as_cheap_as_the_whole():
     assert list(part.gray()) == list(part[:1].gray()) == [gray]
 
 
+def test_stamps_of_sweeps_are_known_without_reading_any():
+    def load(index: int) -> Sweep:
+        raise AssertionError(f"sweep {index} is read")
+
+    assert Sweeps([3, 5], load, stamps={3: 300, 5: 500}).where(lambda index: index > 3).stamps[5] == 500
+    sweep = Sweep(2, 0.0, torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1, dtype=torch.bool), 0.0, 200)
+    assert Sweeps.of((sweep,)).stamps == {2: 200}
+
+
 def test_what_was_not_used_for_longest_makes_way():
     asked: list[int] = []
 

@@ -3,7 +3,7 @@
 import torch
 
 from sparsestreet.data.lidar import color_points, depth_image, near_returns
-from sparsestreet.types import Camera
+from sparsestreet.types import Camera, Frame
 
 # At the origin, looking along z; a point (x, y, z) falls on pixel (2 x/z + 1.5, 2 y/z + 1).
 CAMERA = Camera(torch.eye(4), torch.tensor([[2.0, 0, 1.5], [0, 2.0, 1.0], [0, 0, 1]]), width=3, height=2)
@@ -11,9 +11,13 @@ TURNED = Camera(torch.diag(torch.tensor([-1.0, 1, -1, 1])), CAMERA.intrinsics, w
 IMAGE = torch.arange(18, dtype=torch.uint8).reshape(2, 3, 3)
 
 
+def frame(camera: Camera = CAMERA, image: torch.Tensor = IMAGE, ego: torch.Tensor | None = None) -> Frame:
+    return Frame(camera, 0.0, 0, 0, image=image, ego=ego)
+
+
 def test_each_point_gets_the_pixel_it_falls_into():
     points = torch.tensor([[0.0, 0.2, 1.0], [-0.7, -0.4, 1.0], [1.4, 0.8, 2.0], [0.0, 0.0, -1.0], [5.0, 0.0, 1.0]])
-    colors, colored = color_points(points, [(CAMERA, IMAGE)])
+    colors, colored = color_points(points, [frame()])
     assert colored.tolist() == [True, True, True, False, False]
     expected = torch.stack((IMAGE[1, 1], IMAGE[0, 0], IMAGE[1, 2])).float() / 255
     assert torch.equal(colors[:3], expected)
@@ -22,7 +26,7 @@ def test_each_point_gets_the_pixel_it_falls_into():
 
 def test_the_first_camera_counts_and_others_fill_in():
     points = torch.tensor([[0.0, 0.2, 1.0], [0.0, 0.2, -1.0]])
-    views = [(CAMERA, IMAGE), (CAMERA, IMAGE + 100), (TURNED, IMAGE + 50)]
+    views = [frame(), frame(image=IMAGE + 100), frame(TURNED, IMAGE + 50)]
     colors, colored = color_points(points, views)
     assert colored.all()
     assert torch.equal(colors, torch.stack((IMAGE[1, 1], IMAGE[1, 1] + 50)).float() / 255)
@@ -35,9 +39,22 @@ def test_the_nearest_point_wins_in_any_order():
         assert torch.equal(depth_image(points[order], CAMERA), expected)
 
 
+def test_what_the_recording_car_hides_has_neither_color_nor_depth():
+    points = torch.tensor([[0.0, 0.2, 1.0], [-0.7, -0.4, 1.0]])
+    hood = torch.zeros(2, 3, dtype=torch.bool)
+    hood[1] = True
+    colors, colored = color_points(points, [frame(ego=hood)])
+    assert colored.tolist() == [False, True]
+    assert torch.equal(colors, torch.stack((torch.full((3,), 0.5), IMAGE[0, 0] / 255)))
+    # Another camera may see it.
+    colors, colored = color_points(points, [frame(ego=hood), frame(image=IMAGE + 100)])
+    assert torch.equal(colors, torch.stack((IMAGE[1, 1] + 100, IMAGE[0, 0])) / 255)
+    assert depth_image(points, CAMERA, hood).tolist() == [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+
+
 def test_no_points_give_no_color_and_no_depth():
     empty = torch.zeros(0, 3)
-    colors, colored = color_points(empty, [(CAMERA, IMAGE)])
+    colors, colored = color_points(empty, [frame()])
     assert colors.shape == (0, 3)
     assert colored.shape == (0,)
     assert not depth_image(empty, CAMERA).any()
@@ -66,5 +83,5 @@ def test_a_lens_decides_which_pixel_a_point_falls_into():
     image = torch.zeros(24, 40, 3, dtype=torch.uint8)
     image[19, 35], image[20, 36] = torch.tensor([255, 0, 51]), 102
     point = torch.tensor([[2.0, 1.0, 5.0]])
-    assert torch.equal(color_points(point, [(camera, image)])[0], torch.tensor([[1.0, 0.0, 0.2]]))
+    assert torch.equal(color_points(point, [frame(camera, image)])[0], torch.tensor([[1.0, 0.0, 0.2]]))
     assert depth_image(point, camera).nonzero().tolist() == [[19, 35]]

@@ -72,6 +72,21 @@ def test_points_that_came_with_the_log_are_in_its_world_and_give_no_depth():
     assert not len(log.sweeps)
 
 
+def test_the_recording_car_has_no_returns():
+    points = torch.tensor([[0.0, 0.5, 5.0], [0.0, 1.3, 5.0]], dtype=torch.float64)  # rows 11 and 15.8
+    recording = Recording(
+        name="a",
+        rig=[camera(FLAT)],
+        shots=[Shot(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
+        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
+        read_masks=lambda shot: {"ego": HOOD},
+        sweeps={0: LidarSweep(lambda: points)},
+    )
+    log = log_of(recording, cache_bytes=0, check=list)
+    assert there(log.frames[0].depth).nonzero().tolist() == [[11, 12]]
+    assert log.sweeps[0].colored.tolist() == [True, False]
+
+
 def test_a_declared_shutter_arrives_at_the_view():
     rolling = Shutter(torch.tensor([0.0, 0.0, 0.4]), torch.zeros(3), direction="left")
     shots = [

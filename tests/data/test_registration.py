@@ -35,8 +35,8 @@ def returns(index: int) -> Sweep:
     return Sweep(index, 0.0, points, torch.full_like(points, 0.5), torch.ones(6000, dtype=torch.bool))
 
 
-def measured(right: float, down: float, instants: int = 8) -> EdgeShift | None:
-    frame = Frame(camera(), 0.0, 0, 0, image=box_image(right, down))
+def measured(right: float, down: float, instants: int = 8, ego: torch.Tensor | None = None) -> EdgeShift | None:
+    frame = Frame(camera(), 0.0, 0, 0, image=box_image(right, down), ego=ego)
     frames = Frames.of([replace(frame, frame_index=index) for index in range(instants)])
     return edge_shift(frames, Sweeps.of(tuple(returns(index) for index in range(instants))))
 
@@ -65,3 +65,7 @@ def test_images_without_a_sweep_are_passed_over():
     sweeps = Sweeps.of(tuple(returns(index) for index in range(8)))
     assert edge_shift(frames, sweeps) is not None
     assert edge_shift(frames, Sweeps.of(())) is None
+
+
+def test_the_recording_car_has_no_edges_of_the_street():
+    assert measured(0.0, 0.0, ego=torch.ones(HEIGHT, WIDTH, dtype=torch.bool)) is None

@@ -79,11 +79,11 @@ def test_an_empty_mask_is_told_from_no_mask():
     assert (quality.pixels("vehicle"), quality.value("psnr", "vehicle")) == (0, None)
 
 
-def lidar_regions(monkeypatch, depth, sky=None):
+def lidar_regions(monkeypatch, depth, sky=None, ego=None):
     """Regions of a frame of 48 columns, whose render is off by 0.1 in the first 16, by 0.2 in the next and by 0.3."""
     error = torch.tensor([0.1, 0.2, 0.3]).repeat_interleave(16)[None, :, None]
     replace_render(monkeypatch, lambda view: view.image.float() / 255 + error)
-    frame = make_frame(size=(9, 48), depth=depth, sky=sky)
+    frame = make_frame(size=(9, 48), depth=depth, sky=sky, ego=ego)
     frame = dataclasses.replace(frame, image=frame.image // 2)  # so that no render is clamped
     (quality,) = evaluate_frames(SCENE, [frame], OPTIONS)
     return quality.regions
@@ -106,6 +106,10 @@ def test_near_and_beyond_the_lidar_without_the_sky(monkeypatch):
     assert (near.pixels, beyond.pixels) == (2 * 9, 16 * 9)
     assert beyond.mse == pytest.approx(0.09, abs=5e-6)
     assert there(near.ssim_uniform7) > there(beyond.ssim_uniform7)
+    hood = torch.zeros(9, 48, dtype=torch.bool)
+    hood[6:] = True
+    regions = lidar_regions(monkeypatch, depth, sky, hood)
+    assert (regions["near_lidar"].pixels, regions["beyond_lidar"].pixels) == (2 * 6, 16 * 6)
 
 
 def test_lidar_regions_at_their_ends(monkeypatch):

@@ -8,8 +8,10 @@ import torch
 from plyfile import PlyData
 
 from sparsestreet.export.ply import instance_names, scene_gaussians, write_ply
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.types import Gaussians
 from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street
+from tests.typed import as_a
 
 
 def gaussians(count: int = 7, terms: int = 9) -> Gaussians:
@@ -134,6 +136,13 @@ def test_an_absent_object_is_not_in_the_file(tmp_path):
 def test_a_choice_that_is_not_there_names_what_is(choice, said):
     with pytest.raises(ValueError, match=said):
         scene_gaussians(stored_street(), 0.8, **choice)
+
+
+def test_an_object_that_is_there_between_two_even_frames_is_found():
+    stored = stored_street()
+    as_a(Rigid, stored.scene.nodes["rigid"]).spans[1] = torch.tensor([0.26, 0.37])
+    with pytest.raises(ValueError, match=r"it is there from 0\.260 to 0\.370"):
+        scene_gaussians(stored, 0.8, instances=["tram"])
 
 
 def test_time_lies_in_the_log():

@@ -28,21 +28,22 @@ def image():
     return rgb.detach(), leaves.sh.grad
 """
 WORKER = """
-import multiprocessing, sys
+import multiprocessing
 
 def work(queue):
     queue.put([part.numpy() for part in image()])
 
 if __name__ == "__main__":
-    context = multiprocessing.get_context(sys.argv[1])
     expected = [part.numpy() for part in image()]  # starts the threads that a forked child lacks
-    queue = context.Queue()
-    worker = context.Process(target=work, args=(queue,), daemon=True)
-    worker.start()
-    result = queue.get(timeout=60)
-    assert all((a == b).all() for a, b in zip(expected, result, strict=True))
-    worker.join(60)
-    sys.exit(worker.exitcode)
+    for method in ("fork", "spawn"):
+        context = multiprocessing.get_context(method)
+        queue = context.Queue()
+        worker = context.Process(target=work, args=(queue,), daemon=True)
+        worker.start()
+        result = queue.get(timeout=60)
+        assert all((a == b).all() for a, b in zip(expected, result, strict=True)), method
+        worker.join(60)
+        assert worker.exitcode == 0, method
 """
 LOADED_FIRST = """
 import ctypes, sys
@@ -68,12 +69,8 @@ def run(script: Path, text: str, *arguments: str) -> None:
     assert answer.returncode == 0, answer.stderr
 
 
-def test_in_a_spawned_process(tmp_path):
-    run(tmp_path / "script.py", SCENE + WORKER, "spawn")
-
-
-def test_loaded_after_torch_and_in_a_forked_process(tmp_path):
-    run(tmp_path / "script.py", SCENE + SUBNORMALS + WORKER, "fork")
+def test_loaded_after_torch_and_in_forked_and_spawned_processes(tmp_path):
+    run(tmp_path / "script.py", SCENE + SUBNORMALS + WORKER)
 
 
 def test_loaded_before_torch(tmp_path):

@@ -341,8 +341,8 @@ def test_more_pairs_than_may_be_held(monkeypatch):
 
 @pytest.mark.lengthy
 def test_pairs_beyond_32_bits_are_counted_not_allocated():
-    # 20,000 opaque giants over 512 x 512 tiles of a 8192 x 8192 image: 5.2e9 pairs, 42 GB of lists.
-    rows = 20_000
+    # 16,400 opaque giants over 512 x 512 tiles of a 8192 x 8192 image: 2^32 pairs and 4e6, which alone would be taken.
+    rows = 16_400
     giant = one_gaussian(scales=[[900.0] * 3], opacities=[1.0])
     gaussians = type(giant)(
         *(getattr(giant, name).expand(rows, *getattr(giant, name).shape[1:]).float() for name in FIELDS)

@@ -125,6 +125,16 @@ def test_a_change_beside_the_path_costs_what_it_costs_in_the_whole_image():
     torch.testing.assert_close(both, 1.5 * costs, rtol=1e-3, atol=0.0)
 
 
+def test_what_the_recording_car_hides_costs_nothing():
+    scene = scene_of([0.5], [2.0])
+    hood = torch.ones(7, 9, dtype=torch.bool)
+    shown, hidden = frame_of(scene, 20), replace(frame_of(scene, 200), ego=hood)
+    rule = LeaveOneOutRule(0.0, noticeable=0.0)
+    (alone,), (both,) = (rule.costs(scene, frames, CONTEXT)["background"] for frames in ([shown], [shown, hidden]))
+    # Neither the error on the hood, which is large, nor a change there counts.
+    assert both == alone > 0
+
+
 def _selection(scene: SceneGraph, frame: Frame, rule: PruningRule) -> Selection:
     return rule.select(scene, [frame], CONTEXT)["background"]
 

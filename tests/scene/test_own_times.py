@@ -11,7 +11,10 @@ from sparsestreet.geometry.quaternions import slerp
 from sparsestreet.scene.body.people import _filled
 from sparsestreet.scene.initialize.boxes import lidar_in_boxes, outside_boxes
 from sparsestreet.scene.nodes import Rigid
+from sparsestreet.scene.state import FINISHED
 from sparsestreet.types import Track
+from tests.scene.nodes.test_field import field_settings
+from tests.scene.nodes.test_vibrating import vibrating_settings
 from tests.scene.people import walker
 from tests.scene.street import (
     CAR_COLOR,
@@ -67,6 +70,19 @@ def cars(log: DrivingLog, held_out: frozenset[int] = frozenset(), **changes) -> 
 def test_a_frames_worth_of_time():
     assert own_log().frame_periods == pytest.approx(LONG, abs=1e-12)
     assert street_log().frame_periods == NUM_FRAMES - 1
+
+
+def test_nodes_without_boxes_count_time_in_frames_too():
+    data, generator = training_data(own_log()), torch.Generator().manual_seed(0)
+    node = vibrating_settings(lidar=60, near=20).build(data, generator)
+    assert node.frame_periods == field_settings(lidar=20, near=10).build(data, generator).frame_periods == LONG
+    at = {tuple(place): index + SWEEP for index in range(NUM_FRAMES) for place in data.sweeps[index].points.tolist()}
+    measured = [0.02 * at[tuple(place)] for place in node.rows.means[:60].tolist()]
+    assert node.rows.life_peaks[:60].tolist() == pytest.approx(measured, rel=1e-5)  # float32
+    # At the time of a sweep its returns have all of their opacity.
+    rows = [row for row, peak in enumerate(measured) if peak == 0.02 * (1 + SWEEP)]
+    opacities = node.gaussians_at(replace(data.views[0], time=data.sweeps[1].time), FINISHED).opacities
+    torch.testing.assert_close(opacities[rows], torch.sigmoid(node.rows.opacity_logits[rows]))
 
 
 @pytest.mark.parametrize("max_gap", [0, 2])

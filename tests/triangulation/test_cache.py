@@ -75,6 +75,7 @@ OTHERS = {
     "image": replace(FRAMES[0], image=FRAMES[0].image + 1),
     "sky": replace(FRAMES[0], sky=~FRAMES[0].sky),
     "no sky": replace(FRAMES[0], sky=None),
+    "hood": replace(FRAMES[0], ego=torch.ones(4, 6, dtype=torch.bool)),
     "pose": _other_camera(camera_from_world=2 * torch.eye(4)),
     "intrinsics": _other_camera(intrinsics=2 * torch.eye(3)),
     "distortion": _other_camera(distortion=torch.ones(5)),

@@ -13,7 +13,7 @@ from sparsestreet.data.synthetic.parts import BACKGROUND
 from sparsestreet.geometry.distortion import distort
 from sparsestreet.triangulation import ImagePointSettings, street_points
 from sparsestreet.triangulation.features import Features
-from sparsestreet.triangulation.street import _pixel, _rays
+from sparsestreet.triangulation.street import _pixel, _rays, _sighting
 from sparsestreet.types import Camera
 from tests.triangulation.conftest import traced
 
@@ -88,6 +88,13 @@ def test_no_point_is_in_the_sky_or_on_what_moves(street, points):
         depth, instance = _truth(street, place)
         assert (depth[row, column] > 0).all()
         assert not np.isin(instance[row, column], moving).any()
+
+
+def test_no_feature_is_of_the_recording_car(street):
+    frame, hood = street.frames[0], torch.zeros(96, 160, dtype=torch.bool)
+    hood[60:] = True
+    rows = [_sighting(frame, replace(frame, ego=ego), 500).features.pixels[:, 1] for ego in (None, hood)]
+    assert rows[0].max() > 60 > rows[1].max() > 0
 
 
 def test_points_of_a_box_are_in_it_and_on_its_object(street, points):

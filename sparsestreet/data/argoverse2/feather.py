@@ -31,7 +31,7 @@ def read_columns(path: Path, columns: Mapping[str, type]) -> dict[str, np.ndarra
     Raises LogError for a missing or broken file, a column that lacks or has empty cells or another type, and for a file
     that would take more than LARGEST; ModuleNotFoundError without pyarrow.
     """
-    arrow = _pyarrow()
+    arrow = pyarrow_of()
     if not path.is_file():
         raise fault(path, "the file is missing", _REMEDY)
     try:
@@ -163,7 +163,7 @@ def _first_line(broken: Exception) -> str:
     return (str(broken).splitlines() or [type(broken).__name__])[0][:200]
 
 
-def _pyarrow() -> ModuleType:
+def pyarrow_of() -> ModuleType:
     try:
         import pyarrow
         import pyarrow.ipc

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sparsestreet.data.problems import fault
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.data.window import chosen_cameras, frame_window, listed
 
 POSES = "city_SE3_egovehicle.feather"
 USUAL_CAMERAS = ("ring_front_center", "ring_front_left", "ring_front_right")
@@ -57,16 +57,17 @@ def find_log(root: Path, scene: str | int | float | None) -> Layout:
 
     Raises ValueError where there is none, or more than one, or for a scene that is no text: 7e128381 is a number.
     """
-    if isinstance(scene, float):
-        raise ValueError(f"data.log.scene is the number {scene}: put the name of the log into quotes")
-    scene = None if scene is None else str(scene)
     found = sorted({path.parent for folder in _FOLDERS for path in root.glob(f"{folder}/{POSES}")})
     if not found:
         raise ValueError(f"no log of Argoverse 2 is in {root}: a log's folder holds {POSES}")
+    if isinstance(scene, float):
+        names = listed([log.name for log in found])
+        raise ValueError(f"data.log.scene is the number {scene}: put the name of the log into quotes, one of {names}")
+    scene = None if scene is None else str(scene)
     logs = [log for log in found if scene is None or log.resolve().name.startswith(scene)]
     if len(logs) == 1:
         return Layout(logs[0])
-    names = ", ".join(log.name for log in (logs or found)[:5]) + (", ..." if len(logs or found) > 5 else "")
+    names = listed([log.name for log in logs or found])
     which = f"{len(logs)} of {len(found)} logs are named {scene}..." if scene else f"there are {len(found)} logs"
     raise ValueError(f"{which} in {root}: say data.log.scene=, the first characters of one of {names}")
 

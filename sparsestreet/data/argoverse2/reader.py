@@ -20,7 +20,7 @@ from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.data.rig import RigCamera
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,14 +87,7 @@ class Argoverse2Reader(RecordedReader):
         if (size := image_size(image)) != mount.size:
             message = f"the image is {size[0]}x{size[1]}, the calibration says {mount.size[0]}x{mount.size[1]}"
             raise fault(image, message, "fetch images and calibration of the same log; data.log.width scales them")
-        return rig_camera(
-            name,
-            index,
-            intrinsics=mount.intrinsics,
-            distortion=torch.zeros(5, dtype=torch.float64),
-            recorded_size=mount.size,
-            width=self.width,
-        )
+        return self.pinhole(name, index, mount.intrinsics, mount.size)
 
 
 def _check_covered(chosen: Selection, path: PosePath) -> None:

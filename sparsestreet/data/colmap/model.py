@@ -14,6 +14,7 @@ from sparsestreet.data.colmap.lenses import lens_of
 from sparsestreet.data.colmap.rows import CameraRow, ImageRow
 from sparsestreet.data.posed_images import PosedImage
 from sparsestreet.data.problems import LogError, attempt, fault
+from sparsestreet.data.window import listed
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.lenses import Lens
 from sparsestreet.geometry.transforms import inverse
@@ -45,6 +46,8 @@ def find_model(root: Path, folder: str | None) -> SparseModel:
             if cameras.is_file() and images.is_file():
                 return SparseModel(cameras, images, points if points.is_file() else None)
     message = f"no cameras and images, .bin or .txt, in {', '.join(places)}"
+    if found := {path.parent for depth in range(4) for path in root.glob("*/" * depth + "images.[bt][ix][nt]")}:
+        message += f"; there are models in {listed(sorted(path.relative_to(root).as_posix() for path in found))}"
     raise fault(root, message, "name the folder above sparse/0 and images, or the model's with data.log.model")
 
 

@@ -1,5 +1,6 @@
-"""Logs in DriveStudio's processed layout: Waymo and nuScenes flavor."""
+"""Logs in DriveStudio's processed layout: read in the flavor of each of its data sets, written in that of nuScenes."""
 
 from sparsestreet.data.drivestudio.reader import DriveStudioReader
+from sparsestreet.data.drivestudio.writer import DriveStudioWriter
 
-__all__ = ["DriveStudioReader"]
+__all__ = ["DriveStudioReader", "DriveStudioWriter"]

@@ -1,5 +1,6 @@
-"""Body poses of people from humanpose/smpl.pkl."""
+"""Body poses of people in humanpose/smpl.pkl: read, and written."""
 
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,6 +19,7 @@ from sparsestreet.geometry.skeleton import NUM_JOINTS
 from sparsestreet.safe_pickle import read_pickled
 from sparsestreet.types import BodyPoses, Track
 
+_MASKS = ("matched_mask", "must_appear_mask", "valid_mask")
 _REMEDY = "write it as DriveStudio's human pose processing does, or say data.log.bodies=false"
 
 
@@ -99,3 +101,29 @@ def _in_world(joints: np.ndarray, layout: Layout, frame: int, camera: int, name:
         raise fault(layout.bodies, message, _REMEDY)
     rotations[0] = world_from_camera(layout, frame, camera)[:3, :3] @ rotations[0]
     return rotations
+
+
+def blank_person(num_frames: int) -> dict[str, Any]:
+    """A person of the file in a log of so many frames, without a pose in any."""
+    rotations = np.tile(np.eye(3, dtype=np.float32), (num_frames, NUM_JOINTS, 1, 1))
+    masks = {mask: np.zeros(num_frames, bool) for mask in _MASKS}
+    smpl = {
+        "global_orient": rotations[:, :1].copy(),
+        "body_pose": rotations[:, 1:].copy(),
+        "betas": np.zeros((num_frames, 10), np.float32),
+    }
+    return {"smpl": smpl, "selected_cam_idx": np.full(num_frames, -1, np.int64), **masks}
+
+
+def set_pose(person: dict[str, Any], frame: int, joints: np.ndarray, camera: int) -> None:
+    """Give a person a pose in a frame: 24 x 3 x 3 rotations of the joints, that of the root as the camera sees it."""
+    person["smpl"]["global_orient"][frame] = joints[:1]
+    person["smpl"]["body_pose"][frame] = joints[1:]
+    person["selected_cam_idx"][frame] = camera
+    for mask in _MASKS:
+        person[mask][frame] = True
+
+
+def pickled_people(people: dict[int, dict[str, Any]]) -> bytes:
+    """The file of people by their ids. It holds NumPy arrays; DriveStudio's own files hold torch tensors."""
+    return pickle.dumps(people, protocol=4)

@@ -63,6 +63,8 @@ def read_frame(layout: Layout, rig: Sequence[RigCamera[int]], view: View) -> Fra
     return Frame.of(
         view,
         image=read_image(layout.image(number, camera.name), camera.size, lens),
-        ego=None if ego is None else read_mask(ego, camera.size, sky=False, undistortion=lens),
+        ego=camera.not_of_the_street(
+            None if ego is None else read_mask(ego, camera.size, sky=False, undistortion=lens)
+        ),
         **masks,
     )

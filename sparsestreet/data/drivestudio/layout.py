@@ -7,11 +7,17 @@ from pathlib import Path
 
 from sparsestreet.data.drivestudio.flavors import Flavor, FlavorName, flavor_of, named_flavor
 from sparsestreet.data.problems import LogError, fault
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.data.window import chosen_cameras, frame_window, listed
 
 _FRAME = re.compile(r"(\d+)")
 _CAMERA = re.compile(r"(\d+)")
 _FRAME_CAMERA = re.compile(r"(\d+)_(\d+)")
+
+SKY_MASKS = "sky_masks"
+FINE_MASKS = "fine_dynamic_masks"
+"""Holds a folder a kind; so do the coarse ones, which are projected boxes."""
+COARSE_MASKS = "dynamic_masks"
+EGO_MASKS = "ego_masks"
 
 
 @dataclass(frozen=True)
@@ -84,7 +90,7 @@ class Layout:
 
     def ego_mask(self, camera: int) -> Path | None:
         """What the recording car covers of a camera's images, the same at all frames; None where it is not told."""
-        path = self.root / "ego_masks" / f"{camera}.png"
+        path = self.root / EGO_MASKS / f"{camera}.png"
         return path if path.is_file() else None
 
     def mask_folder(self, kind: str) -> Path | None:
@@ -93,9 +99,9 @@ class Layout:
         Fine masks replace the coarse ones as soon as their folder exists, never a class at a time (DriveStudio).
         """
         if kind == "sky":
-            folder = self.root / "sky_masks"
+            folder = self.root / SKY_MASKS
             return folder if folder.is_dir() else None
-        coarse, fine = self.root / "dynamic_masks" / kind, self.root / "fine_dynamic_masks"
+        coarse, fine = self.root / COARSE_MASKS / kind, self.root / FINE_MASKS
         if fine.is_dir():
             # A class that has coarse masks only counts as missing: mixing the two would change what metrics mean.
             return fine / kind if (fine / kind).is_dir() or coarse.is_dir() else None
@@ -147,7 +153,8 @@ def _no_log(root: Path) -> LogError:
         return fault(root, "this is a file" if root.exists() else "nothing is there", f"name {wanted}")
     scenes = sorted(path.parent.name for path in root.glob("*/images"))
     if scenes:
-        return fault(root, f"the folder has no images/; it holds {len(scenes)} scenes", f"name one: {root / scenes[0]}")
+        message = f"the folder has no images/; it holds the scenes {listed(scenes)}"
+        return fault(root, message, f"name one: {root / scenes[0]}")
     remedy = f"name {wanted}, or say data=auto, which finds out whose files these are"
     return fault(root, "the folder has no images/", remedy)
 

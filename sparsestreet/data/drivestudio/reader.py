@@ -62,7 +62,8 @@ class DriveStudioReader(LogReader):
     that is one, None: none. The log's notes say which."""
     undistort: bool = False
     """Whether every lens is taken out of images and masks as they are read (DriveStudio, on Waymo), and none is
-    simulated. Cameras are then pinholes with the same intrinsics; what they did not record is black."""
+    simulated. Cameras are then pinholes with the same intrinsics; what they did not record is black, and no loss sees
+    it (``Frame.ego``)."""
     lidar_ahead: Sequence[float | int] | None = None
     """Meters ahead of the vehicle, least and most, of the returns that are read (DriveStudio: -2 and 80); of the Waymo
     flavor only. None: all."""
@@ -121,6 +122,7 @@ class DriveStudioReader(LogReader):
             num_cameras=len(rig),
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
+            carried_without=folder.holding_out,
             notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
         )

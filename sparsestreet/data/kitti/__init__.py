@@ -1,5 +1,6 @@
-"""KITTI's raw data as they are shipped."""
+"""KITTI's raw data as they are shipped: read and written."""
 
 from sparsestreet.data.kitti.reader import KittiReader
+from sparsestreet.data.kitti.writer import KittiWriter
 
-__all__ = ["KittiReader"]
+__all__ = ["KittiReader", "KittiWriter"]

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.data.problems import fault
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.data.window import chosen_cameras, frame_window, listed
 
 COLOR = ("image_02", "image_03")
 GRAY = ("image_00", "image_01")
 _NAME = re.compile(r"(\d{4}_\d\d_\d\d)_drive_\d{4}")
+_NO_DRIVES = "there are no folders DATE/DATE_drive_NNNN_sync below data.root, which must be the folder of the dates"
+_REMEDY = "set data.root and data.log.drive, or unpack the archive there"
 
 
 @dataclass(frozen=True)
@@ -56,16 +58,12 @@ class Drive:
         return min(numbered(self.folder / "oxts" / "data", ".txt"), default=0)
 
 
-def find_drive(root: Path, name: str, cameras: Sequence[str] | None, first_frame: int, last_frame: int) -> Drive:
-    """A drive below the folder of the dates. Raises LogError where it is not there, ValueError for a wanted part that
-    it lacks."""
-    match = _NAME.fullmatch(name.removesuffix("_sync"))
-    if match is None:
-        raise ValueError(f"a drive is named as 2011_09_26_drive_0001, got {name!r}: set data.log.drive")
-    folder = root / match[1] / f"{name.removesuffix('_sync')}_sync"
-    if not folder.is_dir():
-        remedy = "set data.root and data.log.drive, or unpack the archive there"
-        raise fault(folder, _what_is_there(root, folder), remedy)
+def find_drive(
+    root: Path, name: str | int | None, cameras: Sequence[str] | None, first_frame: int, last_frame: int
+) -> Drive:
+    """A drive below the folder of the dates; None: the only one. Raises LogError where it is not there, ValueError for
+    a wanted part that it lacks."""
+    folder = _folder(root, None if name is None else str(name).removesuffix("_sync"))
     found = [camera for camera in (*GRAY, *COLOR) if (folder / camera / "data").is_dir()]
     usual = [camera for camera in COLOR if camera in found]
     chosen = chosen_cameras(found, usual or found if cameras is None else cameras, root)
@@ -76,13 +74,26 @@ def find_drive(root: Path, name: str, cameras: Sequence[str] | None, first_frame
     return Drive(folder, chosen, frames, 1 + max(images))
 
 
-def _what_is_there(root: Path, folder: Path) -> str:
-    if folder.with_name(folder.name.replace("_sync", "_extract")).is_dir():
-        return "only the unsynchronized, distorted recording (_extract) is there: the _sync one is read"
-    found = sorted(path.name.removesuffix("_sync") for path in root.glob("*/*_drive_*_sync"))
-    if not found:
-        return f"there are no folders DATE/DATE_drive_NNNN_sync below {root}, which must be the folder of the dates"
-    return f"there is no such drive, but {', '.join(found[:5])}" + (", ..." if len(found) > 5 else "")
+def _folder(root: Path, name: str | None) -> Path:
+    """Of the drive of a name, or of the only one."""
+    found = {path.name.removesuffix("_sync"): path for path in sorted(root.glob("*/*_drive_*_sync"))}
+    there = f"the drives in {root} are {listed(list(found))}"
+    if name is None:
+        if len(found) > 1:
+            raise ValueError(f"{there}: name one (data.log.drive)")
+        if not found:
+            raise fault(root, _NO_DRIVES, _REMEDY)
+        (name,) = found
+    match = _NAME.fullmatch(name)
+    if match is None:
+        raise ValueError(f"a drive is named as 2011_09_26_drive_0001, got {name!r}; {there}: set data.log.drive")
+    folder = root / match[1] / f"{name}_sync"
+    if folder.is_dir():
+        return folder
+    message = f"there is no such drive; {there}" if found else _NO_DRIVES
+    if folder.with_name(f"{name}_extract").is_dir():
+        message = "only the unsynchronized, distorted recording (_extract) is there: the _sync one is read"
+    raise fault(folder, message, _REMEDY)
 
 
 def numbered(folder: Path, suffix: str) -> set[int]:

@@ -25,7 +25,6 @@ from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.geometry.transforms import transform_points
 
 _POSES = "poses are those of GPS and IMU, as shipped: where they err, images and lidar of different frames disagree"
@@ -56,13 +55,17 @@ class KittiReader(RecordedReader):
 
     marks = Marks(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
 
-    drive: str
-    """Such as 2011_09_26_drive_0001."""
+    drive: str | int | None = None
+    """Such as 2011_09_26_drive_0001; None: the only one."""
 
     def recording(self) -> Recording:
         drive, parts = self._drive(), self._parts()
-        rig = tuple(self._rig_camera(parts.calibration, index, name) for index, name in enumerate(drive.cameras))
-        sizes = tuple(parts.calibration.cameras[name].size for name in drive.cameras)
+        cameras = [parts.calibration.cameras[name] for name in drive.cameras]
+        rig = tuple(
+            self.pinhole(name, index, camera.intrinsics, camera.size)
+            for index, (name, camera) in enumerate(zip(drive.cameras, cameras, strict=True))
+        )
+        sizes = tuple(camera.size for camera in cameras)
         given = None if self.masks is None else GivenMasks(Path(self.masks))
         pixels = Pixels(rig, sizes, given)
         return Recording(
@@ -113,18 +116,6 @@ class KittiReader(RecordedReader):
         if problems or calibration is None or clock is None:
             raise LogError(problems)
         return _Parts(calibration, clock, oxts, poses, turns, tracklets)
-
-    def _rig_camera(self, calibration: Calibration, index: int, name: str) -> RigCamera[str]:
-        camera = calibration.cameras[name]
-        return rig_camera(
-            name,
-            index,
-            intrinsics=camera.intrinsics,
-            distortion=torch.zeros(5, dtype=torch.float64),
-            recorded_size=camera.size,
-            width=self.width,
-            min_lens_shift=self.min_lens_shift,
-        )
 
     def _notes(self, drive: Drive, parts: _Parts) -> list[str]:
         notes = [f"camera {name} records gray, not colors" for name in drive.cameras if name in GRAY]

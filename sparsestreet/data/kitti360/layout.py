@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.data.problems import fault
-from sparsestreet.data.window import chosen_cameras
+from sparsestreet.data.window import chosen_cameras, listed
 
 RECTIFIED = ("image_00", "image_01")
 FISHEYE = ("image_02", "image_03")
@@ -54,24 +54,38 @@ class SequenceFolders:
         return self.root / "data_2d_raw" / self.name / camera
 
 
-def find_sequence(root: Path, sequence: int | str, cameras: Sequence[str] | None) -> SequenceFolders:
-    """Raises LogError where the sequence is not there, ValueError for a name or cameras that cannot be."""
-    number = str(sequence).removeprefix("2013_05_28_drive_").removesuffix("_sync")
-    if not (number.isascii() and number.isdigit() and len(number) <= 4):
-        message = f"a sequence of KITTI-360 is a number from 0 to 18, got {sequence!r}: set data.log.sequence"
-        raise ValueError(message)
-    name = f"2013_05_28_drive_{int(number):04d}_sync"
+def find_sequence(root: Path, sequence: int | str | None, cameras: Sequence[str] | None) -> SequenceFolders:
+    """None: the only one. Raises LogError where the sequence is not there, ValueError for a name or cameras that cannot
+    be."""
+    name = _name(root, sequence)
     images = root / "data_2d_raw" / name
-    if not images.is_dir():
-        found = sorted(path.name[-9:-5] for path in root.glob("data_2d_raw/2013_05_28_drive_*_sync"))
-        there = f"there are sequences {', '.join(found)}" if found else "root must be the folder of data_2d_raw"
-        raise fault(images, f"the sequence is not there; {there}", "set data.root and data.log.sequence")
     on_disk = [camera for camera in (*RECTIFIED, *FISHEYE) if images_of(images / camera).is_dir()]
     usual = [camera for camera in RECTIFIED if camera in on_disk]
     if not on_disk or not (usual or cameras):
         message = "it holds neither image_00/data_rect nor image_01/data_rect"
         raise fault(images, message, "unpack the perspective images")
     return SequenceFolders(root, name, chosen_cameras(on_disk, usual if cameras is None else cameras, root))
+
+
+def _name(root: Path, sequence: int | str | None) -> str:
+    """Of the folders of a sequence, or of the only one."""
+    found = sorted(path.name[-9:-5] for path in root.glob("data_2d_raw/2013_05_28_drive_????_sync"))
+    there = f"there are sequences {listed(found)}" if found else "root must be the folder of data_2d_raw"
+    if sequence is None:
+        if not found:
+            raise fault(root / "data_2d_raw", f"there is no sequence; {there}", "set data.root")
+        if len(found) > 1:
+            raise ValueError(f"{there} in {root}: name one (data.log.sequence)")
+        (sequence,) = found
+    number = str(sequence).removeprefix("2013_05_28_drive_").removesuffix("_sync")
+    if not (number.isascii() and number.isdigit() and len(number) <= 4):
+        message = f"a sequence of KITTI-360 is a number from 0 to 18, got {sequence!r}; {there}: set data.log.sequence"
+        raise ValueError(message)
+    name = f"2013_05_28_drive_{int(number):04d}_sync"
+    if not (root / "data_2d_raw" / name).is_dir():
+        message = f"the sequence is not there; {there}"
+        raise fault(root / "data_2d_raw" / name, message, "set data.root and data.log.sequence")
+    return name
 
 
 def images_of(camera: Path) -> Path:

@@ -28,7 +28,7 @@ from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.poses import RIGIDITY_TOLERANCE, are_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.data.rig import RigCamera, lens_camera, rig_camera
+from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.transforms import rigidity_error, transform_points
 
 _TURN = 103_300_000
@@ -61,8 +61,8 @@ class Kitti360Reader(RecordedReader):
 
     marks = Marks(("data_2d_raw/*_drive_*_sync",))
 
-    sequence: int | str
-    """0, 2 to 10 or 18."""
+    sequence: int | str | None = None
+    """0, 2 to 10 or 18; None: the only one."""
     pinhole_fov: float | None = None
     """Degrees that the pinholes see which the fisheyes are resampled to (``rig.lens_camera``); None: by their
     resolution."""
@@ -152,15 +152,7 @@ class Kitti360Reader(RecordedReader):
                 min_lens_shift=self.min_lens_shift,
                 pinhole_fov=self.pinhole_fov,
             )
-        return rig_camera(
-            name,
-            index,
-            intrinsics=camera.intrinsics,
-            distortion=torch.zeros(5, dtype=torch.float64),
-            recorded_size=camera.size,
-            width=self.width,
-            min_lens_shift=self.min_lens_shift,
-        )
+        return self.pinhole(name, index, camera.intrinsics, camera.size)
 
     def _notes(self, sequence: SequenceFolders, parts: _Parts, num_labeled: int) -> tuple[str, ...]:
         notes = []

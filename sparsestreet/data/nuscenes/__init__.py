@@ -1,5 +1,6 @@
-"""Reader of nuScenes as it is published: tables of JSON, and the files that they name."""
+"""nuScenes as it is published: tables of JSON, and the files that they name, read and written."""
 
 from sparsestreet.data.nuscenes.reader import NuScenesReader
+from sparsestreet.data.nuscenes.writer import NuScenesWriter
 
-__all__ = ["NuScenesReader"]
+__all__ = ["NuScenesReader", "NuScenesWriter"]

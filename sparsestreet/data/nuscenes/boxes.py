@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from sparsestreet.data.nuscenes.scene import SceneFiles, pose_of
+from sparsestreet.data.nuscenes.scene import LIDAR, SceneFiles, pose_of
 from sparsestreet.data.nuscenes.tables import Row, all_rows, rows_of_tokens
 from sparsestreet.data.recording import Boxes
 
@@ -20,7 +20,7 @@ def read_boxes(
     """Every object of the scene that some return hit, with all its boxes; and what should be known of the others.
 
     A box without returns is one that annotators placed between boxes with returns: the object is hidden there, not
-    gone. An object without any return is a guess, and left out.
+    gone. An object without any return is a guess, and left out. Without lidar nobody can tell, and all are kept.
 
     Args:
         scene: whose samples the boxes are of.
@@ -30,7 +30,8 @@ def read_boxes(
     objects: dict[str, list[Row]] = {}
     for row in annotations:
         objects.setdefault(row.text("instance_token"), []).append(row)
-    seen = {token: rows for token, rows in objects.items() if any(map(_returns, rows))}
+    without_lidar = LIDAR not in scene.files
+    seen = {token: rows for token, rows in objects.items() if without_lidar or any(map(_returns, rows))}
     classes = _classes(scene, seen)
     boxes = [_boxes(scene, token, classes[token], rows, of_samples) for token, rows in seen.items()]
     return boxes, tuple(_notes(scene, seen, len(objects) - len(seen)))
@@ -82,7 +83,7 @@ def _notes(scene: SceneFiles, objects: Mapping[str, Sequence[Row]], unseen: int)
     notes = []
     if unseen:
         notes.append(f"{unseen} objects that no lidar or radar return hit at any keyframe are left out")
-    if hidden := sum(not _returns(row) for row in rows):
+    if LIDAR in scene.files and (hidden := sum(not _returns(row) for row in rows)):
         notes.append(f"{hidden} of {len(rows)} boxes hold no return: their objects are hidden then, and are kept")
     names = {row.token: row.text("name") for row in all_rows(scene.tables / "attribute.json")}
     counts = Counter(names.get(token, "?") for row in rows for token in _attributes(row))

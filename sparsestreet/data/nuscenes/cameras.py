@@ -13,7 +13,7 @@ from sparsestreet.data.rig import RigCamera, rig_camera
 
 _LARGEST_SIDE = 1 << 14
 """Pixels; genuine images have 1600x900."""
-_EGO_ROWS = {"CAM_BACK": 80}
+EGO_ROWS = {"CAM_BACK": 80}
 """Channel -> how many of the lowest rows show the recording car (neurad-studio's nuScenes reader)."""
 _EGO_ROWS_OF_SCENES = {"scene-0164": {"CAM_BACK": 146}}
 _HEIGHT = 900
@@ -66,7 +66,7 @@ def nuscenes_camera(
 
 def ego_mask(scene: str, camera: RigCamera[str]) -> Bool[Tensor, "h w"] | None:
     """True where the recording car is seen, at the camera's size; None where it is not."""
-    rows = {**_EGO_ROWS, **_EGO_ROWS_OF_SCENES.get(scene, {})}.get(camera.name)
+    rows = {**EGO_ROWS, **_EGO_ROWS_OF_SCENES.get(scene, {})}.get(camera.name)
     return None if rows is None else bottom_rows(camera.size, rows, _HEIGHT)
 
 

@@ -4,20 +4,21 @@ from pathlib import Path
 
 from sparsestreet.data.nuscenes.tables import REMEDY, Row, all_rows
 from sparsestreet.data.problems import fault
+from sparsestreet.data.window import listed
 
-_SHOWN = 12
-"""Scenes that an error message lists."""
 _DIGITS = 4
 """Of the number in a scene's name."""
 
 
 def find_tables(root: Path, version: str | None) -> Path:
     """The folder of tables below ``root``. Raises LogError without one, and ValueError where one must be named."""
+    found = sorted(path.parent for path in root.glob("*/sample_data.json"))
+    names = listed([path.name for path in found])
     if version is not None:
         if not (root / version / "sample_data.json").is_file():
-            raise ValueError(f"data.log.version={version}: {root / version} holds no sample_data.json")
+            there = f"there are tables of {names}"
+            raise ValueError(f"data.log.version={version}: {root / version} holds no sample_data.json; {there}")
         return root / version
-    found = sorted(path.parent for path in root.glob("*/sample_data.json"))
     if not found:
         if (root / "sample_data.json").is_file():
             raise fault(
@@ -26,7 +27,6 @@ def find_tables(root: Path, version: str | None) -> Path:
         here = "the folder holds no */sample_data.json" if root.is_dir() else "no such folder"
         raise fault(root, here, "name the folder that holds v1.0-mini, v1.0-trainval or v1.0-test beside samples/")
     if len(found) > 1:
-        names = ", ".join(path.name for path in found)
         raise ValueError(f"{root} holds the tables of {names}: say which, as data.log.version={found[0].name}")
     return found[0]
 
@@ -52,24 +52,20 @@ def _place(tables: Path, names: list[str], scene: str | int | None) -> int:
         if len(names) == 1:
             return 0
         raise ValueError(
-            f"{tables} holds {len(names)} scenes: name one, as data.log.scene={names[0]}; {_listed(names)}"
+            f"{tables} holds {len(names)} scenes: name one, as data.log.scene={names[0]}; there are {listed(names)}"
         )
     if isinstance(scene, int):
         if 0 <= scene < len(names):
             return scene
         reach = f"a number is a place within 0 to {len(names) - 1} of scene.json"
-        raise ValueError(f"data.log.scene={scene}: {reach}{_other(scene, names)}; {_listed(names)}")
+        raise ValueError(f"data.log.scene={scene}: {reach}{_other(scene, names)}; there are {listed(names)}")
     if scene in names:
         return names.index(scene)
     other = _other(int(scene), names) if scene.isascii() and scene.isdigit() and len(scene) <= _DIGITS else ""
-    raise ValueError(f"data.log.scene={scene}: no scene of {tables} has this name{other}; {_listed(names)}")
+    raise ValueError(f"data.log.scene={scene}: no scene of {tables} has this name{other}; there are {listed(names)}")
 
 
 def _other(number: int, names: list[str]) -> str:
     """What the number would be in a name."""
     name = f"scene-{number:0{_DIGITS}d}"
     return f"; for the scene whose name has this number say data.log.scene={name}" if name in names else ""
-
-
-def _listed(names: list[str]) -> str:
-    return f"there are {', '.join(names[:_SHOWN])}" + (", ..." if len(names) > _SHOWN else "")

@@ -16,7 +16,11 @@ from sparsestreet.data.problems import fault
 from sparsestreet.geometry import quaternions as quat
 
 LIDAR = "LIDAR_TOP"
-_ORDER = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK_RIGHT", "CAM_BACK")
+CHANNELS = {
+    "CAM_FRONT": 0.0, "CAM_FRONT_LEFT": 55.0, "CAM_FRONT_RIGHT": -55.0, "CAM_BACK_LEFT": 110.0,
+    "CAM_BACK_RIGHT": -110.0, "CAM_BACK": 180.0,
+}  # fmt: skip
+"""The front camera first, then in DriveStudio's order; degrees to the left that each looks."""
 _UNIT_TOLERANCE = 1e-3
 """By how much the length of a stored quaternion may be off: more is no rounding."""
 
@@ -89,8 +93,8 @@ def read_scene(root: Path, tables: Path, row: Row) -> SceneFiles:
 
 
 def _ordered_cameras(channels: Mapping[str, object]) -> tuple[str, ...]:
-    cameras = sorted(channel for channel in channels if channel != LIDAR)
-    return tuple(sorted(cameras, key=lambda name: _ORDER.index(name) if name in _ORDER else len(_ORDER)))
+    order, cameras = list(CHANNELS), sorted(channel for channel in channels if channel != LIDAR)
+    return tuple(sorted(cameras, key=lambda name: order.index(name) if name in order else len(order)))
 
 
 def _samples(tables: Path, scene: Row) -> tuple[Row, ...]:

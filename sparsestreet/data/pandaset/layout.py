@@ -5,11 +5,17 @@ from pathlib import Path
 
 import torch
 
+from sparsestreet.data.window import listed
 from sparsestreet.geometry import quaternions as quat
 
 FRONT = "front_camera"
 """Its instants are the middles of the sweeps."""
 USUAL_CAMERAS = (FRONT, "front_left_camera", "front_right_camera")
+CAMERAS = {
+    FRONT: 0.0, "front_left_camera": 45.0, "front_right_camera": -45.0, "left_camera": 90.0, "right_camera": -90.0,
+    "back_camera": 180.0,
+}  # fmt: skip
+"""About how many degrees to the left each looks."""
 EGO_ROWS = {"back_camera": (260, 1080)}
 """How many of the lowest rows show the recording car, and of how many (NeuRAD crops these)."""
 CAMERA_FROM_LIDAR = torch.eye(4, dtype=torch.float64)
@@ -40,8 +46,12 @@ class Layout:
     def image(self, name: str, frame: int) -> Path:
         return self.camera(name) / f"{frame:02d}.jpg"
 
+    @property
+    def lidar(self) -> Path:
+        return self.root / "lidar"
+
     def sweep(self, frame: int) -> Path:
-        return _packed(self.root / "lidar", frame)
+        return _packed(self.lidar, frame)
 
     @property
     def cuboids(self) -> Path:
@@ -68,7 +78,7 @@ def find_sequence(root: Path, scene: str | int | None) -> Layout:
     fitting = [one for one in found if name is None or one.resolve().name == name]
     if len(fitting) == 1:
         return Layout(fitting[0])
-    names = ", ".join(one.name for one in (fitting or found)[:5]) + (", ..." if len(fitting or found) > 5 else "")
+    names = listed([one.name for one in fitting or found])
     which = f"{len(fitting)} of {len(found)} sequences are" if name else f"there are {len(found)} sequences"
     raise ValueError(f"{which}{f' {name}' if name else ''} in {root}: say data.log.scene=, one of {names}")
 

@@ -22,7 +22,7 @@ from sparsestreet.data.pandaset.spin import Spin, spin_of
 from sparsestreet.data.pandaset.tables import PER_SECOND, read_intrinsics, read_poses, read_returns, read_stamps
 from sparsestreet.data.problems import LogError, Problem, fault, missing_files
 from sparsestreet.data.recording import LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.window import chosen_cameras, frame_window
 
 
@@ -75,7 +75,7 @@ class PandaSetReader(RecordedReader):
         tables = [layout.camera(name) / file for name in {FRONT, *chosen.cameras} for file in _TABLES]
         boxes = [layout.boxes(frame) for frame in chosen.frames]
         images = [layout.image(name, frame) for name in chosen.cameras for frame in chosen.frames]
-        points = [layout.sweep(frame) for frame in chosen.frames] if self.lidar else []
+        points = [layout.sweep(frame) for frame in chosen.frames] if self.lidar and layout.lidar.is_dir() else []
         return LogFiles((*tables, *boxes), (*images, *points))
 
     def _selection(self) -> "_Selection":
@@ -90,20 +90,14 @@ class PandaSetReader(RecordedReader):
         folder = chosen.layout.camera(name)
         if absent := missing_files(chosen.layout.image(name, frame) for frame in chosen.frames):
             raise LogError(absent)
-        return rig_camera(
-            name,
-            index,
-            intrinsics=read_intrinsics(folder / "intrinsics.json"),
-            distortion=torch.zeros(5, dtype=torch.float64),
-            recorded_size=image_size(chosen.layout.image(name, chosen.frames[0])),
-            width=self.width,
-        )
+        size = image_size(chosen.layout.image(name, chosen.frames[0]))
+        return self.pinhole(name, index, read_intrinsics(folder / "intrinsics.json"), size)
 
     def _sweeps(
         self, chosen: "_Selection", stamps: Sequence[int], world_from_lidar: Float64[Tensor, "f 4 4"]
     ) -> tuple[dict[int, LidarSweep] | None, Spin | None]:
-        """The sweeps, and the turn of the lidar as the first of them shows it."""
-        if not self.lidar:
+        """The sweeps, and the turn of the lidar as the first of them shows it; None where there is no lidar."""
+        if not self.lidar or not chosen.layout.lidar.is_dir():
             return None, None
         paths = [chosen.layout.sweep(frame) for frame in chosen.frames]
         if absent := missing_files(paths):

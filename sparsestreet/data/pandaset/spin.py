@@ -35,7 +35,8 @@ def spin_of(azimuths: np.ndarray, seconds: np.ndarray, period: float) -> Spin | 
         seconds: from the stamp of the sweep to each return.
         period: seconds of a turn.
     """
-    if not len(azimuths):
+    # Points of another data set, written in this one's layout, are where they were at one instant.
+    if not len(azimuths) or seconds.min() == seconds.max():
         return None
     middle = (seconds.min() + seconds.max()) / 2
     turns = 2 * np.pi * seconds / period

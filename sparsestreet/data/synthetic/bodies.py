@@ -1,6 +1,5 @@
 """Body poses of the street's pedestrians, in the format in which DriveStudio keeps estimated poses."""
 
-import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from sparsestreet.data.drivestudio.bodies import blank_person, pickled_people, set_pose
 from sparsestreet.data.synthetic.models.people import Pedestrian
 from sparsestreet.data.synthetic.noise import stream
 from sparsestreet.data.synthetic.parts import Point
@@ -84,26 +84,11 @@ class BodyWriter:
         rotations = rotations @ Rotation.from_rotvec(spread * rng.standard_normal((NUM_JOINTS, 3))).as_matrix()
         world_from_camera = frame.images[camera].camera.world_from_camera[:3, :3]
         rotations[0] = world_from_camera.T @ frame.actor_poses[actor][:3, :3] @ rotations[0]
-        stored = self._people.setdefault(key, _nobody(self.settings.num_frames))
-        stored["smpl"]["global_orient"][frame.index] = rotations[:1]
-        stored["smpl"]["body_pose"][frame.index] = rotations[1:]
-        stored["selected_cam_idx"][frame.index] = camera
-        for mask in ("matched_mask", "must_appear_mask", "valid_mask"):
-            stored[mask][frame.index] = True
+        stored = self._people.setdefault(key, blank_person(self.settings.num_frames))
+        set_pose(stored, frame.index, rotations, camera)
 
     def write(self, path: Path) -> None:
-        """Writes the file if anybody was seen. It holds NumPy arrays; DriveStudio's own files hold torch tensors."""
+        """Writes the file if anybody was seen."""
         if self._people:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(pickle.dumps(self._people, protocol=4))
-
-
-def _nobody(num_frames: int) -> dict[str, Any]:
-    rotations = np.tile(np.eye(3, dtype=np.float32), (num_frames, NUM_JOINTS, 1, 1))
-    masks = {mask: np.zeros(num_frames, bool) for mask in ("matched_mask", "must_appear_mask", "valid_mask")}
-    smpl = {
-        "global_orient": rotations[:, :1].copy(),
-        "body_pose": rotations[:, 1:].copy(),
-        "betas": np.zeros((num_frames, 10), np.float32),
-    }
-    return {"smpl": smpl, "selected_cam_idx": np.full(num_frames, -1, np.int64), **masks}
+            path.write_bytes(pickled_people(self._people))

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int16
-from PIL import Image
+from jaxtyping import Int16
 
+from sparsestreet.data.encoded import jpeg, mask_png
 from sparsestreet.data.synthetic.bodies import BodyWriter
 from sparsestreet.data.synthetic.cameras import street_camera
 from sparsestreet.data.synthetic.declared import write_declared
@@ -72,7 +72,7 @@ class StreetWriter:
         for camera in range(self.settings.num_cameras if self.settings.hood_known else 0):
             coverage = hood_coverage(self.settings, camera)
             if coverage is not None:
-                _write_mask(self._file("ego_masks", f"{camera}.png"), coverage > 0)
+                self._file("ego_masks", f"{camera}.png").write_bytes(mask_png(coverage > 0))
 
     def _claimed(self, frame: StreetFrame, camera: int) -> StreetImage:
         """The image with the pose that its camera has at the frame's instant."""
@@ -113,19 +113,17 @@ class StreetWriter:
 
     def _write_image(self, image: StreetImage, frame: int, camera: int, annotated: list[int]) -> None:
         name = f"{frame:03d}_{camera}"
-        picture = Image.fromarray(image.rgb)
-        # 4:4:4, because halved color would smear edges, for which a 320-pixel image has few pixels.
-        picture.save(self._file("images", f"{name}.jpg"), quality=self.settings.jpeg, subsampling=0)
+        self._file("images", f"{name}.jpg").write_bytes(jpeg(image.rgb, self.settings.jpeg))
         said = noisy_camera(self.settings, image.camera.world_from_camera, frame, camera)
         np.savetxt(self._file("extrinsics", f"{name}.txt"), said)
-        _write_mask(self._file("sky_masks", f"{name}.png"), image.sky)
+        self._file("sky_masks", f"{name}.png").write_bytes(mask_png(image.sky))
         classes = {index: self.world.actors[index].model.class_name for index in annotated}
         for folder, members in (
             ("all", HUMAN_CLASSES + VEHICLE_CLASSES), ("human", HUMAN_CLASSES), ("vehicle", VEHICLE_CLASSES),
         ):  # fmt: skip
             chosen = [index for index, class_name in classes.items() if class_name in members]
             mask = np.isin(image.object_indices, np.array(chosen, np.int16))
-            _write_mask(self._file(f"dynamic_masks/{folder}", f"{name}.png"), mask)
+            self._file(f"dynamic_masks/{folder}", f"{name}.png").write_bytes(mask_png(mask))
         ids = np.full(len(self.world.actors) + 1, -1, np.int16)  # the last entry is that of BACKGROUND = -1
         for index in annotated:
             ids[index] = self._ids[index]
@@ -141,7 +139,3 @@ class StreetWriter:
 def _count(indices: Int16[np.ndarray, "..."], actors: int) -> np.ndarray:
     """Returns how often each actor's index occurs."""
     return np.bincount(indices[indices >= 0], minlength=actors)
-
-
-def _write_mask(path: Path, mask: Bool[np.ndarray, "h w"]) -> None:
-    Image.fromarray(mask.astype(np.uint8) * 255).save(path)

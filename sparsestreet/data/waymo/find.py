@@ -5,15 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.data.problems import fault
-from sparsestreet.data.waymo.segment import Segment
+from sparsestreet.data.waymo.segment import Segment, canonical
 from sparsestreet.data.waymo.v1.segment import RecordSegment
 from sparsestreet.data.waymo.v2.segment import TableSegment
+from sparsestreet.data.window import listed
 
 _COMPONENTS = ("vehicle_pose", "camera_image", "camera_calibration", "lidar", "lidar_box")
 _RECORDS = ("*.tfrecord", "*/*.tfrecord", "*/*/*.tfrecord")
 _LARGEST_INDEX = 10**6
 """A number above is no place in a list but a name: Hydra takes the digits and underscores of one for a number."""
-_SHOWN = 3
 
 
 @dataclass(frozen=True)
@@ -22,16 +22,6 @@ class Found:
 
     version: int
     places: Mapping[str, Path]
-
-
-def canonical(name: str) -> str:
-    """A segment's name without what files add to it.
-
-    >>> canonical("segment-1024_3580_000_3600_000_with_camera_labels.tfrecord")
-    '1024_3580_000_3600_000'
-    """
-    name = name.strip().removesuffix(".tfrecord").removesuffix(".parquet")
-    return name.removeprefix("segment-").removesuffix("_with_camera_labels")
 
 
 def find_segments(root: Path) -> Found:
@@ -72,13 +62,13 @@ def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Se
 
 def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Path) -> str:
     names = sorted(found.places)
-    shown = ", ".join(names[:_SHOWN]) + (f" ... ({len(names)} in all)" if len(names) > _SHOWN else "")
+    shown = listed(names)
     if scene is None:
         if len(names) > 1:
             raise ValueError(f"data.log.scene must name one of the segments in {root}: {shown}")
         return names[0]
     if isinstance(scene, int) and scene <= _LARGEST_INDEX:
-        scene = _listed(scene, scenes)
+        scene = _at_place(scene, scenes, shown)
     if isinstance(scene, int):
         name = next((name for name in names if name.replace("_", "") == str(scene)), str(scene))
     else:
@@ -88,15 +78,16 @@ def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Pa
     return name
 
 
-def _listed(place: int, scenes: Path | None) -> str:
+def _at_place(place: int, scenes: Path | None, shown: str) -> str:
+    """The line of a list of names."""
     if scenes is None:
-        raise ValueError(
-            f"data.log.scene={place} is a place in a list of segments: name the list (data.log.scenes), or the segment"
-        )
+        message = f"data.log.scene={place} is a place in a list of segments: name the list (data.log.scenes)"
+        raise ValueError(f"{message}, or one of the segments {shown}")
     try:
         lines = [line for line in scenes.read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         raise fault(scenes, f"the list cannot be read ({error})", "write the name of a segment a line") from error
     if not 0 <= place < len(lines):
-        raise ValueError(f"data.log.scene={place} is not within the {len(lines)} segments of {scenes}, counted from 0")
+        message = f"data.log.scene={place} is not within the {len(lines)} segments of {scenes}, counted from 0"
+        raise ValueError(f"{message}; there are files of {shown}")
     return lines[place]

@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.data.vehicle import AHEAD_FROM_OPENCV
 from sparsestreet.data.waymo.segment import CameraCalibration, ImageMotion
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Shutter
 
 _PER_SECOND = 1_000_000_000
-CAMERA_FROM_OPENCV = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
-"""Waymo's camera looks along x, with y to the left and z up."""
-_SIDES: dict[int, Literal["top", "left", "bottom", "right"]] = {1: "top", 2: "left", 3: "bottom", 4: "right"}
+SIDES: dict[int, Literal["top", "left", "bottom", "right"]] = {1: "top", 2: "left", 3: "bottom", 4: "right"}
 """Side of the image that is read first."""
 
 
@@ -51,12 +50,12 @@ def vehicle_at(motion: ImageMotion, stamp: int) -> Float64[Tensor, "4 4"]:
 
 def camera_at(motion: ImageMotion, camera: CameraCalibration, stamp: int) -> Float64[Tensor, "4 4"]:
     """world_from_camera with OpenCV's axes."""
-    return vehicle_at(motion, stamp) @ camera.vehicle_from_camera @ CAMERA_FROM_OPENCV
+    return vehicle_at(motion, stamp) @ camera.vehicle_from_camera @ AHEAD_FROM_OPENCV
 
 
 def shutter(motion: ImageMotion, camera: CameraCalibration) -> Shutter | None:
     """The camera's motion while its image is read out; None where all pixels are read at once, or no order is known."""
-    if camera.direction not in _SIDES:
+    if camera.direction not in SIDES:
         return None
     duration = readout(motion) / _PER_SECOND
     vehicle, pose = vehicle_at(motion, middle(motion)), camera_at(motion, camera, middle(motion))
@@ -65,4 +64,4 @@ def shutter(motion: ImageMotion, camera: CameraCalibration) -> Shutter | None:
     camera_from_world = pose[:3, :3].T
     translation = camera_from_world @ (motion.linear + lever) * duration
     rotation = camera_from_world @ vehicle[:3, :3] @ motion.angular * duration
-    return Shutter(translation.float(), rotation.float(), _SIDES[camera.direction], duration)
+    return Shutter(translation.float(), rotation.float(), SIDES[camera.direction], duration)

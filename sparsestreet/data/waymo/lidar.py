@@ -14,7 +14,8 @@ from torch import Tensor
 from sparsestreet.data.problems import fault
 from sparsestreet.data.waymo.segment import REMEDY, LidarCalibration, Returns
 
-_FARTHEST = 1000.0
+FARTHEST = 1000.0
+"""Meters: no return is from there."""
 SPIN = 100_000_000
 """Nanoseconds of a turn of the lidar TOP."""
 
@@ -45,9 +46,9 @@ def check_returns(returns: Returns, lidar: LidarCalibration | None, path: Path, 
     if returns.poses is not None and returns.poses.shape[:2] != returns.shape:
         message = f"{what} has a range image of {returns.shape} pixels, and poses of {returns.poses.shape[:2]}"
         raise fault(path, message, REMEDY)
-    broken = int((~(returns.ranges < _FARTHEST)).sum())
+    broken = int((~(returns.ranges < FARTHEST)).sum())
     if broken or not (returns.poses is None or np.isfinite(returns.poses).all()):
-        message = f"{what} has {broken} ranges that are NaN, infinite or more than {_FARTHEST:g} m, or such poses"
+        message = f"{what} has {broken} ranges that are NaN, infinite or more than {FARTHEST:g} m, or such poses"
         raise fault(path, message, REMEDY)
     return lidar
 

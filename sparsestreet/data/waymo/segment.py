@@ -160,6 +160,16 @@ class Segment(ABC):
         """What is wrong with the files as such, all bytes of which are read."""
 
 
+def canonical(name: str) -> str:
+    """A segment's name without what files add to it.
+
+    >>> canonical("segment-1024_3580_000_3600_000_with_camera_labels.tfrecord")
+    '1024_3580_000_3600_000'
+    """
+    name = name.strip().removesuffix(".tfrecord").removesuffix(".parquet")
+    return name.removeprefix("segment-").removesuffix("_with_camera_labels")
+
+
 def transform(values: Sequence[float] | np.ndarray, path: Path, what: str) -> Float64[Tensor, "4 4"]:
     """A rigid transform from its 16 numbers, row by row. Raises LogError for other ones, naming the file."""
     if len(values) != 16:

@@ -19,7 +19,7 @@ VIEWS = 48
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares of the pixels that are not sky; they add up to 1.
+    """Shares of the pixels that are neither sky nor the recording car; they add up to 1.
 
     >>> Coverage(lidar=0.5, images=0.25).nothing
     0.25
@@ -43,7 +43,9 @@ def coverage(data: TrainingData) -> Coverage:
     pixels = by_lidar = by_images = 0
     for place in spread(len(data.frames), VIEWS):
         frame = data.frames[place]
-        solid = torch.ones(frame.image.shape[:2], dtype=torch.bool) if frame.sky is None else ~frame.sky
+        solid = torch.ones(frame.image.shape[:2], dtype=torch.bool)
+        for mask in (frame.sky, frame.ego):
+            solid = solid if mask is None else solid & ~mask
         returned = _near_lidar(frame) & solid
         pixels += int(solid.sum())
         by_lidar += int(returned.sum())

@@ -17,7 +17,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings
 from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
-from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node, stored_frame_periods
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
 
@@ -57,13 +57,16 @@ class FieldSettings(BackgroundSettings):
             rows,
             center=log.center,
             radius=log.radius,
-            num_frames=log.num_frames,
+            frame_periods=log.frame_periods,
             seed=generator.initial_seed(),
             mask=mask,
         )
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Field":
-        return Field(self, rows, center=tensors["center"], **header)
+        periods = stored_frame_periods(header)
+        return Field(
+            self, rows, center=tensors["center"], radius=header["radius"], frame_periods=periods, seed=header["seed"]
+        )
 
 
 class Field(Node):
@@ -79,15 +82,15 @@ class Field(Node):
         *,
         center: Float[Tensor, "3"],
         radius: float,
-        num_frames: int,
+        frame_periods: float,
         seed: int = 0,
         mask: Mask | None = None,
     ) -> None:
         """``center`` and ``radius``, meters, are the ball of the scene in which the network's positions are linear;
-        ``seed`` is the seed of weights and noise."""
+        ``frame_periods`` are the log's, ``seed`` is the seed of weights and noise."""
         super().__init__(settings, rows, mask)
         self.radius = radius
-        self.num_frames = num_frames
+        self.frame_periods = frame_periods
         self.seed = seed
         self.register_buffer("center", center)
         self.network = DeformationNetwork(settings.network, seed=seed)
@@ -115,7 +118,7 @@ class Field(Node):
         )
 
     def header(self) -> dict[str, Any]:
-        return {"radius": self.radius, "num_frames": self.num_frames, "seed": self.seed}
+        return {"radius": self.radius, "frame_periods": self.frame_periods, "seed": self.seed}
 
     def pose_bytes(self) -> int:
         """float32 bytes of the network."""
@@ -141,4 +144,4 @@ class Field(Node):
         settings = self.settings
         left = max(1 - state.progress / settings.time_noise_until, 0.0) if settings.time_noise_until > 0 else 0.0
         normal = torch.randn((), generator=named_generator(self.seed, f"time noise {state.progress}")).item()
-        return normal * left * settings.time_noise / max(self.num_frames - 1, 1)
+        return normal * left * settings.time_noise / self.frame_periods

@@ -164,6 +164,8 @@ class Instances:
     """Row of the node -> its instance."""
     sizes: Float[Tensor, "i 3"]
     """Length, width, height of their boxes, meters."""
+    spans: Float[Tensor, "i 2"] | None = None
+    """Normalized times from when to when they may be there; None: unknown."""
 
     def counts(self) -> Int[Tensor, " i"]:
         """Returns the number of rows of every instance."""
@@ -300,3 +302,12 @@ class Node(nn.Module, ABC):
 
 def _bytes(column: Tensor) -> int:
     return column.numel() * (1 if column.dtype == torch.uint8 else BYTES_PER_NUMBER)
+
+
+def stored_frame_periods(header: Mapping[str, Any]) -> float:
+    """Returns ``DrivingLog.frame_periods`` from a node's header in a scene file; older files have the number of frames.
+
+    >>> stored_frame_periods({"frame_periods": 3.5}), stored_frame_periods({"num_frames": 4})
+    (3.5, 3.0)
+    """
+    return header["frame_periods"] if "frame_periods" in header else float(header["num_frames"] - 1)

@@ -247,7 +247,7 @@ class Tracked(Node):
 
     def instances(self) -> Instances:
         """Returns the objects, named like their tracks."""
-        return Instances(self.names, self.rows.instances, self.sizes)
+        return Instances(self.names, self.rows.instances, self.sizes, self.spans)
 
     def header(self) -> dict[str, Any]:
         return {"names": list(self.names), "max_gap": self.max_gap}

@@ -15,7 +15,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings
-from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.nodes.node import Node, stored_frame_periods
 from sparsestreet.scene.state import SceneState
 from sparsestreet.scene.vibration import displacements, faded_logits, mean_velocities
 from sparsestreet.types import View
@@ -58,22 +58,23 @@ class VibratingSettings(BackgroundSettings):
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Vibrating":
         """Raises ValueError if there is not a single point to start from."""
-        seed, num_frames = generator.initial_seed(), data.log.num_frames
+        seed = generator.initial_seed()
+        periods = data.log.frame_periods if data.log.num_frames > 1 else 0.0
         seeds = self.seeds(data, generator)
         anywhere = torch.zeros(len(seeds))
         if self.random_life_peaks:
             anywhere = torch.rand(len(seeds), generator=named_generator(seed, "life peaks"))
-        peaks = torch.where(seeds.times.isnan(), anywhere, seeds.times) * self.frame_time * (num_frames - 1)
+        peaks = torch.where(seeds.times.isnan(), anywhere, seeds.times) * self.frame_time * periods
         columns = {
             "velocities": torch.zeros(len(seeds), 3),
             "life_peaks": peaks,
             "log_life_spans": torch.full((len(seeds),), math.log(self.initial_life_span)),
         }
         rows, mask = self.start_from(seeds, data, generator, columns)
-        return Vibrating(self, rows, num_frames=num_frames, seed=seed, mask=mask)
+        return Vibrating(self, rows, frame_periods=periods, seed=seed, mask=mask)
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Vibrating":
-        return Vibrating(self, rows, num_frames=header["num_frames"], seed=header["seed"])
+        return Vibrating(self, rows, frame_periods=stored_frame_periods(header), seed=header["seed"])
 
 
 class Vibrating(Node):
@@ -83,18 +84,18 @@ class Vibrating(Node):
     settings: VibratingSettings
 
     def __init__(
-        self, settings: VibratingSettings, rows: Rows, *, num_frames: int, seed: int = 0, mask: Mask | None = None
+        self, settings: VibratingSettings, rows: Rows, *, frame_periods: float, seed: int = 0, mask: Mask | None = None
     ) -> None:
-        """``num_frames``: number of frames of the log; ``seed``: seed of the temporal smoothing."""
+        """``frame_periods``: of the log; ``seed``: seed of the temporal smoothing."""
         super().__init__(settings, rows, mask)
-        self.num_frames = num_frames
+        self.frame_periods = frame_periods
         self.seed = seed
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
         """Returns every row at its place and with its opacity at the view's time; faded rows are hidden."""
         rows, settings, stored = self.rows, self.settings, self.stored(view)
         shift = self._shift(state) if state.training else 0.0
-        ages = view.time * settings.frame_time * (self.num_frames - 1) + shift - rows.life_peaks
+        ages = view.time * settings.frame_time * self.frame_periods + shift - rows.life_peaks
         means = rows.means + displacements(rows.velocities, ages, settings.cycle)
         if shift:
             means = means - shift * self.mean_velocities()
@@ -119,7 +120,7 @@ class Vibrating(Node):
         return {"velocity": self.settings.velocity_weight * lengths.sum() / drawn.sum().clamp(min=1)}
 
     def header(self) -> dict[str, Any]:
-        return {"num_frames": self.num_frames, "seed": self.seed}
+        return {"frame_periods": self.frame_periods, "seed": self.seed}
 
     def _shift(self, state: SceneState) -> float:
         """Returns the difference from the view's time to the time that rows are taken from.

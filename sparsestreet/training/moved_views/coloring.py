@@ -24,6 +24,9 @@ def seen_colors(
     for frame, place in zip(frames, places or [points] * len(frames), strict=True):
         rows, positions, _ = unhidden(frame.camera, place)
         column, line = positions.long().unbind(-1)
+        if frame.ego is not None:  # the recording car hides what lies behind it
+            shown = ~frame.ego[line, column]
+            rows, column, line = rows[shown], column[shown], line[shown]
         new = ~seen[rows]
         colors[rows[new]] = frame.image[line[new], column[new]].float() / 255
         seen[rows] = True
@@ -41,7 +44,7 @@ def agreement(
     """
     least = torch.full((len(points),), torch.inf)
     for frame in others:
-        rows, pixels, _ = visible_pixels(frame.camera, points)
+        rows, pixels, _ = visible_pixels(frame.camera, points, frame.ego)
         difference = (frame.image.reshape(-1, 3)[pixels].float() / 255 - colors[rows]).abs().mean(1)
         least[rows] = torch.minimum(least[rows], difference)
     return torch.where(least.isinf(), 1.0, torch.exp(-least / tolerance))

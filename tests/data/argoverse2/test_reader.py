@@ -117,7 +117,7 @@ def test_a_log_is_named_by_its_first_characters(log):
     with pytest.raises(ValueError, match="0 of 2 logs are named 8"):
         Argoverse2Reader(root=root, scene="8").recording()
     # As a command line reads 7e128381 and 12345678.
-    with pytest.raises(ValueError, match="the number inf: put the name of the log into quotes"):
+    with pytest.raises(ValueError, match=f"the number inf: put the name of the log into quotes, one of {LOG}, 7f11"):
         Argoverse2Reader(root=root, scene=float("inf")).recording()
     log.rename(log.parent / "12345678-0")
     assert Argoverse2Reader(root=root, scene=12345678).recording().name == "12345678-0"

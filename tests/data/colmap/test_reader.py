@@ -321,6 +321,12 @@ def test_a_folder_without_a_model(tmp_path):
     with pytest.raises(LogError, match=r"no cameras and images, \.bin or \.txt, in \., sparse/0, sparse"):
         ColmapReader(root=tmp_path).read()
     assert len(ColmapReader(root=tmp_path / "none").check()) == 1
+    for place in ("sparse/0", "sparse/1"):
+        (tmp_path / place).mkdir(parents=True)
+        for name in ("cameras", "images"):
+            (tmp_path / place / f"{name}.bin").touch()
+    with pytest.raises(LogError, match="in sparse/2; there are models in sparse/0, sparse/1;"):
+        ColmapReader(root=tmp_path, model="sparse/2").read()
 
 
 @pytest.mark.slow

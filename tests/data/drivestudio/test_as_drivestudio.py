@@ -26,6 +26,7 @@ from tests.data.drivestudio.folders import (
 )
 
 BARREL, SLIGHT = [-0.25, 0.05, 1e-3, -1e-3, 0.0], [0.01, 0.0, 0.0, 0.0, 0.0]
+PINCUSHION = [0.3, 0.0, 0.0, 0.0, 0.0]
 
 
 def taken_out(camera: Camera, coefficients: list[float]) -> Undistortion:
@@ -70,13 +71,31 @@ def test_lenses_are_taken_out_of_images_and_masks(bent, width):
         mask = read_mask(bent / path / "001_1.png", size, sky=kind == "sky", undistortion=take_out)
         assert torch.equal(getattr(log.frames[4], kind), mask)
         assert not torch.equal(mask, getattr(plain.frames[4], kind))
-    assert torch.equal(log.frames[4].ego, read_mask(bent / "ego_masks/1.png", size, sky=False, undistortion=take_out))
+    hood = read_mask(bent / "ego_masks/1.png", size, sky=False, undistortion=take_out)
+    assert torch.equal(log.frames[4].ego, hood if take_out.blank is None else hood | take_out.blank)
     # The pinhole's image is as recorded.
     assert torch.equal(log.frames[3].image, read_image(bent / "images/001_0.jpg", size))
 
 
+def test_no_loss_sees_what_the_lens_did_not_record(tmp_path):
+    """A pincushion's pinhole has black corners."""
+    make_waymo(tmp_path, cameras=2)
+    write_lines(tmp_path / "intrinsics/1.txt", [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, *PINCUSHION])
+    pixels = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    for frame in range(3):
+        write_image(tmp_path / f"images/{frame:03d}_1.jpg", pixels)
+    frame = DriveStudioReader(tmp_path, undistort=True).read().frames[3]
+    assert frame.ego[[0, 0, -1, -1], [0, -1, 0, -1]].all()
+    assert 0 < int(frame.ego.sum()) < frame.ego.numel() / 2
+    # JPEG leaves 255 at 254 or more.
+    assert (frame.image[~frame.ego] >= 254).all()
+    assert (frame.image[0, 0] == 0).all()
+    assert DriveStudioReader(tmp_path).read().frames[3].ego is None
+
+
 def test_lidar_meets_a_pinhole_where_the_lens_is_taken_out(bent):
     """(10, 2, 0.75) is 9 m ahead of camera 1 at frame 1, 1.5 m to its left and 0.75 m below it."""
+    (bent / "ego_masks/1.png").unlink()
     frame = DriveStudioReader(bent, undistort=True).read().frames[4]
     column, row = WIDTH / 2 - FOCAL * 1.5 / 9, HEIGHT / 2 + FOCAL * 0.75 / 9
     assert float(frame.depth[int(row), int(column)]) == pytest.approx(9.0)

@@ -297,7 +297,12 @@ def test_a_publishers_own_files_are_sent_to_the_reader_of_theirs(tmp_path):
 
 @pytest.mark.parametrize(
     ("named", "words"),
-    [("nowhere", "nothing is there"), ("a.txt", "this is a file"), ("empty", "no images/"), ("", "it holds 2 scenes")],
+    [
+        ("nowhere", "nothing is there"),
+        ("a.txt", "this is a file"),
+        ("empty", "no images/"),
+        ("", "it holds the scenes 007, 012"),
+    ],
 )
 def test_what_is_no_scene_is_told_apart(named, words, tmp_path):
     for scene in ("007", "012"):

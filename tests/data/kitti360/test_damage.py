@@ -1,6 +1,5 @@
 """Broken sequences: one clear error that names the file, or a counted note."""
 
-import random
 import shutil
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 from sparsestreet.data.kitti360 import Kitti360Reader
 from sparsestreet.data.kitti360.boxes import read_boxes
 from sparsestreet.data.problems import LogError
-from tests.data.kitti.damage import (
+from tests.data.damage import (
     FETCHED,
     LAUGHS,
     assert_found,
@@ -20,6 +19,7 @@ from tests.data.kitti.damage import (
     line,
     long,
     png,
+    refusals,
     replaced,
     written,
 )
@@ -132,25 +132,26 @@ def test_whatever_is_not_there_is_said(whole, tmp_path):
     with pytest.raises(LogError, match="root must be the folder of data_2d_raw"):
         Kitti360Reader(root=tmp_path, sequence=4).read()
     for name in ("../3", "0003x", -1, ""):
-        with pytest.raises(ValueError, match="is a number from 0 to 18"):
+        with pytest.raises(ValueError, match=r"is a number from 0 to 18, got .*; there are sequences 0003: set"):
             Kitti360Reader(root=whole, sequence=name).read()
     with pytest.raises(ValueError, match=r"cameras \['image_03'\] must be different ones"):
         Kitti360Reader(root=whole, sequence=3, cameras=["image_03"]).read()
 
 
+def test_the_only_sequence_needs_no_number(whole, tmp_path):
+    assert Kitti360Reader(root=whole).read().name == "2013_05_28_drive_0003"
+    with pytest.raises(LogError, match="there is no sequence; root must be the folder of data_2d_raw"):
+        Kitti360Reader(root=tmp_path).read()
+    for number in (0, 18):
+        (tmp_path / f"data_2d_raw/2013_05_28_drive_{number:04d}_sync").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"there are sequences 0000, 0018 in .*: name one"):
+        Kitti360Reader(root=tmp_path).read()
+
+
 @pytest.mark.slow
 def test_nothing_but_problems_comes_of_random_bytes(whole, tmp_path):
-    source = random.Random(360)
+    def read(path: Path) -> object:
+        return read_boxes(path, np.array([0, 1, 3]), np.zeros((3, 3)))
+
     content = (whole / XML).read_bytes()
-    path, refused = tmp_path / "boxes.xml", 0
-    for _ in range(200):
-        broken = bytearray(content)
-        for _ in range(source.randint(1, 6)):
-            at = source.randrange(len(broken))
-            broken[at : at + source.randint(0, 3)] = source.randbytes(source.randint(0, 3))
-        path.write_bytes(broken)
-        try:
-            read_boxes(path, np.array([0, 1, 3]), np.zeros((3, 3)))
-        except LogError:
-            refused += 1
-    assert 50 < refused < 200
+    assert 50 < refusals(read, tmp_path / "boxes.xml", content, count=200, seed=360) < 200

@@ -4,10 +4,13 @@ Run as a script, without TRITON_INTERPRET: launches (recorded by test_machine_co
 input, what was compiled of them goes out as JSON.
 """
 
+import bisect
 import hashlib
 import importlib
+import itertools
 import json
 import re
+import struct
 import subprocess
 import sys
 import tempfile
@@ -17,17 +20,21 @@ import triton
 import triton.language as tl
 from triton import knobs
 from triton.backends.compiler import GPUTarget
-from triton.compiler import ASTSource
+from triton.compiler import ASTSource, CompiledKernel
 from triton.runtime.jit import JITFunction
 
 _TOOLS = Path(triton.__file__).parent / "backends" / "nvidia" / "bin"
 
 
-def compile_launch(launch: dict, arch: int) -> dict:
-    """Registers, spills, instructions per sample and tensor-core instructions of one launch on one architecture.
+def compile_launches(launches: list[dict], arch: int) -> list[dict]:
+    """Registers, spills, instructions per sample and tensor-core instructions of each launch on one architecture."""
+    compiled = [_compile_launch(launch, arch) for launch in launches]
+    machine_code = instructions_of([each.asm["cubin"] for each in compiled], arch)
+    return [_found(each, instructions) for each, instructions in zip(compiled, machine_code, strict=True)]
 
-    It is compiled while the functions ``without`` are missing from the kernel's module.
-    """
+
+def _compile_launch(launch: dict, arch: int) -> CompiledKernel:
+    """It is compiled while the functions ``without`` are missing from the kernel's module."""
     module = importlib.import_module(launch["module"])
     missing = {name: getattr(module, name) for name in launch.get("without", ())}
     for name in missing:
@@ -39,7 +46,7 @@ def compile_launch(launch: dict, arch: int) -> dict:
         vars(module).update(missing)
 
 
-def _compile(kernel: JITFunction, launch: dict, arch: int) -> dict:
+def _compile(kernel: JITFunction, launch: dict, arch: int) -> CompiledKernel:
     constants = {name: _constant(value) for name, value in launch["constants"].items()}
     types = {**launch["types"], **dict.fromkeys(constants, "constexpr")}
     signature = {name: types[name] for name in kernel.arg_names}
@@ -47,15 +54,16 @@ def _compile(kernel: JITFunction, launch: dict, arch: int) -> dict:
     attributes = {
         (i,): [["tt.divisibility", 16]] for i, name in enumerate(kernel.arg_names) if types[name].startswith("*")
     }
-    compiled = triton.compile(
-        ASTSource(kernel, signature, constants, attributes), GPUTarget("cuda", arch, 32), options=launch["options"]
-    )
-    cubin = compiled.asm["cubin"]
-    instructions = _instructions_of(cubin)
+    source = ASTSource(kernel, signature, constants, attributes)
+    return triton.compile(source, GPUTarget("cuda", arch, 32), options=launch["options"])
+
+
+def _found(compiled: CompiledKernel, instructions: list[tuple[int, str]]) -> dict:
+    forbidden = forbidden_in(instructions)
     return {
-        **resources_of(cubin),
-        "tensor_core": _tensor_core(instructions) + compiled.asm["ptx"].count("tf32"),
-        "atomics": _atomics(instructions),
+        **resources_of(compiled.asm["cubin"]),
+        **forbidden,
+        "tensor_core": forbidden["tensor_core"] + compiled.asm["ptx"].count("tf32"),
         "sample": _per_sample(instructions),
         "loads": sum(text.startswith("LDG") for _, text in instructions),
         "stores": sum(text.startswith("STG") for _, text in instructions),
@@ -70,35 +78,52 @@ def _constant(value: object) -> object:
 
 def resources_of(cubin: bytes) -> dict[str, int]:
     """Registers, and bytes of stack, where spilled registers go."""
-    used = re.search(r"REG:(\d+) STACK:(\d+)", _listed(cubin, "-res-usage"))
+    used = re.search(r"REG:(\d+) STACK:(\d+)", _listed("cuobjdump", cubin, "-res-usage"))
     return {"registers": int(used[1]), "spilled": int(used[2])}
 
 
-def forbidden_in(cubin: bytes) -> dict[str, int]:
+def forbidden_in(instructions: list[tuple[int, str]]) -> dict[str, int]:
     """Instructions of the tensor cores, and atomics."""
-    instructions = _instructions_of(cubin)
-    return {"tensor_core": _tensor_core(instructions), "atomics": _atomics(instructions)}
+    return {
+        "tensor_core": sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions),
+        "atomics": sum(text.split()[0].startswith(("ATOM", "RED.", "REDG.")) for _, text in instructions),
+    }
 
 
-def _tensor_core(instructions: list[tuple[int, str]]) -> int:
-    return sum(bool(re.match(r"[A-Z]*MMA", text)) for _, text in instructions)
-
-
-def _atomics(instructions: list[tuple[int, str]]) -> int:
-    return sum(text.split()[0].startswith(("ATOM", "RED.", "REDG.")) for _, text in instructions)
-
-
-def _instructions_of(cubin: bytes) -> list[tuple[int, str]]:
-    """Instructions with their addresses."""
+def instructions_of(cubins: list[bytes], arch: int) -> list[list[tuple[int, str]]]:
+    """Of each, with addresses from its beginning. They are listed behind each other: to start takes the disassembler
+    a third of a second, and a kernel hardly anything."""
+    codes = [_code(cubin) for cubin in cubins]
+    ends = list(itertools.accumulate(map(len, codes)))
     pattern = r"^\s*/\*([0-9a-f]{4,})\*/\s+(?:@!?U?P\d+\s+)?(.*?);"
-    found = re.findall(pattern, _listed(cubin, "-sass"), re.MULTILINE)
-    return [(int(address, 16), text.strip()) for address, text in found]
+    listed = re.findall(pattern, _listed("nvdisasm", b"".join(codes), "-b", f"SM{arch}"), re.MULTILINE)
+    found: list[list[tuple[int, str]]] = [[] for _ in cubins]
+    for address, text in listed:
+        kernel = bisect.bisect_right(ends, int(address, 16))
+        start = ends[kernel] - len(codes[kernel])
+        found[kernel].append((int(address, 16) - start, _from(start, text.strip())))
+    return found
 
 
-def _listed(cubin: bytes, what: str) -> str:
+def _code(cubin: bytes) -> bytes:
+    """Its machine code: the one section .text of the file (ELF, 64 bits; its header, then those of its sections)."""
+    (table,), (size, count, names) = struct.unpack_from("<Q", cubin, 40), struct.unpack_from("<HHH", cubin, 58)
+    # Name and kind, flags and address, place in the file and length.
+    sections = [struct.unpack_from("<IIQQQQ", cubin, table + i * size) for i in range(count)]
+    texts = [one for one in sections if cubin.startswith(b".text.", sections[names][4] + one[0])]
+    (_, _, _, _, start, length), = texts  # fmt: skip
+    return cubin[start : start + length]
+
+
+def _from(start: int, text: str) -> str:
+    """With the target of a jump counted from the beginning of the kernel."""
+    return re.sub(r"^((?:BRA|BSSY)\b.*)\b0x([0-9a-f]+)", lambda jump: f"{jump[1]}0x{int(jump[2], 16) - start:x}", text)
+
+
+def _listed(tool: str, code: bytes, *options: str) -> str:
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
-        Path(file.name).write_bytes(cubin)
-        command = [_TOOLS / "cuobjdump", what, file.name]
+        Path(file.name).write_bytes(code)
+        command = [_TOOLS / tool, *options, file.name]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
@@ -130,4 +155,4 @@ def _per_sample(instructions: list[tuple[int, str]]) -> float | None:
 
 if __name__ == "__main__":
     given = json.load(sys.stdin)
-    json.dump([compile_launch(launch, given["arch"]) for launch in given["launches"]], sys.stdout)
+    json.dump(compile_launches(given["launches"], given["arch"]), sys.stdout)

@@ -1,6 +1,7 @@
 """Launches one kernel with arguments of many kinds, and says which machine code each launch got.
 
-Run as a script, without TRITON_INTERPRET: names of kinds come in as JSON on standard input.
+Run as a script, without TRITON_INTERPRET: names of kinds come in as JSON on standard input, by the version that Triton
+is said to have (its own where that is empty).
 """
 
 import json
@@ -73,6 +74,8 @@ def measure(device: FakeDevice, names: list[str]) -> list[dict]:
 if __name__ == "__main__":
     fake = FakeDevice()
     install(fake)
-    given = json.load(sys.stdin)
-    triton.__version__ = given.get("version", triton.__version__)
-    json.dump(measure(fake, given["names"]), sys.stdout)
+    version, answers = triton.__version__, {}
+    for other, names in json.load(sys.stdin).items():
+        triton.__version__ = other or version
+        answers[other] = measure(fake, names)
+    json.dump(answers, sys.stdout)

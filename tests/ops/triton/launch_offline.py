@@ -18,7 +18,7 @@ from sparsestreet.ops import splat
 from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
 from sparsestreet.ops.triton.launch import launch
 from tests.ops.scenes import camera, cast, random_gaussians
-from tests.ops.triton.compile_offline import forbidden_in, resources_of
+from tests.ops.triton.compile_offline import forbidden_in, instructions_of, resources_of
 from tests.ops.triton.fake_driver import Binary, FakeDevice, install
 
 MODULES: tuple[ModuleType, ...] = (screen, lists, parts, pixels, rasterizer)
@@ -67,10 +67,13 @@ class Case:
         return list(self.dispatches.names)
 
 
-def found_in(binary: Binary) -> dict:
-    resources = resources_of(binary.cubin) | forbidden_in(binary.cubin)
-    types = dict(binary.source.signature)
-    return {"name": binary.name, "types": types, "known": binary.specialized(), "shared": binary.shared, **resources}
+def found_in(binaries: list[Binary], arch: int) -> list[dict]:
+    machine_code = instructions_of([binary.cubin for binary in binaries], arch)
+    return [
+        {"name": binary.name, "types": dict(binary.source.signature), "known": binary.specialized()}
+        | {"shared": binary.shared, **resources_of(binary.cubin), **forbidden_in(instructions)}
+        for binary, instructions in zip(binaries, machine_code, strict=True)
+    ]
 
 
 def launch_time(case: Case, repeats: int) -> float:
@@ -97,7 +100,7 @@ def measure(device: FakeDevice, given: dict) -> dict:
     before = len(device.binaries)
     case = Case(given)
     case.run()
-    answer: dict[str, Any] = {"compiled": [found_in(binary) for binary in device.binaries[before:]]}
+    answer: dict[str, Any] = {"compiled": found_in(device.binaries[before:], device.arch)}
     device.launches.clear()
     answer["dispatches"] = case.run(backward=False, counted=True)
     answer["forward"] = [binary.name for binary in device.launches]

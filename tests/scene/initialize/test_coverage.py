@@ -51,6 +51,14 @@ def test_without_sky_mask_every_pixel_counts():
     assert coverage(data_of(frame([(10, 10)]))) == Coverage(lidar=9 / 500, images=0.0)
 
 
+def test_the_recording_car_is_no_part_of_the_scene():
+    hood = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    hood[11:] = True
+    points = triangulated([[0.0] * 3], [(0, 0, 20.0, 15.9)])
+    # The lowest row of the window around the return is of the hood, as is all around the point.
+    assert coverage(data_of(replace(frame([(10, 10)]), ego=hood), points=points)) == Coverage(6 / 275, 0.0)
+
+
 def test_without_lidar_points_from_images_count_alone():
     points = triangulated([[0.0] * 3], [(0, 0, 0.5, 0.5)])
     assert coverage(data_of(frame(), points=points)) == Coverage(lidar=0.0, images=4 / 500)

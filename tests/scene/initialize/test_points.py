@@ -7,6 +7,7 @@ from sparsestreet.scene.initialize.points import Points, thinned
 from sparsestreet.scene.initialize.sources import FarPoints, NearPoints
 from sparsestreet.scene.initialize.sources.guesses import random_points, seen_points
 from tests.scene.street import frame_at
+from tests.typed import there
 
 CENTER = torch.tensor([1.0, -2.0, 3.0])
 near_positions, far_positions = NearPoints(part=1.0).positions, FarPoints(part=1.0).positions
@@ -48,6 +49,19 @@ def test_without_sky_masks_every_position_in_view_is_kept():
     unmasked = type(frame)(frame.camera, 0.0, 0, 0, image=frame.image)
     positions = near_positions(500, CENTER, 20.0, torch.Generator().manual_seed(1))
     assert len(seen_points(positions, [unmasked])) == int(project(frame.camera, positions)[2].sum())
+
+
+def test_a_position_that_the_recording_car_hides_is_left_to_other_views():
+    near, other = frame_at(0), frame_at(4)
+    hood = torch.zeros_like(there(near.sky))
+    hood[near.camera.height // 2 :] = True
+    positions = near_positions(3000, CENTER, 20.0, torch.Generator().manual_seed(1))
+    pixels, _, inside = project(near.camera, positions)
+    hidden = positions[inside & (pixels[:, 1] >= near.camera.height // 2)]
+    assert len(hidden)
+    masked = replace(near, ego=hood)
+    assert not len(seen_points(hidden, [masked]))
+    assert len(seen_points(hidden, [masked, other])) == len(seen_points(hidden, [other])) > 0
 
 
 def test_samples_are_distinct_points_with_their_colors():

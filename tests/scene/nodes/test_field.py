@@ -32,7 +32,7 @@ def street(count: int = 30, *, awake: bool = True, **changes) -> Field:
         random_rows(count, 0),
         center=CENTER,
         radius=RADIUS,
-        num_frames=NUM_FRAMES,
+        frame_periods=NUM_FRAMES - 1.0,
         seed=5,
     )
     if awake:
@@ -155,7 +155,7 @@ def test_it_starts_as_the_background_and_knows_its_log():
     assert torch.equal(node.rows.means, still.rows.means)
     log = street_log()
     assert torch.equal(node.center, log.center)
-    assert (node.radius, node.num_frames) == (log.radius, 5)
+    assert (node.radius, node.frame_periods) == (log.radius, 4)
     again = settings.build(data, torch.Generator().manual_seed(3))
     assert torch.equal(again.network.first.of_row.weight, node.network.first.of_row.weight)
     assert again.seed == node.seed
@@ -175,7 +175,7 @@ def test_a_scene_file_keeps_it(tmp_path):
     save_scene(tmp_path / "scene.safetensors", stored)
     loaded = load_scene(tmp_path)
     again = as_a(Field, loaded.scene.nodes["street"])
-    assert (again.radius, again.num_frames, again.seed) == (RADIUS, NUM_FRAMES, 5)
+    assert (again.radius, again.frame_periods, again.seed) == (RADIUS, NUM_FRAMES - 1, 5)
     assert again.settings.network == NETWORK
     for time in (0.0, 0.4, 1.0):
         assert torch.equal(loaded.render(view_at(time, camera_at(-6.0))).rgb,

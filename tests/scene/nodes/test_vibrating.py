@@ -52,7 +52,7 @@ def vibrating_rows(count: int, seed: int = 0, mask=None, dtype: torch.dtype = to
 
 def vibrating(count: int = 20, *, mask=None, dtype: torch.dtype = torch.float32, **changes) -> Vibrating:
     rows = vibrating_rows(count, mask=mask, dtype=dtype)
-    return Vibrating(vibrating_settings(**changes), rows, num_frames=NUM_FRAMES, seed=7, mask=mask)
+    return Vibrating(vibrating_settings(**changes), rows, frame_periods=NUM_FRAMES - 1.0, seed=7, mask=mask)
 
 
 def training(progress: float) -> SceneState:
@@ -131,7 +131,7 @@ def test_in_training_some_steps_take_rows_from_another_time():
 def test_the_same_step_of_the_same_seed_draws_the_same():
     """So a resumed run repeats the uninterrupted one, whatever was drawn in between."""
     node, same = vibrating(smoothing_probability=1.0), vibrating(smoothing_probability=1.0)
-    other = Vibrating(node.settings, vibrating_rows(20), num_frames=NUM_FRAMES, seed=8)
+    other = Vibrating(node.settings, vibrating_rows(20), frame_periods=NUM_FRAMES - 1.0, seed=8)
     torch.rand(3)
     states = [training(step / 9) for step in range(9)]
     assert [node._shift(state) for state in states] == [same._shift(state) for state in reversed(states)][::-1]
@@ -239,7 +239,7 @@ def test_a_scene_file_keeps_it(tmp_path):
     save_scene(tmp_path / "scene.safetensors", stored)
     loaded = load_scene(tmp_path)
     again = as_a(Vibrating, loaded.scene.nodes["street"])
-    assert (again.num_frames, again.seed, again.settings.velocity_weight) == (NUM_FRAMES, 7, 0.25)
+    assert (again.frame_periods, again.seed, again.settings.velocity_weight) == (NUM_FRAMES - 1, 7, 0.25)
     for time in (0.0, 0.4, 1.0):
         assert torch.equal(loaded.render(view_at(time)).rgb, stored.render(view_at(time)).rgb)
 

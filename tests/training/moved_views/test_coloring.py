@@ -1,6 +1,7 @@
 """Colors of returns, and how far other images agree."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -31,6 +32,18 @@ def test_weights_fall_with_the_least_difference():
     weights = agreement(points, colors, [frame(160), frame(130)], tolerance=0.1)
     assert weights[0] == pytest.approx(math.exp(-(30 / 255 / 3) / 0.1), rel=1e-5)
     assert weights[1] == 1  # no image shows it
+
+
+def test_an_image_shows_nothing_behind_the_recording_car():
+    points = torch.tensor([at_pixel(2.5, 1.5, 5.0), at_pixel(3.5, 1.5, 5.0)])
+    hood = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    hood[:, :3] = True
+    masked = replace(frame(200), ego=hood)
+    colors, seen = seen_colors(points, [masked])
+    assert seen.tolist() == [False, True]
+    assert not colors[0].any()
+    assert seen_colors(points, [masked, frame(100)])[0][:, 0].tolist() == pytest.approx([100 / 255, 200 / 255])
+    assert agreement(points, torch.zeros(2, 3), [masked], tolerance=0.1)[0] == 1
 
 
 def test_nothing_to_color():

@@ -20,10 +20,11 @@ from sparsestreet.data.waymo.segment import (
 )
 from sparsestreet.data.waymo.v2.tables import CAMERA, LASER, OBJECT, Table
 
-_INTRINSIC = [f"intrinsic.{name}" for name in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
-_SIZE_AND_DIRECTION = ["width", "height", "rolling_shutter_direction"]
-_MOUNT = "extrinsic.transform"
-_INCLINATION = [f"beam_inclination.{name}" for name in ("min", "max")]
+INTRINSIC = [f"intrinsic.{name}" for name in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
+SIZE_AND_DIRECTION = ["width", "height", "rolling_shutter_direction"]
+MOUNT = "extrinsic.transform"
+INCLINATION = [f"beam_inclination.{name}" for name in ("min", "max")]
+INCLINATIONS = "beam_inclination.values"
 POSE = "pose.transform"
 VELOCITY = [f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz"]
 _SHUTTER = "rolling_shutter_params"
@@ -63,21 +64,21 @@ def matrix(row: dict[str, Any], column: str, path: Path) -> list[float]:
 
 def read_cameras(table: Table) -> dict[str, CameraCalibration]:
     found = {}
-    for row in table.rows([CAMERA], [*_INTRINSIC, _MOUNT, *_SIZE_AND_DIRECTION]):
+    for row in table.rows([CAMERA], [*INTRINSIC, MOUNT, *SIZE_AND_DIRECTION]):
         name = sensor(row[CAMERA], CAMERAS, table.path)
-        width, height, direction = (int(value) for value in numbers(row, _SIZE_AND_DIRECTION, table.path))
-        intrinsic, mount = numbers(row, _INTRINSIC, table.path), matrix(row, _MOUNT, table.path)
+        width, height, direction = (int(value) for value in numbers(row, SIZE_AND_DIRECTION, table.path))
+        intrinsic, mount = numbers(row, INTRINSIC, table.path), matrix(row, MOUNT, table.path)
         found[name] = camera_calibration(intrinsic, mount, (width, height), direction, table.path, name)
     return found
 
 
 def read_lidars(table: Table) -> dict[str, LidarCalibration]:
     found = {}
-    for row in table.rows([LASER], [_MOUNT, *_INCLINATION, "beam_inclination.values"]):
+    for row in table.rows([LASER], [MOUNT, *INCLINATION, INCLINATIONS]):
         name = sensor(row[LASER], LIDARS, table.path)
-        low, high = numbers(row, _INCLINATION, table.path)
-        values = row["beam_inclination.values"] or []
-        found[name] = lidar_calibration(matrix(row, _MOUNT, table.path), values, (low, high), table.path, name)
+        low, high = numbers(row, INCLINATION, table.path)
+        values = row[INCLINATIONS] or []
+        found[name] = lidar_calibration(matrix(row, MOUNT, table.path), values, (low, high), table.path, name)
     return found
 
 

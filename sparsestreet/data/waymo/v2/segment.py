@@ -25,9 +25,9 @@ from sparsestreet.data.waymo.v2 import components
 from sparsestreet.data.waymo.v2.range_images import pack_poses, pack_returns, unpack
 from sparsestreet.data.waymo.v2.tables import CAMERA, FRAME, LASER, OBJECT, SEGMENT, Table, data_of
 
-_POSE = "world_from_vehicle.transform"
-_LABEL, _DIVISOR = "panoptic_label", "panoptic_label_divisor"
-_RETURNS = [f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape")]
+VEHICLE_POSE = "world_from_vehicle.transform"
+LABEL, DIVISOR = "panoptic_label", "panoptic_label_divisor"
+RETURNS = [f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape")]
 
 
 class TableSegment(Segment):
@@ -39,9 +39,9 @@ class TableSegment(Segment):
         self.source, self.calibration_file = self._path("vehicle_pose"), self._path("camera_calibration")
         self.image_file, self.box_file = self._path("camera_image"), self._path("lidar_box")
         self.lidar_file, self.label_file = self._path("lidar"), self._path("camera_segmentation")
-        poses = self._table("vehicle_pose", "VehiclePoseComponent").rows([SEGMENT, FRAME], [_POSE])
+        poses = self._table("vehicle_pose", "VehiclePoseComponent").rows([SEGMENT, FRAME], [VEHICLE_POSE])
         self._check_name(poses)
-        self._poses = {row[FRAME]: components.matrix(row, _POSE, self.source) for row in poses}
+        self._poses = {row[FRAME]: components.matrix(row, VEHICLE_POSE, self.source) for row in poses}
         if not self._poses or not all(isinstance(stamp, int) for stamp in self._poses):
             raise fault(self.source, f"the column {FRAME} does not hold a time a frame", REMEDY)
         self.stamps = sorted(self._poses)
@@ -135,10 +135,10 @@ class TableSegment(Segment):
     def _segmentation(self) -> tuple[Table | None, dict[tuple[int, str], tuple[int, int]]]:
         """The table, and row and divisor of each labelled image."""
         table = self._optional("camera_segmentation", "CameraSegmentationLabelComponent")
-        rows = [] if table is None else table.rows([FRAME, CAMERA], [_DIVISOR])
+        rows = [] if table is None else table.rows([FRAME, CAMERA], [DIVISOR])
         path = self._path("camera_segmentation")
         keys = [(row[FRAME], components.sensor(row[CAMERA], CAMERAS, path)) for row in rows]
-        divisors = [int(components.numbers(row, [_DIVISOR], path)[0]) for row in rows]
+        divisors = [int(components.numbers(row, [DIVISOR], path)[0]) for row in rows]
         return table, {key: (place, divisors[place]) for place, key in enumerate(keys)}
 
     @cached_property
@@ -150,7 +150,7 @@ class TableSegment(Segment):
         table, rows = self._segmentation
         assert table is not None  # it has the rows that are asked for
         places = {key: place for key, (place, _) in rows.items()}
-        return table.spooled(places, [_LABEL], lambda cells: data_of(cells[0], table.path))
+        return table.spooled(places, [LABEL], lambda cells: data_of(cells[0], table.path))
 
     @cached_property
     def _returns_table(self) -> Table | None:
@@ -164,14 +164,14 @@ class TableSegment(Segment):
     def _read_returns(self) -> Callable[[Any], bytes]:
         table = self._returns_table
         assert table is not None  # it has the rows that are asked for
-        second = [name for name in _RETURNS if table.column(name) in table.columns]
+        second = [name for name in RETURNS if table.column(name) in table.columns]
         return table.spooled(self._return_places, second, lambda cells: pack_returns(cells, table.path))
 
     @cached_property
     def _read_poses(self) -> Callable[[Any], bytes]:
         table = self._table("lidar_pose", "LiDARPoseComponent")
         places = self._places(table)
-        read = table.spooled(places, _RETURNS[:2], lambda cells: pack_poses(cells, table.path))
+        read = table.spooled(places, RETURNS[:2], lambda cells: pack_poses(cells, table.path))
 
         def checked(key: tuple[int, str]) -> bytes:
             if key not in places:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.geometry.cameras import project
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.gaussians import MINIMUM_SCALE
@@ -98,15 +99,16 @@ def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Poi
     """Returns the positions that the first view looking at them does not show as sky, with their color in that view.
 
     A ray that ends in the sky meets nothing, so a Gaussian on it could only learn to vanish. Without sky masks every
-    position inside some view is kept.
+    position inside some view is kept. A view does not look at what the recording car hides.
     """
     kept, undecided = [], positions
     for frame in frames:
-        pixels, _, inside = project(frame.camera, undecided)
-        column, row = pixels[inside].long().unbind(1)
-        seen = Points(undecided[inside], frame.image[row, column].float() / 255)
-        kept.append(seen if frame.sky is None else seen.where(~frame.sky[row, column]))
-        undecided = undecided[~inside]
+        rows, pixels, _ = visible_pixels(frame.camera, undecided, frame.ego)
+        seen = Points(undecided[rows], frame.image.reshape(-1, 3)[pixels].float() / 255)
+        kept.append(seen if frame.sky is None else seen.where(~frame.sky.flatten()[pixels]))
+        left = torch.ones(len(undecided), dtype=torch.bool)
+        left[rows] = False
+        undecided = undecided[left]
     return Points.concatenate(kept)
 
 

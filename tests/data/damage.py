@@ -1,6 +1,7 @@
 """Ways to break files, and what must be said then."""
 
 import io
+import random
 import shutil
 import struct
 import zlib
@@ -101,3 +102,19 @@ def assert_found(reader: RecordedReader, path: Path, said: str) -> None:
         log = reader.read()
         list(log.frames)
         list(log.sweeps)
+
+
+def refusals(read: Callable[[Path], object], path: Path, content: bytes, *, count: int, seed: int) -> int:
+    """How many of ``count`` files, with some bytes changed, cut out and put in, raise LogError; nothing else may."""
+    source, refused = random.Random(seed), 0
+    for _ in range(count):
+        broken = bytearray(content)
+        for _ in range(source.randint(1, 8)):
+            at = source.randrange(len(broken))
+            broken[at : at + source.randint(0, 3)] = source.randbytes(source.randint(0, 3))
+        path.write_bytes(broken)
+        try:
+            read(path)
+        except LogError:
+            refused += 1
+    return refused

@@ -1,0 +1,137 @@
+"""`sparsestreet data convert`: which log, which layout, and one line on what is wrong."""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import MISSING, fields
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from sparsestreet.cli import convert as module
+from sparsestreet.cli.compose import CONF
+from sparsestreet.cli.data import data
+from sparsestreet.data.convert import partial_folder
+from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
+from sparsestreet.data.writer import LogFile
+from tests.cli.test_data import SMALL
+from tests.conftest import unchecked
+from tests.data.drivestudio.folders import make_nuscenes, make_waymo
+
+
+def converted(*words: str) -> int:
+    return data(["convert", *words])
+
+
+def test_the_short_form_finds_the_reader_and_writes_drivestudios_layout(tmp_path, capsys):
+    log, out = make_waymo(tmp_path / "a log, {odd}"), tmp_path / "out"
+    assert converted(f"from={log}", f"to={out}") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"data=drivestudio, as {log}/images/000_0.jpg tells"
+    assert "47 of 47 files" in lines[-2]
+    assert lines[-1] == f"{out}: 47 files, 0.0 MB, 3 frames of 2 cameras"
+    assert DriveStudioReader(out).check() == []
+
+
+def test_the_part_the_layout_and_its_settings_are_chosen_by_keys(tmp_path, capsys):
+    log, out = make_nuscenes(tmp_path / "log"), tmp_path / "out"
+    part = ["data.log.cameras=[1]", "data.log.last_frame=1", "data.log.width=20"]
+    words = ["data=drivestudio", f"data.root={log}", *part, "layout=drivestudio", "layout.jpeg_quality=null"]
+    assert converted(*words, f"to={out}") == 0
+    assert {path.name for path in (out / "images").iterdir()} == {"000_0.jpg", "001_0.jpg"}
+    assert (out / "images/000_0.jpg").read_bytes().startswith(b"\x89PNG")
+    said = json.loads((out / "conversion.json").read_text())
+    assert said["source"]["data_hash"] == DriveStudioReader(log, cameras=[1], last_frame=1).data_hash()
+    assert said["source"]["reader"]["width"] == 20
+    assert not {"root", "cache_mb"} & set(said["source"]["reader"])
+    assert said["settings"] == {"jpeg_quality": None}
+    assert said["losses"] == ["names of cameras are lost (1): 1 become 0"]
+    assert "  lost or changed: names of cameras are lost (1): 1 become 0" in capsys.readouterr().out
+
+
+def test_a_street_is_made_and_converted(tmp_path, capsys):
+    out = tmp_path / "out"
+    with unchecked():
+        assert converted("data=synthetic", *SMALL, f"data.log.parent={tmp_path}/streets", f"to={out}") == 0
+    assert "lost or changed: what cameras beside the recorded path would see" in capsys.readouterr().out
+    assert DriveStudioReader(out).check() == []
+
+
+def stopped(files: Iterable[LogFile], total: int, what: str) -> Iterator[LogFile]:
+    yield from list(files)[:10]
+    raise KeyboardInterrupt
+
+
+def test_after_ctrl_c_the_same_command_goes_on(tmp_path, capsys, monkeypatch):
+    words = [f"from={make_nuscenes(tmp_path / 'log')}", f"to={tmp_path / 'out'}"]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "shown", stopped)
+        assert converted(*words) == 130
+    partial = partial_folder(tmp_path / "out")
+    assert capsys.readouterr().err == (
+        f"sparsestreet data convert: stopped, what is written stays in {partial}: give the same command to go on, or "
+        "remove the folder\n"
+    )
+    assert converted(*words, "data.log.width=20") == 1
+    assert "differs in source: remove it, or name another place" in capsys.readouterr().err
+    assert converted(*words, "data.log.cache_mb=9") == 0
+    assert "files, 10 of them there already, " in capsys.readouterr().out
+    assert not partial.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["to={out}"], 2, "no log is named: say sparsestreet data convert from=DIR to=DIR"),
+        (["from={log}"], 2, "to=DIR is missing"),
+        (["from={log}", "to="], 2, "to=DIR names one folder"),
+        (["from={log}", "from={log}", "to={out}"], 2, "from=DIR names one folder"),
+        (["from={log}", "data.root={log}", "to={out}"], 2, "name the same: leave one out"),
+        (["from={log}", "data=synthetic", "to={out}"], 2, "leave from=... out"),
+        (["from={log}", "to={log}/new"], 2, "lies in the log itself"),
+        (["from={log}", "to={out}", "layout=drivestudo"], 2, "no option 'drivestudo' in conf/layout: choose one of "),
+        (["from={log}", "to={out}", "layout=drivestudio", "layout=x"], 2, "written in one layout"),
+        (["from={log}", "to={out}", "layout.jpeg_qualty=9"], 2, "did you mean 'layout.jpeg_quality'?"),
+        (
+            ["from={log}", "to={out}", "layout.jpeg_quality=fine"],
+            2,
+            "layout.jpeg_quality must be int | None, got 'fine'",
+        ),
+        (["from={log}", "to={out}", "layout.jpeg_quality=200"], 2, "jpeg_quality lies in 1 to 100, got 200"),
+        (["from={log}", "to={out}", "layout.jpeg_quality=1,2"], 2, "layout.jpeg_quality"),
+        (["from={log}", "to={out}", "data.log.last_frme=3"], 2, "no key 'data.log.last_frme'"),
+        (["from={log}", "to={out}", "data.log.last_frame=30"], 1, "are not within the log's 0 to 2"),
+        (["from={log}", "to={full}"], 1, "is no empty folder: name another place with to=..., or remove it"),
+        (["from={empty}", "to={out}"], 1, "no reader knows"),
+    ],
+)
+def test_a_wrong_command_is_answered_and_nothing_is_written(words, status, said, tmp_path, capsys):
+    places = {"log": make_nuscenes(tmp_path / "log"), "out": tmp_path / "out", "full": tmp_path / "full"}
+    places["empty"] = tmp_path / "empty"
+    places["empty"].mkdir()
+    places["full"].mkdir()
+    (places["full"] / "mine.txt").touch()
+    before = set(tmp_path.rglob("*"))
+    assert converted(*(word.format(**places) for word in words)) == status
+    written = capsys.readouterr().err
+    assert said in written
+    assert written.startswith("sparsestreet data convert: ")
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_every_setting_of_a_layout_is_a_key_with_its_own_default():
+    keys: Any = OmegaConf.load(CONF / "layout" / "drivestudio.yaml")
+    assert set(keys) == {"_target_"} | {field.name for field in fields(DriveStudioWriter)}
+    for field in fields(DriveStudioWriter):
+        assert field.default is not MISSING
+        assert keys[field.name] == field.default
+
+
+def test_a_layout_of_ones_own(tmp_path, capsys):
+    own = tmp_path / "conf"
+    (own / "layout").mkdir(parents=True)
+    (own / "layout/letters.yaml").write_text("_target_: tests.data.test_convert.Letters\nnames: [a, b]\n")
+    words = [f"from={make_nuscenes(tmp_path / 'log')}", f"to={tmp_path / 'out'}", f"hydra.searchpath=[file://{own}]"]
+    assert converted(*words, "layout=letters") == 0
+    assert (tmp_path / "out/b").read_text() == "b whole"
+    assert "lost or changed: 3 letters are lost" in capsys.readouterr().out
