@@ -81,6 +81,7 @@ ALL = {
     "loss.depth.farthest": 80.0,
     "effects.sky.when": "on",
     "effects.shutter.when": "off",
+    "effects.exposure.when": "off",  # its module for every image is the affine map
     "node.background.sources.images.number": 0,
     "node.background.sources.lidar.box_enlargement": None,
     "node.background.sources.lidar.voxel": None,

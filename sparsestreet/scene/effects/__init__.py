@@ -1,13 +1,15 @@
 """Effects: what cameras and light do to the image of a scene, each in a module of its own.
 
 ``effect`` says what one is, ``linearized`` how all of a scene change an image together. The sky is an image behind the
-splats, the affine map one of their colors; lens and shutter are what a camera brings, and what takes them away from it.
+splats, the affine map one of their colors, the exposure a gain for each image; lens and shutter are what a camera
+brings, and what takes them away from it.
 """
 
 from sparsestreet.scene.effects.affine import Affine, AffineSettings
 from sparsestreet.scene.effects.box_poses import BoxPosesSettings
 from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.exposure import Exposure, ExposureSettings
 from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
@@ -25,6 +27,8 @@ __all__ = [
     "Effect",
     "EffectPlan",
     "EffectSettings",
+    "Exposure",
+    "ExposureSettings",
     "Finding",
     "HoodSettings",
     "Lens",

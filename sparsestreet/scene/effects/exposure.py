@@ -1,0 +1,187 @@
+"""Exposure and white balance: a gain for each training image and channel, behind the sky."""
+
+import math
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sparsestreet.evidence.exposure import ImageGains, image_gains
+from sparsestreet.evidence.gain_errors import EV, GainErrors, gain_errors
+from sparsestreet.geometry.boxes import without_frames
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import LearningRate, Rates
+from sparsestreet.scene.options import RenderOptions
+from sparsestreet.scene.state import SceneState
+from sparsestreet.types import Rendering, View
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExposureSettings(EffectSettings):
+    """Called for where gains for images would remove an error of ``threshold`` or more from held-out images.
+
+    The error is measured at static lidar points (``evidence/gain_errors.py``). A gain that jumps at random from image
+    to image is not called for: neighbors do not foretell it. Raises ValueError for a threshold or a weight below 0.
+    """
+
+    threshold: float = 0.05
+    """EV: of the root mean square error over images and channels that gains would remove."""
+    without_psnr: float = 28.0
+    """dB: what held-out images reach but for the error, for the predicted gain alone."""
+    smooth: float = 1.0
+    """Weight of the squared distance of a log gain from the line between its neighbors in time."""
+    level: float = 1.0
+    """Weight of the squared mean log gain over all images, by channel: twice the gains with half the light are the same
+    images."""
+    learning_rates: Rates = field(default_factory=lambda: {"log_gains": LearningRate(1e-3)})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("threshold", "smooth", "level"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}: 0 leaves it out")
+
+    def detect(self, data: TrainingData) -> Finding:
+        gains = _measured(data)
+        errors = None if gains is None else gain_errors(gains)
+        if gains is None or errors is None:
+            reason = "no three images in a row share enough lidar points, so gains of images are not measured"
+            return Finding(called_for=False, reason=reason, unit="EV", threshold=self.threshold)
+        return Finding(
+            called_for=errors.removed >= self.threshold,
+            reason=_reason(errors, self.threshold),
+            value=errors.removed,
+            unit="EV",
+            threshold=self.threshold,
+            noise=errors.noise,
+            gain=_gain(errors, gains.mean_square, self.without_psnr),
+        )
+
+    def cost(self, data: TrainingData) -> Cost:
+        return Cost(numbers=3 * len(data.views), ns_per_pixel=1.1)
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Exposure":
+        """Starts from the gains that are measured on all images; from none where nothing can be measured."""
+        made = Exposure(self, _times(data.views))
+        gains = _measured(data, most=None)
+        if gains is not None:
+            made.start_from(gains.views, gains.log_gains)
+        return made
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Exposure":
+        return Exposure(self, {int(camera): times for camera, times in header["times"].items()})
+
+
+class Exposure(Effect):
+    """Multiplies red, green and blue of each image by factors of its own: x -> x exp(g).
+
+    Another view of a camera with training images, such as a held-out one, has g on the line in time between the two
+    training images around it, or that of the first or last. A view of no camera, or of one without training images,
+    has g = 0, the mean of all images.
+    """
+
+    settings: ExposureSettings
+
+    def __init__(self, settings: ExposureSettings, times: Mapping[int, Sequence[float]]) -> None:
+        """``times``: camera index -> normalized times of its training images, increasing."""
+        super().__init__(settings)
+        self.times = {camera: tuple(own) for camera, own in times.items()}
+        self._first: dict[int, int] = {}
+        count = 0
+        for camera, own in self.times.items():
+            self._first[camera] = count
+            count += len(own)
+        self.log_gains = nn.Parameter(torch.zeros(count, 3))
+
+    @torch.no_grad()
+    def start_from(self, views: Sequence[View], log_gains: Float[Tensor, "n 3"]) -> None:
+        """Sets the gains of training views."""
+        for view, gain in zip(views, log_gains, strict=True):
+            _, camera = view.indices
+            self.log_gains[self._first[camera] + bisect_left(self.times[camera], view.time)] = gain.to(self.log_gains)
+
+    def log_gain(self, view: View) -> Float[Tensor, "3"]:
+        """g of a view."""
+        if view.camera_index not in self.times:
+            return self.log_gains.new_zeros(3)
+        return self._on_line(view.camera_index, view.time, *self._around(view.camera_index, view.time))
+
+    def _around(self, camera: int, time: float) -> tuple[int, int]:
+        """Numbers of the camera's training images at or before and at or behind a time; the same beyond the ends."""
+        own = self.times[camera]
+        behind = bisect_left(own, time)
+        if behind == len(own):
+            return behind - 1, behind - 1
+        return (behind, behind) if behind == 0 or own[behind] == time else (behind - 1, behind)
+
+    def _on_line(self, camera: int, time: float, before: int, behind: int) -> Float[Tensor, "3"]:
+        own, first = self.times[camera], self._first[camera]
+        if before == behind:
+            return self.log_gains[first + before]
+        part = (time - own[before]) / (own[behind] - own[before])
+        return torch.lerp(self.log_gains[first + before], self.log_gains[first + behind], part)
+
+    def image(
+        self, rgb: Float[Tensor, "h w 3"], splats: Rendering, view: View, options: RenderOptions
+    ) -> Float[Tensor, "h w 3"]:
+        return rgb * self.log_gain(view).exp()
+
+    def slope(self, view: View) -> Float[Tensor, "h w"]:
+        """Root mean square of the three factors: exact where channels are alike, or a change is the same in all."""
+        factor = self.log_gain(view).exp().square().mean().sqrt()
+        return factor.expand(view.camera.height, view.camera.width)
+
+    def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
+        """Returns ``smooth``, for a training image between two others of its camera, and ``level``."""
+        terms = {}
+        if self.settings.level > 0:
+            terms["level"] = self.settings.level * self.log_gains.mean(0).square().sum()
+        camera = view.camera_index
+        if self.settings.smooth > 0 and camera in self.times:
+            own = self.times[camera]
+            place = bisect_left(own, view.time)
+            if 0 < place < len(own) - 1 and own[place] == view.time:
+                line = self._on_line(camera, view.time, place - 1, place + 1)
+                off = self.log_gains[self._first[camera] + place] - line
+                terms["smooth"] = self.settings.smooth * off.square().sum()
+        return terms
+
+    def header(self) -> dict[str, Any]:
+        return {"times": {str(camera): list(own) for camera, own in self.times.items()}}
+
+
+def _measured(data: TrainingData, **most: None) -> ImageGains | None:
+    return image_gains(data.frames, data.sweeps, without_frames(data.log.tracks, data.held_out), **most)
+
+
+def _times(views: Sequence[View]) -> dict[int, list[float]]:
+    """Camera index -> times of its views, increasing."""
+    times: dict[int, list[float]] = defaultdict(list)
+    for view in sorted(views, key=lambda view: view.time):
+        times[view.indices[1]].append(view.time)
+    return dict(sorted(times.items()))
+
+
+def _reason(errors: GainErrors, threshold: float) -> str:
+    size = (
+        f"gains of images that show the same lidar points differ by {errors.without:.3f} EV "
+        f"({errors.color:.3f} between channels)"
+    )
+    if errors.removed >= threshold:
+        return f"{size}, {errors.foretold:.3f} beside the neighbors in time"
+    if errors.without >= threshold:
+        return f"{size}, but neighbors in time foretell too little: {errors.foretold:.3f} EV would remain"
+    return f"{size}, which is too little to matter"
+
+
+def _gain(errors: GainErrors, mean_square: float, without_psnr: float) -> float:
+    """dB: an error e of the log gain adds e^2 times the images' mean square to their mean squared error."""
+    rest = 10 ** (-without_psnr / 10)
+    before, behind = (rest + (EV * error) ** 2 * mean_square for error in (errors.without, errors.foretold))
+    return 10 * math.log10(before / behind)

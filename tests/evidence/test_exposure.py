@@ -1,0 +1,201 @@
+"""Gains of images from lidar points, against gains that are planted."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.data.lazy import Sweeps
+from sparsestreet.evidence.exposure import ImageGains, Links, image_gains, solved
+from sparsestreet.types import Track
+from tests.evidence import wall
+
+# Levels are rounded to 1 of 100, in medians of hundreds of points and over dozens of links.
+TOLERANCE = 0.004
+PLANTED = wall.random_gains(0.1)
+
+
+def gains_of(made, sweeps=None, boxes=()) -> ImageGains:
+    found = image_gains(wall.lazy(made), wall.sweeps() if sweeps is None else sweeps, boxes)
+    assert found is not None
+    return found
+
+
+def assert_planted(found: ImageGains, planted: torch.Tensor = PLANTED, tolerance: float = TOLERANCE) -> None:
+    wanted = torch.stack([planted[view.frame_index, view.camera_index] for view in found.views]).double()
+    torch.testing.assert_close(found.log_gains, wanted, rtol=0, atol=tolerance)
+
+
+def gain(instant: int, number: int) -> torch.Tensor:
+    return PLANTED[instant, number].exp()
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return wall.frames(gain)
+
+
+def test_planted_gains_of_images_and_channels_are_measured(frames):
+    found = gains_of(frames)
+    assert_planted(found)
+    assert found.points > 5000
+    # The wall has levels around 100.
+    assert found.mean_square == pytest.approx((100 / 255) ** 2, rel=0.2)
+    assert bool(found.inner.all())
+
+
+def test_without_lidar_nothing_is_measured(frames):
+    assert image_gains(wall.lazy(frames), Sweeps.of(()), ()) is None
+
+
+def test_images_without_a_sweep_of_their_own_are_measured_too(frames):
+    odd = Sweeps.of(tuple(wall.sweep(instant) for instant in range(1, wall.INSTANTS, 2)))
+    assert_planted(gains_of(frames, odd))
+
+
+def flickering(frames, **changes):
+    """Pictures whose left 70 % flicker by another factor, and what the frames have beside that."""
+    edge = int(0.7 * wall.WIDTH)
+    made = []
+    for place, frame in enumerate(frames):
+        image = frame.image.float()
+        image[:, :edge] *= (0.7, 1.0, 1.4)[place % 3]
+        made.append(replace(frame, image=image.round().clamp(0, 255).to(torch.uint8), **changes))
+    return made
+
+
+def left() -> torch.Tensor:
+    mask = torch.zeros(wall.HEIGHT, wall.WIDTH, dtype=torch.bool)
+    mask[:, : int(0.7 * wall.WIDTH)] = True
+    return mask
+
+
+@pytest.mark.parametrize("mask", ["ego", "vehicle", "human", "sky"])
+def test_masked_pixels_are_left_out(frames, mask: str):
+    assert_planted(gains_of(flickering(frames, **{mask: left()})))
+
+
+def test_flicker_without_a_mask_would_be_taken_for_a_gain(frames):
+    found = gains_of(flickering(frames))
+    with pytest.raises(AssertionError):
+        assert_planted(found, tolerance=0.1)
+
+
+def test_what_hides_behind_something_near_is_not_looked_up(frames):
+    """A plate at 3 m goes with the car; returns from it and from the wall behind it lie in the same pixels."""
+
+    def with_plate(sweep):
+        side = torch.cartesian_prod(torch.linspace(-3.4, 1.5, 90), torch.linspace(-1.3, 1.3, 50))
+        plate = torch.cat((side + torch.tensor([wall.STEP * sweep.index, 0.0]), torch.full((len(side), 1), 3.0)), 1)
+        # No camera colored it: it hides, and is not looked up.
+        return replace(
+            sweep,
+            points=torch.cat((sweep.points, plate)),
+            colors=torch.full((len(sweep.points) + len(plate), 3), 0.5),
+            colored=torch.cat((sweep.colored, torch.zeros(len(plate), dtype=torch.bool))),
+        )
+
+    hiding = Sweeps.of(tuple(with_plate(sweep) for sweep in wall.sweeps()))
+    # Each camera sees the plate over its pixels -16.7 + 40 ... to 51 of 80 or farther to the right.
+    made = []
+    for place, frame in enumerate(frames):
+        image = frame.image.clone()
+        right = {0: 78, 1: 51}[frame.camera_index]
+        image[:, :right] = (50, 100, 200)[place % 3]
+        made.append(replace(frame, image=image))
+    found = image_gains(wall.lazy(made), hiding, ())
+    assert found is not None
+    own = [place for place, view in enumerate(found.views) if view.camera_index == 1]
+    planted = PLANTED[:, 1].double()
+    measured = found.log_gains[own]
+    torch.testing.assert_close(measured - measured.mean(0), planted - planted.mean(0), rtol=0, atol=2 * TOLERANCE)
+
+
+def test_what_lies_in_a_box_is_left_out(frames):
+    """The wall's part from x = -9 to 3 is the side of a tram, whose levels flicker."""
+    track = Track(
+        "tram",
+        "Tram",
+        torch.arange(wall.INSTANTS),
+        torch.eye(4, dtype=torch.float64).repeat(wall.INSTANTS, 1, 1),
+        torch.tensor([12.0, 9.0, 1.0]),
+    )
+    track.world_from_object[:, :3, 3] = torch.tensor([-3.0, 0.0, wall.DEPTH], dtype=torch.float64)
+    made = []
+    for place, frame in enumerate(frames):
+        x = frame.camera.position[0] + wall.DEPTH * (torch.arange(wall.WIDTH) + 0.5 - wall.WIDTH / 2) / wall.FOCAL
+        image = frame.image.float()
+        image[:, x < 3] *= (0.7, 1.0, 1.4)[place % 3]
+        made.append(replace(frame, image=image.round().clamp(0, 255).to(torch.uint8)))
+    assert_planted(gains_of(made, boxes=[track]))
+
+
+def test_low_points_and_the_others_are_told_apart(frames):
+    """What lies more than 0.8 m below the cameras shines now and then."""
+
+    def shining(place, frame):
+        image = frame.image.float()
+        y = wall.DEPTH * (torch.arange(wall.HEIGHT) + 0.5 - wall.HEIGHT / 2) / wall.FOCAL
+        image[y > 0.8] *= (0.8, 1.0, 1.2)[place % 3]
+        return replace(frame, image=image.round().clamp(0, 255).to(torch.uint8))
+
+    found = gains_of([shining(place, frame) for place, frame in enumerate(frames)])
+    low, others = (replace(found, log_gains=part.log_gains) for part in found.parts)
+    assert_planted(others)
+    shine = torch.tensor([0.8, 1.0, 1.2]).log()[torch.arange(len(frames)) % 3].view(wall.INSTANTS, 2, 1)
+    # The lowest row of blocks holds a little of both.
+    assert_planted(low, PLANTED + shine - shine.mean(), tolerance=2 * TOLERANCE)
+
+
+def test_white_and_dark_levels_say_nothing():
+    """Two thirds of the wall are three times as bright: in the brighter images they are white."""
+
+    def lit(frame):
+        factor = gain(*frame.indices)
+        bright = torch.where((torch.arange(wall.HEIGHT) % 30 < 20)[:, None, None], 3.0, 1.0)
+        clean = wall.frame(*frame.indices, torch.ones(3)).image
+        return replace(frame, image=(clean * bright * factor).round().clamp(0, 255).to(torch.uint8))
+
+    assert_planted(gains_of([lit(frame) for frame in wall.frames(gain)]), tolerance=2 * TOLERANCE)
+
+
+def test_large_images_are_looked_at_coarsely(frames):
+    def enlarged(frame):
+        camera = frame.camera
+        intrinsics = camera.intrinsics * torch.tensor([[6.0], [6.0], [1.0]])
+        camera = replace(camera, intrinsics=intrinsics, width=6 * camera.width, height=6 * camera.height)
+        image = frame.image.repeat_interleave(6, 0).repeat_interleave(6, 1)
+        return replace(frame, camera=camera, image=image)
+
+    assert_planted(gains_of([enlarged(frame) for frame in frames]))
+
+
+def test_of_many_images_runs_of_neighbors_are_looked_at():
+    made = [replace(wall.frame(0, 0, torch.ones(3)), frame_index=index, time=index / 99) for index in range(100)]
+    sweeps = Sweeps.of(tuple(replace(wall.sweep(0, 200), index=index) for index in range(100)))
+    found = image_gains(wall.lazy(made), sweeps, (), most=48)
+    assert found is not None
+    indices = [view.frame_index for view in found.views]
+    assert indices == [*range(24), *range(76, 100)]
+    # Instants around the others were not looked at, but nothing was recorded before the first or behind the last.
+    assert [index for index, inner in zip(indices, found.inner, strict=True) if inner] == [*range(16), *range(84, 100)]
+
+
+def test_a_wrong_link_moves_no_gain():
+    pairs = torch.combinations(torch.arange(8))
+    truth = torch.linspace(-0.3, 0.3, 8, dtype=torch.float64)[:, None].expand(8, 3)
+    ratios = truth[pairs[:, 1]] - truth[pairs[:, 0]]
+    noise = 1e-3 * torch.randn(ratios.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ratios = ratios + noise
+    ratios[3] += 1.0
+    links = Links(pairs, ratios, torch.full_like(ratios, 1e-3), torch.full((len(pairs),), 100))
+    # 28 links of 0.001; least squares without weights would be 0.1 off.
+    torch.testing.assert_close(solved(links, 8), truth, rtol=0, atol=3e-3)
+
+
+def test_groups_that_share_nothing_have_mean_zero_each():
+    pairs = torch.tensor([[0, 1], [2, 3]])
+    ratios = torch.tensor([[0.2] * 3, [-0.4] * 3], dtype=torch.float64)
+    links = Links(pairs, ratios, torch.full_like(ratios, 1e-3), torch.tensor([100, 100]))
+    found = solved(links, 5)[:, 0].tolist()
+    assert found == pytest.approx([-0.1, 0.1, 0.2, -0.2, 0.0], abs=1e-6)
