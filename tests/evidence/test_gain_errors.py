@@ -122,3 +122,20 @@ def test_only_what_both_kinds_of_points_show_is_an_error_of_gains():
     assert apart is not None
     # Of the square a quarter: the waves are a few and the drive ends.
     assert apart.removed < 0.5 * wanted.removed
+
+
+def test_an_image_that_one_kind_of_points_does_not_link_does_not_count():
+    """The road is not seen in the images of instant 50: they have no gain of their own, and are no neighbors."""
+    wave = gains(gray(0.1 * torch.sin(torch.arange(COUNT) * torch.pi / 10)))
+    road = wave.parts[0]
+    kept = (road.links.images != 50).all(1)
+    links = Links(road.links.images[kept], road.links.ratios[kept], road.links.errors[kept], road.links.shared[kept])
+    without = road.log_gains.clone()
+    without[50] = 0.3
+    found = gain_errors(replace(wave, parts=(replace(road, log_gains=without, links=links), road)))
+    assert found is not None
+    assert found.images == COUNT - 2 - 1
+    wanted = gain_errors(wave)
+    assert wanted is not None
+    # Two of 200 images have neighbors farther away.
+    assert found.removed == pytest.approx(wanted.removed, rel=0.02)
