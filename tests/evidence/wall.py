@@ -32,7 +32,7 @@ def albedo(x: Float[Tensor, "*b"], y: Float[Tensor, "*b"]) -> Float[Tensor, "*b 
     return 100 + 40 * torch.stack(waves, -1)
 
 
-def frame(instant: int, number: int, gain: Float[Tensor, "3"], **masks: Tensor) -> Frame:
+def frame(instant: int, number: int, gain: Float[Tensor, "3"]) -> Frame:
     """What a camera sees of the wall, each channel times a gain."""
     seen = camera(instant, number)
     column = torch.arange(WIDTH) + 0.5
@@ -41,7 +41,7 @@ def frame(instant: int, number: int, gain: Float[Tensor, "3"], **masks: Tensor) 
     y = DEPTH * (line - HEIGHT / 2) / FOCAL
     light = albedo(x[None].expand(HEIGHT, WIDTH), y[:, None].expand(HEIGHT, WIDTH))
     image = (gain * light).round().clamp(0, 255).to(torch.uint8)
-    return Frame(seen, instant / (INSTANTS - 1), instant, number, image=image, **masks)
+    return Frame(seen, instant / (INSTANTS - 1), instant, number, image=image)
 
 
 def frames(gain: Callable[[int, int], Float[Tensor, "3"]]) -> list[Frame]:

@@ -14,7 +14,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
-from sparsestreet.types import Track, View
+from sparsestreet.types import Sweep, Track, View
 from tests.evidence import wall
 from tests.scene.effects.test_effects import built
 from tests.scene.street import background, camera_at, random_rows, training_data
@@ -206,7 +206,12 @@ def test_held_out_images_are_not_looked_at():
     pixels = Unread({frame.indices: frame for frame in log.frames if frame.frame_index != 5})
     views = [View(f.camera, f.time, f.frame_index, f.camera_index) for f in log.frames]
     lazy = Frames(views, lambda seen: pixels[seen.indices])
-    sweeps = Sweeps(range(wall.INSTANTS), lambda index: {5: None}.get(index, wall.sweep(index)))
+
+    def sweep(index: int) -> Sweep:
+        assert index != 5
+        return wall.sweep(index)
+
+    sweeps = Sweeps(range(wall.INSTANTS), sweep)
     data = of(replace(log, frames=lazy, sweeps=sweeps), frozenset({5}))
     SETTINGS.build(data, SETTINGS.detect(data), torch.Generator())
 
