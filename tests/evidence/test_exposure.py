@@ -151,10 +151,10 @@ def test_white_and_dark_levels_say_nothing():
     """Two thirds of the wall are three times as bright: in the brighter images they are white."""
 
     def lit(frame):
-        factor = gain(*frame.indices)
         bright = torch.where((torch.arange(wall.HEIGHT) % 30 < 20)[:, None, None], 3.0, 1.0)
-        clean = wall.frame(*frame.indices, torch.ones(3)).image
-        return replace(frame, image=(clean * bright * factor).round().clamp(0, 255).to(torch.uint8))
+        instant, number = frame.indices
+        clean = wall.frame(instant, number, torch.ones(3)).image
+        return replace(frame, image=(clean * bright * gain(instant, number)).round().clamp(0, 255).to(torch.uint8))
 
     assert_planted(gains_of([lit(frame) for frame in wall.frames(gain)]), tolerance=2 * TOLERANCE)
 
