@@ -7,10 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
+
+_NS_PER_ROW = 13.5
+"""The projection of a Gaussian through a lens, less that of a pinhole (docs/effects.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +31,9 @@ class LensSettings(EffectSettings):
             declared=True,
             missing=None if cameras else "give the log their coefficients or lower data.log.min_lens_shift",
         )
+
+    def cost(self, data: TrainingData) -> Cost:
+        return Cost(ns_per_row=_NS_PER_ROW)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Lens":
         return Lens(self)

@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from sparsestreet.evidence.shear import readout_shear
-from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
+
+_NS_PER_ROW = 1.4
+"""The motion of a Gaussian during the readout, beside its projection (docs/effects.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +48,9 @@ class ShutterSettings(EffectSettings):
             noise=found.error,
             declared=True,
         )
+
+    def cost(self, data: TrainingData) -> Cost:
+        return Cost(ns_per_row=_NS_PER_ROW)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "RollingShutter":
         return RollingShutter(self)

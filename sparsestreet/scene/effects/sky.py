@@ -8,14 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sparsestreet.evidence.sky import sky_share
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import over_sky
 from sparsestreet.ops.cube_map import colors_along
-from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.types import Rendering, View
+
+_NS_PER_PIXEL = 2.6
+"""Of a frame behind the splats (docs/effects.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +28,8 @@ class SkySettings(EffectSettings):
 
     resolution: int = 128
     initial_color: float = 0.5
+    min_share: float = 0.005
+    """Of the pixels, from which the log calls for it: what a tunnel lacks."""
     learning_rates: Rates = field(default_factory=lambda: {"texels": LearningRate(0.01)})
 
     def __post_init__(self) -> None:
@@ -32,7 +38,25 @@ class SkySettings(EffectSettings):
             raise ValueError(f"a cube map needs at least one texel a side, got resolution {self.resolution}")
 
     def detect(self, data: TrainingData) -> Finding:
-        return Finding(called_for=True, reason="streets lie under the sky")
+        found = sky_share(data.frames)
+        if found is None:
+            return Finding(
+                called_for=True,
+                reason=f"{data.log.name} has no sky masks that would say otherwise, and streets lie under the sky",
+                unit="of the pixels",
+                threshold=self.min_share,
+            )
+        return Finding(
+            called_for=found.share >= self.min_share,
+            reason=f"masks of {found.frames} images show sky in {100 * found.share:.1f} % of their pixels",
+            value=found.share,
+            unit="of the pixels",
+            threshold=self.min_share,
+            noise=found.error,
+        )
+
+    def cost(self, data: TrainingData) -> Cost:
+        return Cost(numbers=18 * self.resolution**2, ns_per_pixel=_NS_PER_PIXEL)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Sky":
         return Sky(self)

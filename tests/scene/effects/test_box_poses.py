@@ -1,6 +1,7 @@
 """Whether nodes learn corrections of boxes, and what is left where they do not."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -22,7 +23,7 @@ def trembling(meters: float, frames: int = 40) -> Track:
     return Track("car", "Car", torch.arange(frames), torch.stack(poses), torch.tensor([4.0, 2.0, 1.5]))
 
 
-def cars(when: str) -> Rigid:
+def cars(when: Any) -> Rigid:
     data = training_data()
     plan = plan_effects({"boxes": BoxPosesSettings(when=when)}, data)
     scene = build_scene(street_log(), data.frames, frozenset(), {"cars": rigid_settings()}, plan, 0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,8 @@ def loss_of(poses: CameraPoses, rows: Gaussians, view: View, settings: SplatSett
     drawn = splat(poses.gaussians(rows, seen) if wrapped else rows, seen.camera, settings=settings, backend="reference")
     draw = torch.Generator().manual_seed(5)
     images = drawn.rgb, drawn.alpha, drawn.alpha * drawn.depth  # a depth of almost nothing jumps
-    return sum((image * torch.randn(image.shape, generator=draw, dtype=torch.float64)).sum() for image in images)
+    parts = [(image * torch.randn(image.shape, generator=draw, dtype=torch.float64)).sum() for image in images]
+    return torch.stack(parts).sum()
 
 
 def both_gradients(camera: Camera, degree: int, settings: SplatSettings) -> tuple[torch.Tensor, torch.Tensor]:
@@ -216,6 +218,6 @@ def test_the_log_calls_for_it_where_images_say_that_poses_are_off(monkeypatch: p
 
 
 @pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"threshold": -1.0}])
-def test_negative_numbers_are_errors(wrong: dict[str, float]):
+def test_negative_numbers_are_errors(wrong: dict[str, Any]):
     with pytest.raises(ValueError, match="must be >= 0"):
         CameraPosesSettings(**wrong)
