@@ -21,6 +21,7 @@ examples:
   sparsestreet bench step                       phases of a training step: time, operations, distance to their floors
   sparsestreet bench step sparsify=paper        the same of another training: options as those of train
   sparsestreet bench masks                      a mask over time: its network a frame, and the bits that it leaves
+  sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -35,6 +36,7 @@ def bench(arguments: list[str]) -> int:
         "blend": _blend,
         "step": _step,
         "masks": _masks,
+        "effects": _effects,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -111,6 +113,14 @@ def _step(options: argparse.Namespace) -> bool:
     with TemporaryDirectory() as folder:
         train = train_with(options.overrides, Path(folder))
         step.run_step(" ".join(["train", *options.overrides]), train, window, _file(options), options.out)
+    return True
+
+
+def _effects(options: argparse.Namespace) -> bool:
+    from sparsestreet.bench import planted
+    from sparsestreet.cli.effects import planned
+
+    planted.run_planted(planned, range(1 if options.quick else 10), _file(options))
     return True
 
 

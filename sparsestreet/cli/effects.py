@@ -50,6 +50,16 @@ def effects(arguments: list[str]) -> int:
     return 0
 
 
+def planned(overrides: Sequence[str]) -> tuple[EffectDecision, ...]:
+    """The plan of a training with these options."""
+    from sparsestreet.cli.assemble import data_of, recipe_of, with_views
+
+    cfg = composed(overrides)
+    data = data_of(cfg)
+    recipe = recipe_of(with_views(cfg, data))
+    return recipe.decisions(recipe.plan(data), data)
+
+
 def _plan(cfg: DictConfig) -> Iterator[str]:
     from sparsestreet.cli.assemble import data_of, recipe_of, with_views
 
