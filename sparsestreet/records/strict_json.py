@@ -149,7 +149,7 @@ def _decoded_dataclass(kind: type, value: Json, where: str) -> typing.Any:
                 f"{where}: the record has format {entries.get(entry.name)}, this version reads {entry.default}: "
                 f"{entry.metadata['remedy']}"
             )
-    required = {entry.name for entry in fields(kind) if entry.default is MISSING}
+    required = {entry.name for entry in fields(kind) if entry.default is MISSING and entry.default_factory is MISSING}
     names = {entry.name for entry in fields(kind)}
     missing, unknown = sorted(required - set(entries)), sorted(set(entries) - names)
     if missing or unknown:

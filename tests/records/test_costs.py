@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
-from sparsestreet.records.costs import COSTS, CostRecord, NodeCost, stage_costs, step_costs, update_costs
+from sparsestreet.records.costs import COSTS, CostRecord, EffectGain, NodeCost, stage_costs, step_costs, update_costs
 from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
 from sparsestreet.records.strict_json import RecordError
 from tests.evaluation.frames import NOISE
@@ -107,3 +107,13 @@ def _peaks_can_be_forgotten() -> bool:
     except OSError:
         return False
     return True
+
+
+def test_a_record_from_before_gains_were_measured_has_none(tmp_path):
+    update_costs(tmp_path, effects={"sky": 0.5}, gains={"sky": EffectGain(1.0, None, 2.0, 3)})
+    assert COSTS.read(tmp_path).gains == {"sky": EffectGain(1.0, None, 2.0, 3)}
+    path = tmp_path / "records" / "cost.json"
+    entries = json.loads(path.read_text())
+    del entries["gains"]
+    path.write_text(json.dumps(entries))
+    assert COSTS.read(tmp_path).gains == {}
