@@ -126,8 +126,7 @@ class StreetData(LightningDataModule):
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
         log = log.holding_out(split(log, stride=stride, offset=offset, cameras=cameras).held_out_indices)
         self.split = split(log, stride=stride, offset=offset, cameras=cameras)
-        if hood is not None:
-            hoods = find_hoods(self.split.train, log.sweeps)
+        if hood is not None and (hoods := find_hoods(self.split.train, log.sweeps)):
             seen = {camera: found for camera, found in hoods.items() if found.share >= hood}
             log = replace(log, frames=with_hoods(log.frames, seen), hoods=hoods)
             self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))

@@ -142,11 +142,12 @@ def test_a_bench_trains_without_what_a_run_leaves(log, monkeypatch, tmp_path):
     """As its options say, with one callback more and one less."""
     given: list[Any] = []
     system = make_system({"background": background(1)})
-    monkeypatch.setattr(step_module, "build", lambda recipe, data: given.append((recipe, data)) or system)
+    monkeypatch.setattr(step_module, "build", lambda recipe, data, plan: given.append((recipe, data, plan)) or system)
     monkeypatch.setattr(step_module, "fit", lambda *args, **how: given.append((args, how)))
     watch = Callback()
     assert train_with(WORDS, tmp_path)(watch) is system
-    (recipe, data), ((one, of, callbacks, make, folder), how) = given
+    (recipe, data, plan), ((one, of, callbacks, make, folder), how) = given
+    assert [each.name for each in plan.effects] == list(recipe.effects)
     assert (recipe.seed, data.driving_log, one, of) == (7, log, system, data)
     assert (folder, how) == (tmp_path, {"max_steps": 90})
     assert callbacks[-1] is watch
