@@ -70,7 +70,7 @@ def test_a_camera_whose_exposure_changes():
 
 @pytest.mark.parametrize("moving", [True, False])
 def test_what_moves_as_the_lidar_says_is_street(moving: bool):
-    """A camera that moves by a meter aside in front of a wall 10 m away, which its 10 px of focal length show as 1 px."""
+    """A camera with 10 px of focal length moves by a meter aside, in front of a wall 10 m away: 1 px."""
     intrinsics = torch.tensor([[10.0, 0.0, WIDTH / 2], [0.0, 10.0, HEIGHT / 2], [0.0, 0.0, 1.0]])
     wall = torch.randint(0, 250, (HEIGHT, 3 * WIDTH, 1), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     seen, sweeps = [], []

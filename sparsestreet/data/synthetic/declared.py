@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic.cameras import street_camera
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -50,8 +50,14 @@ def with_declared(log: DrivingLog, settings: StreetSettings, root: Path) -> Driv
         read = shutter(*view.indices) if "readout" in said else None
         return replace(view, camera=replace(view.camera, shutter=read, exposure=said.get("exposure", 0.0)))
 
-    load = log.frames.load
-    return replace(log, frames=Frames(map(told, log.views), lambda view: told(load(view))))
+    def all_told(frames: Frames) -> Frames:
+        return Frames(map(told, frames.views), lambda view: told(frames.load(view)))
+
+    def carried_without(held_out: frozenset[int]) -> tuple[Frames, Sweeps]:
+        kept = log.holding_out(held_out)
+        return all_told(kept.frames), kept.sweeps
+
+    return replace(log, frames=all_told(log.frames), carried_without=carried_without)
 
 
 def _motion(settings: StreetSettings, world: World, frame: int, camera: int) -> list[float]:

@@ -82,6 +82,14 @@ def test_a_log_declares_how_its_cameras_move(folder, log):
 
 
 @pytest.mark.lengthy
+def test_a_split_declares_it_too(log):
+    """A training reads the log without the boxes of what it holds out."""
+    kept = log.holding_out(frozenset({1}))
+    for view, frame in zip(kept.views, kept.frames, strict=True):
+        for camera in (view.camera, frame.camera):
+            assert there(camera.shutter).seconds == 0.06
+
+
 def test_files_can_be_silent_on_it(tmp_path, log):
     write_declared(replace(SETTINGS, readout_known=False), build_world(SETTINGS), tmp_path)
     assert not list(tmp_path.iterdir())
