@@ -45,8 +45,10 @@ def _render_options(cfg: DictConfig) -> RenderOptions:
 def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out."""
     log = instantiate(cfg.data.log, _convert_="all").read()
-    hood = cfg.effects.hood if cfg.effects and "hood" in cfg.effects and cfg.effects.hood.when != "off" else None
-    return StreetData(log, **cfg.split, seed=cfg.seed, hood=None if hood is None else hood.min_share)
+    # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
+    hood = (cfg.effects or {}).get("hood")
+    looked_for = hood is not None and hood.when != "off"
+    return StreetData(log, **cfg.split, seed=cfg.seed, hood=hood.min_share if looked_for else None)
 
 
 def with_views(cfg: DictConfig, data: StreetData) -> DictConfig:
