@@ -46,9 +46,9 @@ def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out."""
     log = instantiate(cfg.data.log, _convert_="all").read()
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
-    hood = (cfg.effects or {}).get("hood")
-    looked_for = hood is not None and hood.when != "off"
-    return StreetData(log, **cfg.split, seed=cfg.seed, hood=hood.min_share if looked_for else None)
+    hood = cfg.effects.get("hood") if cfg.effects else None
+    share = None if hood is None or hood.when == "off" else hood.min_share
+    return StreetData(log, **cfg.split, seed=cfg.seed, hood=share)
 
 
 def with_views(cfg: DictConfig, data: StreetData) -> DictConfig:
