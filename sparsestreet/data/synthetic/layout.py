@@ -4,6 +4,8 @@ EGO_LANE = 0.0
 OVERTAKING_LANE = 3.5
 ONCOMING_LANE = 7.0
 CYCLE_LANE = -2.55
+LANES = (-3.0, 8.6)
+"""From the right side of the lanes to their left, between the parked cars."""
 PARKING_RIGHT = -4.45
 PARKING_LEFT = 10.0
 

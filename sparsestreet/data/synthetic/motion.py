@@ -1,4 +1,4 @@
-"""Positions of things over time: straight along the street, with one smooth change of lane."""
+"""Positions of things over time: straight along the street, with one smooth change of lane, or straight across it."""
 
 from dataclasses import dataclass
 
@@ -50,6 +50,35 @@ class Path:
     def _eased(self, time: float) -> float:
         s = self._phase(time)
         return s * s * (3 - 2 * s)
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Waits at one side of the lanes, walks straight across and stands at the other (world frame, meters and seconds).
+
+    >>> Crossing(x=5.0, start=-3.0, end=8.0, speed=2.0, at=1.0).position(2.0)
+    (5.0, -1.0)
+    """
+
+    x: float
+    start: float
+    end: float
+    """y of the two sides."""
+    speed: float
+    """Meters per second."""
+    at: float
+    """When it leaves, seconds."""
+
+    def position(self, time: float) -> tuple[float, float]:
+        return self.x, self.start + float(np.copysign(self.traveled(time), self.end - self.start))
+
+    def traveled(self, time: float) -> float:
+        """Returns meters walked by then."""
+        return float(np.clip(self.speed * (time - self.at), 0, abs(self.end - self.start)))
+
+    def pose(self, time: float, height: float) -> Pose:
+        """Returns world from object, with the object's origin ``height`` meters above the road."""
+        return at(*self.position(time), height, float(np.copysign(np.pi / 2, self.end - self.start)))
 
 
 @dataclass(frozen=True)

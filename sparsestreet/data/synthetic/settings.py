@@ -77,6 +77,9 @@ class StreetSettings:
     num_moving_cars: int = 5
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
     num_pedestrians: int = 6
+    num_crossing: int = 0
+    """People who cross the street 6 to 10 m before the car, spread over the drive. They walk through other traffic:
+    leave out moving cars."""
     num_cyclists: int = 2
     limp: float = 0.0
     """Share by which a pedestrian's right leg and arm swing less than the left ones; 1: not at all."""
@@ -102,8 +105,8 @@ class StreetSettings:
             if not getattr(self, name) > 0:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
-            "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_cyclists", "body_pose_noise",
-            "exposure_walk", "white_balance", "readout", "shutter_time", "hood",
+            "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_crossing", "num_cyclists",
+            "body_pose_noise", "exposure_walk", "white_balance", "readout", "shutter_time", "hood",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:

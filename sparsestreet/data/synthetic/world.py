@@ -9,7 +9,7 @@ from sparsestreet.data.synthetic.models.car import random_car
 from sparsestreet.data.synthetic.models.model import Model
 from sparsestreet.data.synthetic.models.people import random_cyclist, random_pedestrian
 from sparsestreet.data.synthetic.models.roadside import bin_box, house, lamp_post, tree
-from sparsestreet.data.synthetic.motion import EgoDrive, Path
+from sparsestreet.data.synthetic.motion import Crossing, EgoDrive, Path
 from sparsestreet.data.synthetic.noise import stream
 from sparsestreet.data.synthetic.parts import Part, Pose, at, placed
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -18,6 +18,9 @@ from sparsestreet.data.synthetic.sky import Weather, random_weather
 from sparsestreet.data.synthetic.textures.ground import Asphalt, Footway, Lines
 from sparsestreet.data.synthetic.tunnel import tunnel, tunnel_light
 
+CROSSING_AHEAD = (6.0, 10.0)
+"""Meters from the ego car's rear axle to people who cross its lane, least and most."""
+
 
 @dataclass(frozen=True)
 class Actor:
@@ -25,7 +28,7 @@ class Actor:
 
     name: str
     model: Model
-    path: Path
+    path: Path | Crossing
     ground: float
     """Height of the ground under it, meters."""
 
@@ -61,6 +64,7 @@ def build_world(settings: StreetSettings) -> World:
         *_parked_cars(settings, end),
         *_moving_cars(settings, ego),
         *_pedestrians(settings, end),
+        *_crowd(settings, ego),
         *_cyclists(settings),
     ]
     return World(ego, (*_ground(seed, end), *beside), tuple(actors), weather)
@@ -205,6 +209,21 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
         actors.append(
             Actor(f"pedestrian_{number:02d}", random_pedestrian(rng, settings.limp), path, layout.CURB_HEIGHT)
         )
+    return actors
+
+
+def _crowd(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
+    """Returns people who cross the street before the ego car, from both sides in turn, and heed no other car."""
+    rng = stream(settings.seed, "crowd")
+    actors = []
+    for number in range(settings.num_crossing):
+        # When they are in the middle of the ego lane, spread evenly over the drive, and how far ahead of the car.
+        time = settings.duration * (number + float(rng.uniform(0.2, 0.8))) / settings.num_crossing
+        x = float(ego.pose(time)[0, 3]) + float(rng.uniform(*CROSSING_AHEAD))
+        speed = float(rng.uniform(0.9, 1.6))
+        start, end = layout.LANES if number % 2 == 0 else layout.LANES[::-1]
+        path = Crossing(x, start, end, speed, time - abs(start - layout.EGO_LANE) / speed)
+        actors.append(Actor(f"crossing_{number:02d}", random_pedestrian(rng, settings.limp), path, 0.0))
     return actors
 
 

@@ -111,6 +111,33 @@ def test_people_walk_on_footways_and_cars_on_the_road():
         assert bottom == pytest.approx(0.0 if on_road else layout.CURB_HEIGHT, abs=1e-9)
 
 
+def test_a_crowd_crosses_close_before_the_car_and_waits_beside_the_lanes():
+    settings = StreetSettings(seed=3, num_crossing=9, num_frames=60, num_moving_cars=0, num_cyclists=0)
+    world = build_world(settings)
+    crowd = [actor for actor in world.actors if actor.name.startswith("crossing")]
+    assert len(crowd) == 9
+    times = np.linspace(0, settings.duration, 601)
+    ego = np.array([world.ego.pose(time)[0, 3] for time in times])
+    for actor in crowd:
+        y = np.array([actor.pose(time)[1, 3] for time in times])
+        middle = np.abs(y) < 0.05  # in the middle of the car's lane, where it has it 6 to 10 m ahead
+        ahead = actor.pose(0.0)[0, 3] - ego[middle]
+        # 0.05 m take a walker of 0.9 m/s 0.06 s, in which the car drives half a meter.
+        assert middle.any()
+        assert 5.4 < ahead.min() <= ahead.max() < 10.6
+        assert layout.LANES[0] - 1e-9 <= y.min()
+        assert y.max() <= layout.LANES[1] + 1e-9
+        steps = np.abs(np.diff(y)) * 600 / settings.duration
+        walks = steps > 1e-6
+        assert 0.8 < np.median(steps[walks]) < 1.7
+        # Legs move with the way: none is walked standing.
+        np.testing.assert_allclose(
+            np.diff([actor.path.traveled(time) for time in times]), np.abs(np.diff(y)), atol=1e-9
+        )
+        forward = actor.pose(0.0)[:3, 0]
+        assert forward[1] * (y[-1] - y[0]) > 0.99 * abs(y[-1] - y[0]) > 0
+
+
 @pytest.mark.lengthy
 def test_seeds_give_other_streets_and_counts_can_be_zero():
     first, again, other = (build_world(StreetSettings(seed=seed)) for seed in (0, 0, 1))
