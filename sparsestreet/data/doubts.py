@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.data.followed import FEWEST, followed
-from sparsestreet.data.lazy import Frames, Sweeps, spread
+from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.types import Track, View
 
@@ -16,7 +16,7 @@ MOST_FRAMES = 36
 _FLAT = 3.0
 """Gray levels, standard deviation over an image, below which it shows nothing."""
 _UNLIKE = 1.0
-"""Of ``followed``: 0.2 to 0.9 where poses are right, 1.09 and more where the axes of a camera are swapped."""
+"""Of ``followed``: 0.3 to 0.8 where poses are right, 1.03 and more where the axes of a camera are swapped."""
 _ACCELERATION = 30.0
 """Meters per second squared; three times what tires hold."""
 _OUTLYING = 10.0
@@ -34,7 +34,7 @@ def doubts(log: DrivingLog, frames: Frames | None = None) -> tuple[str, ...]:
     names = log.camera_names or tuple(map(str, range(log.num_cameras)))
     return (
         *_covered(frames, names),
-        *_swapped(frames, log.sweeps, names),
+        *_swapped(frames, log, names),
         *_jumps(frames.views, names),
         *_shared_boxes(log.tracks),
     )
@@ -55,8 +55,8 @@ def _covered(frames: Frames, names: Sequence[str]) -> Iterator[str]:
         )
 
 
-def _swapped(frames: Frames, sweeps: Sweeps, names: Sequence[str]) -> Iterator[str]:
-    for camera, change in followed(frames, sweeps).items() if len(sweeps) else ():
+def _swapped(frames: Frames, log: DrivingLog, names: Sequence[str]) -> Iterator[str]:
+    for camera, change in followed(frames, log.sweeps, log.tracks).items() if len(log.sweeps) else ():
         if change is None:
             yield (
                 f"camera {names[camera]} sees hardly any return of the lidar (below {FEWEST} an image): check the axes "
@@ -66,7 +66,7 @@ def _swapped(frames: Frames, sweeps: Sweeps, names: Sequence[str]) -> Iterator[s
             yield (
                 f"returns of the lidar change their gray level {change:.1f} times as much if camera {names[camera]} is "
                 "followed along its poses as if it stood still: check the axes of camera and poses (OpenCV: x right, y "
-                "down, z ahead) and the stamps"
+                "down, z ahead) and the stamps, or mask the recording car where the image shows it (data.log.masks)"
             )
 
 

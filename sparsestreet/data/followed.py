@@ -1,15 +1,19 @@
 """Whether lidar returns keep their gray level from one image to the next, where the poses say that they are."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, Sweeps, spread
+from sparsestreet.geometry.boxes import box_at, inside_box
 from sparsestreet.geometry.cameras import project
-from sparsestreet.types import Frame, View
+from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.types import Frame, Sweep, Track, View
 
+Pixels = tuple[Int[Tensor, " n"], Int[Tensor, " n"]]
 PAIRS = 8
 """Of images of a camera that are compared."""
 LEAST_STEP = 1.5
@@ -17,30 +21,63 @@ LEAST_STEP = 1.5
 a few large pixels, outweighs the street's."""
 FEWEST = 50
 """Returns of a pair; fewer say nothing."""
+_LARGER = 1.2
+"""Sides of boxes, whose objects move on their own."""
 _MOVES = 2.0
 """Pixels within a pair, below which a return does not count: whoever stands is right anyway."""
 
 
-def followed(frames: Frames, sweeps: Sweeps) -> dict[int, float | None]:
+@dataclass(frozen=True)
+class FollowedReturns:
+    """Returns that two images of a camera show, and how their gray level changes."""
+
+    old: Pixels
+    """Row and column in the first image."""
+    new: Pixels
+    """In the second, as the poses have it."""
+    stayed: Float[Tensor, " n"]
+    """Change of the gray level at the old pixel, of 255; exposure left out."""
+    moved: Float[Tensor, " n"]
+    """From the old pixel to the new one."""
+    enough: bool
+    """Whether both images show as many returns as it takes to say something, moving ones or not."""
+
+
+def followed_returns(own: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> Iterator[FollowedReturns]:
+    """Of pairs of a camera's images, spread over the drive: the returns that move by some pixels. Those in boxes are
+    left out."""
+    places = {index: place for place, index in enumerate(sweeps.indices)}
+    pairs = [(a, b) for a, b in _pairs(own.views) if own.views[a].indices[0] in places]
+    for a, b in (pairs[place] for place in (spread(len(pairs), PAIRS) if pairs else ())):
+        first, second = own[a], own[b]
+        old, new = _seen(first, second, _standing(sweeps[places[first.indices[0]]], tracks))
+        moving = (new - old).norm(dim=1) >= _MOVES
+        before, after = (frame.image.float().mean(-1) for frame in (first, second))
+        after = after * (before.mean() / after.mean().clamp(min=1.0))
+        here, there = _places(old[moving]), _places(new[moving])
+        level = before[here]
+        yield FollowedReturns(
+            here, there, (after[here] - level).abs(), (after[there] - level).abs(), len(old) >= FEWEST
+        )
+
+
+def followed(frames: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> dict[int, float | None]:
     """Camera index -> how much the gray level changes at returns that are followed, over that at their old pixels.
 
     Right poses make it smaller than 1. If the axes of a camera are swapped, returns move anywhere, and following them
     is worse than staying. The median over pairs of images; None where most show hardly any return. Cameras that stand
     are left out.
     """
-    places, found = {index: place for place, index in enumerate(sweeps.indices)}, {}
+    found = {}
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.indices[1] == camera)
-        pairs = [(a, b) for a, b in _pairs(own.views) if own.views[a].indices[0] in places]
-        ratios, blind, looked = [], 0, spread(len(pairs), PAIRS) if pairs else []
-        for first, second in (pairs[place] for place in looked):
-            both = own[first], own[second]
-            old, new = _seen(*both, sweeps[places[own.views[first].indices[0]]].points)
-            blind += len(old) < FEWEST
-            moving = (new - old).norm(dim=1) >= _MOVES
-            if int(moving.sum()) >= FEWEST:
-                ratios.append(_ratio(*both, old[moving], new[moving]))
-        if 2 * blind > len(looked):
+        returns = list(followed_returns(own, sweeps, tracks))
+        ratios = [
+            float(each.moved.mean() / each.stayed.mean().clamp(min=0.5))
+            for each in returns
+            if len(each.moved) >= FEWEST
+        ]
+        if 2 * sum(not each.enough for each in returns) > len(returns):
             found[camera] = None
         elif ratios:
             found[camera] = float(torch.tensor(ratios).median())
@@ -58,6 +95,17 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     return found
 
 
+def _standing(sweep: Sweep, tracks: Sequence[Track]) -> Float[Tensor, "n 3"]:
+    """The sweep's points outside of all boxes."""
+    points = sweep.points
+    for track in tracks:
+        world_from_box = box_at(track, sweep.index, sweep.time)
+        if world_from_box is not None:
+            in_box = transform_points(inverse(world_from_box), points.double()).to(points.dtype)
+            points = points[~inside_box(in_box, track.size, _LARGER)]
+    return points
+
+
 def _seen(
     first: Frame, second: Frame, points: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 2"]]:
@@ -72,14 +120,6 @@ def _seen(
     return here[street], there[street]
 
 
-def _places(pixels: Float[Tensor, "n 2"]) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+def _places(pixels: Float[Tensor, "n 2"]) -> Pixels:
     column, row = pixels.long().clamp(min=0).unbind(1)
     return row, column
-
-
-def _ratio(first: Frame, second: Frame, old: Float[Tensor, "n 2"], new: Float[Tensor, "n 2"]) -> float:
-    before, after = (frame.image.float().mean(-1) for frame in (first, second))
-    after = after * (before.mean() / after.mean().clamp(min=1.0))  # exposure may change
-    level = before[_places(old)]
-    stayed = (after[_places(old)] - level).abs().mean()
-    return float((after[_places(new)] - level).abs().mean() / stayed.clamp(min=0.5))
