@@ -46,9 +46,13 @@ def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out."""
     log = instantiate(cfg.data.log, _convert_="all").read()
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
-    hood = cfg.effects.get("hood") if cfg.effects else None
-    share = None if hood is None or hood.when == "off" else hood.min_share
-    return StreetData(log, **cfg.split, seed=cfg.seed, hood=share)
+    return StreetData(log, **cfg.split, seed=cfg.seed, hood=_masked_from(cfg, "hood"), dirt=_masked_from(cfg, "dirt"))
+
+
+def _masked_from(cfg: DictConfig, name: str) -> float | None:
+    """Share of an image from which what an effect finds is masked; None: it is not looked for."""
+    effect = cfg.effects.get(name) if cfg.effects else None
+    return None if effect is None or effect.when == "off" else effect.min_share
 
 
 def with_views(cfg: DictConfig, data: StreetData) -> DictConfig:

@@ -7,6 +7,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sparsestreet.data.doubts import doubts
+from sparsestreet.data.hood import find_hoods, with_hoods
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
@@ -28,6 +30,8 @@ def report_check(reader: LogReader, console: Console | None = None) -> int:
         console.print(_track_table(log))
     for note in log.notes:
         console.print(f"[yellow]note[/] {escape(note)}")
+    for doubt in doubts(log, with_hoods(log.frames, find_hoods(log.frames, log.sweeps))):
+        console.print(f"[bold yellow]doubt[/] {escape(doubt)}")
     console.print(f"[bold green]ready to train[/]: {escape(str(reader.folder))}")
     return 0
 

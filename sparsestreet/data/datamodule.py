@@ -9,6 +9,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
+from sparsestreet.data.dirt import find_dirt
 from sparsestreet.data.hood import find_hoods, with_hoods
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog, Split, split
@@ -108,6 +109,7 @@ class StreetData(LightningDataModule):
         val_frames: int | None = None,
         with_replacement: bool = False,
         hood: float | None = None,
+        dirt: float | None = None,
     ) -> None:
         """
         Args:
@@ -120,6 +122,7 @@ class StreetData(LightningDataModule):
             with_replacement: as in ``ShuffledFrames``.
             hood: what is found of the recording car joins the ``ego`` pixels of all frames of a camera that shows at
                 least this share of it; None: it is not looked for.
+            dirt: the same of spots on the lens.
         """
         super().__init__()
         if val_frames is not None and val_frames < 1:
@@ -129,6 +132,10 @@ class StreetData(LightningDataModule):
         if hood is not None and (hoods := find_hoods(self.split.train, log.sweeps)):
             seen = {camera: found for camera, found in hoods.items() if found.share >= hood}
             log = replace(log, frames=with_hoods(log.frames, seen), hoods=hoods)
+            self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))
+        if dirt is not None and (spots := find_dirt(self.split.train, log.sweeps, log.tracks)):
+            seen = {camera: found for camera, found in spots.items() if float(found.mask.float().mean()) >= dirt}
+            log = replace(log, frames=with_hoods(log.frames, seen), dirt=spots)
             self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))
         # Colors of a sweep are those of images, so a camera that is held out gives none.
         self.driving_log = replace(log, sweeps=recolored(log, self.split)) if cameras else log

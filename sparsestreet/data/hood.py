@@ -61,7 +61,7 @@ def find_hoods(frames: Frames, sweeps: Sweeps) -> dict[int, Hood]:
     found = {}
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.indices[1] == camera)
-        if _driven(own) >= LEAST_DRIVE:
+        if driven(own) >= LEAST_DRIVE:
             gray = torch.stack([own[place].image.float().mean(-1) for place in spread(len(own), MOST_FRAMES)])
             mask = _seen_still(gray)
             if mask.any() and _is_street(mask, own, sweeps):
@@ -125,7 +125,7 @@ def with_hoods(frames: Frames, hoods: dict[int, Hood]) -> Frames:
     return Frames(frames.keys, load)
 
 
-def _driven(frames: Frames) -> float:
+def driven(frames: Frames) -> float:
     """Meters along the path of a camera."""
     centers = torch.stack([view.camera.position for view in frames.views])
     return float((centers[1:] - centers[:-1]).norm(dim=1).sum())

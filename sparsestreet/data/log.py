@@ -79,6 +79,8 @@ class DrivingLog:
 
     hoods: Mapping[int, Hood] = field(default_factory=dict)
     """Camera index -> what it was found to see of the car that carries it (``hood.find_hoods``)."""
+    dirt: Mapping[int, Hood] = field(default_factory=dict)
+    """Camera index -> what was found on its lens (``dirt.find_dirt``)."""
 
     @property
     def views(self) -> tuple[View, ...]:

@@ -87,6 +87,16 @@ def pose_noise(frames: Frames, moving: Sequence[Track]) -> PoseNoise | None:
     )
 
 
+def seen_from(frames: Frames, views: Sequence[View]) -> Frames:
+    """The same images, taken to be seen from other cameras; they are read when they are indexed."""
+    places = {view.indices: place for place, view in enumerate(frames.views)}
+
+    def load(view: View) -> Frame:
+        return replace(frames[places[view.indices]], camera=view.camera)
+
+    return Frames(views, load)
+
+
 def _noise(stretches: Sequence[_Stretch]) -> float:
     excess = np.concatenate([each.squares - each.floor for each in stretches])
     return float(np.sqrt(max(np.median(excess), 0.0)))

@@ -78,7 +78,7 @@ def _effects(plan: EffectPlan, data: TrainingData, seed: int) -> dict[str, Effec
 
 def _word(planned: PlannedEffect) -> str:
     if planned.settings.when == "auto":
-        return "on" if planned.on else "not needed"
+        return "on" if planned.on else "found, not simulated" if planned.only_found else "not needed"
     return f"forced {planned.settings.when}"
 
 

@@ -16,6 +16,7 @@ from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.loggers import CSVLogger, Logger
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.doubts import doubts
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene
 from sparsestreet.phases import StageRecorder, stage
@@ -155,6 +156,8 @@ def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     seed_everything(recipe.seed, verbose=False)
     for note in data.driving_log.notes:
         log.info(note)
+    for doubt in doubts(data.driving_log, data.split.train):
+        log.warning(doubt)
     with stage("initialize"):
         return recipe.build(data, plan)
 

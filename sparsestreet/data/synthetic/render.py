@@ -9,10 +9,12 @@ from jaxtyping import Bool, Float32, Int16, UInt8
 
 from sparsestreet.data.synthetic.cameras import StreetCamera, street_camera
 from sparsestreet.data.synthetic.capture import captured
+from sparsestreet.data.synthetic.dirt import behind_dirt, dirt_opacity
 from sparsestreet.data.synthetic.exposure import recorded_gains
 from sparsestreet.data.synthetic.hood import behind_hood, hood_coverage
 from sparsestreet.data.synthetic.instant import Instant, Sight
 from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
+from sparsestreet.data.synthetic.night import at_night
 from sparsestreet.data.synthetic.parts import Pose
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.shading import to_srgb
@@ -72,7 +74,10 @@ def _recorded(
     coverage = hood_coverage(settings, camera)
     if coverage is not None:
         sight = behind_hood(sight, coverage, mounted, world.weather)
-    return developed(mounted, sight, recorded_gains(settings, frame, camera))
+    dirt = dirt_opacity(settings, camera)
+    if dirt is not None:
+        sight = behind_dirt(sight, dirt)
+    return developed(mounted, at_night(settings, sight, frame, camera), recorded_gains(settings, frame, camera))
 
 
 def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:

@@ -65,6 +65,10 @@ class StreetSettings:
     """Whose images it covers."""
     hood_known: bool = False
     """True: the street's files have masks of it."""
+    dirt: float = 0.0
+    """Share of the front camera's images that three dark, soft spots on its lens cover."""
+    night: float = 0.0
+    """Stops by which there is less light, EV; the noise of the sensor shows then."""
     jpeg: int = 97
     """Quality of the images' files, 1 to 100, without halved colors."""
     supersampling: int = 2
@@ -106,7 +110,7 @@ class StreetSettings:
                 raise ValueError(f"StreetSettings.{name} must be positive but is {getattr(self, name)}")
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_crossing", "num_cyclists",
-            "body_pose_noise", "exposure_walk", "white_balance", "readout", "shutter_time", "hood",
+            "body_pose_noise", "exposure_walk", "white_balance", "readout", "shutter_time", "hood", "dirt", "night",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
@@ -126,6 +130,8 @@ class StreetSettings:
             raise ValueError(f"StreetSettings.jpeg must be a quality from 1 to 100 but is {self.jpeg}")
         if self.hood > 0.5:
             raise ValueError(f"StreetSettings.hood must be a share of the image up to 0.5 but is {self.hood}")
+        if self.dirt > 0.1:
+            raise ValueError(f"StreetSettings.dirt must be a share of the image up to 0.1 but is {self.dirt}")
         if self.hood_cameras not in ("front", "all"):
             raise ValueError(f"StreetSettings.hood_cameras must be front or all but is {self.hood_cameras}")
         if self.white_balance and self.num_cameras == 1:

@@ -8,12 +8,15 @@ brings, and what takes them away from it.
 from sparsestreet.scene.effects.affine import Affine, AffineSettings
 from sparsestreet.scene.effects.box_poses import BoxPosesSettings
 from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
+from sparsestreet.scene.effects.dirt import DirtSettings
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.effects.exposure import Exposure, ExposureSettings
 from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
+from sparsestreet.scene.effects.night import NightSettings
 from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
+from sparsestreet.scene.effects.saturation import SaturationSettings
 from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
 from sparsestreet.scene.effects.sky import Sky, SkySettings
 
@@ -24,6 +27,7 @@ __all__ = [
     "CameraPoses",
     "CameraPosesSettings",
     "Cost",
+    "DirtSettings",
     "Effect",
     "EffectPlan",
     "EffectSettings",
@@ -34,7 +38,9 @@ __all__ = [
     "Lens",
     "LensSettings",
     "LinearizedEffects",
+    "NightSettings",
     "RollingShutter",
+    "SaturationSettings",
     "ShutterSettings",
     "Sky",
     "SkySettings",

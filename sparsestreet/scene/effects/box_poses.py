@@ -29,6 +29,9 @@ class BoxPosesSettings(EffectSettings):
     threshold: float = 2.0
     """Centimeters, standard deviation of a corner about its path (``evidence.boxes``)."""
 
+    smooth: bool = True
+    """Corrections start where boxes would lie on smooth paths (``geometry.smooth_paths``); false: at zero."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.threshold >= 0:
@@ -55,6 +58,8 @@ class BoxPosesSettings(EffectSettings):
         for node in nodes:
             if isinstance(node, Tracked) and not on:
                 node.fix_boxes()
+            elif isinstance(node, Tracked) and self.smooth:
+                node.smooth_boxes()
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> Effect | None:
         return None

@@ -6,7 +6,7 @@ small sums over the rows in the backward pass, and nothing in the forward pass.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from sparsestreet.evidence.poses import pose_noise
+from sparsestreet.evidence.poses import pose_noise, seen_from
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.geometry.cameras import exact_position
@@ -24,10 +24,18 @@ from sparsestreet.scene.effects.recorded_poses import RecordedPoses
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Camera, Gaussians, View
+from sparsestreet.types import Camera, Gaussians, Track, View
 
 _MOVES = 0.5
 """Meters that an object must get before its points do not count."""
+_DEPTH = 10.0
+"""Meters away, at which a shift of the camera moves what it sees as far as a turn does."""
+_LEAST = 0.02
+"""Pixels that a pose is taken to be off at least; poses of exact streets measure 0.02 to 0.06."""
+_CONFIRMED = 0.7
+"""Smooth paths are taken if poses on them measure less than this part of the recorded ones' errors."""
+_LEFT = 0.3
+"""Of errors that differ from image to image, on a smooth path: 0.1 to 0.4 of them are left (docs/effects.md)."""
 _SHARED = 4.0
 """Of the threshold: what all images of a camera share is worth a word from here on. Streets without errors have up to
 0.9 px of it, because little says where a whole camera is."""
@@ -39,12 +47,13 @@ class CameraPosesSettings(EffectSettings):
 
     threshold: float = 0.5
     """Pixels that poses move the median image by, from one image to the next (``evidence.poses``)."""
-    weight: float = 1e-5
-    """Of the squares of a step's correction, in centimeters and milliradians; it also decides where the world is, which
+    weight: float = 5e-4
+    """Of the squares of a step's correction, in units of the measured error; it also decides where the world is, which
     images alone do not."""
     learning_rates: Rates = field(
-        default_factory=lambda: {"translations": LearningRate(1e-2, 1e-4), "rotations": LearningRate(1e-3, 1e-5)}
+        default_factory=lambda: {"translations": LearningRate(0.15, 0.0015), "rotations": LearningRate(0.15, 0.0015)}
     )
+    """In units of the measured error: where poses are right, hardly anything is learned."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,8 +62,7 @@ class CameraPosesSettings(EffectSettings):
 
     def detect(self, data: TrainingData) -> Finding:
         """Measures images of a few stretches of the drive (``evidence.poses``)."""
-        tracks = [track for track in data.log.tracks if displacement(track) > _MOVES]
-        found = pose_noise(data.frames, without_frames(tracks, data.held_out))
+        found = pose_noise(data.frames, _moving(data))
         if found is None:
             reason = f"no image of {data.log.name} shares enough points with others to tell whether its pose is off"
             return Finding(called_for=False, reason=reason, unit="px", threshold=self.threshold)
@@ -76,17 +84,33 @@ class CameraPosesSettings(EffectSettings):
         return Cost(numbers=6 * len(data.views))
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "CameraPoses":
-        views = data.views
+        """Corrections start where poses lie on smooth paths, if rays of points meet better from there; else at zero."""
+        views, noise = data.views, self.threshold if finding.value is None else finding.value
         poses = torch.stack([view.camera.camera_from_world for view in views])
-        return CameraPoses(self, RecordedPoses([view.indices for view in views], [view.time for view in views], poses))
+        recorded = RecordedPoses([view.indices for view in views], [view.time for view in views], poses)
+        start = recorded.to_smooth_paths()
+        smooth = [replace(view, camera=_moved(view.camera, each)) for view, each in zip(views, start, strict=True)]
+        found = None if finding.value is None else pose_noise(seen_from(data.frames, smooth), _moving(data))
+        if found is None or found.value > _CONFIRMED * noise:
+            start = torch.zeros_like(start)
+        else:
+            noise = _LEFT * noise
+        focal = torch.stack([view.camera.intrinsics[0, 0] for view in views])
+        return CameraPoses(self, recorded, start.float(), max(noise, _LEAST) / focal)
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "CameraPoses":
         indices = [(frame, camera) for frame, camera in tensors["indices"].tolist()]
-        return CameraPoses(self, RecordedPoses(indices, tensors["times"].tolist(), tensors["poses"]))
+        recorded = RecordedPoses(indices, tensors["times"].tolist(), tensors["poses"])
+        return CameraPoses(self, recorded, tensors["start"], tensors["expected"])
+
+
+def _moving(data: TrainingData) -> Sequence[Track]:
+    tracks = [track for track in data.log.tracks if displacement(track) > _MOVES]
+    return without_frames(tracks, data.held_out)
 
 
 class CameraPoses(Effect):
-    """Corrections of the recorded poses, zero at the start, in the frame of each camera.
+    """Corrections of the recorded poses in the frame of each camera: a start, and what is learned beside it.
 
     The camera of a training image gets its own, that of another recorded image what its neighbors say
     (``RecordedPoses.predicted``). A view that nobody recorded is seen from where it says: so are views beside the path,
@@ -97,8 +121,20 @@ class CameraPoses(Effect):
     indices: Tensor
     times: Tensor
     poses: Tensor
+    start: Tensor
+    expected: Tensor
 
-    def __init__(self, settings: CameraPosesSettings, recorded: RecordedPoses) -> None:
+    def __init__(
+        self,
+        settings: CameraPosesSettings,
+        recorded: RecordedPoses,
+        start: Float[Tensor, "n 6"],
+        expected: Float[Tensor, " n"],
+    ) -> None:
+        """``expected`` is the error that poses are taken to have, radians; ``start`` has meters and radians.
+
+        What is learned is in units of it, and of what moves the image as far at 10 m.
+        """
         super().__init__(settings)
         self.recorded = recorded
         count = len(recorded.indices)
@@ -107,6 +143,8 @@ class CameraPoses(Effect):
         self.register_buffer("indices", torch.tensor(recorded.indices, dtype=torch.int64).reshape(-1, 2))
         self.register_buffer("times", torch.tensor(recorded.times, dtype=torch.float64))
         self.register_buffer("poses", recorded.poses)
+        self.register_buffer("start", start)
+        self.register_buffer("expected", expected)
 
     def view(self, view: View, state: SceneState) -> View:
         place = self.recorded.place(view)
@@ -126,8 +164,8 @@ class CameraPoses(Effect):
         as_recorded = replace(view.camera, camera_from_world=recorded)
         if not torch.equal(self._corrected(place, as_recorded).camera_from_world, view.camera.camera_from_world):
             return gaussians
-        rotation = quat.to_matrix(quat.from_rotation_vector(self.rotations[place]))
-        motion = torch.cat((rotation, self.translations[place, :, None]), 1)
+        correction = self._correction()[place]
+        motion = torch.cat((quat.to_matrix(quat.from_rotation_vector(correction[3:])), correction[:3, None]), 1)
         center = exact_position(as_recorded)
         means, quaternions = _SeenRigidly.apply(
             gaussians.means, gaussians.quaternions, motion, recorded[:, :3].to(motion), center.to(motion)
@@ -136,19 +174,21 @@ class CameraPoses(Effect):
 
     def corrections(self) -> Float64[Tensor, "n 6"]:
         """Translations (m) and rotation vectors (rad) of all training images, on the host."""
-        return torch.cat((self.translations, self.rotations), 1).detach().cpu().double()
+        return self._correction().detach().cpu().double()
+
+    def _correction(self) -> Float[Tensor, "n 6"]:
+        return self.start + self.expected[:, None] * torch.cat((_DEPTH * self.translations, self.rotations), 1)
 
     def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
         """Returns ``correction``, of the view's own pose, where it has a weight and the view is a training image."""
         place = self.recorded.place(view)
         if place is None or not self.settings.weight > 0:
             return {}
-        centimeters, milliradians = 100 * self.translations[place], 1000 * self.rotations[place]
-        return {"correction": self.settings.weight * (centimeters.square().sum() + milliradians.square().sum())}
+        learned = self.translations[place].square().sum() + self.rotations[place].square().sum()
+        return {"correction": self.settings.weight * learned}
 
     def _corrected(self, place: int, camera: Camera) -> Camera:
-        correction = torch.cat((self.translations[place], self.rotations[place])).detach().cpu().double()
-        return _moved(camera, correction)
+        return _moved(camera, self.corrections()[place])
 
 
 def _moved(camera: Camera, correction: Float64[Tensor, "6"]) -> Camera:

@@ -17,6 +17,11 @@ class PlannedEffect:
     finding: Finding
     on: bool
 
+    @property
+    def only_found(self) -> bool:
+        """Whether the log calls for it, and something is missing for a scene to have it."""
+        return self.finding.called_for and not self.on
+
     def decision(self, data: TrainingData, rows: int) -> EffectDecision:
         """The effect as records have it, for a scene of ``rows`` Gaussians."""
         finding, cost = self.finding, self.settings.cost(data)
@@ -24,7 +29,7 @@ class PlannedEffect:
             name=self.name,
             on=self.on,
             source="forced" if self.settings.when != "auto" else "declared" if finding.declared else "measured",
-            reason=finding.reason,
+            reason=f"found, not simulated: {finding.reason}" if self.only_found else finding.reason,
             value=finding.value,
             unit=finding.unit,
             threshold=finding.threshold,

@@ -13,6 +13,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.smooth_paths import smoothed
+from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.types import View
 
@@ -55,6 +57,22 @@ class RecordedPoses:
             return None
         beside = self._beside(view.camera.camera_from_world, around)
         return _mean(corrections, around) + self._shares(corrections) * beside
+
+    def to_smooth_paths(self) -> Float64[Tensor, "n 6"]:
+        """The corrections that move each image to a smooth path of its camera (``geometry.smooth_paths``)."""
+        found = torch.zeros(len(self.indices), 6, dtype=torch.float64)
+        for places in self._by_camera.values():
+            times = torch.tensor([[self.times[place] for place in places]])
+            ends = inverse(self.poses[places].double())
+            turned = quat.from_matrix(ends[:, :3, :3]).float()[None]
+            path = Trajectories(
+                times, turned, ends[None, :, :3, 3].float(), torch.ones_like(times, dtype=torch.bool), times[:, [0, -1]]
+            )
+            rotations, shifts = (each[0].double() for each in smoothed(path))
+            undone = quat.to_matrix(quat.from_rotation_vector(-rotations))
+            ahead = ends[:, :3, :3].mT @ shifts[:, :, None]
+            found[places] = torch.cat((-(undone @ ahead)[:, :, 0], -rotations), 1)
+        return found
 
     def _around(self, view: View) -> Neighbors | None:
         places = self._by_camera.get(-1 if view.camera_index is None else view.camera_index)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import view_lag, without_frames
+from sparsestreet.geometry.smooth_paths import smoothed
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
@@ -200,6 +201,13 @@ class Tracked(Node):
             values = getattr(self, name).detach()
             delattr(self, name)
             self.register_buffer(name, values)
+
+    def smooth_boxes(self) -> None:
+        """Starts the boxes' corrections where they make each object's path smooth (``geometry.smooth_paths``)."""
+        with torch.no_grad():
+            rotations, translations = smoothed(self.keyframes)
+            self.rotation_deltas.copy_(rotations)
+            self.translation_deltas.copy_(translations)
 
     def placed(self, view: View) -> RawGaussians:
         """Returns the stored rows, each placed by its instance's box at the view's time; opacity 0 if it is absent."""

@@ -42,6 +42,21 @@ def test_where_it_is_off_corrections_are_no_parameters_and_objects_move_as_their
         assert off.pose_at(time).translations.grad_fn is None
 
 
+@pytest.mark.parametrize("smooth", [True, False])
+def test_corrections_start_on_a_smooth_path(smooth: bool):
+    log = replace(street_log(), tracks=(trembling(0.03),))
+    data = training_data(log)
+    plan = plan_effects({"boxes": BoxPosesSettings(when="on", smooth=smooth)}, data)
+    node = build_scene(log, data.frames, frozenset(), {"cars": rigid_settings()}, plan, 0).nodes["cars"]
+    assert isinstance(node, Rigid)
+    true = torch.tensor([[5.0 + frame, 0.0, 0.0] for frame in range(40)])
+    beside = [(positions - true).square().mean().sqrt() for positions in (
+        node.keyframe_translations[0], (node.keyframe_translations + node.translation_deltas)[0].detach()
+    )]  # fmt: skip
+    # A straight line has two degrees of freedom of 40: a quarter of the errors.
+    assert beside[1] < 0.4 * beside[0] if smooth else beside[1] == beside[0]
+
+
 @pytest.mark.parametrize(("meters", "on"), [(0.0, False), (0.005, False), (0.03, True)])
 def test_it_is_called_for_where_boxes_tremble(meters: float, on: bool):
     log = replace(street_log(), tracks=(trembling(meters),))

@@ -8,20 +8,23 @@ import numpy as np
 import pytest
 import torch
 
+from sparsestreet.data.lazy import Frames
 from sparsestreet.evidence.poses import PoseNoise
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.scene.effects import camera_poses
+from sparsestreet.scene.effects import Finding, camera_poses
 from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
 from sparsestreet.scene.effects.recorded_poses import RecordedPoses
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
-from sparsestreet.types import Camera, Gaussians, Shutter, View
+from sparsestreet.types import Camera, Frame, Gaussians, Shutter, View
 from tests.scene.street import background, camera_at, random_rows, training_data
 
 SETTINGS = CameraPosesSettings(weight=0.01)
+EXPECTED, START = 0.02, 0.01
+"""Radians that the poses are taken to be off; meters and radians of all corrections at the start."""
 PLAIN = replace(camera_at(-6.0, width=17, height=11), intrinsics=torch.tensor([[9.0, 0, 8], [0, 9, 5], [0, 0, 1]]))
 BENT = replace(PLAIN, distortion=torch.tensor([-0.2, 0.05, 0.01, 0.0, 0.0]))
 ROLLING = replace(PLAIN, shutter=Shutter(torch.tensor([0.3, 0.0, 0.1]), torch.tensor([0.0, 0.1, 0.02])))
@@ -58,10 +61,14 @@ def gaussians(degree: int) -> Gaussians:
 def effect(camera: Camera, *, indices=((0, 0),), times=(0.5,), dtype=torch.float64) -> CameraPoses:
     """Corrections of images that one camera took, with values."""
     poses = camera.camera_from_world.repeat(len(indices), 1, 1)
-    made = CameraPoses(SETTINGS, RecordedPoses(indices, times, poses)).to(dtype)
+    expected = torch.full((len(indices),), EXPECTED)
+    start = torch.full((len(indices), 6), START)
+    made = CameraPoses(SETTINGS, RecordedPoses(indices, times, poses), start, expected).to(dtype)
     with torch.no_grad():
-        made.translations.copy_(torch.linspace(-0.2, 0.3, 3 * len(indices)).reshape(-1, 3))
-        made.rotations.copy_(torch.linspace(0.15, -0.1, 3 * len(indices)).reshape(-1, 3))
+        shifts = torch.linspace(-0.2, 0.3, 3 * len(indices)) - START
+        made.translations.copy_((shifts / (10 * EXPECTED)).reshape(-1, 3))
+        turns = torch.linspace(0.15, -0.1, 3 * len(indices)) - START
+        made.rotations.copy_((turns / EXPECTED).reshape(-1, 3))
     return made
 
 
@@ -83,11 +90,11 @@ def both_gradients(camera: Camera, degree: int, settings: SplatSettings) -> tupl
     rows = replace(rows, means=rows.means.requires_grad_(), quaternions=rows.quaternions.requires_grad_())
     loss_of(poses, rows, view, settings, wrapped=True).backward()
     found = torch.cat((poses.translations.grad[0], poses.rotations.grad[0]))
-    differences, step = [], 1e-6
+    differences = []
     with torch.no_grad():
-        for parameter in (poses.translations, poses.rotations):
+        for parameter, unit in ((poses.translations, 10 * EXPECTED), (poses.rotations, EXPECTED)):
             for axis in range(3):
-                ends = []
+                step, ends = 1e-6 / unit, []
                 for sign in (1, -1):
                     parameter[0, axis] += sign * step
                     ends.append(loss_of(poses, rows, view, settings, wrapped=False))
@@ -122,8 +129,9 @@ def corrected(poses: CameraPoses, view: View) -> torch.Tensor:
 def test_an_image_has_its_own_correction_and_other_views_have_none():
     poses = effect(PLAIN, indices=((0, 0), (2, 0)), times=(0.0, 1.0), dtype=torch.float32)
     with torch.no_grad():
+        poses.start.zero_()
         poses.rotations.zero_()
-        poses.translations.copy_(torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]]))
+        poses.translations.copy_(torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.2, 0.0]]) / (10 * EXPECTED))
     pose = PLAIN.camera_from_world
     for frame, time, shift in ((0, 0.0, [0.1, 0.0, 0.0]), (2, 1.0, [0.0, 0.2, 0.0]), (1, 0.25, [0.075, 0.05, 0.0])):
         got = corrected(poses, View(PLAIN, time, frame, 0)) - pose
@@ -186,11 +194,12 @@ def test_two_images_of_one_camera_and_frame_are_an_error():
 def test_the_term_is_that_of_the_image_of_the_step():
     poses, view = effect(PLAIN, dtype=torch.float32), View(PLAIN, 0.5, 0, 0)
     with torch.no_grad():
-        poses.translations.fill_(0.01)
-        poses.rotations.fill_(0.002)
+        poses.translations.fill_(1.0)
+        poses.rotations.fill_(2.0)
     torch.testing.assert_close(poses.regularizers(view, FINISHED)["correction"], torch.tensor(0.01 * (3 * 1 + 3 * 4)))
     assert poses.regularizers(View(PLAIN, 0.5, 3, 0), FINISHED) == {}
-    assert CameraPoses(replace(SETTINGS, weight=0.0), poses.recorded).regularizers(view, FINISHED) == {}
+    unweighted = CameraPoses(replace(SETTINGS, weight=0.0), poses.recorded, poses.start, poses.expected)
+    assert unweighted.regularizers(view, FINISHED) == {}
 
 
 def test_corrections_come_back_from_a_file(tmp_path: Path):
@@ -221,3 +230,54 @@ def test_the_log_calls_for_it_where_images_say_that_poses_are_off(monkeypatch: p
 def test_negative_numbers_are_errors(wrong: dict[str, Any]):
     with pytest.raises(ValueError, match="must be >= 0"):
         CameraPosesSettings(**wrong)
+
+
+def driven(frames: int, size: float) -> tuple[list[View], torch.Tensor]:
+    """A camera on a gentle curve, recorded with turns and shifts that are off by ``size`` (rad, 10 m); and what undoes
+    them."""
+    draw, views, undone = torch.Generator().manual_seed(5), [], []
+    for frame in range(frames):
+        along = torch.tensor([0.0, 0.02 * frame**2, -1.0 * frame], dtype=torch.float64)
+        camera = moved(replace(PLAIN, width=17), along)
+        error = (
+            size * torch.randn(6, generator=draw, dtype=torch.float64) * torch.tensor([10, 10, 10, 1, 1, 1]).double()
+        )
+        views.append(View(camera_poses._moved(camera, error), frame / (frames - 1), frame, 0))
+        undone.append(-error)
+    return views, torch.stack(undone)
+
+
+@pytest.mark.parametrize(("after", "starts"), [(0.1, True), (0.9, False), (None, False)])
+def test_corrections_start_on_a_smooth_path_if_rays_meet_better_there(
+    monkeypatch: pytest.MonkeyPatch, after: float | None, starts: bool
+):
+    """1 px of errors are 1/9 rad at a focal length of 9 px; of 0.01 rad a smooth path leaves little."""
+    views, undone = driven(30, 0.01)
+    frames = Frames.of([Frame.of(view, image=torch.zeros(11, 17, 3, dtype=torch.uint8)) for view in views])
+    seen = []
+
+    def found(looked_at: Frames, moving: object) -> PoseNoise | None:
+        seen.append(torch.stack([view.camera.camera_from_world for view in looked_at.views]))
+        return None if after is None else PoseNoise(after, 0.0, 0.0, 9, 50, np.zeros(9), np.zeros((9, 2), np.int64))
+
+    monkeypatch.setattr(camera_poses, "pose_noise", found)
+    finding = Finding(called_for=True, reason="", value=1.0)
+    made = SETTINGS.build(replace(training_data(), frames=frames), finding, torch.Generator())
+    corrections = made.corrections()
+    if not starts:
+        assert not corrections.any()
+        assert made.expected[0] == pytest.approx(1.0 / 9)
+        return
+    # Of 30 errors a path with about five degrees of freedom keeps 0.4.
+    assert (corrections - undone).square().mean().sqrt() < 0.5 * undone.square().mean().sqrt()
+    assert made.expected[0] == pytest.approx(0.3 / 9)
+    # The images were looked at from these very poses.
+    for view, pose in zip(views, seen[0], strict=True):
+        torch.testing.assert_close(made.view(view, FINISHED).camera.camera_from_world, pose, atol=2e-6, rtol=0)
+
+
+def test_forced_on_without_a_measurement_errors_are_as_large_as_the_threshold():
+    data = training_data()
+    made = SETTINGS.build(data, Finding(called_for=False, reason=""), torch.Generator())
+    assert not made.corrections().any()
+    assert made.expected[0] == pytest.approx(0.5 / float(data.views[0].camera.intrinsics[0, 0]))

@@ -1,0 +1,131 @@
+"""What is probably wrong with a log that can be read: said once, before anything is trained."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from sparsestreet.data.followed import FEWEST, followed
+from sparsestreet.data.lazy import Frames, spread
+from sparsestreet.data.log import DrivingLog
+from sparsestreet.types import Track, View
+
+MOST_FRAMES = 36
+"""Images that are looked at."""
+_FLAT = 3.0
+"""Gray levels, standard deviation over an image, below which it shows nothing."""
+_UNLIKE = 1.0
+"""Of ``followed``: 0.3 to 0.8 where poses are right, 1.03 and more where the axes of a camera are swapped."""
+_ACCELERATION = 30.0
+"""Meters per second squared; three times what tires hold."""
+_OUTLYING = 10.0
+"""Times the median acceleration of a camera: poses that tremble have no single one that is wrong."""
+_SAME = 0.25
+"""Of the sides of a box: a second center this near is that of the same object, if its volume is half as large."""
+
+
+def doubts(log: DrivingLog, frames: Frames | None = None) -> tuple[str, ...]:
+    """One sentence each, with what to do; empty for a log without any. Takes a second or two.
+
+    ``frames`` are those that are looked at; None: all of the log.
+    """
+    frames = log.frames if frames is None else frames
+    names = log.camera_names or tuple(map(str, range(log.num_cameras)))
+    return (
+        *_covered(frames, names),
+        *_swapped(frames, log, names),
+        *_jumps(frames.views, names),
+        *_shared_boxes(log.tracks),
+    )
+
+
+def _covered(frames: Frames, names: Sequence[str]) -> Iterator[str]:
+    seen, flat = Counter[int](), Counter[int]()
+    for place in spread(len(frames), MOST_FRAMES):
+        frame = frames[place]
+        camera = frame.indices[1]
+        gray = frame.image.float().mean(-1)
+        seen[camera] += 1
+        flat[camera] += float((gray if frame.ego is None else gray[~frame.ego]).std()) < _FLAT
+    for camera in sorted(camera for camera in seen if flat[camera]):
+        yield (
+            f"camera {names[camera]} shows a single gray level in {flat[camera]} of {seen[camera]} images, as if it "
+            "were covered: leave it out (data.log.cameras), or mask what it shows (data.log.masks)"
+        )
+
+
+def _swapped(frames: Frames, log: DrivingLog, names: Sequence[str]) -> Iterator[str]:
+    for camera, change in followed(frames, log.sweeps, log.tracks).items() if len(log.sweeps) else ():
+        if change is None:
+            yield (
+                f"camera {names[camera]} sees hardly any return of the lidar (below {FEWEST} an image): check the axes "
+                "of camera and poses (OpenCV: x right, y down, z ahead), unless it looks where no lidar reaches"
+            )
+        elif change >= _UNLIKE:
+            yield (
+                f"returns of the lidar change their gray level {change:.1f} times as much if camera {names[camera]} is "
+                "followed along its poses as if it stood still: check the axes of camera and poses (OpenCV: x right, y "
+                "down, z ahead) and the stamps, or mask the recording car where the image shows it (data.log.masks)"
+            )
+
+
+def _jumps(views: Sequence[View], names: Sequence[str]) -> Iterator[str]:
+    """The worst of each camera."""
+    for camera in sorted({view.indices[1] for view in views}):
+        own = [view for view in views if view.indices[1] == camera and view.seconds is not None]
+        if len(own) < 4:
+            continue
+        seconds = torch.tensor([view.seconds for view in own], dtype=torch.float64)
+        steps = seconds.diff().clamp(min=1e-3)
+        velocities = torch.stack([view.camera.position for view in own]).double().diff(dim=0) / steps[:, None]
+        changes = velocities.diff(dim=0).norm(dim=1) / ((steps[1:] + steps[:-1]) / 2)
+        worst = float(changes.max())
+        if worst > max(_ACCELERATION, _OUTLYING * float(changes.median())):
+            # A wrong frame changes the steps on both of its sides, and with them three accelerations.
+            three = torch.nn.functional.pad(changes, (1, 1)).unfold(0, 3, 1).sum(1)
+            yield (
+                f"by its poses and stamps camera {names[camera]} is accelerated by {worst:.0f} m/s^2 around frame "
+                f"{own[int(three.argmax()) + 1].indices[0]}: check pose and stamp there"
+            )
+
+
+def _shared_boxes(tracks: Sequence[Track]) -> Iterator[str]:
+    same, inside = Counter[tuple[int, int]](), Counter[tuple[int, int]]()
+    present: dict[int, list[tuple[int, Tensor]]] = {}
+    for number, track in enumerate(tracks):
+        for frame, pose in zip(track.frames.tolist(), track.world_from_object, strict=True):
+            present.setdefault(frame, []).append((number, pose))
+    for boxes in present.values():
+        for large, small, beside in _within(tracks, boxes):
+            alike = float(tracks[small].size.prod()) > 0.5 * float(tracks[large].size.prod())
+            (same if alike and beside < _SAME else inside)[large, small] += 1
+    for (large, small), count in same.items():
+        if 2 * count >= len(tracks[small].frames):
+            yield (
+                f"objects {tracks[large].name} and {tracks[small].name} ({tracks[small].class_name}) have one box in "
+                f"{count} frames: remove one of them, or both are drawn"
+            )
+    for (large, small), count in inside.items():
+        if 2 * count >= len(tracks[small].frames):
+            yield (
+                f"object {tracks[small].name} ({tracks[small].class_name}) is inside the box of {tracks[large].name} "
+                f"({tracks[large].class_name}) in {count} frames: both start from what is seen there; remove the one "
+                "that needs no motion of its own"
+            )
+
+
+def _within(tracks: Sequence[Track], boxes: Sequence[tuple[int, Tensor]]) -> Iterator[tuple[int, int, float]]:
+    """Pairs of one frame of which the smaller box has its center in the larger one, and how far beside the middle: the
+    largest part of a side."""
+    centers = torch.stack([pose[:3, 3] for _, pose in boxes])
+    reach = max(float(tracks[number].size.max()) for number, _ in boxes) / 2
+    for one, other in torch.nonzero(torch.cdist(centers, centers) <= reach).tolist():
+        (large, pose), (small, _) = boxes[one], boxes[other]
+        volumes = [(float(tracks[number].size.prod()), -number) for number in (large, small)]
+        if one == other or volumes[0] < volumes[1]:
+            continue
+        offset = pose[:3, :3].T @ (centers[other] - centers[one])
+        beside = float((offset.abs() / tracks[large].size).max())
+        if beside <= 0.5:
+            yield large, small, beside

@@ -1,0 +1,68 @@
+"""Level, noise and cut-off pixels of images that are made with them."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.data.lazy import Frames
+from sparsestreet.evidence.light import measured_light
+from sparsestreet.scene.effects import NightSettings, SaturationSettings, plan_effects
+from sparsestreet.types import Camera, Frame
+from tests.scene.street import training_data
+
+HEIGHT, WIDTH = 30, 40
+
+
+def frames(level: float, noise: float = 0.0, white: float = 0.0) -> Frames:
+    """Ten images of one level with noise; ``white`` of the last one's pixels are."""
+    draw, made = torch.Generator().manual_seed(0), []
+    for index in range(10):
+        image = (level + noise * torch.randn(HEIGHT, WIDTH, 1, generator=draw)).expand(-1, -1, 3).clone()
+        image[: round(white * HEIGHT) if index == 9 else 0] = 255.0
+        camera = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
+        made.append(Frame(camera, index / 9, index, 0, image=image.round().clamp(0, 255).byte()))
+    return Frames.of(made)
+
+
+def test_level_and_noise_are_those_of_the_images():
+    found = measured_light(frames(90, noise=6))
+    assert found.level == pytest.approx(90, abs=0.5)
+    # 1,200 pixels: the median of absolute values is known to 4 %; rounding adds 0.3 levels.
+    # Gray is the mean of equal channels, so their noise is its own.
+    assert found.noise == pytest.approx(6, rel=0.1)
+    assert (found.clipped, found.worst, found.images) == (0, 0, 10)
+
+
+def test_cut_off_pixels_are_counted_and_the_worst_image_is_named():
+    found = measured_light(frames(90, white=0.5))
+    assert found.clipped == pytest.approx(0.05)
+    assert (found.worst, found.worst_frame) == (pytest.approx(0.5), 9)
+    assert found.clipped_error == pytest.approx(0.15 / 10**0.5)  # nine images of 0, one of 0.5
+
+
+def test_sky_and_car_do_not_count():
+    top = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    top[:15] = True
+    masked = [replace(frame, sky=top) for frame in frames(90, white=0.5)]
+    assert measured_light(Frames.of(masked)).clipped == 0
+    nothing = [replace(frame, sky=top, ego=~top) for frame in frames(5, white=0.5)]
+    assert measured_light(Frames.of(nothing)).level == 128
+
+
+@pytest.mark.parametrize(("level", "night"), [(118, False), (60, False), (30, True), (0, True)])
+def test_night_is_reported_and_not_simulated(level: float, night: bool):
+    data = replace(training_data(), frames=frames(level))
+    (decision,) = plan_effects({"night": NightSettings()}, data).decisions(data, rows=0)
+    assert not decision.on
+    assert decision.reason.startswith("found, not simulated: ") is night
+    with pytest.raises(ValueError, match=r"effects.night is on, but 10 images .* nothing simulates it, or say auto"):
+        plan_effects({"night": NightSettings(when="on")}, data)
+
+
+@pytest.mark.parametrize(("white", "found"), [(0.0, False), (0.1, False), (0.4, True)])
+def test_saturation_is_reported_and_not_simulated(white: float, found: bool):
+    data = replace(training_data(), frames=frames(90, white=white))
+    (decision,) = plan_effects({"saturation": SaturationSettings()}, data).decisions(data, rows=0)
+    assert not decision.on
+    assert decision.reason.startswith("found, not simulated: ") is found
