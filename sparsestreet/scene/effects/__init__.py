@@ -8,11 +8,12 @@ brings, and what takes them away from it.
 from sparsestreet.scene.effects.affine import Affine, AffineSettings
 from sparsestreet.scene.effects.box_poses import BoxPosesSettings
 from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
-from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Exposed, Finding, Moment
 from sparsestreet.scene.effects.exposure import Exposure, ExposureSettings
 from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
+from sparsestreet.scene.effects.motion_blur import MotionBlur, MotionBlurSettings
 from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
 from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
 from sparsestreet.scene.effects.sky import Sky, SkySettings
@@ -27,6 +28,7 @@ __all__ = [
     "Effect",
     "EffectPlan",
     "EffectSettings",
+    "Exposed",
     "Exposure",
     "ExposureSettings",
     "Finding",
@@ -34,6 +36,9 @@ __all__ = [
     "Lens",
     "LensSettings",
     "LinearizedEffects",
+    "Moment",
+    "MotionBlur",
+    "MotionBlurSettings",
     "RollingShutter",
     "ShutterSettings",
     "Sky",
