@@ -85,7 +85,10 @@ class MotionBlurSettings(EffectSettings):
 
 
 class MotionBlur(Effect):
-    """Averages the light of a few moments of the exposure. A view that nobody recorded is sharp."""
+    """Averages the light of a few moments of the exposure.
+
+    A view that nobody recorded is sharp, and so is one whose camera says no exposure: videos are made of such.
+    """
 
     settings: MotionBlurSettings
 
@@ -97,9 +100,9 @@ class MotionBlur(Effect):
         self.motions, self.num_moments = dict(motions), num_moments
 
     def exposed(self, view: View) -> Exposed | None:
-        motion = None
-        if view.frame_index is not None and view.camera_index is not None:
-            motion = self.motions.get(view.indices)
+        if not view.camera.exposure > 0 or view.frame_index is None or view.camera_index is None:
+            return None
+        motion = self.motions.get(view.indices)
         if motion is None:
             return None
         instants = moments_of(self.num_moments)

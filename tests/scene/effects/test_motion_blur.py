@@ -31,7 +31,7 @@ from tests.scene.street import (
 )
 
 OPTIONS = RenderOptions(backend="reference")
-CAMERA = camera_at(-6.0, width=33, height=21)
+CAMERA = replace(camera_at(-6.0, width=33, height=21), exposure=0.02)
 MOTION = Shutter(torch.tensor([0.5, 0.0, 0.3]), torch.tensor([0.0, 0.03, 0.02]), seconds=0.02, span=0.2)
 VIEW = View(CAMERA, 0.5, 2, 0)
 
@@ -101,7 +101,13 @@ def test_what_a_moment_shows_is_what_the_view_of_then_shows():
 
 @torch.no_grad()
 @pytest.mark.parametrize(
-    "view", [replace(VIEW, frame_index=None), replace(VIEW, frame_index=1), replace(VIEW, camera_index=None)]
+    "view",
+    [
+        replace(VIEW, frame_index=None),
+        replace(VIEW, frame_index=1),
+        replace(VIEW, camera_index=None),
+        replace(VIEW, camera=replace(CAMERA, exposure=0.0)),
+    ],
 )
 def test_a_view_that_nobody_recorded_is_sharp(view):
     assert torch.equal(
