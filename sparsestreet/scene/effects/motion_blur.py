@@ -21,15 +21,15 @@ from sparsestreet.types import Camera, Shutter, View
 MOST_MOMENTS = 5
 _PIXELS_A_MOMENT = 3.0
 """A longer blur gets one moment more for each (docs/effects.md)."""
-_NS_PER_ROW, _NS_PER_PIXEL = 80.0, 250.0
-"""Of a frame without blur, which each further moment renders once more (docs/effects.md)."""
+_NS_PER_ROW, _NS_PER_PIXEL = 42.0, 67.0
+"""What splats, sky and light of a further moment take (docs/effects.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionBlurSettings(EffectSettings):
     """Called for where what stands still moves far enough during the declared exposure. Nothing is learned."""
 
-    min_blur: float = 1.0
+    min_blur: float = 1.5
     """Pixels, of the images as they are read, that a tenth of the static points move during the exposure, or more."""
 
     def __post_init__(self) -> None:

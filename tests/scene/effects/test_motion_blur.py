@@ -14,7 +14,7 @@ from sparsestreet.scene.effects.light import light_of, stored_of
 from sparsestreet.scene.effects.motion_blur import moments_of, num_moments
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.options import RenderOptions
-from sparsestreet.scene.rendering import render
+from sparsestreet.scene.rendering import GatheredSplats, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.types import Shutter, View
@@ -29,6 +29,7 @@ from tests.scene.street import (
     track,
     training_data,
 )
+from tests.typed import as_a, there
 
 OPTIONS = RenderOptions(backend="reference")
 CAMERA = replace(camera_at(-6.0, width=33, height=21), exposure=0.02)
@@ -132,8 +133,9 @@ def test_gradients_of_all_moments_come_together():
     slope = (values[0] - values[1]) / 2e-5
     # Cameras and boxes are float32; the difference is good to 1e-6 of the slope.
     assert float((means.grad * direction).sum()) == pytest.approx(slope, rel=1e-4)
-    gathered = rendering.splats.screen_gradients
-    alone = [one.screen_offsets.grad for one in rendering.splats.moments]
+    splats = as_a(GatheredSplats, rendering.splats)
+    gathered = splats.screen_gradients
+    alone = [there(one.screen_offsets.grad) for one in splats.moments]
     assert torch.equal(gathered, alone[0] + alone[1])
     assert all(float(one.abs().max()) > 0 for one in alone)
 
@@ -160,13 +162,12 @@ def exposed_log(seconds: float) -> DrivingLog:
 
 def test_a_log_calls_for_it_from_the_threshold_on():
     """The blur grows in proportion to the exposure."""
-    settings = MotionBlurSettings()
-    pixels = settings.detect(training_data(exposed_log(0.01))).value
-    at_threshold = 0.01 * settings.min_blur / pixels
+    pixels = there(MotionBlurSettings().detect(training_data(exposed_log(0.01))).value)
+    settings = MotionBlurSettings(min_blur=pixels)
     for times, on in ((0.5, False), (0.99, False), (1.01, True), (2.0, True)):
-        (planned,) = plan_effects({"blur": settings}, training_data(exposed_log(times * at_threshold))).effects
+        (planned,) = plan_effects({"blur": settings}, training_data(exposed_log(times * 0.01))).effects
         assert planned.on == on
-        assert planned.finding.value == pytest.approx(times * settings.min_blur, rel=0.05)  # the camera comes closer
+        assert planned.finding.value == pytest.approx(times * pixels, rel=0.01)  # the camera comes a little closer
 
 
 @pytest.mark.parametrize(
@@ -212,7 +213,7 @@ def test_a_least_blur_is_positive(least):
 
 def test_a_moment_more_is_a_frame_more():
     data = training_data(exposed_log(0.05))
-    pixels = MotionBlurSettings().detect(data).value
+    pixels = there(MotionBlurSettings().detect(data).value)
     assert num_moments(pixels) == 2
     few = MotionBlurSettings().cost(data)
     many = MotionBlurSettings().cost(training_data(exposed_log(0.05 * 4 / pixels)))
