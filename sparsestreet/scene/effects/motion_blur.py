@@ -29,7 +29,7 @@ _NS_PER_ROW, _NS_PER_PIXEL = 42.0, 67.0
 class MotionBlurSettings(EffectSettings):
     """Called for where what stands still moves far enough during the declared exposure. Nothing is learned."""
 
-    min_blur: float = 1.5
+    min_blur: float = 3.0
     """Pixels, of the images as they are read, that a tenth of the static points move during the exposure, or more."""
 
     def __post_init__(self) -> None:
