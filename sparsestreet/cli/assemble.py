@@ -8,7 +8,7 @@ from lightning import Trainer
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
-from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.compose import check_moved, resolved
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
@@ -43,7 +43,8 @@ def _render_options(cfg: DictConfig) -> RenderOptions:
 
 
 def data_of(cfg: DictConfig) -> StreetData:
-    """The log, and its split into views to train on and views held out."""
+    """The log, and its split into views to train on and views held out. Raises ValueError for a key that has moved."""
+    check_moved(cfg)
     log = instantiate(cfg.data.log, _convert_="all").read()
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
     return StreetData(log, **cfg.split, seed=cfg.seed, hood=_masked_from(cfg, "hood"), dirt=_masked_from(cfg, "dirt"))

@@ -29,6 +29,8 @@ WORDS = {
     **dict.fromkeys(("device", "gpu", "accelerator"), "trainer"),
 }
 """Words of the field -> our key."""
+MOVED = {"data.log.min_lens_shift": "effects.lens.min_shift"}
+"""Keys of earlier versions -> where their value belongs now."""
 SHORT = 4
 """Letters of a word below which another word is like it by chance (lr, logger)."""
 FEW_PLACES = 6
@@ -208,6 +210,8 @@ def _group(key: str) -> str:
 
 def _unknown_key(key: str) -> str:
     """One line with the key that was probably meant, or the few that it may be, and the options where it is a group."""
+    if key in MOVED:
+        return f"no key {key!r}: it is {MOVED[key]!r} now"
     meant = _meant(key)
     if not meant:
         return f"no key {key!r}; sparsestreet train --cfg job prints all"
@@ -267,6 +271,16 @@ def _keys(tree: object, prefix: str = "") -> dict[str, object]:
             keys[f"{prefix}{name}"] = value
             keys |= _keys(value, f"{prefix}{name}.")
     return keys
+
+
+def check_moved(cfg: DictConfig) -> None:
+    """Raises ValueError for a key that an earlier version wrote, and that has another name now."""
+    for old, new in MOVED.items():
+        place, _, name = old.rpartition(".")
+        if name in (OmegaConf.select(cfg, place) or {}):
+            raise ValueError(
+                f"the configuration has {old}, which is {new} now: move its value there, in .hydra/config.yaml"
+            )
 
 
 def resolved(cfg: DictConfig) -> dict[str, Any]:

@@ -137,7 +137,6 @@ def recording_of(
             lens=lens,
             recorded_size=size,
             width=reader.width,
-            min_lens_shift=reader.min_lens_shift,
             pinhole_fov=pinhole_fov,
         )
         for index, (name, (lens, size)) in enumerate(images.cameras.items())

@@ -128,8 +128,6 @@ class RecordedReader(LogReader):
     """Pixels; every image is scaled to it at its own aspect, and the intrinsics with it. None: as recorded."""
     lidar: bool = True
     """False: as if the log had none."""
-    min_lens_shift: float | None = 0.5
-    """As ``DriveStudioReader`` has it."""
     masks: Path | str | None = None
     """Folder of masks that somebody made: ``sky``, ``human``, ``vehicle``, ``ego``, in each a folder a camera, in it
     PNGs with the stems of the images, white where the kind is. None: those of the data set, if it has any."""

@@ -1,4 +1,4 @@
-"""The cameras of a rig: what is the same in all images of one, and whether its lens is simulated."""
+"""The cameras of a rig: what is the same in all images of one, and what becomes of its lens."""
 
 import math
 from dataclasses import dataclass
@@ -18,6 +18,8 @@ from sparsestreet.types import Camera
 
 Name = TypeVar("Name", str, int)
 
+_WORTH_RESAMPLING = 0.5
+"""Pixels that a lens of another model must move some pixel by to be taken out: to resample an image blurs all of it."""
 _WIDEST_PINHOLE = 170.0
 """Degrees. At its border such a pinhole has 130 times as many pixels for a small angle as at its center."""
 
@@ -34,7 +36,7 @@ class RigCamera(Generic[Name]):
     size: tuple[int, int]
     """(width, height) of the images as they are read, pixels; without their lens too."""
     distortion: Float[Tensor, "5"] | None
-    """Of a lens that is simulated."""
+    """Of the lens that its images show; None: they are a pinhole's."""
     note: str | None
     """What becomes of the lens, where the camera has one."""
     undistortion: Undistortion | None = None
@@ -60,7 +62,6 @@ def rig_camera(
     distortion: Float64[Tensor, "5"],
     recorded_size: tuple[int, int],
     width: int | None = None,
-    min_lens_shift: float | None = 0.5,
     undistort: bool = False,
 ) -> RigCamera[Name]:
     """Size after scaling, and intrinsics scaled per axis with it: pixel centers lie at +0.5, so cx and cy scale too.
@@ -72,23 +73,20 @@ def rig_camera(
         distortion: Brown-Conrady k1, k2, p1, p2, k3 as OpenCV orders them; zeros for a pinhole.
         recorded_size: (width, height) of the recorded images.
         width: to which images are scaled, the height in proportion; None: as recorded.
-        min_lens_shift: a lens that moves some pixel, of the images as they are read, by at least this many is
-            simulated; 0: every lens, None: none.
-        undistort: whether every lens is taken out of the images instead, and none is simulated.
+        undistort: whether every lens is taken out of the images.
 
     Raises ValueError for a width that the images do not have.
     """
     size = _scaled_size(name, recorded_size, width)
     intrinsics = _scaled(intrinsics, recorded_size, size)
-    simulated, note, undistortion = False, None, None
+    lens, note, undistortion = None, None, None
     if distortion.any():
         shift = largest_shift(intrinsics, distortion, *size)
         if undistort:
             undistortion = Undistortion.of(BrownConrady.of(intrinsics, distortion), intrinsics, size, size)
             note = f"camera {name}: its lens, which moves pixels by up to {shift:.3g}, is taken out of the images"
         else:
-            simulated, note = _lens_decision(name, shift, min_lens_shift)
-    lens = distortion.float() if simulated else None
+            lens, note = distortion.float(), f"camera {name}: its lens moves pixels by up to {shift:.3g}"
     return RigCamera(name, index, intrinsics.float(), size, lens, note, undistortion)
 
 
@@ -99,7 +97,6 @@ def lens_camera(
     lens: Lens,
     recorded_size: tuple[int, int],
     width: int | None = None,
-    min_lens_shift: float | None = 0.5,
     pinhole_fov: float | None = None,
 ) -> RigCamera[Name]:
     """As ``rig_camera``, of a camera with a lens of any model. What the splat op cannot simulate is taken out.
@@ -113,7 +110,6 @@ def lens_camera(
         lens: in pixels of the recorded images.
         recorded_size: (width, height) of the recorded images.
         width: as in ``rig_camera``.
-        min_lens_shift: as in ``rig_camera``; None keeps no lens in the images that cannot be simulated.
         pinhole_fov: degrees that the pinhole sees from its left to its right edge; None: by the resolution.
 
     Raises ValueError for a width or an angle that cannot be.
@@ -127,7 +123,6 @@ def lens_camera(
             distortion=brown_conrady,
             recorded_size=recorded_size,
             width=width,
-            min_lens_shift=min_lens_shift,
         )
     size = _scaled_size(name, recorded_size, width)
     intrinsics = _scaled(lens.pinhole, recorded_size, size)
@@ -135,8 +130,8 @@ def lens_camera(
         intrinsics = _seeing(intrinsics, size[0], pinhole_fov)
     undistortion = Undistortion.of(lens, intrinsics, size, recorded_size)
     shift = undistortion.largest_shift
-    if pinhole_fov is None and min_lens_shift is not None and shift < min_lens_shift:
-        _, note = _lens_decision(name, shift, min_lens_shift)
+    if pinhole_fov is None and shift < _WORTH_RESAMPLING:
+        note = f"camera {name}: its lens ({type(lens).__name__}) moves pixels by at most {shift:.3g} and is left out"
         return RigCamera(name, index, intrinsics.float(), size, None, note)
     return RigCamera(
         name, index, intrinsics.float(), size, None, _resampling(name, lens, intrinsics, undistortion), undistortion
@@ -167,16 +162,6 @@ def check_lens(
         message = f"the lens k1 k2 p1 p2 k3 = {distortion.tolist()} images nothing in parts of the image: no inverse"
         remedy = "write the coefficients of the calibration, in OpenCV's order; zeros for images without distortion"
         raise fault(path, message, remedy) from error
-
-
-def _lens_decision(name: str | int, shift: float, min_lens_shift: float | None) -> tuple[bool, str]:
-    """Whether a lens that moves pixels by up to ``shift`` is simulated, and a sentence that says so."""
-    lens = f"camera {name}: its lens"
-    if min_lens_shift is None:
-        return False, f"{lens}, which moves pixels by up to {shift:.3g}, is ignored, as asked"
-    if shift < min_lens_shift:
-        return False, f"{lens} moves pixels by at most {shift:.3g} and is left out (data.log.min_lens_shift)"
-    return True, f"{lens} moves pixels by up to {shift:.3g} and is simulated"
 
 
 def _scaled_size(name: str | int, recorded_size: tuple[int, int], width: int | None) -> tuple[int, int]:

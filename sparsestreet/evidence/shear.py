@@ -25,14 +25,14 @@ class ReadoutShear:
     """Motion in the image between the first and the last row (or column) of a readout, at static points."""
 
     pixels: float
-    """The mean over the views of each view's 95th percentile."""
+    """The mean over the views of a percentile of each view's points, the 95th unless another is asked for."""
     error: float
     """Standard error of that mean."""
     views: int
     points: int
 
 
-def readout_shear(views: Sequence[View], sweeps: Sweeps) -> ReadoutShear:
+def readout_shear(views: Sequence[View], sweeps: Sweeps, quantile: float = QUANTILE) -> ReadoutShear:
     """The shear by the declared motion of the cameras at the lidar's points; without lidar, 10 m away.
 
     Raises ValueError where no view has a shutter.
@@ -47,7 +47,7 @@ def readout_shear(views: Sequence[View], sweeps: Sweeps) -> ReadoutShear:
         world = sweeps[places[index]].points if index in places else _at_distance(view.camera)
         moved = _moved(view.camera, world)
         if len(moved):
-            quantiles.append(moved.quantile(QUANTILE))
+            quantiles.append(moved.quantile(quantile))
             points += len(moved)
     found = torch.stack(quantiles)
     error = float(found.std() / len(found) ** 0.5) if len(found) > 1 else 0.0

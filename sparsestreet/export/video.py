@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -23,9 +24,12 @@ _STREAMABLE = ["-movflags", "+faststart"]
 
 
 def path_pictures(stored: StoredScene, path: CameraPath) -> Iterator[Picture]:
-    """Yields one picture an instant with the images of its cameras side by side; each is rendered on demand."""
+    """Yields one picture an instant with the images of its cameras side by side; each is rendered on demand.
+
+    Pictures are sharp: no exposure blurs them, whatever the cameras of the path say.
+    """
     for rig in path:
-        images = [stored.render(view).rgb for view in rig]
+        images = [stored.render(replace(view, camera=replace(view.camera, exposure=0.0))).rgb for view in rig]
         yield side_by_side([(image.clamp(0, 1) * 255).round().byte().cpu().numpy() for image in images])
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import RawGaussians
-from sparsestreet.scene.effects.effect import Effect
+from sparsestreet.scene.effects.effect import Effect, Exposed
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node
@@ -70,11 +70,17 @@ class SceneGraph(nn.Module):
             start += len(part)
         gaussians = activate(list(parts.values()), sh_degree=state.sh_degree)
         if view.camera.shutter is not None and view.camera.shutter.span > 0:
-            gaussians = replace(gaussians, displacements=self._displacements(view, parts, view.camera.shutter.span))
+            gaussians = replace(gaussians, displacements=self.displacements(view, parts, view.camera.shutter.span))
         return SceneGaussians(gaussians, spans, parts, view)
 
+    def exposed(self, view: View) -> Exposed | None:
+        """What the view gathers its light over, by the effects; None: nothing blurs it."""
+        found = (effect.exposed(view) for effect in self.effects.values())
+        return next((one for one in found if one is not None), None)
+
     @torch.no_grad()
-    def _displacements(self, view: View, parts: Mapping[str, RawGaussians], span: float) -> Float[Tensor, "n 3"]:
+    def displacements(self, view: View, parts: Mapping[str, RawGaussians], span: float) -> Float[Tensor, "n 3"]:
+        """How far each row moves in the world, meters, during a normalized time around the view's."""
         moves = {name: self.nodes[name].displacements_over(span, view, part) for name, part in parts.items()}
         return torch.cat([torch.zeros_like(parts[name].means) if one is None else one for name, one in moves.items()])
 

@@ -1,5 +1,6 @@
 """From a scene and a view to an image."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,6 +10,8 @@ from torch import Tensor
 from sparsestreet.ops import splat
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.phases import phase
+from sparsestreet.scene.effects.effect import Exposed
+from sparsestreet.scene.effects.light import light_of, stored_of
 from sparsestreet.scene.graph import SceneGaussians, SceneGraph
 from sparsestreet.scene.options import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.scene.state import FINISHED, SceneState
@@ -52,6 +55,9 @@ def render(
     with torch.autocast(scene.device.type, enabled=False):
         with phase("scene"):
             placed = scene.gaussians_at(view, state)
+        exposed = scene.exposed(placed.view)
+        if exposed is not None:
+            return _gathered(scene, placed, exposed, state, options)
         return _drawn(scene, placed, state, options)
 
 
@@ -68,6 +74,51 @@ def from_another_camera(
         seen = scene.seen(view, state)
         placed = SceneGaussians(rendering.gaussians, rendering.spans, rendering.parts, seen)
         return _drawn(scene, placed, state, options)
+
+
+@dataclass(frozen=True)
+class GatheredSplats(Rendering):
+    """Splats of several moments of an exposure: means of what they show, the largest radius of each row."""
+
+    moments: tuple[Rendering, ...] = ()
+
+    @property
+    def screen_gradients(self) -> Float[Tensor, "n 2"]:
+        return torch.stack([one.screen_gradients for one in self.moments]).sum(0)
+
+
+def _gathered(
+    scene: SceneGraph, placed: SceneGaussians, exposed: Exposed, state: SceneState, options: RenderOptions
+) -> SceneRendering:
+    """The mean light of all moments. Rows move on lines; what a network changes in them meanwhile is left out."""
+    with phase("scene"):
+        moves = scene.displacements(placed.view, placed.parts, exposed.span)
+    drawn, weights = [], [moment.weight for moment in exposed.moments]
+    for moment in exposed.moments:
+        gaussians = replace(placed.gaussians, means=placed.gaussians.means + moment.share * moves)
+        then = replace(placed, gaussians=gaussians, view=replace(placed.view, camera=moment.camera))
+        drawn.append(_drawn(scene, then, state, options))
+    splats = [one.splats for one in drawn]
+    gathered = GatheredSplats(
+        rgb=_mean([one.rgb for one in splats], weights),
+        alpha=_mean([one.alpha for one in splats], weights),
+        depth=_mean([one.depth for one in splats], weights),
+        radii=torch.stack([one.radii for one in splats]).amax(0),
+        screen_offsets=splats[0].screen_offsets,
+        moments=tuple(splats),
+    )
+    return replace(
+        drawn[0],
+        rgb=stored_of(_mean([light_of(one.rgb) for one in drawn], weights)),
+        alpha=gathered.alpha,
+        depth=gathered.depth,
+        splats=gathered,
+        gaussians=placed.gaussians,
+    )
+
+
+def _mean(images: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
+    return torch.stack([weight * image for weight, image in zip(weights, images, strict=True)]).sum(0)
 
 
 def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options: RenderOptions) -> SceneRendering:

@@ -102,6 +102,15 @@ def test_a_trainer_and_a_logger(tmp_path):
     assert Path(as_a(CSVLogger, logger_of(cfg)).log_dir) == tmp_path / "curves"
 
 
+def test_a_key_of_an_earlier_version_has_one_clear_error(log):
+    """As a run has it that is evaluated again; also where its value is nothing."""
+    old = OmegaConf.merge(composed(*WORDS), OmegaConf.create({"data": {"log": {}}}))
+    OmegaConf.set_struct(old, False)
+    old.data.log.min_lens_shift = None
+    with pytest.raises(ValueError, match=r"has data\.log\.min_lens_shift, which is effects\.lens\.min_shift now"):
+        data_of(as_a(DictConfig, old))
+
+
 def test_a_command_is_quoted():
     assert this_command(["train", "out=a b"]) == "sparsestreet train 'out=a b'"
 

@@ -39,6 +39,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
     [
         (["foo"], "'foo' is no override: write key=value"),
         (["trainer.fast_dev_runx=true"], "did you mean 'trainer.fast_dev_run'"),
+        (["data.log.min_lens_shift=0.5"], "no key 'data.log.min_lens_shift': it is 'effects.lens.min_shift' now"),
         (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
         (["nod.background.num_points=5"], "did you mean 'node.background.num_points'"),
         (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of capped, importance, masks, mcmc"),

@@ -9,7 +9,7 @@ def test_the_plan_of_a_street(tiny_street, capsys):
     assert effects([*tiny_street, "effects.affine=on"]) == 0
     said = capsys.readouterr().out
     assert "of 2 cameras" in said
-    assert "lens          off  declared  0 cameras (on from 1)" in said
+    assert "lens          off  declared  0 px (on from 0.5)" in said
     assert "affine        on   forced" in said
     assert "planned in" in said
 

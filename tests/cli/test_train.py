@@ -302,7 +302,7 @@ def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
         out = run_train(tmp_path, *street, *lens, "trainer.fast_dev_run=2")
     said = (out / "train.log").read_text()
     assert "camera 0: its lens moves pixels by up to" in said
-    assert "and is simulated" in said
+    assert "effect 'lens' is on: 1 of 1 cameras" in said
     assert "no lidar: Gaussians start from points in images" in said
 
 

@@ -67,7 +67,7 @@ def recording(**changes) -> Recording:
     rig = [
         rig_camera(
             camera.name, number, intrinsics=torch.from_numpy(camera.intrinsics), distortion=torch.zeros(5).double(),
-            recorded_size=(camera.width, camera.height), width=None, min_lens_shift=None,
+            recorded_size=(camera.width, camera.height), width=None,
         )
         for number, camera in enumerate(PLAN.cameras)
     ]  # fmt: skip

@@ -28,10 +28,9 @@ def test_a_scaled_image_keeps_a_row():
 
 
 @pytest.mark.parametrize("lens", [BrownConrady(**FOCAL, **BARREL), Rational(**FOCAL, **BARREL)], ids=["brown", "eight"])
-@pytest.mark.parametrize("min_lens_shift", [0.5, 100.0, None])
-def test_brown_conrady_is_simulated_however_it_is_written(lens, min_lens_shift):
+def test_brown_conrady_is_kept_however_it_is_written(lens):
     size, width = (120, 80), 60
-    camera = lens_camera("a", 3, lens=lens, recorded_size=size, width=width, min_lens_shift=min_lens_shift)
+    camera = lens_camera("a", 3, lens=lens, recorded_size=size, width=width)
     intrinsics, numbers = lens.pinhole, torch.tensor([*BARREL.values()], dtype=torch.float64)
     same = rig_camera(
         "a",
@@ -40,15 +39,11 @@ def test_brown_conrady_is_simulated_however_it_is_written(lens, min_lens_shift):
         distortion=numbers,
         recorded_size=size,
         width=width,
-        min_lens_shift=min_lens_shift,
     )
     assert (camera.index, camera.size, camera.note) == (3, (60, 40), same.note)
     assert torch.equal(camera.intrinsics, same.intrinsics)
     assert camera.undistortion is None
-    if min_lens_shift == 0.5:
-        assert torch.equal(there(camera.distortion), numbers.float())
-    else:
-        assert camera.distortion is None
+    assert torch.equal(there(camera.distortion), numbers.float())
 
 
 def test_another_lens_is_taken_out_at_the_resolution_of_its_center():
@@ -87,14 +82,16 @@ def test_the_pinhole_may_keep_a_field_of_view():
         lens_camera("wide", 0, lens=lens, recorded_size=(120, 80), width=121)
 
 
-def test_a_lens_that_moves_nothing_is_left_out():
-    lens = Rational(**FOCAL, k1=0.3, k4=0.3001)
+@pytest.mark.parametrize(("k1", "is_left_out"), [(0.3, True), (0.5, False)])
+def test_images_are_not_resampled_for_a_lens_that_moves_nothing(k1, is_left_out):
+    """The corner lies at r = 0.355, 72 pixels from the center. It moves by r^2 (k1 - k4) of them: 9 for 0.2."""
+    lens = Rational(**FOCAL, k1=k1, k4=0.3001)
     camera = lens_camera("a", 0, lens=lens, recorded_size=(120, 80))
-    assert camera.undistortion is None
-    assert re.fullmatch(r"camera a: its lens moves pixels by at most \S+ and is left out .*", there(camera.note))
-    for always in (0.0, None):
-        camera = lens_camera("a", 0, lens=lens, recorded_size=(120, 80), min_lens_shift=always)
-        assert camera.undistortion is not None
+    assert (camera.undistortion is None) == is_left_out
+    said = re.fullmatch(
+        r"camera a: its lens \(Rational\) moves pixels by at most \S+ and is left out", there(camera.note)
+    )
+    assert (said is not None) == is_left_out
 
 
 def test_a_lens_without_an_inverse_is_refused():

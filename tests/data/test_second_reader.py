@@ -83,10 +83,7 @@ def test_its_cameras_have_instants_of_their_own(root):
 def test_its_notes_are_what_is_absent_and_what_becomes_of_its_lenses(root):
     *absent, lens = ToyRigReader(root).read().notes
     assert [note.split(":")[0] for note in absent] == ["no sky masks", "no human masks", "no vehicle masks"]
-    assert lens == "camera right: its lens moves pixels by up to 3.38 and is simulated"
-    log = ToyRigReader(root, min_lens_shift=3.4).read()
-    assert log.notes[-1].startswith("camera right: its lens moves pixels by at most 3.38 and is left out")
-    assert {view.camera.distortion is None for view in log.views} == {True}
+    assert lens == "camera right: its lens moves pixels by up to 3.38"
     assert torch.equal(there(ToyRigReader(root).read().views[1].camera.distortion), torch.tensor(BARREL))
 
 

@@ -38,7 +38,6 @@ class ToyRigReader(LogReader):
     first_frame: int = 0
     last_frame: int = -1
     width: int | None = None
-    min_lens_shift: float | None = 0.5
 
     @property
     def folder(self) -> Path:
@@ -122,7 +121,6 @@ class ToyRigReader(LogReader):
             distortion=camera["lens"],
             recorded_size=image_size(self._image(name, 0)),
             width=self.width,
-            min_lens_shift=self.min_lens_shift,
         )
 
     def _origin(self) -> Tensor:

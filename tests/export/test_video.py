@@ -3,14 +3,19 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from sparsestreet.export.path import of_cameras, recorded
 from sparsestreet.export.video import path_pictures, side_by_side, write_pictures
+from sparsestreet.scene.effects import MotionBlur, MotionBlurSettings
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.types import Shutter
 from tests.export.street import stored_street, street_views
 
 
@@ -56,6 +61,19 @@ def test_pictures_are_the_scenes_renderings_side_by_side():
     # Half a level of rounding.
     np.testing.assert_allclose(pictures[3][:, 48:] / 255, rgb, atol=0.5 / 255 + 1e-6)
     assert pictures[3].shape == (32, 96, 3)
+
+
+def test_pictures_are_sharp_whatever_the_cameras_say():
+    stored, path = stored_street(), of_cameras(recorded(street_views()), [0])
+    exposed = tuple(tuple(replace(view, camera=replace(view.camera, exposure=0.02)) for view in rig) for rig in path)
+    moved = Shutter(torch.tensor([0.5, 0.0, 0.0]), torch.zeros(3), seconds=0.02)
+    scene = stored.scene
+    blur = MotionBlur(MotionBlurSettings(), {view.indices: moved for rig in path for view in rig}, 3)
+    blurred = replace(stored, scene=SceneGraph(dict(scene.nodes.items()), dict(scene.effects.items()) | {"blur": blur}))
+    view = exposed[0][0]
+    assert (blurred.render(view).rgb - stored.render(view).rgb).abs().max() > 0.02
+    for sharp, found in zip(path_pictures(stored, path), path_pictures(blurred, exposed), strict=True):
+        np.testing.assert_array_equal(sharp, found)
 
 
 def test_lower_images_stand_in_the_middle():

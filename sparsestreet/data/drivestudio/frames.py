@@ -14,9 +14,7 @@ from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.types import Frame, View
 
 
-def read_rig(
-    layout: Layout, width: int | None, min_lens_shift: float | None, undistort: bool = False
-) -> list[RigCamera[int]]:
+def read_rig(layout: Layout, width: int | None, undistort: bool = False) -> list[RigCamera[int]]:
     """The chosen cameras; raises as ``rig_camera``."""
     rig = []
     for index, number in enumerate(layout.cameras):
@@ -29,7 +27,6 @@ def read_rig(
                 distortion=distortion,
                 recorded_size=image_size(layout.image(layout.frames[0], number)),
                 width=width,
-                min_lens_shift=min_lens_shift,
                 undistort=undistort,
             )
         )

@@ -57,13 +57,9 @@ class DriveStudioReader(LogReader):
     """False: as if the log had none."""
     bodies: bool = True
     """False: as if the log had no body poses of people."""
-    min_lens_shift: float | None = 0.5
-    """Pixels; a lens that moves some pixel of the image, as it is read, by at least so much is simulated; 0: every lens
-    that is one, None: none. The log's notes say which."""
     undistort: bool = False
-    """Whether every lens is taken out of images and masks as they are read (DriveStudio, on Waymo), and none is
-    simulated. Cameras are then pinholes with the same intrinsics; what they did not record is black, and no loss sees
-    it (``Frame.ego``)."""
+    """Whether every lens is taken out of images and masks as they are read (DriveStudio, on Waymo). Cameras are then
+    pinholes with the same intrinsics; what they did not record is black, and no loss sees it (``Frame.ego``)."""
     lidar_ahead: Sequence[float | int] | None = None
     """Meters ahead of the vehicle, least and most, of the returns that are read (DriveStudio: -2 and 80); of the Waymo
     flavor only. None: all."""
@@ -101,7 +97,7 @@ class DriveStudioReader(LogReader):
         start = first_pose(layout)
         origin = start[:3, 3]
         tracks, people = _read_tracks(layout, origin)
-        clock, rig = read_clock(layout), read_rig(layout, self.width, self.min_lens_shift, self.undistort)
+        clock, rig = read_clock(layout), read_rig(layout, self.width, self.undistort)
         views = read_views(layout, rig, origin, clock)
         tracks = timed_tracks(tracks, clock, views)
         folder = SceneFolder(

@@ -149,7 +149,6 @@ class Kitti360Reader(RecordedReader):
                 lens=camera.lens,
                 recorded_size=camera.size,
                 width=self.width,
-                min_lens_shift=self.min_lens_shift,
                 pinhole_fov=self.pinhole_fov,
             )
         return self.pinhole(name, index, camera.intrinsics, camera.size)

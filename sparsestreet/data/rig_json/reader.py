@@ -86,7 +86,6 @@ class RigJsonReader(RecordedReader):
             lens=entry.lens,
             recorded_size=entry.size,
             width=self.width,
-            min_lens_shift=self.min_lens_shift,
             pinhole_fov=self.pinhole_fov,
         )
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sparsestreet.data.synthetic.parts import Pose, at
+from sparsestreet.data.synthetic.settings import TURNS, swing
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,16 @@ class EgoDrive:
     """The recording car. It drives at y = 0 on average, sways a little and changes its speed slowly."""
 
     speed: float
+    turn: float = 0.0
+    """Degrees, of its weaving within the lane (``StreetSettings.turn``)."""
 
     def pose(self, time: float) -> Pose:
         """Returns world from ego: x forward, y left, z up, origin on the road under the rear axle."""
         x = self.speed * (time + 0.15 * np.sin(0.9 * time))
         y = 0.12 * np.sin(0.8 * time)
-        slope = 0.12 * 0.8 * np.cos(0.8 * time) / (self.speed * (1 + 0.15 * 0.9 * np.cos(0.9 * time)))
+        sideways = 0.12 * 0.8 * np.cos(0.8 * time)
+        if self.turn:
+            weave = swing(self.speed, self.turn)
+            y, sideways = y + weave * np.sin(TURNS * time), sideways + weave * TURNS * np.cos(TURNS * time)
+        slope = sideways / (self.speed * (1 + 0.15 * 0.9 * np.cos(0.9 * time)))
         return at(float(x), float(y), 0.0, float(np.arctan(slope)))

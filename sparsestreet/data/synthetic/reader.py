@@ -32,8 +32,6 @@ class StreetReader(LogReader):
     """False: the log has no lidar, although the street is traced with it."""
     bodies: bool = True
     """False: the log has no body poses of the street's pedestrians."""
-    min_lens_shift: float | None = 0.5
-    """Pixels; the settings' lens is simulated if it moves some pixel by at least this much; 0: always, None: never."""
     undistort: bool = False
     lidar_ahead: Sequence[float | int] | None = None
     extent: SceneExtent = "world"
@@ -62,7 +60,6 @@ class StreetReader(LogReader):
             root,
             lidar=self.lidar,
             bodies=self.bodies,
-            min_lens_shift=self.min_lens_shift,
             undistort=self.undistort,
             lidar_ahead=self.lidar_ahead,
             extent=self.extent,

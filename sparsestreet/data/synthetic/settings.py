@@ -15,6 +15,17 @@ CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)
 """Front, front left, front right. With 60 degrees of view each, neighbors overlap by 10."""
 
 
+TURNS = 2 * math.pi / 4
+"""Radians a second, of the weaving of a car that turns."""
+_LANE = 1.75
+"""Meters from the middle of the lane to its border."""
+
+
+def swing(speed: float, turn: float) -> float:
+    """Meters to each side of the lane's middle: y = swing sin(TURNS t) has the slope tan(turn) at t = 0."""
+    return speed * math.tan(math.radians(turn)) / TURNS
+
+
 @dataclass(frozen=True)
 class StreetSettings:
     """A short drive along a straight street, seen by up to three cameras and a spinning lidar.
@@ -77,6 +88,9 @@ class StreetSettings:
     """Frames per second."""
     ego_speed: float = 8.0
     """Mean speed of the recording car, meters per second."""
+    turn: float = 0.0
+    """Degrees by which the recording car turns to the left and to the right of the street, once in 4 seconds. It weaves
+    within its lane, and its heading changes by up to 1.6 times as many degrees a second."""
     num_parked_cars: int = 14
     num_moving_cars: int = 5
     """Oncoming and overtaking in turn; their meetings with the ego car are spread over the drive."""
@@ -111,6 +125,7 @@ class StreetSettings:
         not_negative = (
             "seed", "num_parked_cars", "num_moving_cars", "num_pedestrians", "num_crossing", "num_cyclists",
             "body_pose_noise", "exposure_walk", "white_balance", "readout", "shutter_time", "hood", "dirt", "night",
+            "turn",
         )  # fmt: skip
         for name in not_negative:
             if getattr(self, name) < 0:
@@ -137,6 +152,11 @@ class StreetSettings:
         if self.white_balance and self.num_cameras == 1:
             raise ValueError(
                 "StreetSettings.white_balance needs two cameras: the constant gains of one are colors of the street"
+            )
+        if swing(self.ego_speed, self.turn) > _LANE:
+            raise ValueError(
+                f"StreetSettings.turn must keep the car within {_LANE:g} m of its lane's middle, but {self.turn:g} "
+                f"degrees at {self.ego_speed:g} m/s take it {swing(self.ego_speed, self.turn):.2f} m off: turn less"
             )
         if not 10 <= self.field_of_view <= 120:
             raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")

@@ -23,7 +23,7 @@ _LATER = frozenset(
     {
         "delays", "delays_known", "exposure_walk", "white_balance", "pose_noise", "box_noise", "readout",
         "readout_direction", "readout_known", "shutter_time", "shutter_time_known", "hood", "hood_cameras",
-        "hood_known", "tunnel", "jpeg", "limp", "num_crossing", "dirt", "night",
+        "hood_known", "tunnel", "jpeg", "limp", "num_crossing", "dirt", "night", "turn",
     }
 )  # fmt: skip
 """Settings that came after ``GENERATOR``; at their defaults a street is as it was without them."""

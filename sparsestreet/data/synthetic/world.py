@@ -55,7 +55,7 @@ class World:
 
 
 def build_world(settings: StreetSettings) -> World:
-    ego = EgoDrive(settings.ego_speed)
+    ego = EgoDrive(settings.ego_speed, settings.turn)
     end = settings.ego_speed * settings.duration
     seed = settings.seed
     beside = tunnel(seed, end) if settings.tunnel else [*_houses(seed, end), *_footway_things(seed, end)]

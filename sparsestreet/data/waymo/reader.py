@@ -139,7 +139,6 @@ class WaymoReader(RecordedReader):
                     distortion=distortion,
                     recorded_size=calibration.size,
                     width=self.width,
-                    min_lens_shift=self.min_lens_shift,
                 )
             )
         return rig

@@ -9,11 +9,12 @@ from sparsestreet.scene.effects.affine import Affine, AffineSettings
 from sparsestreet.scene.effects.box_poses import BoxPosesSettings
 from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
 from sparsestreet.scene.effects.dirt import DirtSettings
-from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Exposed, Finding, Moment
 from sparsestreet.scene.effects.exposure import Exposure, ExposureSettings
 from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
+from sparsestreet.scene.effects.motion_blur import MotionBlur, MotionBlurSettings
 from sparsestreet.scene.effects.night import NightSettings
 from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
 from sparsestreet.scene.effects.saturation import SaturationSettings
@@ -31,6 +32,7 @@ __all__ = [
     "Effect",
     "EffectPlan",
     "EffectSettings",
+    "Exposed",
     "Exposure",
     "ExposureSettings",
     "Finding",
@@ -38,6 +40,9 @@ __all__ = [
     "Lens",
     "LensSettings",
     "LinearizedEffects",
+    "Moment",
+    "MotionBlur",
+    "MotionBlurSettings",
     "NightSettings",
     "RollingShutter",
     "SaturationSettings",

@@ -18,7 +18,7 @@ from sparsestreet.scene.learning_rate import Rates, rates_of
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import Gaussians, Rendering, View
+from sparsestreet.types import Camera, Gaussians, Rendering, View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,27 @@ class Cost:
     def ms(self, pixels: int, rows: int) -> float:
         """Milliseconds of a rendered frame of so many pixels, of a scene of so many Gaussians."""
         return 1e-6 * (self.ns_per_pixel * pixels + self.ns_per_row * rows)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One of the instants over which light is gathered."""
+
+    camera: Camera
+    """Where the camera of the view is then."""
+    share: float
+    """Of the whole exposure, from its middle: -1/2 is its start."""
+    weight: float
+    """Part of the light; those of all moments sum to 1."""
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """What a view gathers its light over, instead of at one instant."""
+
+    span: float
+    """The exposure in the log's normalized time, for whatever moves meanwhile."""
+    moments: tuple[Moment, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +146,13 @@ class Effect(nn.Module, ABC):
     def view(self, view: View, state: SceneState) -> View:
         """The view as nodes and splats see it."""
         return view
+
+    def exposed(self, view: View) -> Exposed | None:
+        """Instants whose images are averaged, in linear light and behind all effects; None: the view's own alone.
+
+        ``view`` is the one that is splatted. At most one effect of a scene answers.
+        """
+        return None
 
     def gaussians(self, gaussians: Gaussians, view: View) -> Gaussians:
         """The Gaussians as the op gets them: the same values, of which gradients reach what the effect learns."""

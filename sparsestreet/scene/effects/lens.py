@@ -7,10 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sparsestreet.geometry.distortion import largest_shift
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
-from sparsestreet.types import View
+from sparsestreet.types import Camera, View
 
 _NS_PER_ROW = 13.5
 """The projection of a Gaussian through a lens, less that of a pinhole (docs/effects.md)."""
@@ -18,18 +19,29 @@ _NS_PER_ROW = 13.5
 
 @dataclass(frozen=True, kw_only=True)
 class LensSettings(EffectSettings):
-    """Called for where a view of the log has a lens. Nothing is learned."""
+    """Called for where the lens of a camera moves pixels far enough; all cameras have theirs then. Learns nothing."""
+
+    min_shift: float = 0.5
+    """Pixels, of the images as they are read, by which some lens moves some pixel away from a pinhole's; 0: any."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.min_shift >= 0:
+            raise ValueError(f"min_shift must be pixels >= 0, got {self.min_shift}: to leave out lenses say when=off")
 
     def detect(self, data: TrainingData) -> Finding:
-        cameras = {view.camera_index for view in data.log.views if view.camera.distortion is not None}
+        log = data.log
+        cameras = {view.camera_index: view.camera for view in log.views if view.camera.distortion is not None}
+        shift = max(map(_shift, cameras.values()), default=0.0)
+        moved = f", which moves pixels by up to {shift:.3g}" if cameras else ""
         return Finding(
-            called_for=bool(cameras),
-            reason=f"{len(cameras)} of {data.log.num_cameras} cameras of {data.log.name} have a lens",
-            value=float(len(cameras)),
-            unit="cameras",
-            threshold=1.0,
+            called_for=bool(cameras) and shift >= self.min_shift,
+            reason=f"{len(cameras)} of {log.num_cameras} cameras of {log.name} have a lens{moved}",
+            value=shift,
+            unit="px",
+            threshold=self.min_shift,
             declared=True,
-            missing=None if cameras else "give the log their coefficients or lower data.log.min_lens_shift",
+            missing=None if cameras else "give the log their coefficients",
         )
 
     def cost(self, data: TrainingData) -> Cost:
@@ -54,3 +66,9 @@ class Pinhole(Effect):
 
     def view(self, view: View, state: SceneState) -> View:
         return view if view.camera.distortion is None else replace(view, camera=replace(view.camera, distortion=None))
+
+
+def _shift(camera: Camera) -> float:
+    """Pixels by which the lens moves some pixel of the camera's images."""
+    assert camera.distortion is not None  # as those have that are asked
+    return largest_shift(camera.intrinsics, camera.distortion, camera.width, camera.height)

@@ -126,7 +126,7 @@ def test_lenses(model, write, tmp_path):
     numbers, lens = LENSES[model]
     write_images(tmp_path / "images", PLAN)
     write(tmp_path, with_lens(model, numbers))
-    log = ColmapReader(root=tmp_path, min_lens_shift=0.01).read()
+    log = ColmapReader(root=tmp_path).read()
     view = log.views[0]
     torch.testing.assert_close(view.camera.intrinsics, lens.pinhole.float())
     five = lens.brown_conrady()

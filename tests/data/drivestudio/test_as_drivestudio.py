@@ -56,7 +56,7 @@ def test_lenses_are_taken_out_of_images_and_masks(bent, width):
     assert all(view.camera.distortion is None for view in log.views)
     assert [note.split(",")[0] for note in log.notes] == [f"camera {camera}: its lens" for camera in (1, 2)]
     assert all(note.endswith("is taken out of the images") for note in log.notes)
-    plain = DriveStudioReader(bent, min_lens_shift=None, width=width).read()
+    plain = DriveStudioReader(bent, width=width).read()
     for camera, lens in ((1, BARREL), (2, SLIGHT)):
         seen, recorded = log.frames[3 + camera], plain.frames[3 + camera]
         # The same intrinsics, scaled with the image.

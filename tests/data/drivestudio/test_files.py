@@ -78,7 +78,7 @@ def test_frames_and_cameras_that_are_not_read_do_not_count(choice: dict, change:
 def test_a_run_without_lidar_bodies_or_resolution_is_of_the_same_log(make, tmp_path):
     """A report compares such runs, and would say that their data differ."""
     before = hash_of(make(tmp_path))
-    assert hash_of(tmp_path, lidar=False, bodies=False, width=20, min_lens_shift=None) == before
+    assert hash_of(tmp_path, lidar=False, bodies=False, width=20) == before
 
 
 def test_of_boxes_and_poses_every_byte_counts(tmp_path):

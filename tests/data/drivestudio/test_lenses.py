@@ -35,37 +35,18 @@ def with_lenses(root):
     return root
 
 
-BARREL_IS, SLIGHT_IS = "camera 1: its lens moves pixels by up to 3.38", "camera 2: its lens moves pixels by"
-CHOICES = {
-    "as it comes": ({}, (True, False), (f"{BARREL_IS} and is simulated", f"{SLIGHT_IS} at most 0.378 and is left out")),
-    "every lens": ({"min_lens_shift": 0.0}, (True, True), (BARREL_IS, f"{SLIGHT_IS} up to 0.378 and is simulated")),
-    "just so strong": ({"min_lens_shift": 3.38}, (True, False), (BARREL_IS, SLIGHT_IS)),
-    "stronger ones": ({"min_lens_shift": 3.4}, (False, False), ("at most 3.38 and is left out", SLIGHT_IS)),
-    "none": (
-        {"min_lens_shift": None},
-        (False, False),
-        ("camera 1: its lens, which moves pixels by up to 3.38, is ignored, as asked", "camera 2: its lens, which"),
-    ),
-    "small images": ({"width": 20, "min_lens_shift": 1.7}, (False, False), ("at most 1.69", "at most 0.189")),
-    "one camera": ({"cameras": [1]}, (True,), ("camera 1: its lens",)),
-}
-
-
-@pytest.mark.parametrize("name", CHOICES)
-def test_a_lens_is_simulated_where_it_moves_pixels_far_enough(name, tmp_path):
-    choice, simulated, notes = CHOICES[name]
-    log = DriveStudioReader(with_lenses(tmp_path), **choice).read()
-    assert len(log.notes) == len(notes)
-    for note, start in zip(log.notes, notes, strict=True):
-        assert start in note
-    lenses = (BARREL, SLIGHT)
-    cameras = [view.camera for view in log.frames.views[-len(simulated) :]]
-    for camera, lens, used in zip(cameras, lenses, simulated, strict=False):
-        assert (camera.distortion is not None) == used
-        if used:
-            assert torch.equal(there(camera.distortion), torch.tensor(lens))
-    if name != "one camera":
-        assert log.frames[0].camera.distortion is None  # the pinhole
+@pytest.mark.parametrize(("width", "shifts"), [(None, ("3.38", "0.378")), (20, ("1.69", "0.189"))])
+def test_cameras_have_their_lenses_and_notes_say_how_far_they_move_pixels(width, shifts, tmp_path):
+    """However little that is: a plan decides what is simulated."""
+    log = DriveStudioReader(with_lenses(tmp_path), width=width).read()
+    pinhole, *cameras = (view.camera for view in log.frames.views[-3:])
+    assert pinhole.distortion is None
+    for camera, lens in zip(cameras, (BARREL, SLIGHT), strict=True):
+        assert torch.equal(there(camera.distortion), torch.tensor(lens))
+    first, second = shifts
+    assert log.notes[0] == f"camera 1: its lens moves pixels by up to {first}"
+    assert log.notes[1] == f"camera 2: its lens moves pixels by up to {second}"
+    assert len(log.notes) == 2
 
 
 def test_lidar_meets_the_pixels_behind_the_lens(tmp_path):

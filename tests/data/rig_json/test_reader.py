@@ -208,7 +208,7 @@ def test_lenses(model, written):
     lens = {name: NUMBERS.get(name, 1e-3 * (1 + place)) for place, name in enumerate(names)}
     content["cameras"]["front"]["lens"] = {"model": model} | lens
     write_json(folder, content)
-    found = RigJsonReader(root=folder, min_lens_shift=0.0).recording().rig[0]
+    found = RigJsonReader(root=folder).recording().rig[0]
     wanted = LENSES[model](**{name: tuple(value) if isinstance(value, list) else value for name, value in lens.items()})  # pyright: ignore
     torch.testing.assert_close(found.intrinsics, wanted.pinhole.float())
     assert (found.undistortion is None) == (model in ("pinhole", "opencv"))

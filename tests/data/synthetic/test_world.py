@@ -58,8 +58,24 @@ def test_path_heading_is_the_tangent():
         np.testing.assert_allclose(expected, tangent, atol=1e-4)
 
 
-def test_ego_heading_is_the_tangent():
-    ego = EgoDrive(8.0)
+def test_a_car_turns_to_both_sides_and_stays_in_its_lane():
+    """The heading swings by 15 degrees once in 4 s: at most 15 pi / 2 = 24 degrees a second, and the speed's part."""
+    ego, times = EgoDrive(8.0, 15.0), np.arange(0, 4, 0.01)
+    poses = np.stack([ego.pose(time) for time in times])
+    headings = np.degrees(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    rates = np.diff(headings) / 0.01
+    assert 14 < headings.max() < 17
+    assert -17 < headings.min() < -14
+    assert (np.abs(rates) > 15).mean() > 0.5
+    assert 22 < np.abs(rates).max() < 28
+    assert np.abs(poses[:, 1, 3]).max() < 1.75
+    # The way along the street, which meetings with other cars follow from, stays what it was.
+    np.testing.assert_array_equal(poses[:, 0, 3], [EgoDrive(8.0).pose(time)[0, 3] for time in times])
+
+
+@pytest.mark.parametrize("turn", [0.0, 15.0])
+def test_ego_heading_is_the_tangent(turn):
+    ego = EgoDrive(8.0, turn)
     for time in (0.0, 1.3, 3.9):
         tangent = (ego.pose(time + 1e-5)[:2, 3] - ego.pose(time - 1e-5)[:2, 3]) / 2e-5
         forward = ego.pose(time)[:2, 0]

@@ -66,7 +66,7 @@ def test_a_written_log_has_no_field_that_waymo_own_messages_lack(roots, tmp_path
     messages = pytest.importorskip(
         "waymo_open_dataset.dataset_pb2", reason="waymo-open-dataset-tf-2-12-0 is not installed"
     )
-    log = WaymoReader(root=roots[1], min_lens_shift=0.0).read()
+    log = WaymoReader(root=roots[1]).read()
     (path,) = written(WaymoV1Writer(jpeg_quality=None, rows=16, columns=64), log, tmp_path / "own").glob("*.tfrecord")
     segment, parsed = Records(path), []
     for number in range(len(segment)):

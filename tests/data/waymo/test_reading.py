@@ -140,7 +140,7 @@ def test_boxes_of_the_lidar_are_of_the_instant_when_the_beam_crossed_them(tmp_pa
 
 
 def test_the_log_has_images_lenses_and_masks(root, drive):
-    log = WaymoReader(root=root, min_lens_shift=0.0).read()
+    log = WaymoReader(root=root).read()
     assert (log.num_frames, log.num_cameras, len(log.sweeps), len(log.tracks)) == (4, 2, 4, 1)
     for frame in log.frames:
         index, place = frame.indices

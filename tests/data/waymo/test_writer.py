@@ -59,7 +59,7 @@ def street(tmp_path_factory) -> DrivingLog:
 @pytest.fixture(scope="module")
 def recorded(roots) -> DrivingLog:
     """The planned drive, which the tests' own writer wrote: rolling shutters, lenses, images of their own instants."""
-    return WaymoReader(root=roots[1], min_lens_shift=0.0).read()
+    return WaymoReader(root=roots[1]).read()
 
 
 def test_a_street_comes_back(street, writer, tmp_path):
@@ -97,7 +97,7 @@ def test_a_street_whose_cameras_fire_one_after_the_other(tmp_path_factory, tmp_p
 def test_a_recorded_drive_comes_back(recorded, writer, tmp_path):
     """Shutters, lenses, stamps of their own, a world 4 km from its origin."""
     root = written(replace(writer, rows=64, columns=1024), recorded, tmp_path)
-    read = WaymoReader(root=root, min_lens_shift=0.0).read()
+    read = WaymoReader(root=root).read()
     # What the car drives in the clock's error, and float32.
     assert_same_views(recorded, read, place=6e-6, clock=CLOCK)
     assert_same_pixels(recorded, read, ("sky", "human", "vehicle"))

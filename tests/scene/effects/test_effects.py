@@ -1,6 +1,7 @@
 """Which effects a scene has, where they act, and what it is without one of them."""
 
 import logging
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +40,7 @@ from tests.scene.street import (
     track,
     training_data,
 )
+from tests.typed import there
 
 CAMERA = camera_at(-6.0, width=17, height=11)
 BENT = replace(CAMERA, distortion=torch.tensor([-0.2, 0.05, 0.0, 0.0, 0.0]))
@@ -99,9 +101,34 @@ def test_a_scene_has_what_its_log_calls_for(lens: bool, shutter: bool, caplog):
     assert f"effect 'lens' {state} cameras of hand-made have a lens" in caplog.text
 
 
+def test_a_lens_is_simulated_where_it_moves_pixels_far_enough():
+    """By the same formula along the diagonal of the image: r (1 - 0.2 r^2 + 0.05 r^4) at its corner, undone."""
+    log = log_through(lens=True)
+    (fx, _, cx), (_, fy, cy), _ = log.views[0].camera.intrinsics.tolist()
+    found = LensSettings().detect(training_data(log))
+    corner = math.hypot(cx / fx, cy / fy)
+    ray = corner
+    for _ in range(100):
+        ray += corner - ray * (1 - 0.2 * ray**2 + 0.05 * ray**4)
+    # Pixels are square, so a distance along the diagonal is one of pixels.
+    assert fx == fy
+    assert there(found.value) == pytest.approx((ray - corner) * fx, rel=1e-5)
+    for least, called_for in ((0.0, True), (0.999 * there(found.value), True), (1.001 * there(found.value), False)):
+        effects = built({"lens": LensSettings(min_shift=least)}, log)
+        # A lens that is left out is in the cameras of the log, and is taken from them.
+        assert isinstance(effects["lens"], Pinhole) != called_for
+    assert log.views[0].camera.distortion is not None
+
+
+@pytest.mark.parametrize("least", [-1.0, math.nan])
+def test_a_least_shift_is_a_number(least):
+    with pytest.raises(ValueError, match=r"min_shift must be pixels >= 0, got .*: to leave out lenses say when=off"):
+        LensSettings(min_shift=least)
+
+
 def test_a_finding_has_a_number_and_its_threshold():
     found = LensSettings().detect(training_data(log_through(lens=True)))
-    assert (found.called_for, found.value, found.unit, found.threshold) == (True, 1.0, "cameras", 1.0)
+    assert (found.called_for, found.unit, found.threshold, found.declared) == (True, "px", 0.5, True)
     assert not ShutterSettings().detect(training_data(log_through(lens=True))).called_for
 
 
