@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sparsestreet.evidence.exposure import ImageGains, image_gains
-from sparsestreet.evidence.gain_errors import EV, GainErrors, gain_errors
+from sparsestreet.evidence.gain_errors import EV, FEWEST_INSTANTS, GainErrors, gain_errors
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -51,7 +51,8 @@ class ExposureSettings(EffectSettings):
         gains = _measured(data)
         errors = None if gains is None else gain_errors(gains)
         if gains is None or errors is None:
-            reason = "no three images in a row share enough lidar points, so gains of images are not measured"
+            few = f"images of fewer than {FEWEST_INSTANTS} instants share enough lidar points with their neighbors"
+            reason = f"{few}, so gains are not measured"
             return Finding(called_for=False, reason=reason, unit="EV", threshold=self.threshold)
         return Finding(
             called_for=errors.removed >= self.threshold,
