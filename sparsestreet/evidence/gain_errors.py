@@ -40,6 +40,10 @@ class GainErrors:
     cameras: dict[int, tuple[float, float, float]]
     """By camera index: mean over its images of the log gain of red, green and blue, EV."""
     images: int
+    low: Float64[Tensor, " i"]
+    """Of each of these images, what low points say of ``without``: the mean over channels, EV."""
+    high: Float64[Tensor, " i"]
+    """The same of the others."""
 
 
 def gain_errors(gains: ImageGains) -> GainErrors | None:
@@ -65,6 +69,8 @@ def gain_errors(gains: ImageGains) -> GainErrors | None:
         agreement=float(without.mean() / sizes.clamp(min=1e-12)),
         cameras=_by_camera(gains),
         images=len(places),
+        low=low.mean(1),
+        high=high.mean(1),
     )
 
 

@@ -73,7 +73,7 @@ class CameraPosesSettings(EffectSettings):
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=6 * len(data.views))
+        return Cost(numbers=6 * len(data.views), ms_per_frame=2.0)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "CameraPoses":
         views = data.views
