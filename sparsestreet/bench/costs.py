@@ -127,14 +127,16 @@ def run_costs(
     """
     found = Finding(called_for=True, reason="it is timed")
     images, even = [street.scaled(scale) for scale in scales], [Street.proxy(size, street.view) for size in proxies]
-    made = {name: one.build(data, found, torch.Generator().manual_seed(0)) for name, one in effects.items()}
-    costs = []
-    for name, effect in made.items():
-        for one in () if effect is None else images if effect.has_image else even:
-            costs.append(_cost(name, effect, effects[name].cost(data), one, budget))
+    costs, predicted = [], {}
+    for name, settings in effects.items():
+        effect = settings.build(data, found, torch.Generator().manual_seed(0))
+        if effect is None:
+            continue
+        predicted[name] = settings.cost(data)
+        for one in images if effect.has_image else even:
+            costs.append(_cost(name, effect, predicted[name], one, budget))
             file.write("costs", costs[-1])
             say(str(costs[-1]))
-    predicted = {name: effects[name].cost(data) for name, effect in made.items() if effect is not None}
     for line in fitted(costs, predicted):
         say(line)
     return costs

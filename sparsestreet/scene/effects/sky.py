@@ -70,9 +70,9 @@ class SkySettings(EffectSettings):
 
 def _shown(data: TrainingData) -> list[Marked]:
     """The sky of the first image that has a mask."""
-    frame = next(frame for frame in data.frames if frame.sky is not None)
+    frame, mask = next((frame, frame.sky) for frame in data.frames if frame.sky is not None)
     index, camera = frame.indices
-    return [Marked(f"sky of frame {index}, camera {camera}", frame.image.numpy(), frame.sky.numpy())]
+    return [Marked(f"sky of frame {index}, camera {camera}", frame.image.numpy(), mask.numpy())]
 
 
 class Sky(Effect):
