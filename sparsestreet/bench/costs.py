@@ -98,8 +98,8 @@ class Street:
         """The view with what the camera itself must have for an effect."""
         camera = self.view.camera
         distortion = camera.intrinsics.new_tensor(DISTORTION) if name == "lens" else None
-        moves = (camera.intrinsics.new_tensor(move) for move in (TRANSLATION, ROTATION))
-        shutter = Shutter(*moves) if name == "shutter" else None
+        translation, rotation = (camera.intrinsics.new_tensor(move) for move in (TRANSLATION, ROTATION))
+        shutter = Shutter(translation, rotation) if name == "shutter" else None
         return replace(self.view, camera=replace(camera, distortion=distortion, shutter=shutter))
 
 
