@@ -29,7 +29,6 @@ class Plant:
 PLANTS = (
     Plant("lens", "lens", lambda level: f"lens=[{-0.019 * level:.5f},0,0,0,0]"),
     Plant("shutter", "shutter", lambda level: f"readout={0.009 * level:.5f}"),
-    Plant("motion blur", "motion_blur", lambda level: f"shutter_time={0.03 * level:.5f}"),
     Plant("hood", "hood", lambda level: f"hood={0.025 * level:.5f}"),
     Plant("exposure", "exposure", lambda level: f"exposure_walk={0.09 * level:.5f}"),
     Plant("white balance", "exposure", lambda level: f"white_balance={0.09 * level:.5f}"),

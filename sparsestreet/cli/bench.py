@@ -4,6 +4,7 @@ import argparse
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -11,6 +12,17 @@ from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.cli.compose import override_problem
 from sparsestreet.records.provenance import this_machine, this_source
+
+if TYPE_CHECKING:
+    from sparsestreet.scene.storage import StoredScene
+    from sparsestreet.types import View
+
+COSTS_STREET = (
+    "data.log.settings.width=96",
+    "data.log.settings.height=64",
+    "data.log.settings.num_frames=8",
+)
+"""A street of which every effect can be built; what they cost is measured on another."""
 
 EXAMPLES = """\
 examples:
@@ -22,6 +34,7 @@ examples:
   sparsestreet bench step sparsify=paper        the same of another training: options as those of train
   sparsestreet bench masks                      a mask over time: its network a frame, and the bits that it leaves
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
+  sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -37,6 +50,7 @@ def bench(arguments: list[str]) -> int:
         "step": _step,
         "masks": _masks,
         "effects": _effects,
+        "costs": _costs,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -124,6 +138,24 @@ def _effects(options: argparse.Namespace) -> bool:
     return True
 
 
+def _costs(options: argparse.Namespace) -> bool:
+    from sparsestreet.bench import costs
+    from sparsestreet.bench.timing import TimingBudget
+    from sparsestreet.cli.effects import known_effects
+
+    if options.street is None:
+        raise SystemExit("sparsestreet bench costs: name the folder of a trained run with --street RUN")
+    stored, view = _stored(options.street)
+    street = costs.Street(dict(stored.scene.nodes.items()), view)
+    effects, data = known_effects(COSTS_STREET)
+    if options.quick:
+        once = TimingBudget(repeats=2, least=1)
+        costs.run_costs(effects, data, street, (1.0, 0.5), (Size(48, 32, 200),), once, _file(options))
+    else:
+        costs.run_costs(effects, data, street, costs.SCALES, costs.PROXIES, TimingBudget(60, 60.0), _file(options))
+    return True
+
+
 def _masks(options: argparse.Namespace) -> bool:
     from sparsestreet.bench import masks
     from sparsestreet.bench.timing import TimingBudget
@@ -164,16 +196,19 @@ def trained_street(run: Path) -> BenchScene:
 
     Raises FileNotFoundError if the folder holds no scene or no views.
     """
-    from sparsestreet.scene.storage import load_scene
-    from sparsestreet.scene.views import FILE_NAME, read_views
-
-    stored = load_scene(run)
-    views = read_views(run / FILE_NAME).all
-    view = views[len(views) // 2]
+    stored, view = _stored(run)
     with torch.no_grad():
         placed = stored.scene.gaussians_at(view)
     source = f"trained: {run.name} on {stored.name}, frame {view.frame_index}"
     return BenchScene("trained street", source, placed.gaussians, placed.view.camera)
+
+
+def _stored(run: Path) -> "tuple[StoredScene, View]":
+    from sparsestreet.scene.storage import load_scene
+    from sparsestreet.scene.views import FILE_NAME, read_views
+
+    views = read_views(run / FILE_NAME).all
+    return load_scene(run), views[len(views) // 2]
 
 
 def _file(options: argparse.Namespace) -> RecordFile:

@@ -3,7 +3,9 @@
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -13,10 +15,15 @@ from sparsestreet.cli.compose import composed, override_problem
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.records.effects import EffectDecision
 
+if TYPE_CHECKING:
+    from sparsestreet.scene.effects import EffectSettings
+    from sparsestreet.scene.initialize.training_data import TrainingData
+
 USAGE = """\
-sparsestreet effects [data=... data.root=DIR] [effects.NAME=on|off] [other options of train]
+sparsestreet effects [data=... data.root=DIR] [effects.NAME=on|off] [out=DIR] [other options of train]
     print the plan of effects: what the log declares, what was measured on its images, lidar and boxes, the
-    threshold, the decision and its reason, and the predicted cost; trains nothing and takes seconds
+    threshold, the decision and its reason, and the predicted cost; trains nothing and takes seconds; what it was
+    measured from is drawn in DIR/evidence.png (outputs/effects/LOG/evidence.png)
 
   sparsestreet effects                                         of the embedded synthetic street
   sparsestreet effects data=auto data.root=DIR                 of a drive of your own
@@ -41,7 +48,8 @@ def effects(arguments: list[str]) -> int:
     if found:
         print(found)
     try:
-        print("\n".join(_plan(composed(overrides))))
+        asked = next((Path(text.partition("=")[2]) for text in overrides if text.startswith("out=")), None)
+        print("\n".join(_plan(composed(overrides), asked)))
     except BrokenPipeError:
         raise  # somebody reads no more of our output
     except (ValueError, OSError) as error:
@@ -60,19 +68,37 @@ def planned(overrides: Sequence[str]) -> tuple[EffectDecision, ...]:
     return recipe.decisions(recipe.plan(data), data)
 
 
-def _plan(cfg: DictConfig) -> Iterator[str]:
+def known_effects(overrides: Sequence[str]) -> "tuple[Mapping[str, EffectSettings], TrainingData]":
+    """The effects that a training with these options knows, and what they would be built from."""
     from sparsestreet.cli.assemble import data_of, recipe_of, with_views
+    from sparsestreet.scene.initialize.training_data import TrainingData
+
+    cfg = composed(overrides)
+    data = data_of(cfg)
+    effects = recipe_of(with_views(cfg, data)).effects
+    return effects, TrainingData(data.driving_log, data.split.train, data.split.held_out_indices)
+
+
+def _plan(cfg: DictConfig, out: Path | None) -> Iterator[str]:
+    from sparsestreet.cli.assemble import data_of, recipe_of, with_views
+    from sparsestreet.pictures.evidence import draw_evidence
 
     started = time.perf_counter()
     data = data_of(cfg)
     recipe = recipe_of(with_views(cfg, data))
     opened = time.perf_counter()
-    decisions = recipe.decisions(recipe.plan(data), data)
+    plan = recipe.plan(data)
+    decisions = recipe.decisions(plan, data)
     planned = time.perf_counter()
     log = data.driving_log
     yield f"{log.name}: {len(data.split.train)} training images of {log.num_cameras} cameras"
     yield from plan_lines(decisions)
     yield f"\nread in {opened - started:.1f} s, planned in {planned - opened:.1f} s"
+    panels = [panel for effect in plan.effects for panel in effect.finding.evidence()]
+    if panels:
+        picture = (Path("outputs/effects") / log.name if out is None else out) / "evidence.png"
+        draw_evidence(picture, f"{log.name}: what its effects are decided from", panels)
+        yield f"drawn: {picture}"
 
 
 def plan_lines(decisions: Sequence[EffectDecision]) -> Iterator[str]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter
 from torch import Tensor
 
@@ -28,6 +28,8 @@ _SAME = 0.7
 _PAIRS = 20
 """Images of a camera that are compared with the next one."""
 _FEWEST_RETURNS = 100
+_JUMP = 2
+"""Rows from one column to the next by which a hood's edge does not move: the line is a median over many columns."""
 _HOOD_CHANGES = 0.65
 """Change of the gray level at a return's old place, over that at its new one: above this it is street. Smooth road has
 1.0 to 1.5, and 0.8 with poses that are a pixel off; a hood that mirrors the street 0.5 (streets of 96x64)."""
@@ -64,8 +66,9 @@ def find_hoods(frames: Frames, sweeps: Sweeps) -> dict[int, Hood]:
         if driven(own) >= LEAST_DRIVE:
             gray = torch.stack([own[place].image.float().mean(-1) for place in spread(len(own), MOST_FRAMES)])
             mask = _seen_still(gray)
-            if mask.any() and _is_street(mask, own, sweeps):
-                found[camera] = Hood(torch.zeros_like(mask), 0.0)
+            mask = _without_street(mask, own, sweeps)
+            if not mask.any():
+                found[camera] = Hood(mask, 0.0)
                 continue
             shares = [_share(_seen_still(part)) for part in (gray[::2], gray[1::2])]
             found[camera] = Hood(mask, abs(shares[0] - shares[1]) / 2)
@@ -79,17 +82,39 @@ def _seen_still(gray: Float[Tensor, "f h w"]) -> Bool[Tensor, "h w"]:
     return max(found, key=_share)
 
 
-def _is_street(mask: Bool[Tensor, "h w"], frames: Frames, sweeps: Sweeps) -> bool:
-    """Whether returns within the mask keep their gray level on their way through the images.
+def _without_street(mask: Bool[Tensor, "h w"], frames: Frames, sweeps: Sweeps) -> Bool[Tensor, "h w"]:
+    """The mask without the columns in which its edge is one of the street: those get their neighbors' edge.
 
-    They are followed to the next image. There the street has the level at the return's new place, a hood at the old.
+    An edge is looked at piece by piece, between the columns at which it jumps; pieces with few returns count as one.
     Where the lidar does not reach, nothing speaks against a hood.
+    """
+    heights = mask.sum(0)
+    piece = torch.cat((heights.new_zeros(1), (heights[1:] - heights[:-1]).abs() > _JUMP)).cumsum(0)
+    moved, stayed, columns = _followed(mask, frames, sweeps)
+    returns = piece[columns].bincount(minlength=len(heights))[piece]
+    piece = torch.where(returns < _FEWEST_RETURNS, -1, piece)
+    street = torch.zeros_like(piece, dtype=torch.bool)
+    for one in piece.unique():
+        own = piece[columns] == one
+        if int(own.sum()) >= _FEWEST_RETURNS:
+            street[piece == one] = float(stayed[own].mean()) > _HOOD_CHANGES * float(moved[own].mean())
+    if not street.any():
+        return mask
+    return _below_line(len(mask) - heights, (heights > 0) & ~street, len(mask))
+
+
+def _followed(
+    mask: Bool[Tensor, "h w"], frames: Frames, sweeps: Sweeps
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"], Int[Tensor, " n"]]:
+    """Of returns in the mask, how far the gray level of the next image is off, and their columns.
+
+    A street has the level of the first image at the return's new place (first result), a hood at its old (second).
     """
     places = {index: place for place, index in enumerate(sweeps.indices)}
     inner = mask.clone()
     inner[2:] &= mask[:-2]  # away from the edge, where a pixel shows both
     inner[:2] = False
-    moved, stayed = [], []
+    moved, stayed, columns = [torch.zeros(0)], [torch.zeros(0)], [torch.zeros(0, dtype=torch.int64)]
     for place in spread(len(frames) - 1, _PAIRS):
         first, second = frames[place], frames[place + 1]
         if first.indices[0] not in places:
@@ -105,9 +130,8 @@ def _is_street(mask: Bool[Tensor, "h w"], frames: Frames, sweeps: Sweeps) -> boo
         level = before[old[1], old[0]]
         moved.append((after[new[1], new[0]] - level).abs())
         stayed.append((after[old[1], old[0]] - level).abs())
-    if sum(map(len, moved)) < _FEWEST_RETURNS:
-        return False
-    return float(torch.cat(stayed).mean()) > _HOOD_CHANGES * float(torch.cat(moved).mean())
+        columns.append(old[0])
+    return torch.cat(moved), torch.cat(stayed), torch.cat(columns)
 
 
 def with_hoods(frames: Frames, hoods: dict[int, Hood]) -> Frames:
@@ -144,12 +168,17 @@ def _below_a_still_edge(gray: Float[Tensor, "f h w"]) -> Bool[Tensor, "h w"]:
     stays = (slope > _EDGE) & (slope > _SAME * (gray[:, 1:] - gray[:, :-1]).abs().median(0).values)
     slope = torch.where(stays & rows[:-1], slope, 0.0)
     steepest, tops = slope.max(0)
-    height, width = rows.shape
-    ends, columns = steepest > 0, torch.arange(width)
+    return _below_line(tops, steepest > 0, len(rows))
+
+
+def _below_line(tops: Int[Tensor, " w"], ends: Bool[Tensor, " w"], height: int) -> Bool[Tensor, "h w"]:
+    """Pixels below a smooth line through the tops of the columns that have one; none where these are too few."""
+    columns = torch.arange(len(tops))
     if float(ends.float().mean()) < LEAST_WIDTH:
-        return torch.zeros_like(rows)
+        return torch.zeros(height, len(tops), dtype=torch.bool)
     # A column whose reflection or road hides the edge is like its neighbors; the row of the edge itself is half street.
     found = columns[ends].numpy()
-    line = median_filter(np.interp(columns.numpy(), found, tops[ends].numpy()), max(width // 8, 9), mode="nearest")
+    line = np.interp(columns.numpy(), found, tops[ends].numpy())
+    line = median_filter(line, max(len(tops) // 8, 9), mode="nearest")
     inside = (columns >= int(found[0])) & (columns <= int(found[-1]))
     return (torch.arange(height)[:, None] >= torch.from_numpy(line).floor()) & inside

@@ -1,7 +1,9 @@
 """Gray levels of the same static lidar points in different images: the gain of each image and channel."""
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -21,6 +23,9 @@ RUN = 24
 REACH = 8
 """Instants before and after an image whose sweeps give it points. Half as many would miss that most of a street stays
 in sight for longer (docs/effects.md)."""
+REACH_SECONDS = 0.8
+"""The same in time, where the log has a clock: of a drive at 2 Hz the instants around are 20 m away, and what is seen
+from there has another level without any gain."""
 POINTS = 3000
 """Of each sweep."""
 DARK, BRIGHT = 16, 245
@@ -104,17 +109,18 @@ def image_gains(
     rank = {index: place for place, index in enumerate(instants)}
     looked_at = {sweep.index: sweep for sweep in sweeps.where(rank.__contains__).gray()}
     points, ranks = _static_points(looked_at, rank, boxes)
-    levels = _Levels(len(points))
+    reach = _reach(frames.views)
+    levels = _Levels(len(points), reach)
     for frame in frames.where(lambda view: view.frame_index in rank):
         index, _ = frame.indices
-        near = ((ranks - rank[index]).abs() <= REACH).nonzero().flatten()
+        near = ((ranks - rank[index]).abs() <= reach).nonzero().flatten()
         others = looked_at[index].points if index in looked_at else points[:0]
         levels.look_up(frame, rank[index], points[near], near, others)
     everything, *parts = levels.links()
     if not len(everything.shared):
         return None
     low, high = (PartGains(solved(links, len(levels.views)), links) for links in parts)
-    inner = _inner(levels.views, {view.indices[0] for view in frames.views}, set(instants))
+    inner = _inner(levels.views, {view.indices[0] for view in frames.views}, set(instants), reach)
     gains = solved(everything, len(levels.views))
     return ImageGains(tuple(levels.views), gains, (low, high), inner, levels.mean_square, levels.seen)
 
@@ -161,9 +167,19 @@ def _instants(views: Sequence[View], most: int | None) -> list[int]:
     return sorted({index for start in starts for index in instants[start : start + RUN]})
 
 
-def _inner(views: Sequence[View], recorded: set[int], looked_at: set[int]) -> Bool[Tensor, " n"]:
+def _reach(views: Sequence[View]) -> int:
+    """Instants before and after an image that count, two at least: by a clock those within ``REACH_SECONDS``."""
+    moments = {view.indices[0]: view.seconds for view in views}
+    seconds = sorted(moment for moment in moments.values() if moment is not None)
+    steps = [behind - before for before, behind in pairwise(seconds) if behind > before]
+    if not steps:
+        return REACH
+    return min(max(round(REACH_SECONDS / statistics.median(steps)), 2), REACH)
+
+
+def _inner(views: Sequence[View], recorded: set[int], looked_at: set[int], reach: int) -> Bool[Tensor, " n"]:
     missing = recorded - looked_at
-    return torch.tensor([not any(abs(view.indices[0] - index) <= REACH for index in missing) for view in views])
+    return torch.tensor([not any(abs(view.indices[0] - index) <= reach for index in missing) for view in views])
 
 
 def _static_points(
@@ -193,7 +209,8 @@ def _outside(boxes: Sequence[Track], sweep: Sweep) -> Bool[Tensor, " n"]:
 class _Levels:
     """Log levels of numbered points in one image after the other."""
 
-    def __init__(self, points: int) -> None:
+    def __init__(self, points: int, reach: int) -> None:
+        self._reach = reach
         self.views: list[View] = []
         self._ranks: list[int] = []
         self._numbers: list[Int[Tensor, " _"]] = []
@@ -235,7 +252,7 @@ class _Levels:
             place.fill_(-1)
             place[numbers] = torch.arange(len(numbers))
             for second in range(first + 1, len(self.views)):
-                if abs(self._ranks[second] - self._ranks[first]) > 2 * REACH:
+                if abs(self._ranks[second] - self._ranks[first]) > 2 * self._reach:
                     continue
                 at = place[self._numbers[second]]
                 both = at >= 0

@@ -13,6 +13,8 @@ EV = 0.6931471805599453
 """ln 2: a gain of one EV doubles."""
 BLOCKS = 8
 """Parts of the drive, of which each is left out once for the standard error."""
+FEWEST_INSTANTS = 8
+"""What images of fewer instants have in common may be the street as well as a gain."""
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,20 @@ class GainErrors:
     cameras: dict[int, tuple[float, float, float]]
     """By camera index: mean over its images of the log gain of red, green and blue, EV."""
     images: int
+    low: Float64[Tensor, " i"]
+    """Of each of these images, what low points say of ``without``: the mean over channels, EV."""
+    high: Float64[Tensor, " i"]
+    """The same of the others."""
 
 
 def gain_errors(gains: ImageGains) -> GainErrors | None:
-    """Errors of all inner images with a neighbor on both sides that both kinds of points link. Returns None without."""
+    """Errors of all inner images with a neighbor on both sides that both kinds of points link.
+
+    Returns None where they are of fewer than ``FEWEST_INSTANTS``.
+    """
     (low, foretold_low), (high, foretold_high) = (_errors(gains, part) for part in gains.parts)
     places = torch.tensor(sorted(foretold_low.keys() & foretold_high.keys()), dtype=torch.int64)
-    if not len(places):
+    if len({gains.views[place].frame_index for place in places.tolist()}) < FEWEST_INSTANTS:
         return None
     low, high = low[places], high[places]
     without = (low * high).mean(1)
@@ -60,6 +69,8 @@ def gain_errors(gains: ImageGains) -> GainErrors | None:
         agreement=float(without.mean() / sizes.clamp(min=1e-12)),
         cameras=_by_camera(gains),
         images=len(places),
+        low=low.mean(1),
+        high=high.mean(1),
     )
 
 

@@ -54,6 +54,15 @@ def readout_shear(views: Sequence[View], sweeps: Sweeps, quantile: float = QUANT
     return ReadoutShear(float(found.mean()), error, len(found), points)
 
 
+def shear_over(view: View, sweeps: Sweeps) -> tuple[Float[Tensor, "m 2"], Float[Tensor, " m"]]:
+    """Pixels of the static points that a view with a shutter sees, and by how many pixels each moves meanwhile."""
+    index, _ = view.indices
+    places = {index: place for place, index in enumerate(sweeps.indices)}
+    world = sweeps[places[index]].points if index in places else _at_distance(view.camera)
+    pixels, _, inside = project(view.camera, world)
+    return pixels[inside], _moved(view.camera, world)
+
+
 def _moved(camera: Camera, world: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
     """Pixels between the images of the points that the camera sees, at the end of the readout and at its start."""
     _, _, inside = project(camera, world)

@@ -5,13 +5,15 @@ import pytest
 from sparsestreet.cli.effects import effects
 
 
-def test_the_plan_of_a_street(tiny_street, capsys):
-    assert effects([*tiny_street, "effects.affine=on"]) == 0
+def test_the_plan_of_a_street(tiny_street, tmp_path, capsys):
+    assert effects([*tiny_street, "effects.affine=on", f"out={tmp_path}"]) == 0
     said = capsys.readouterr().out
     assert "of 2 cameras" in said
     assert "lens          off  declared  0 px (on from 0.5)" in said
     assert "affine        on   forced" in said
     assert "planned in" in said
+    assert f"drawn: {tmp_path / 'evidence.png'}" in said
+    assert (tmp_path / "evidence.png").is_file()
 
 
 def test_what_cannot_be_forced_is_one_line(tiny_street, capsys):

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Sweeps
+from sparsestreet.evidence import exposure
 from sparsestreet.evidence.exposure import ImageGains, Links, image_gains, solved
-from sparsestreet.types import Track
+from sparsestreet.types import Camera, Track, View
 from tests.evidence import wall
 
 # Levels are rounded to 1 of 100, in medians of hundreds of points and over dozens of links.
@@ -199,3 +200,12 @@ def test_groups_that_share_nothing_have_mean_zero_each():
     links = Links(pairs, ratios, torch.full_like(ratios, 1e-3), torch.tensor([100, 100]))
     found = solved(links, 5)[:, 0].tolist()
     assert found == pytest.approx([-0.1, 0.1, 0.2, -0.2, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("rate", "reach"), [(None, 8), (10.0, 8), (5.0, 4), (2.0, 2), (0.1, 2)])
+def test_points_are_looked_up_as_long_before_and_after_at_every_rate(rate: float | None, reach: int):
+    """0.8 s, at least two instants; one that is held out in the middle changes nothing."""
+    moments = [i for i in range(9) if i != 4]
+    camera = Camera(torch.eye(4), torch.eye(3), 4, 4)
+    views = [View(camera, i / 8, i, c, seconds=None if rate is None else i / rate) for i in moments for c in (0, 1)]
+    assert exposure._reach(views) == reach

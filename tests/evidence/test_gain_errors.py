@@ -105,6 +105,13 @@ def test_only_images_whose_neighbors_were_all_looked_at_count():
     assert gain_errors(replace(measured, inner=torch.zeros(COUNT, dtype=torch.bool))) is None
 
 
+@pytest.mark.parametrize(("instants", "enough"), [(7, False), (8, True)])
+def test_few_instants_say_nothing(instants: int, enough: bool):
+    inner = torch.arange(COUNT) < instants + 1  # the first image has no neighbor before it
+    found = gain_errors(replace(gains(gray(torch.zeros(COUNT))), inner=inner))
+    assert (found is not None) is enough
+
+
 def test_only_what_both_kinds_of_points_show_is_an_error_of_gains():
     """A wave that all points show, and on the road one more, of another period."""
     instants = torch.arange(COUNT)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.options import RenderOptions
@@ -40,6 +40,9 @@ class AffineSettings(EffectSettings):
 
     def detect(self, data: TrainingData) -> Finding:
         return Finding(called_for=False, reason="one map of colors for all images is nothing that a log calls for")
+
+    def cost(self, data: TrainingData) -> Cost:
+        return Cost(numbers=12, ns_per_pixel=6.0, ms_per_frame=0.35)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Affine":
         return Affine(self)

@@ -5,7 +5,7 @@ log calls for, by name; one that it does not have is not built and costs nothing
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sparsestreet.pictures.panels import Panel
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of
 from sparsestreet.scene.nodes.node import Node
@@ -42,23 +43,28 @@ class Finding:
     """What the log lacks for the effect to be simulated, one sentence with the remedy; None: nothing."""
     gain: float | None = None
     """Predicted gain in PSNR over the images, dB; None: there is no prediction."""
+    evidence: Callable[[], Sequence[Panel]] = tuple
+    """Makes the pictures by which a person judges the value; asked only if they are drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
     """What an effect is predicted to cost: numbers that are stored, and time of a frame by pixels and rows.
 
-    Times are those of two threads of the machine that docs/effects.md names; another machine scales all alike.
+    Times are those of one thread of the machine that docs/effects.md names; another machine scales all alike.
+    ``sparsestreet bench costs`` measures them.
     """
 
     numbers: int = 0
     """Learned or stored, float32."""
     ns_per_pixel: float = 0.0
     ns_per_row: float = 0.0
+    ms_per_frame: float = 0.0
+    """Whatever its size."""
 
     def ms(self, pixels: int, rows: int) -> float:
         """Milliseconds of a rendered frame of so many pixels, of a scene of so many Gaussians."""
-        return 1e-6 * (self.ns_per_pixel * pixels + self.ns_per_row * rows)
+        return self.ms_per_frame + 1e-6 * (self.ns_per_pixel * pixels + self.ns_per_row * rows)
 
 
 @dataclass(frozen=True)

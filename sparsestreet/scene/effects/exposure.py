@@ -5,6 +5,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,8 +13,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sparsestreet.evidence.exposure import ImageGains, image_gains
-from sparsestreet.evidence.gain_errors import EV, GainErrors, gain_errors
+from sparsestreet.evidence.gain_errors import EV, FEWEST_INSTANTS, GainErrors, gain_errors
 from sparsestreet.geometry.boxes import without_frames
+from sparsestreet.pictures.panels import Dots
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
@@ -51,7 +53,8 @@ class ExposureSettings(EffectSettings):
         gains = _measured(data)
         errors = None if gains is None else gain_errors(gains)
         if gains is None or errors is None:
-            reason = "no three images in a row share enough lidar points, so gains of images are not measured"
+            few = f"images of fewer than {FEWEST_INSTANTS} instants share enough lidar points with their neighbors"
+            reason = f"{few}, so gains are not measured"
             return Finding(called_for=False, reason=reason, unit="EV", threshold=self.threshold)
         return Finding(
             called_for=errors.removed >= self.threshold,
@@ -61,10 +64,11 @@ class ExposureSettings(EffectSettings):
             threshold=self.threshold,
             noise=errors.noise,
             gain=_gain(errors, gains.mean_square, self.without_psnr),
+            evidence=partial(_shown, gains, errors),
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=3 * len(data.views), ns_per_pixel=1.1)
+        return Cost(numbers=3 * len(data.views), ns_per_pixel=3.8, ms_per_frame=0.15)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Exposure":
         """Starts from the gains that are measured on all images; from none where nothing can be measured."""
@@ -178,6 +182,22 @@ def _reason(errors: GainErrors, threshold: float) -> str:
     if errors.without >= threshold:
         return f"{size}, but neighbors in time foretell too little: {errors.foretold:.3f} EV would remain"
     return f"{size}, which is too little to matter"
+
+
+def _shown(gains: ImageGains, errors: GainErrors) -> list[Dots]:
+    """Gains over the drive, and how far road and rest agree on what one street for all images misses."""
+    cameras: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
+    for view, gain in sorted(zip(gains.views, gains.log_gains, strict=True), key=lambda pair: pair[0].time):
+        times, levels = cameras[f"camera {view.camera_index}"]
+        times.append(view.time if view.seconds is None else view.seconds)
+        levels.append(float(gain.mean()) / EV)
+    clock = "time, 0 to 1" if any(view.seconds is None for view in gains.views) else "s"
+    both = {f"{errors.images} images": (errors.low.tolist(), errors.high.tolist())}
+    title = f"gains less those of images with the same points: both agree on {errors.without:.3f} EV"
+    return [
+        Dots("gray levels of the same lidar points: gain of each image", clock, "EV", dict(cameras), joined=True),
+        Dots(title, "by points of the road, EV", "by the other points, EV", both, diagonal=True),
+    ]
 
 
 def _gain(errors: GainErrors, mean_square: float, without_psnr: float) -> float:

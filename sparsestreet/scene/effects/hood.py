@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from sparsestreet.data.hood import LEAST_DRIVE
+from sparsestreet.pictures.panels import Marked
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 
@@ -45,6 +47,7 @@ class HoodSettings(EffectSettings):
             unit="of an image",
             threshold=self.min_share,
             noise=largest.error,
+            evidence=partial(_shown, data),
             missing=None if largest.share > 0 else "give masks of the car (data.log.masks), if the images show it",
         )
 
@@ -53,3 +56,13 @@ class HoodSettings(EffectSettings):
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
         raise ValueError("a scene file holds no hood: it is a matter of the log; train the scene again")
+
+
+def _shown(data: TrainingData) -> list[Marked]:
+    """An image of each camera that moved, with what is found of the car."""
+    panels = []
+    for camera, hood in data.log.hoods.items():
+        own = data.frames.where(lambda view, camera=camera: view.indices[1] == camera)
+        found = f"hood, {100 * hood.share:.1f} % of the image" if hood.mask.any() else "no hood"
+        panels.append(Marked(f"camera {camera}: {found}", own[len(own) // 2].image.numpy(), hood.mask.numpy()))
+    return panels

@@ -21,7 +21,7 @@ from sparsestreet.types import Camera, Shutter, View
 MOST_MOMENTS = 5
 _PIXELS_A_MOMENT = 3.0
 """A longer blur gets one moment more for each (docs/effects.md)."""
-_NS_PER_ROW, _NS_PER_PIXEL = 42.0, 67.0
+_NS_PER_ROW, _NS_PER_PIXEL = 84.0, 134.0
 """What splats, sky and light of a further moment take (docs/effects.md)."""
 
 

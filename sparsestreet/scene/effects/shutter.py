@@ -2,18 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sparsestreet.evidence.shear import readout_shear
+from sparsestreet.evidence.shear import readout_shear, shear_over
+from sparsestreet.pictures.panels import Places
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
 
-_NS_PER_ROW = 1.4
+_NS_PER_ROW = 2.2
 """The motion of a Gaussian during the readout, beside its projection (docs/effects.md)."""
 
 
@@ -47,6 +49,7 @@ class ShutterSettings(EffectSettings):
             threshold=self.min_shear,
             noise=found.error,
             declared=True,
+            evidence=partial(_shown, data),
         )
 
     def cost(self, data: TrainingData) -> Cost:
@@ -60,6 +63,18 @@ class ShutterSettings(EffectSettings):
 
     def left_out(self) -> "GlobalShutter":
         return GlobalShutter(replace(self, when="off"))
+
+
+def _shown(data: TrainingData) -> list[Places]:
+    """The shear over an image of each camera with a shutter, in the middle of the drive."""
+    panels = []
+    for camera in sorted({view.indices[1] for view in data.views if view.camera.shutter is not None}):
+        own = data.frames.where(lambda view, camera=camera: view.indices[1] == camera)
+        frame = own[len(own) // 2]
+        pixels, moved = shear_over(frame, data.sweeps)
+        title = f"camera {camera}: what static points cross during the readout"
+        panels.append(Places(title, frame.image.numpy(), pixels.numpy(), moved.numpy(), "px"))
+    return panels
 
 
 class RollingShutter(Effect):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,14 +13,15 @@ from sparsestreet.evidence.sky import sky_share
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import over_sky
 from sparsestreet.ops.cube_map import colors_along
+from sparsestreet.pictures.panels import Marked
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.types import Rendering, View
 
-_NS_PER_PIXEL = 2.6
-"""Of a frame behind the splats (docs/effects.md)."""
+_NS_PER_PIXEL = 5.4
+"""Where light gets through a fourth of the pixels, as in trained streets (docs/effects.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,16 +55,24 @@ class SkySettings(EffectSettings):
             unit="of the pixels",
             threshold=self.min_share,
             noise=found.error,
+            evidence=partial(_shown, data),
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=18 * self.resolution**2, ns_per_pixel=_NS_PER_PIXEL)
+        return Cost(numbers=18 * self.resolution**2, ns_per_pixel=_NS_PER_PIXEL, ms_per_frame=0.4)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Sky":
         return Sky(self)
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Sky":
         return Sky(self)
+
+
+def _shown(data: TrainingData) -> list[Marked]:
+    """The sky of the first image that has a mask."""
+    frame, mask = next((frame, frame.sky) for frame in data.frames if frame.sky is not None)
+    index, camera = frame.indices
+    return [Marked(f"sky of frame {index}, camera {camera}", frame.image.numpy(), mask.numpy())]
 
 
 class Sky(Effect):
