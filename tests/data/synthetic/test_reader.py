@@ -47,7 +47,7 @@ def test_every_setting_has_a_folder_of_its_own_and_the_seed_comes_last():
     others |= {"delays": (0.0, 0.01), "delays_known": False, "pose_noise": (0.1, 0.0), "box_noise": (0.0, 1.0)}
     others |= {"readout": 0.01, "readout_direction": "left", "readout_known": False}
     others |= {"hood": 0.1, "hood_cameras": "all", "hood_known": True, "tunnel": True, "limp": 0.5}
-    others |= {"shutter_time": 0.01, "shutter_time_known": False}
+    others |= {"shutter_time": 0.01, "shutter_time_known": False, "dirt": 0.01}
     for field in fields(StreetSettings):
         changed = others[field.name] if field.name in others else getattr(SETTINGS, field.name) + 1
         folders[field.name] = StreetReader(replace(SETTINGS, **{field.name: changed})).folder
