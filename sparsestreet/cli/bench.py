@@ -207,8 +207,8 @@ def _stored(run: Path) -> "tuple[StoredScene, View]":
     from sparsestreet.scene.storage import load_scene
     from sparsestreet.scene.views import FILE_NAME, read_views
 
-    views = read_views(run / FILE_NAME).all
-    return load_scene(run), views[len(views) // 2]
+    stored, views = load_scene(run), read_views(run / FILE_NAME).all
+    return stored, views[len(views) // 2]
 
 
 def _file(options: argparse.Namespace) -> RecordFile:

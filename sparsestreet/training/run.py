@@ -156,9 +156,9 @@ def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     seed_everything(recipe.seed, verbose=False)
     for note in data.driving_log.notes:
         log.info(note)
-    for doubt in doubts(data.driving_log, data.split.train):
-        log.warning(doubt)
     with stage("initialize"):
+        for doubt in doubts(data.driving_log, data.split.train):
+            log.warning(doubt)
         return recipe.build(data, plan)
 
 

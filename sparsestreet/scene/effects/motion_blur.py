@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ _NS_PER_ROW, _NS_PER_PIXEL = 84.0, 134.0
 class MotionBlurSettings(EffectSettings):
     """Called for where what stands still moves far enough during the declared exposure. Nothing is learned."""
 
+    when: Literal["auto", "on", "off"] = "off"
     min_blur: float = 3.0
     """Pixels, of the images as they are read, that a tenth of the static points move during the exposure, or more."""
 

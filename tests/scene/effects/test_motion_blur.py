@@ -38,7 +38,7 @@ VIEW = View(CAMERA, 0.5, 2, 0)
 
 
 def blur(moments: int = 3, motion: Shutter = MOTION) -> MotionBlur:
-    return MotionBlur(MotionBlurSettings(), {(2, 0): motion}, moments)
+    return MotionBlur(MotionBlurSettings(when="auto"), {(2, 0): motion}, moments)
 
 
 def street(**effects) -> SceneGraph:
@@ -162,8 +162,8 @@ def exposed_log(seconds: float) -> DrivingLog:
 
 def test_a_log_calls_for_it_from_the_threshold_on():
     """The blur grows in proportion to the exposure."""
-    pixels = there(MotionBlurSettings().detect(training_data(exposed_log(0.01))).value)
-    settings = MotionBlurSettings(min_blur=pixels)
+    pixels = there(MotionBlurSettings(when="auto").detect(training_data(exposed_log(0.01))).value)
+    settings = MotionBlurSettings(when="auto", min_blur=pixels)
     for times, on in ((0.5, False), (0.99, False), (1.01, True), (2.0, True)):
         (planned,) = plan_effects({"blur": settings}, training_data(exposed_log(times * 0.01))).effects
         assert planned.on == on
@@ -181,7 +181,7 @@ def test_a_log_calls_for_it_from_the_threshold_on():
 )
 def test_what_is_not_declared_is_missing(log, lacks):
     data = training_data(log)
-    assert not plan_effects({"blur": MotionBlurSettings()}, data).effects[0].on
+    assert not plan_effects({"blur": MotionBlurSettings(when="auto")}, data).effects[0].on
     with pytest.raises(ValueError, match=rf"effects.blur is on, but {lacks}.*reader that knows exposures"):
         plan_effects({"blur": MotionBlurSettings(when="on")}, data)
 
@@ -208,13 +208,13 @@ def test_a_stored_scene_is_blurred_as_before(tmp_path):
 @pytest.mark.parametrize("least", [0.0, -1.0, float("nan")])
 def test_a_least_blur_is_positive(least):
     with pytest.raises(ValueError, match=r"min_blur must be pixels > 0, got .*when=on"):
-        MotionBlurSettings(min_blur=least)
+        MotionBlurSettings(when="auto", min_blur=least)
 
 
 def test_a_moment_more_is_a_frame_more():
     data = training_data(exposed_log(0.05))
-    pixels = there(MotionBlurSettings().detect(data).value)
+    pixels = there(MotionBlurSettings(when="auto").detect(data).value)
     assert num_moments(pixels) == 2
-    few = MotionBlurSettings().cost(data)
-    many = MotionBlurSettings().cost(training_data(exposed_log(0.05 * 4 / pixels)))
+    few = MotionBlurSettings(when="auto").cost(data)
+    many = MotionBlurSettings(when="auto").cost(training_data(exposed_log(0.05 * 4 / pixels)))
     assert many.ns_per_row == 2 * few.ns_per_row > 0
