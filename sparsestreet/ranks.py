@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 Item = TypeVar("Item")
 
 
-class LostProcess(ConnectionError):
+class LostProcessError(ConnectionError):
     """Another process does not answer any more: what is in memory is no state to go on from."""
 
 
@@ -38,7 +38,7 @@ class Ranks:
     @torch.no_grad()
     def sum(self, values: Tensor) -> Tensor:
         """Sums over the processes, in place and in their order: one process that adds up the same numbers one after the
-        other gets the same bits. Raises LostProcess, as do all methods below.
+        other gets the same bits. Raises LostProcessError, as do all methods below.
 
         Each process sums a part and hands it to all, which moves as many bytes as a ring's all-reduce.
         """
@@ -77,7 +77,7 @@ class Ranks:
             yield
         except RuntimeError as error:  # all that torch.distributed raises
             reason = (str(error).splitlines() or [""])[0]
-            raise LostProcess(
+            raise LostProcessError(
                 f"{self.moment()}: one of the {self.size} processes that train together no longer answers process "
                 f"{self.rank}; look for its own error, then go on from the newest checkpoint with resume=RUN ({reason})"
             ) from error

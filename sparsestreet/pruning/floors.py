@@ -53,7 +53,10 @@ class InstanceAreas:
             self._pixels[name] = torch.maximum(largest, filled)
 
     def floors(self, ranks: Ranks = ALONE) -> dict[str, Floors]:
-        """Returns name of every node -> its floors, from the views of all processes. Raises ValueError for an area that is not finite."""
+        """Returns name of every node -> its floors, from the views of all ``ranks``.
+
+        Raises ValueError for an area that is not finite.
+        """
         self._pixels = {name: ranks.largest(pixels) for name, pixels in self._pixels.items()}
         return {
             name: Floors(node.settings.min_gaussians, self._of_instances(name)) for name, node in self._nodes.items()

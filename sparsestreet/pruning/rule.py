@@ -72,7 +72,10 @@ def on_device(scene: SceneGraph, frames: Sequence[Frame], ranks: Ranks = ALONE) 
 def contributions(
     scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
 ) -> Iterator[tuple[Contribution, dict[str, slice]]]:
-    """Yields for each view of this process's share the contribution of every row of the whole scene, and name of a node -> its rows."""
+    """Yields for each view the contribution of every row of the whole scene, and name of a node -> its rows.
+
+    Of several processes each looks at its share of the views.
+    """
     for frame in on_device(scene, frames, context.ranks):
         placed = scene.gaussians_at(frame, context.state)
         options = context.options

@@ -15,8 +15,8 @@ from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
-from sparsestreet.training.losses import Loss
 from sparsestreet.training.lightning import image_number, images_per_step
+from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates

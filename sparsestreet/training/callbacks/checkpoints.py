@@ -37,7 +37,11 @@ class Checkpoints(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        if ends_step(trainer, batch_idx) and trainer.global_step % self.every == 0 and trainer.global_step < trainer.max_steps:
+        if (
+            ends_step(trainer, batch_idx)
+            and trainer.global_step % self.every == 0
+            and trainer.global_step < trainer.max_steps
+        ):
             self._try_to_save(trainer, LAST)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

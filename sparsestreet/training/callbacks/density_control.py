@@ -28,9 +28,9 @@ class DensityControl(Callback, RowListener):
         refine_in: when rows that are of no use are culled and, up to ``densify_until``, others split and cloned before.
         densify_until: fraction of the run after which no rows are added any more, unless a node's settings say another.
         reset_in: when opacities are pulled down, so that what is not needed can be culled.
-        pause_after_reset: steps of one image after a reset without refinement: opacities must recover first. None, as in
-            DriveStudio: no refinement in the first steps of each period of ``reset_in``, as many as there are training
-            images and at least ``refine_in.every``; statistics start anew at each refinement that falls out.
+        pause_after_reset: steps (of one image) after a reset without refinement: opacities must recover first. None, as
+            in DriveStudio: no refinement in the first steps of each period of ``reset_in``, as many as there are
+            training images and at least ``refine_in.every``; statistics start anew at each refinement that falls out.
         first_counts_all: as in ``DensityStatistics``.
         seed: of the positions of split children, of rows drawn and of noise.
 

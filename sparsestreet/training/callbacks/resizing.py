@@ -34,7 +34,7 @@ def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan
 
 
 def compare_rows(trainer: Trainer, system: StreetSystem) -> None:
-    """After a change of rows: see that all processes made the same one. Raises Disagreement."""
+    """After a change of rows: see that all processes made the same one. Raises DisagreementError."""
     check_agreement(system.scene, ranks_of(trainer))
 
 

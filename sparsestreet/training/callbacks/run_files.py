@@ -72,9 +72,7 @@ class RunFiles(Callback, RowListener):
             device=device_name(system.device),
             threads=torch.get_num_threads(),
             steps=trainer.global_step,
-            max_steps=system.course.steps
-            if system.course.changed
-            else steps_for(trainer, self.description.max_steps),
+            max_steps=system.course.steps if system.course.changed else steps_for(trainer, self.description.max_steps),
             training_seconds=self.clock.seconds,
             noise=None if before is None else noise_between(before, calibrate(system.device)),
             caps=dict(self.caps),

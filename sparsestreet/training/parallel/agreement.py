@@ -7,7 +7,7 @@ from sparsestreet.ranks import Ranks
 from sparsestreet.scene.graph import SceneGraph
 
 
-class Disagreement(RuntimeError):
+class DisagreementError(ValueError):
     """Two processes train different scenes."""
 
 
@@ -15,7 +15,7 @@ class Disagreement(RuntimeError):
 def check_agreement(scene: SceneGraph, ranks: Ranks) -> None:
     """Compare every node and effect with those of the other processes, bit by bit; alone, nothing happens.
 
-    Raises Disagreement, which names the first node or effect that differs, and LostProcess.
+    Raises DisagreementError, which names the first node or effect that differs, and LostProcessError.
     """
     if ranks.size == 1:
         return
@@ -27,7 +27,7 @@ def check_agreement(scene: SceneGraph, ranks: Ranks) -> None:
         wrong = next((name for name in said | other if said.get(name) != other.get(name)), None)
         if wrong is not None:
             own, others = (each.get(wrong, (0, 0))[0] for each in (said, other))
-            raise Disagreement(
+            raise DisagreementError(
                 f"{ranks.moment()}: {wrong!r} differs between process {ranks.rank} ({own:,} Gaussians) and process "
                 f"{rank} ({others:,}), so they no longer train one scene: use equal devices and versions everywhere, "
                 "and go on from the newest checkpoint with resume=RUN"

@@ -28,7 +28,7 @@ def exchange(parameters: Sequence[Tensor], ranks: Ranks, word: int = 0) -> int:
         The largest word of any process.
 
     Raises:
-        LostProcess: if a process does not answer.
+        LostProcessError: if a process does not answer.
     """
     heads = [word, *(parameter.grad is not None for parameter in parameters)]
     lengths = [_rows(parameter).shape[0] for parameter in parameters]
