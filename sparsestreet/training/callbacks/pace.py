@@ -25,6 +25,7 @@ from sparsestreet.training.lightning import (
     images_per_step,
     is_dev_run,
 )
+from sparsestreet.training.memory import report_memory
 from sparsestreet.training.schedule import milestone
 from sparsestreet.training.system import StreetSystem
 
@@ -63,6 +64,7 @@ class Pace(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if is_dev_run(trainer) or not len(data_of(trainer).split.train):
             return
+        report_memory(pl_module, data_of(trainer))
         self._step = measured_step(pl_module, data_of(trainer)) * trainer.accumulate_grad_batches
         forecast = self._forecast(trainer, pl_module)
         if self.minutes is not None:
