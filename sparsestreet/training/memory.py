@@ -45,8 +45,8 @@ def memory_problem(now: int, grown: int, row_bytes: float, pixels: int, availabl
     rows, needed = (now, start) if start > available else (grown, needed)
     said = (
         f"{rows:,} Gaussians and an image of {pixels:,} pixels need about {needed / 1e9:.1f} GB, and the device has "
-        f"{available / 1e9:.1f} GB: lower max_gaussians of the largest nodes, or the size of the images. More processes "
-        "do not help, since each holds all Gaussians"
+        f"{available / 1e9:.1f} GB: lower max_gaussians of the largest nodes, or the size of the images. More "
+        "processes do not help, since each holds all Gaussians"
     )
     if start > available:
         raise ValueError(said)
