@@ -51,7 +51,7 @@ class Ranks:
             first, *others = received.view(self.size, -1)
             for other in others:
                 first += other
-            dist.all_gather_into_tensor(given, first)
+            dist.all_gather(list(given.view(self.size, -1)), first)
         return values.copy_(given[: values.numel()].view_as(values))
 
     @torch.no_grad()
@@ -76,7 +76,7 @@ class Ranks:
         try:
             yield
         except RuntimeError as error:  # all that torch.distributed raises
-            reason = (str(error).splitlines() or [""])[0]
+            reason = (str(error).splitlines() or [""])[0].partition(". ")[0]
             raise LostProcessError(
                 f"{self.moment()}: one of the {self.size} processes that train together no longer answers process "
                 f"{self.rank}; look for its own error, then go on from the newest checkpoint with resume=RUN ({reason})"
