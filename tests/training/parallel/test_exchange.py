@@ -1,5 +1,6 @@
 """What processes tell each other: sums in order, gradients of rows that any saw, scenes that must be the same."""
 
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,13 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from sparsestreet.pruning import LeaveOneOutRule, RenderContext
 from sparsestreet.ranks import ALONE, LostProcessError, Ranks
+from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.training.parallel import DisagreementError, check_agreement, exchange
 from tests.training.parallel.several import PATIENCE, several
-from tests.training.stubs import background, rigid, set_rows
+from tests.training.stubs import background, frame_at, rigid, set_rows
 
 SIZE = 3
 ORDERED = torch.tensor([[1e8, 1.0], [1.0, 2.0], [-1e8, 3.0]])
@@ -50,6 +53,27 @@ def scene(difference: float = 0.0) -> SceneGraph:
     return SceneGraph(nodes)
 
 
+def scores(ranks: Ranks) -> dict[str, Tensor]:
+    """What pruning decides from: costs of rows, and the floors of the objects, by all views."""
+    street, context = (
+        SceneGraph({"road": background(12), "cars": rigid(8, min_instance_gaussians=5.0)}),
+        RenderContext(),
+    )
+    set_rows(street.nodes["cars"], "opacity_logits", {1: 9.0})
+    frames, context = [frame_at(index, 16 + 8 * index, 16) for index in range(5)], replace(context, ranks=ranks)
+    rule = LeaveOneOutRule(allowed_db=0.1)
+    floors = rule.floors(street, frames, context)["cars"].instances
+    assert floors is not None
+    return rule.costs(street, frames, context) | {"floors": floors.least}
+
+
+def statistics_of(rank: int) -> DensityStatistics:
+    statistics = DensityStatistics(3, watched=["peaks"])
+    radii = torch.tensor([[4.0, 0.0, 1.0], [2.0, 0.0, 8.0], [0.0, 0.0, 3.0]])[rank]
+    statistics.add(torch.full((3, 2), rank + 1.0), radii, 16, 16, {"peaks": torch.full((3,), 2.0**rank)})
+    return statistics
+
+
 def talk(rank: int) -> dict[str, Any]:
     """All that is asked of three processes, in one go; the last dies at the end."""
     dist.init_process_group("gloo", rank=rank, world_size=SIZE, timeout=timedelta(seconds=PATIENCE))
@@ -63,6 +87,10 @@ def talk(rank: int) -> dict[str, Any]:
     said["sum"] = ranks.sum(ORDERED[rank].clone())
     said["largest"] = ranks.largest(torch.tensor([rank, -rank]))
     said["gathered"] = ranks.gathered(f"process {rank}")
+    said["scores"] = scores(ranks)
+    statistics = statistics_of(rank)
+    statistics.total(ranks)
+    said["statistics"] = statistics.state_dict()
     check_agreement(scene(), ranks)
     try:
         check_agreement(scene(0.25 if rank == 1 else 0.0), ranks)
@@ -110,6 +138,26 @@ def test_sums_have_the_order_of_the_processes(answers):
         assert torch.equal(answer["sum"], in_order)
         assert answer["largest"].tolist() == [2, 0]
         assert answer["gathered"] == ["process 0", "process 1", "process 2"]
+
+
+def test_pruning_scores_views_together(answers):
+    """Costs are sums of float64 over other groups of views."""
+    alone = scores(ALONE)
+    assert alone["floors"].max() > 0
+    for answer in answers:
+        assert torch.equal(answer["scores"]["floors"], alone["floors"])
+        for node in ("road", "cars"):
+            torch.testing.assert_close(answer["scores"][node], alone[node], rtol=1e-6, atol=0)
+
+
+def test_statistics_are_those_of_all_views(answers):
+    """By hand: radii over the longer side of 16 pixels, norms of (1, 1), (2, 2) and (3, 3) times half the image."""
+    for answer in answers:
+        found = answer["statistics"]
+        assert found["visits"].tolist() == [2, 0, 3]
+        assert found["largest_screen"].tolist() == [4 / 16, 0.0, 8 / 16]
+        assert found["gradient_sum"].tolist() == pytest.approx([3 * 8 * 2**0.5, 0.0, 6 * 8 * 2**0.5])
+        assert found["watched"]["peaks"].tolist() == [3.0, 0.0, 7.0]
 
 
 def test_scenes_that_differ_in_a_bit_stop_all_and_name_the_node(answers):
