@@ -2,7 +2,9 @@
 
 import dataclasses
 import itertools
+import typing
 from pathlib import Path
+from types import SimpleNamespace
 
 import lightning
 import numpy as np
@@ -58,6 +60,15 @@ def test_a_process_goes_on_at_its_own_place():
     resumed = ShuffledFrames(frames, 3, ranks=Ranks(1, 2))
     resumed.load_state_dict({"finished": 4})
     assert keys(resumed) == keys(whole[4:])
+
+
+def test_a_step_that_accumulates_finishes_all_of_its_images():
+    data = StreetData(make_log(), stride=4, offset=1)
+    data.trainer = typing.cast(
+        lightning.Trainer, SimpleNamespace(global_step=4, accumulate_grad_batches=3, strategy=None)
+    )
+    assert data.train_dataloader().state_dict() == {"finished": 12}
+    assert len(data.train_dataloader()) == 3 * 18
 
 
 def test_the_order_is_given_by_the_seed():

@@ -68,9 +68,6 @@ class Checkpoints(Callback):
         return True
 
     def _save(self, trainer: Trainer, name: str) -> None:
-        if not trainer.is_global_zero:
-            trainer.save_checkpoint(self.folder / name, weights_only=False)  # writes nothing, answers the first
-            return
         with stage("save"), atomic_file(self.folder / name) as temporary:
             trainer.save_checkpoint(temporary, weights_only=False)
 

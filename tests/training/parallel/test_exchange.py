@@ -1,6 +1,5 @@
 """What processes tell each other: sums in order, gradients of rows that any saw, scenes that must be the same."""
 
-from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -56,11 +55,11 @@ def scene(difference: float = 0.0) -> SceneGraph:
 def scores(ranks: Ranks) -> dict[str, Tensor]:
     """What pruning decides from: costs of rows, and the floors of the objects, by all views."""
     street, context = (
-        SceneGraph({"road": background(12), "cars": rigid(8, min_instance_gaussians=5.0)}),
+        SceneGraph({"road": background(12), "cars": rigid(8, min_instance_gaussians=600.0)}),
         RenderContext(),
     )
     set_rows(street.nodes["cars"], "opacity_logits", {1: 9.0})
-    frames, context = [frame_at(index, 16 + 8 * index, 16) for index in range(5)], replace(context, ranks=ranks)
+    frames, context = [frame_at(index, 16 + 8 * index, 16) for index in range(5)], RenderContext(ranks=ranks)
     rule = LeaveOneOutRule(allowed_db=0.1)
     floors = rule.floors(street, frames, context)["cars"].instances
     assert floors is not None
@@ -143,7 +142,7 @@ def test_sums_have_the_order_of_the_processes(answers):
 def test_pruning_scores_views_together(answers):
     """Costs are sums of float64 over other groups of views."""
     alone = scores(ALONE)
-    assert alone["floors"].max() > 0
+    assert alone["floors"].tolist() == [3, 4]  # by the widest image, which the second process looks at
     for answer in answers:
         assert torch.equal(answer["scores"]["floors"], alone["floors"])
         for node in ("road", "cars"):

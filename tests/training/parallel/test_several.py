@@ -13,6 +13,7 @@ import torch
 from lightning import Callback
 
 from sparsestreet.ranks import LostProcessError
+from sparsestreet.training.lightning import begins_step
 from sparsestreet.training.run import CPU_TRAINER
 from tests.conftest import unchecked
 from tests.training.parallel.several import several, trainers
@@ -34,7 +35,7 @@ class At(Callback):
         self.step, self.act = step, act
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
-        if trainer.global_step == self.step:
+        if trainer.global_step == self.step and begins_step(trainer, batch_idx):
             self.act()
 
 
@@ -98,6 +99,16 @@ def test_a_signal_to_one_stops_all_after_the_same_step_and_all_go_on_to_the_same
     for before, after in zip(two, resumed, strict=True):
         for name, value in before["parameters"].items():
             assert torch.equal(value, after["parameters"][name]), name
+
+
+@pytest.mark.slow
+def test_one_that_accumulates_goes_on_to_the_same_bits(two, tmp_path):
+    make = partial(CPU_TRAINER, accumulate_grad_batches=2, limit_val_batches=0)
+    with pytest.raises(SystemExit):
+        train(tmp_path, make, [At(15, lambda: os.kill(os.getpid(), signal.SIGTERM))])
+    resumed = train(tmp_path, make, start=tmp_path / "checkpoints" / "interrupted.ckpt")
+    for name, value in two[0]["parameters"].items():
+        assert torch.equal(value, resumed["parameters"][name]), name
 
 
 def test_a_process_that_is_killed_ends_the_others_with_one_sentence(tmp_path):
