@@ -27,7 +27,7 @@ def foreseen_bytes(rows: int, row_bytes: float, pixels: int) -> float:
         row_bytes: of the columns of one.
         pixels: of the largest image.
 
-    >>> f"{foreseen_bytes(5_000_000, 236, 1920 * 1280) / 1e9:.1f} GB"
+    >>> f"{foreseen_bytes(5_000_000, 236.0, 1920 * 1280) / 1e9:.1f} GB"
     '6.6 GB'
     """
     return rows * (COPIES * row_bytes + STEP_BYTES) + PIXEL_BYTES * pixels
