@@ -15,6 +15,7 @@ from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog, Split, split
 from sparsestreet.data.recolored import recolored
 from sparsestreet.phases import phase
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.types import Frame
 
 
@@ -32,6 +33,8 @@ class ShuffledFrames:
         finished: Callable[[], int] | None = None,
         *,
         with_replacement: bool = False,
+        ranks: Ranks = ALONE,
+        accumulated: int = 1,
     ) -> None:
         """
         Args:
@@ -40,25 +43,36 @@ class ShuffledFrames:
             finished: with how many frames training has finished since its start. A frame that was drawn for a step
                 which was interrupted is to be drawn again, and only training knows. None: with all that were drawn.
             with_replacement: every frame is drawn from all of them, so that an epoch has some twice and some never.
+            ranks: the processes that take turns in one order; each iterator gives this one's frames.
+            accumulated: frames of a process whose gradients a step takes. What an iterator gives are whole steps, as
+                many as there are frames, so that no step ends with an epoch.
         """
         self.frames = frames
+        self._ranks, self._accumulated = ranks, accumulated
+        self._newest: tuple[int, list[int]] = (-1, [])
         self.seed = seed
         self._drawn = 0
         self._finished = finished
         self._with_replacement = with_replacement
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.frames) * self._accumulated
 
     def __iter__(self) -> Iterator[Frame]:
-        epoch, position = divmod(self._drawn, len(self.frames))
-        for index in self._order(epoch)[position:]:
+        for drawn in range(self._drawn, (self._drawn // len(self) + 1) * len(self)):
+            epoch, position = divmod(drawn * self._ranks.size + self._ranks.rank, len(self.frames))
+            index = self._order(epoch)[position]
             self._drawn += 1
             with phase("data"):
                 frame = self.frames[index]
             yield frame
 
     def _order(self, epoch: int) -> list[int]:
+        if self._newest[0] != epoch:
+            self._newest = epoch, self._permuted(epoch)
+        return self._newest[1]
+
+    def _permuted(self, epoch: int) -> list[int]:
         # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
         generator = torch.Generator().manual_seed(self.seed)
         for _ in range(epoch):
@@ -150,8 +164,17 @@ class StreetData(LightningDataModule):
     def train_dataloader(self) -> ShuffledFrames:
         """One training frame a step; an epoch is all of them in random order."""
         trainer = self.trainer
-        finished = None if trainer is None else lambda: trainer.global_step
-        return ShuffledFrames(self.split.train, self.seed, finished, with_replacement=self.with_replacement)
+        if trainer is None:
+            return ShuffledFrames(self.split.train, self.seed, with_replacement=self.with_replacement)
+        accumulated = trainer.accumulate_grad_batches
+        return ShuffledFrames(
+            self.split.train,
+            self.seed,
+            lambda: trainer.global_step * accumulated,
+            with_replacement=self.with_replacement,
+            ranks=getattr(trainer.strategy, "ranks", ALONE),
+            accumulated=accumulated,
+        )
 
     def val_dataloader(self) -> OrderedFrames | list:
         """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out."""

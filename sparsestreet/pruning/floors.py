@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.scene.gaussians import InstanceFloors
 from sparsestreet.scene.nodes import Node
 from sparsestreet.types import Contribution
@@ -51,8 +52,12 @@ class InstanceAreas:
             filled = torch.zeros_like(largest).index_add(0, instances.ids, view.weight[spans[name]].to(largest))
             self._pixels[name] = torch.maximum(largest, filled)
 
-    def floors(self) -> dict[str, Floors]:
-        """Returns name of every node -> its floors. Raises ValueError for an area that is not finite."""
+    def floors(self, ranks: Ranks = ALONE) -> dict[str, Floors]:
+        """Returns name of every node -> its floors, from the views of all ``ranks``.
+
+        Raises ValueError for an area that is not finite.
+        """
+        self._pixels = {name: ranks.largest(pixels) for name, pixels in self._pixels.items()}
         return {
             name: Floors(node.settings.min_gaussians, self._of_instances(name)) for name, node in self._nodes.items()
         }

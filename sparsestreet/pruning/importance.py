@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.types import Contribution
 
 
@@ -64,14 +65,14 @@ class Importance:
         self._total = score if self._total is None else self._total + score
         self.views += 1
 
-    def scores(self) -> Float64[Tensor, " n"]:
-        """Returns I_i; per pixel it lies in [0, 1].
+    def scores(self, ranks: Ranks = ALONE) -> Float64[Tensor, " n"]:
+        """Returns I_i over the views of all processes; per pixel it lies in [0, 1].
 
         Raises ValueError before the first view: zero scores would remove the whole scene.
         """
         if self._total is None:
             raise ValueError("importance needs at least one view, got none: add the training views first")
-        return self._total / self.views
+        return ranks.sum(self._total.clone()) / ranks.sum(torch.tensor(self.views, device=self._total.device))
 
 
 def measure_importance(views: Iterable[Contribution], gate: bool = True) -> Float64[Tensor, " n"]:

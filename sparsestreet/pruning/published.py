@@ -43,7 +43,7 @@ class WeightRule(PruningRule):
         for view, spans in contributions(scene, frames, context):
             sums.add(view)
             areas.add(view, spans)
-        weights, floors = sums.scores(), areas.floors()
+        weights, floors = sums.scores(context.ranks), areas.floors(context.ranks)
         scores = {name: self.scores(name, scene.nodes[name].rows, weights[spans[name]]) for name in floors}
         return keep_counts(scores, self.keep, floors, context)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from sparsestreet.data.device import to_device
 from sparsestreet.ops import contribution
 from sparsestreet.pruning.floors import Floors, InstanceAreas
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import NodeSettings
@@ -25,6 +26,8 @@ class RenderContext:
     """Number of passes of the run."""
     passed: int = 0
     """Number of passes before this one."""
+    ranks: Ranks = ALONE
+    """The processes that score together: each looks at its share of the views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,19 +61,22 @@ class PruningRule(ABC):
         if areas.needed:
             for view, spans in contributions(scene, frames, context):
                 areas.add(view, spans)
-        return areas.floors()
+        return areas.floors(context.ranks)
 
 
-def on_device(scene: SceneGraph, frames: Sequence[Frame]) -> Iterator[Frame]:
-    """Yields one frame at a time on the scene's device."""
-    return (to_device(frame, scene.device) for frame in frames)
+def on_device(scene: SceneGraph, frames: Sequence[Frame], ranks: Ranks = ALONE) -> Iterator[Frame]:
+    """Yields one frame of this process's share at a time, on the scene's device."""
+    return (to_device(frame, scene.device) for frame in ranks.share(frames))
 
 
 def contributions(
     scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
 ) -> Iterator[tuple[Contribution, dict[str, slice]]]:
-    """Yields for each view the contribution of every row of the whole scene, and name of a node -> its rows."""
-    for frame in on_device(scene, frames):
+    """Yields for each view the contribution of every row of the whole scene, and name of a node -> its rows.
+
+    Of several processes each looks at its share of the views.
+    """
+    for frame in on_device(scene, frames, context.ranks):
         placed = scene.gaussians_at(frame, context.state)
         options = context.options
         yield (

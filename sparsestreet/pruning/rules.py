@@ -52,7 +52,7 @@ class ImportanceRule(PruningRule):
         for view, spans in contributions(scene, frames, context):
             importance.add(view)
             areas.add(view, spans)
-        every, floors = importance.scores(), areas.floors()
+        every, floors = importance.scores(context.ranks), areas.floors(context.ranks)
         scores = {name: every[spans[name]] for name in floors}
         if self.keep is not None:
             return keep_counts(scores, self.keep, floors, context)
@@ -117,16 +117,19 @@ class LeaveOneOutRule(PruningRule):
     ) -> dict[str, Float64[Tensor, " _"]]:
         """Returns name of a node -> the cost of each of its rows, relative to the present squared error."""
         none = torch.zeros(3, dtype=torch.float64, device=scene.device)
-        errors = sum((_squared_errors(scene, frame, context) for frame in on_device(scene, frames)), none)
+        ranks = context.ranks
+        errors = sum((_squared_errors(scene, frame, context) for frame in on_device(scene, frames, ranks)), none)
+        errors = ranks.sum(errors)
         spans = scene.gaussians_at(frames[0], context.state).spans
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
         # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
         share = (1 / errors.clamp(min=LEAST_ERROR)).float()
-        for frame in on_device(scene, frames):
+        for frame in on_device(scene, frames, ranks):
             for view, weights in self._seen(frame, share):
                 change = _without_each(scene, view, weights, context)
                 largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
+        largest, squared = ranks.largest(largest), ranks.sum(squared)
         costs = torch.where(largest > self.noticeable, squared, 0.0)
         return {name: costs[rows] for name, rows in spans.items()}
 

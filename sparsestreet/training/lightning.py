@@ -3,6 +3,7 @@
 from lightning import Callback, Trainer
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.ranks import ALONE, Ranks
 
 
 def data_of(trainer: Trainer) -> StreetData:
@@ -18,6 +19,46 @@ def callbacks_of(trainer: Trainer) -> list[Callback]:
 def is_dev_run(trainer: Trainer) -> bool:
     """Whether it only tries a few steps (``fast_dev_run``)."""
     return bool(trainer.fast_dev_run)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def ranks_of(trainer: Trainer) -> Ranks:
+    """The processes that train together; one that trains alone is by itself."""
+    return getattr(trainer.strategy, "ranks", ALONE)
+
+
+def images_per_step(trainer: Trainer) -> int:
+    """Images whose mean gradient a step takes: of all processes, and of ``accumulate_grad_batches`` batches."""
+    return trainer.world_size * trainer.accumulate_grad_batches
+
+
+def image_number(trainer: Trainer, batch_idx: int) -> int:
+    """Number of training images before this one, in the order in which one process would see them."""
+    accumulated, ranks = trainer.accumulate_grad_batches, ranks_of(trainer)
+    return (trainer.global_step * accumulated + batch_idx % accumulated) * ranks.size + ranks.rank
+
+
+def begins_step(trainer: Trainer, batch_idx: int) -> bool:
+    """Whether a batch is the first whose gradient a step takes; else its rows must stay what they are."""
+    return batch_idx % trainer.accumulate_grad_batches == 0
+
+
+def ends_step(trainer: Trainer, batch_idx: int) -> bool:
+    """Whether the optimizer has stepped with a batch."""
+    return begins_step(trainer, batch_idx + 1)
+
+
+def check_images(trainer: Trainer, images: int) -> None:
+    """Raises ValueError where a step would take more images than there are to train on."""
+    if images_per_step(trainer) > max(images, 1):
+        raise ValueError(
+            f"a step takes {images_per_step(trainer)} images, of {trainer.world_size} processes and "
+            f"{trainer.accumulate_grad_batches} batches each, but there are {images} to train on: use fewer processes"
+        )
+
+
+def steps_for(trainer: Trainer, images: int) -> int:
+    """Steps in which a trainer sees so many images."""
+    return -(-images // images_per_step(trainer))
 
 
 def end_after(trainer: Trainer, steps: int) -> None:

@@ -1,6 +1,8 @@
 """One Adam over groups of parameters, each with its own learning rate and decay."""
 
+import math
 from dataclasses import asdict, dataclass
+from typing import Literal
 
 import torch
 
@@ -21,28 +23,35 @@ class OptimizerSettings:
     """Meters: rates that are scaled by the scene's radius count no more of it. Detail does not grow with the length of
     a drive. None: all of it (3DGS, DriveStudio)."""
 
+    batch_rule: Literal["sqrt", "none"] = "sqrt"
+    """Of steps that take n > 1 images. sqrt (Grendel-GS, Zhao et al. 2024): rates times sqrt(n) and Adam's betas to the
+    power of n, so that moments remember as many images and n images move a parameter about as far as n steps of one;
+    none: as for one image."""
+
     def __post_init__(self) -> None:
         if self.largest_radius is not None and not self.largest_radius > 0:
             raise ValueError(f"largest_radius must be > 0 m, got {self.largest_radius}: null for no limit")
 
-    def build(self, scene: SceneGraph, radius: float) -> torch.optim.Optimizer:
+    def build(self, scene: SceneGraph, radius: float, images: int = 1) -> torch.optim.Optimizer:
         """Adam with one group per rate, in which parameters of all nodes are stepped together.
 
-        ``radius`` is the scene's, meters.
+        ``radius`` is the scene's, meters; ``images`` are those of a step.
 
         Raises ValueError for a parameter without a rate.
         """
         rates, groups = scene.learning_rates(), {}
+        images = images if self.batch_rule == "sqrt" else 1
+        factor, betas = math.sqrt(images), (0.9**images, 0.999**images)
         radius = radius if self.largest_radius is None else min(radius, self.largest_radius)
         for name, parameter in scene.named_parameters():
             rate = rates[name]
-            initial = rate.initial * (radius if rate.scale_by_scene_radius else 1.0)
+            initial = rate.initial * (radius if rate.scale_by_scene_radius else 1.0) * factor
             # Plain values: a checkpoint keeps them.
             empty = {"params": [], "lr": initial, "initial_lr": initial, "rate": asdict(rate)}
             groups.setdefault(rate, empty)["params"].append(parameter)
         if self.visible_only:
-            return VisibleAdam(groups.values(), eps=self.eps)
-        return torch.optim.Adam(groups.values(), eps=self.eps, fused=True)
+            return VisibleAdam(groups.values(), betas=betas, eps=self.eps)
+        return torch.optim.Adam(groups.values(), betas=betas, eps=self.eps, fused=True)
 
 
 def set_rates(optimizer: torch.optim.Optimizer, progress: float) -> None:

@@ -42,7 +42,7 @@ from sparsestreet.training.callbacks import (
 from sparsestreet.training.costs import record_costs
 from sparsestreet.training.curves import kept_curves
 from sparsestreet.training.identity import RunIdentity
-from sparsestreet.training.lightning import is_dev_run
+from sparsestreet.training.lightning import check_images, end_after, images_per_step, is_dev_run, steps_for
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.system import StreetSystem
 
@@ -77,13 +77,15 @@ def train(
 ) -> RunSummary | None:
     """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
 
-    Of several processes each one trains; the first alone writes, evaluates and returns a summary.
+    Of several processes (``training/parallel``) each one trains; the first alone writes, evaluates and returns a
+    summary.
 
     Args:
         recipe: the parts of the training. Its callbacks keep state: take a new recipe for another run.
         data: the log, split into views to train on and views held out.
         out: the run's folder.
-        max_steps: optimizer steps.
+        max_steps: optimizer steps of one image; with n images a step (of several processes, or accumulated) the run
+            has as many images, and an n-th of the steps.
         minutes: of the whole command, from the beginning of ``stages`` on: the steps become as many as fit; None: they
             stay ``max_steps``.
         make_trainer: Lightning's Trainer, or what makes one; ``fit`` shows what it is given.
@@ -189,6 +191,10 @@ def fit(
         enable_progress_bar=False,
         enable_checkpointing=False,
     )
+    if images_per_step(trainer) > 1 and not is_dev_run(trainer):
+        check_images(trainer, len(data.split.train))
+        max_steps = steps_for(trainer, max_steps)
+        end_after(trainer, max_steps)
     if start is None:
         trainer.fit(system, datamodule=data)
         return trainer

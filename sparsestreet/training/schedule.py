@@ -15,8 +15,10 @@ class Course:
     and the rest is spread over the steps that are left. No moment of the schedule is passed by or comes twice.
     """
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, images_per_step: int = 1) -> None:
         self.steps = steps
+        self.images_per_step = images_per_step
+        """What recurs counts images, so that a schedule is as long for any number of processes."""
         self._legs = [(0, 0.0)]
         """Where each even part begins: a step, and the fraction that is done there."""
 
@@ -74,9 +76,9 @@ class Interval:
     stop: float
     """Fraction of max_steps at which it happens last."""
     every: int = 100
-    """Steps between two events."""
+    """Steps of one image between two events; with n images a step they are n times as near."""
     shift: int = 0
-    """Steps by which the events come after the multiples of ``every``."""
+    """Steps of one image by which the events come after the multiples of ``every``."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.start <= self.stop <= 1:
@@ -89,8 +91,9 @@ class Interval:
     def due(self, step: int, course: Course) -> bool:
         """Whether the event happens after ``step`` (1 is the first)."""
         begun = step >= course.step_at(self.start) - ROUNDING
+        before, now = (((step - back) * course.images_per_step - self.shift) // self.every for back in (1, 0))
         # The first one comes a whole period after the shift.
-        recurs = (step - self.shift) % self.every == 0 and (step > self.shift or self.shift == 0)
+        recurs = now > before and (now > 0 or self.shift == 0)
         return begun and step <= self.last(course) and recurs
 
     def closes(self, step: int, course: Course) -> bool:

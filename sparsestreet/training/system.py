@@ -15,6 +15,7 @@ from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
+from sparsestreet.training.lightning import image_number, images_per_step
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
@@ -80,7 +81,7 @@ class StreetSystem(LightningModule):
     def course(self) -> Course:
         """How far the run has come at each step."""
         if self._course is None:
-            self._course = Course(self.trainer.max_steps)
+            self._course = Course(self.trainer.max_steps, images_per_step(self.trainer))
         return self._course
 
     def state(self, *, training: bool = False) -> SceneState:
@@ -97,6 +98,10 @@ class StreetSystem(LightningModule):
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
         state = self.state(training=True)
+        if self.course.images_per_step > 1:
+            for node in self.scene.nodes.values():
+                if node.mask is not None:
+                    node.mask.at_image(image_number(self.trainer, index))
         frame = self.resolution.of(frame, self.global_step, self.course)
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
@@ -138,7 +143,7 @@ class StreetSystem(LightningModule):
                     self.log(f"val/psnr_{region}", value, batch_size=1)
 
     def configure_optimizers(self) -> Optimizer:
-        return self.optimizer_settings.build(self.scene, self.radius)
+        return self.optimizer_settings.build(self.scene, self.radius, images_per_step(self.trainer))
 
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
         set_rates(self.trainer.optimizers[0], self.state().progress)

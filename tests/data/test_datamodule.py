@@ -2,7 +2,9 @@
 
 import dataclasses
 import itertools
+import typing
 from pathlib import Path
+from types import SimpleNamespace
 
 import lightning
 import numpy as np
@@ -13,9 +15,11 @@ from sparsestreet.data.datamodule import ShuffledFrames, StreetData
 from sparsestreet.data.device import to_device
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.lazy import Frames
+from sparsestreet.ranks import Ranks
 from sparsestreet.types import Frame, View
 from tests.data.drivestudio.folders import make_nuscenes
 from tests.data.streets import make_log
+from tests.training.stubs import frame_at
 
 
 def keys(frames) -> list[tuple[int, int]]:
@@ -35,6 +39,36 @@ def test_no_two_epochs_have_the_same_order():
     loader = StreetData(make_log(), seed=1).train_dataloader()
     epochs = [tuple(keys(loader)) for _ in range(5)]
     assert len(set(epochs)) == 5
+
+
+@pytest.mark.parametrize(("size", "accumulated"), [(1, 3), (2, 1), (3, 1), (2, 2)])
+def test_processes_take_turns_in_the_order_of_one(size, accumulated):
+    """Seven frames, which no number divides: no step ends with an epoch, and none has a frame of its own order."""
+    frames = [frame_at(index) for index in range(7)]
+    alone = ShuffledFrames(frames, 3)
+    images = [frame.frame_index for _ in range(4 * size * accumulated) for frame in alone]
+    several = [ShuffledFrames(frames, 3, ranks=Ranks(rank, size), accumulated=accumulated) for rank in range(size)]
+    parts = [[frame.frame_index for _ in range(3) for frame in loader] for loader in several]
+    assert {len(part) for part in parts} == {3 * 7 * accumulated} == {3 * len(several[0])}
+    turns = [frame for turn in zip(*parts, strict=True) for frame in turn]
+    assert turns == images[: len(turns)]
+
+
+def test_a_process_goes_on_at_its_own_place():
+    frames = [frame_at(index) for index in range(7)]
+    whole = list(ShuffledFrames(frames, 3, ranks=Ranks(1, 2)))
+    resumed = ShuffledFrames(frames, 3, ranks=Ranks(1, 2))
+    resumed.load_state_dict({"finished": 4})
+    assert keys(resumed) == keys(whole[4:])
+
+
+def test_a_step_that_accumulates_finishes_all_of_its_images():
+    data = StreetData(make_log(), stride=4, offset=1)
+    data.trainer = typing.cast(
+        lightning.Trainer, SimpleNamespace(global_step=4, accumulate_grad_batches=3, strategy=None)
+    )
+    assert data.train_dataloader().state_dict() == {"finished": 12}
+    assert len(data.train_dataloader()) == 3 * 18
 
 
 def test_the_order_is_given_by_the_seed():

@@ -163,6 +163,9 @@ class StubTrainer(Trainer):
     sanity_checking: bool = False
     interrupted: bool = False
     callback_metrics: Any = None
+    world_size: int = 1
+    accumulate_grad_batches: int = 1
+    strategy: Any = SimpleNamespace(broadcast=lambda value: value)
 
     def __init__(
         self,
@@ -178,8 +181,8 @@ class StubTrainer(Trainer):
         self.datamodule = SplitFrames(Split(Frames.of(train), Frames.of(held_out)))
         self.callback_metrics = {}
         self.log_calls: list[tuple[str, float, dict[str, Any]]] = []
-        self.optimizers = [system.configure_optimizers()]
         system.trainer = self
+        self.optimizers = [system.configure_optimizers()]
         system.log, system.log_dict = self._log, self._log_dict
         for callback in self.callbacks:
             callback.setup(self, system, "fit")

@@ -51,6 +51,20 @@ def test_no_more_of_the_radius_than_the_largest_counts_for_rates(largest, means)
     assert rate(optimizer, street, "nodes.rigid.rows.means") == 3e-3  # which is not scaled
 
 
+@pytest.mark.parametrize("visible_only", [False, True])
+@pytest.mark.parametrize(
+    ("rule", "images", "factor", "betas"),
+    [("sqrt", 1, 1.0, (0.9, 0.999)), ("sqrt", 4, 2.0, (0.9**4, 0.999**4)), ("none", 4, 1.0, (0.9, 0.999))],
+)
+def test_the_rule_for_steps_of_several_images(rule, images, factor, betas, visible_only):
+    """Rates times sqrt(n), betas to the power of n; with one image nothing changes, to the bit."""
+    street, settings = scene(), OptimizerSettings(batch_rule=rule, visible_only=visible_only)
+    single, several = settings.build(street, 10.0), settings.build(street, 10.0, images)
+    for one, other in zip(single.param_groups, several.param_groups, strict=True):
+        assert (other["lr"], other["initial_lr"]) == (factor * one["lr"], factor * one["initial_lr"])
+        assert (one["betas"], other["betas"]) == ((0.9, 0.999), betas)
+
+
 def test_a_largest_radius_is_positive():
     with pytest.raises(ValueError, match=r"must be > 0 m, got 0\.0: null"):
         OptimizerSettings(largest_radius=0.0)

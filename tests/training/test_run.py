@@ -198,6 +198,8 @@ class Finished(Trainer):
 
     is_global_zero: bool = True
     fast_dev_run: bool = False
+    world_size: int = 1
+    accumulate_grad_batches: int = 1
     strategy: Any = SimpleNamespace(root_device=torch.device("cpu", 0))
 
     def __init__(self) -> None: ...

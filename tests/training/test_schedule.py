@@ -23,6 +23,16 @@ def test_an_interval_closes_once_even_between_two_events():
     assert not interval.due(810, Course(1000))
 
 
+@pytest.mark.parametrize("images", [2, 3, 8])
+@pytest.mark.parametrize("shift", [0, 7])
+def test_what_recurs_counts_images(images, shift):
+    """It comes in the step that has the image after which it would come, if each step had one."""
+    steps, interval = 200, Interval(0.0, 1.0, every=20, shift=shift)
+    single = [step for step in range(1, steps * images + 1) if interval.due(step, Course(steps * images))]
+    several = [step for step in range(1, steps + 1) if interval.due(step, Course(steps, images))]
+    assert several == [math.ceil(step / images) for step in single]
+
+
 @pytest.mark.parametrize("steps", [7, 60, 100, 700, 2000, 30000])
 def test_steps_are_those_of_the_decimal_fraction(steps):
     """0.07 * 100 is 7.000000000000001 and 0.29 * 100 is 28.999999999999996 in floats: step 7 is in, step 29 as well."""

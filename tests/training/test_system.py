@@ -60,7 +60,7 @@ def test_a_step_moves_by_its_own_rate():
 def test_the_optimizer_is_the_configured_one_at_the_radius_of_the_scene():
     nodes = {"background": background(3, learning_rates=RATES)}
     system = make_system(nodes, optimizer=OptimizerSettings(eps=1e-9, visible_only=True), radius=7.0)
-    optimizer = system.configure_optimizers()
+    (optimizer,) = StubTrainer(system).optimizers
     assert type(optimizer) is VisibleAdam
     assert optimizer.defaults["eps"] == 1e-9
     assert group_of(optimizer, system.scene.nodes["background"].rows.means)["lr"] == pytest.approx(7e-2)

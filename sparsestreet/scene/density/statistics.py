@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestreet.ranks import Ranks
 from sparsestreet.scene.gaussians import RowPlan
 
 
@@ -91,6 +92,18 @@ class DensityStatistics:
                 f"of {len(self)} summed up to {float(total[row])}: the loss of a recent step was not finite"
             )
         return total / self.visits.clamp(min=1)
+
+    def total(self, ranks: Ranks) -> None:
+        """Takes in what the other processes have seen, so that all decide alike."""
+        for values in (self.gradient_sum, self.visits, *self.watched.values()):
+            ranks.sum(values)
+        ranks.largest(self.largest_screen)
+
+    def absorb(self, other: "DensityStatistics") -> None:
+        """Adds what other statistics of the same rows have seen."""
+        self.gradient_sum, self.visits = self.gradient_sum + other.gradient_sum, self.visits + other.visits
+        self.largest_screen = torch.maximum(self.largest_screen, other.largest_screen)
+        self.watched = {name: values + other.watched[name] for name, values in self.watched.items()}
 
     def resize(self, plan: RowPlan) -> None:
         """Applies the plan of the node's rows; fresh rows start at zero."""

@@ -26,6 +26,9 @@ class Mask(nn.Module, ABC):
     floor_firings: int = 0
     """Number of times that K_min kept rows open below the threshold, since the count was last read."""
 
+    def at_image(self, number: int) -> None:
+        """Go to the training image with this number, where steps take several images: their draws follow from it."""
+
     @abstractmethod
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
         """Returns the mask's columns for a new table."""

@@ -100,6 +100,9 @@ class TemporalMask(Mask):
         self.register_buffer("limit", torch.tensor(settings.threshold))
         self.register_buffer("draws", torch.zeros((), dtype=torch.float64))
 
+    def at_image(self, number: int) -> None:
+        self.draws.fill_(number)
+
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
         """Returns random features of standard deviation 0.01, so that rows in one place can learn different masks."""
         generator = torch.Generator().manual_seed(num_rows)

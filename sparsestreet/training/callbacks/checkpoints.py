@@ -8,6 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
 from sparsestreet.training.callbacks.graceful_stop import TornStop
+from sparsestreet.training.lightning import ends_step, ranks_of
 
 log = logging.getLogger(__name__)
 
@@ -36,16 +37,23 @@ class Checkpoints(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        if trainer.global_step % self.every == 0 and trainer.global_step < trainer.max_steps:
+        if (
+            ends_step(trainer, batch_idx)
+            and trainer.global_step % self.every == 0
+            and trainer.global_step < trainer.max_steps
+        ):
             self._try_to_save(trainer, LAST)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.interrupted:
             self._save(trainer, LAST)
-            (self.folder / INTERRUPTED).unlink(missing_ok=True)
+            if trainer.is_global_zero:
+                (self.folder / INTERRUPTED).unlink(missing_ok=True)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        if isinstance(exception, TornStop):
+        # A process that fails by itself has no others to ask for their part of the state.
+        alone = ranks_of(trainer).size > 1 and not isinstance(exception, KeyboardInterrupt)
+        if alone or isinstance(exception, TornStop):
             log.warning("stopped inside step %d: go on from the checkpoint before it", trainer.global_step + 1)
         elif trainer.global_step > 0 and self._try_to_save(trainer, INTERRUPTED):
             log.warning("stopped after step %d; go on with resume=%s", trainer.global_step, self.folder.parent)

@@ -1,18 +1,22 @@
 """When to densify, cull and reset opacities (the schedule of 3DGS, as DriveStudio runs it per node)."""
 
+from functools import partial
 from typing import Any
 
 import torch
 from lightning import Callback, Trainer
+from torch import Tensor
+from torch.utils.hooks import RemovableHandle
 
 from sparsestreet.phases import phase
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.nodes.node import Node
-from sparsestreet.training.callbacks.resizing import RowListener, resize_rows
-from sparsestreet.training.lightning import data_of
+from sparsestreet.training.callbacks.resizing import RowListener, compare_rows, resize_rows
+from sparsestreet.training.lightning import begins_step, data_of, ends_step, ranks_of
 from sparsestreet.training.schedule import Interval, last_step
 from sparsestreet.training.system import StreetSystem
 
@@ -24,9 +28,9 @@ class DensityControl(Callback, RowListener):
         refine_in: when rows that are of no use are culled and, up to ``densify_until``, others split and cloned before.
         densify_until: fraction of the run after which no rows are added any more, unless a node's settings say another.
         reset_in: when opacities are pulled down, so that what is not needed can be culled.
-        pause_after_reset: steps after a reset without refinement: opacities must recover first. None, as in
-            DriveStudio: no refinement in the first steps of each period of ``reset_in``, as many as there are training
-            images and at least ``refine_in.every``; statistics start anew at each refinement that falls out.
+        pause_after_reset: steps (of one image) after a reset without refinement: opacities must recover first. None, as
+            in DriveStudio: no refinement in the first steps of each period of ``reset_in``, as many as there are
+            training images and at least ``refine_in.every``; statistics start anew at each refinement that falls out.
         first_counts_all: as in ``DensityStatistics``.
         seed: of the positions of split children, of rows drawn and of noise.
 
@@ -54,6 +58,12 @@ class DensityControl(Callback, RowListener):
         self.closed_steps = 0
         self.seed, self.generator = seed, torch.Generator().manual_seed(seed)
         self.statistics: dict[str, DensityStatistics] = {}
+        self._of_others: list[dict[str, DensityStatistics]] = []
+        """In a checkpoint of several processes: of those behind the first."""
+        self._ranks = ALONE
+        self._hooks: list[RemovableHandle] = []
+        self._gradients: dict[str, dict[str, Tensor]] = {}
+        """Node, watched column -> its gradient in the image that was differentiated last."""
         self.last_reset: int | None = None
 
     def setup(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
@@ -66,6 +76,8 @@ class DensityControl(Callback, RowListener):
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         # Only now are rows on their device, and statistics of a checkpoint restored.
+        self._ranks = ranks_of(trainer)
+        self._take_own(self._ranks)
         for statistics in self.statistics.values():
             statistics.to(pl_module.device)
         if self.pause_after_reset is None:
@@ -82,9 +94,19 @@ class DensityControl(Callback, RowListener):
         if change.node in self.statistics:
             self.statistics[change.node].resize(plan)
 
+    def on_before_backward(self, trainer: Trainer, pl_module: StreetSystem, loss: Tensor) -> None:
+        """Look at the gradients of watched columns as they come: columns add up those of all images of a step."""
+        if pl_module.screen_gradients and trainer.accumulate_grad_batches > 1:
+            for name, statistics in self.statistics.items():
+                columns, seen = pl_module.scene.nodes[name].rows.columns(), self._gradients.setdefault(name, {})
+                self._hooks += [
+                    columns[column].register_hook(partial(seen.__setitem__, column)) for column in statistics.watched
+                ]
+
     def on_after_backward(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if not pl_module.screen_gradients:
             return
+        images = pl_module.course.images_per_step
         rendering = pl_module.rendering
         assert rendering is not None  # the backward pass of this step went through it
         splats, gradients = rendering.splats, rendering.splats.screen_gradients
@@ -95,21 +117,33 @@ class DensityControl(Callback, RowListener):
                 columns = pl_module.scene.nodes[name].rows.columns()
                 found = ((column, columns[column].grad) for column in statistics.watched)
                 watched = {column: gradient for column, gradient in found if gradient is not None}
-                statistics.add(gradients[span], splats.radii[span], width, height, watched)
+                watched |= self._gradients.pop(name, {})
+                seen = gradients[span]
+                if images > 1:
+                    # The loss is a mean over the images of the step, thresholds are for that of one.
+                    seen, watched = images * seen, {column: images * one for column, one in watched.items()}
+                    statistics.is_empty &= self._ranks.rank == 0  # whose image is the first of the step
+                statistics.add(seen, splats.radii[span], width, height, watched)
+        while self._hooks:
+            self._hooks.pop().remove()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        if not ends_step(trainer, batch_idx):
+            return
         step = trainer.global_step
         for name in self.statistics:
             self._shake(trainer, pl_module, name)
         if not self.refine_in.due(step, pl_module.course):
             return
         for name, statistics in self.statistics.items():
-            if not self._recovering(step):
+            if not self._recovering(step, pl_module.course.images_per_step):
+                statistics.total(self._ranks)
                 self._refine(trainer, pl_module, name)
             elif self.pause_after_reset is None:
                 statistics.reset()
+        compare_rows(trainer, pl_module)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: object, batch_idx: int) -> None:
         last = self.refine_in.last(pl_module.course)
@@ -117,7 +151,7 @@ class DensityControl(Callback, RowListener):
         # Before the next step rather than behind the last one: a look at held-out views that falls between the two
         # would see a scene that has just lost its opacities.
         step = trainer.global_step
-        if step > 0 and self.reset_in.due(step, pl_module.course):
+        if step > 0 and begins_step(trainer, batch_idx) and self.reset_in.due(step, pl_module.course):
             self.last_reset = step
             for name in self.statistics:
                 node = pl_module.scene.nodes[name]
@@ -133,10 +167,10 @@ class DensityControl(Callback, RowListener):
         if noise is not None:
             means += noise
 
-    def _recovering(self, step: int) -> bool:
+    def _recovering(self, step: int, images: int) -> bool:
         if self.pause_after_reset is None:
-            return step % self.reset_in.every <= self.closed_steps
-        return self.last_reset is not None and step - self.last_reset <= self.pause_after_reset
+            return images * step % self.reset_in.every <= self.closed_steps
+        return self.last_reset is not None and images * (step - self.last_reset) <= self.pause_after_reset
 
     def _refine(self, trainer: Trainer, system: StreetSystem, name: str) -> None:
         """Densify (while it is time), then cull, then start new statistics."""
@@ -155,17 +189,40 @@ class DensityControl(Callback, RowListener):
             resize_rows(trainer, system, name, RowPlan.keep(~outside), "outside its box")
         statistics.reset()
 
+    def _take_own(self, ranks: Ranks) -> None:
+        """Of the statistics of a checkpoint, those of this process; the first takes all if they are another number."""
+        if len(self._of_others) == ranks.size - 1:
+            self.statistics = [self.statistics, *self._of_others][ranks.rank]
+        else:
+            for name, statistics in self.statistics.items():
+                for others in self._of_others if ranks.rank == 0 else ():
+                    statistics.absorb(others[name])
+                if ranks.rank:
+                    statistics.reset()
+        self._of_others = []
+
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "statistics": {name: statistics.state_dict() for name, statistics in self.statistics.items()},
-            "generator": self.generator.get_state(),
-            "last_reset": self.last_reset,
-        }
+        """Several processes ask for it together."""
+        own = {name: statistics.state_dict() for name, statistics in self.statistics.items()}
+        state = {"statistics": own, "generator": self.generator.get_state(), "last_reset": self.last_reset}
+        if self._ranks.size > 1:
+            state["of_others"] = self._ranks.gathered(_on_host(own))[1:]
+        return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.statistics = {name: DensityStatistics.from_state(s) for name, s in state_dict["statistics"].items()}
+        first, *self._of_others = (
+            {name: DensityStatistics.from_state(one) for name, one in statistics.items()}
+            for statistics in (state_dict["statistics"], *state_dict.get("of_others", ()))
+        )
+        self.statistics = first
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]
+
+
+def _on_host(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _on_host(one) for name, one in value.items()}
+    return value.cpu() if isinstance(value, Tensor) else value
 
 
 def _strategy(node: Node) -> DensityStrategy:

@@ -7,6 +7,9 @@ from types import FrameType
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from sparsestreet.training.lightning import ends_step
+from sparsestreet.training.parallel import DataParallel
+
 log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -40,6 +43,14 @@ class GracefulStop(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        if not ends_step(trainer, batch_idx):
+            return
+        strategy = trainer.strategy
+        if isinstance(strategy, DataParallel):
+            # All processes stop after the same step, whichever of them heard of it.
+            self.received, strategy.wish = strategy.agreed or self.received, self.received or 0
+            if not strategy.agreed:
+                return
         if self.received is not None:
             raise KeyboardInterrupt
 

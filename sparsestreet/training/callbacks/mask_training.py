@@ -5,7 +5,8 @@ import logging
 from lightning import Callback, Trainer
 
 from sparsestreet.scene.masks import Mask
-from sparsestreet.training.callbacks.resizing import end_mask, resize_rows
+from sparsestreet.training.callbacks.resizing import compare_rows, end_mask, resize_rows
+from sparsestreet.training.lightning import ends_step
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
 
@@ -27,6 +28,8 @@ class MaskTraining(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        if not ends_step(trainer, batch_idx):
+            return
         step, course = trainer.global_step, pl_module.course
         last = self.remove_in.closes(step, course)
         if not last and not self.remove_in.due(step, course):
@@ -36,6 +39,7 @@ class MaskTraining(Callback):
                 self._remove(trainer, pl_module, name, node.mask)
                 if last:
                     end_mask(trainer, pl_module, name)
+        compare_rows(trainer, pl_module)
 
     def _remove(self, trainer: Trainer, system: StreetSystem, name: str, mask: Mask) -> None:
         node = system.scene.nodes[name]

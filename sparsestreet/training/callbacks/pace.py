@@ -17,7 +17,15 @@ from sparsestreet.training.forecast import (
     measured_step,
     renders_of,
 )
-from sparsestreet.training.lightning import callbacks_of, data_of, end_after, is_dev_run
+from sparsestreet.training.lightning import (
+    callbacks_of,
+    data_of,
+    end_after,
+    ends_step,
+    images_per_step,
+    is_dev_run,
+)
+from sparsestreet.training.memory import report_memory
 from sparsestreet.training.schedule import milestone
 from sparsestreet.training.system import StreetSystem
 
@@ -56,7 +64,8 @@ class Pace(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if is_dev_run(trainer) or not len(data_of(trainer).split.train):
             return
-        self._step = measured_step(pl_module, data_of(trainer))
+        report_memory(pl_module, data_of(trainer))
+        self._step = measured_step(pl_module, data_of(trainer)) * trainer.accumulate_grad_batches
         forecast = self._forecast(trainer, pl_module)
         if self.minutes is not None:
             self._fit(trainer, pl_module, forecast)
@@ -73,6 +82,8 @@ class Pace(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        if not ends_step(trainer, batch_idx):
+            return
         step, course = trainer.global_step, pl_module.course
         before, seconds = self._seen
         if (
@@ -91,6 +102,7 @@ class Pace(Callback):
         left = 60 * self.minutes - self._seconds() - forecast.evaluation - self._passes(trainer, system)
         step = trainer.global_step
         steps = step + max(forecast.steps(left, system.course.progress(step)), 2)
+        steps = trainer.strategy.broadcast(steps)  # clocks of several processes differ
         system.course.change(step, steps)
         end_after(trainer, steps)
         self._course = system.course.state_dict()
@@ -118,7 +130,8 @@ class Pace(Callback):
         ]  # fmt: skip
         left = sum(moment > trainer.global_step for moment in moments)
         done = len(moments) - left
-        of_one = self._seconds("prune") / done if done else len(data_of(trainer).split.train) * self._step
+        views = len(data_of(trainer).split.train) / images_per_step(trainer)
+        of_one = self._seconds("prune") / done if done else views * self._step
         return left * of_one
 
     def _seconds(self, stage: str = "") -> float:

@@ -8,6 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
+from sparsestreet.training.lightning import ends_step
 
 LOOP = "loop"
 """What is in no phase: Lightning, and callbacks that have nothing to do in a step."""
@@ -32,6 +33,8 @@ class PhaseTimes(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        if not ends_step(trainer, batch_idx):
+            return
         step = trainer.global_step
         self._note(step)
         if (step + 1) % self.every == 0:

@@ -7,6 +7,7 @@ from lightning import Callback, Trainer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from sparsestreet.training.lightning import ends_step
 from sparsestreet.training.schedule import ROUNDING, Course
 from sparsestreet.training.system import StreetSystem
 
@@ -38,7 +39,7 @@ class TrainingProgress(Callback):
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         step = trainer.global_step
-        if not trainer.is_global_zero or not self._due(step, pl_module.course):
+        if not (trainer.is_global_zero and ends_step(trainer, batch_idx)) or not self._due(step, pl_module.course):
             return
         text = self._status(trainer, pl_module)
         if self._bar is not None:

@@ -7,8 +7,8 @@ from lightning import Callback, Trainer
 
 from sparsestreet.phases import stage
 from sparsestreet.pruning import PruningRule, RenderContext
-from sparsestreet.training.callbacks.resizing import resize_rows
-from sparsestreet.training.lightning import data_of
+from sparsestreet.training.callbacks.resizing import compare_rows, resize_rows
+from sparsestreet.training.lightning import data_of, ends_step, ranks_of
 from sparsestreet.training.schedule import milestone
 from sparsestreet.training.system import StreetSystem
 
@@ -32,12 +32,16 @@ class Pruning(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        if not ends_step(trainer, batch_idx):
+            return
         moments = sorted({milestone(fraction, pl_module.course) for fraction in self.at})
         if trainer.global_step not in moments:
             return
         with stage(f"prune/{type(self.rule).__name__} at step {trainer.global_step}"):
             passed = moments.index(trainer.global_step)
-            self._prune(trainer, pl_module, RenderContext(pl_module.state(), pl_module.options, len(moments), passed))
+            context = RenderContext(pl_module.state(), pl_module.options, len(moments), passed, ranks_of(trainer))
+            self._prune(trainer, pl_module, context)
+            compare_rows(trainer, pl_module)
 
     def _prune(self, trainer: Trainer, pl_module: StreetSystem, context: RenderContext) -> None:
         frames = data_of(trainer).split.train

@@ -6,7 +6,8 @@ from lightning import Trainer
 
 from sparsestreet.records.ledger import CountChange
 from sparsestreet.scene.gaussians import RowPlan
-from sparsestreet.training.lightning import callbacks_of
+from sparsestreet.training.lightning import callbacks_of, ranks_of
+from sparsestreet.training.parallel.agreement import check_agreement
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,11 @@ def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan
         if isinstance(callback, RowListener):
             callback.on_rows_changed(change, plan)
     log.debug("step %d: %s %s, %d -> %d rows", change.step, node, reason, before, change.after)
+
+
+def compare_rows(trainer: Trainer, system: StreetSystem) -> None:
+    """After a change of rows: see that all processes made the same one. Raises DisagreementError."""
+    check_agreement(system.scene, ranks_of(trainer))
 
 
 def end_mask(trainer: Trainer, system: StreetSystem, node: str) -> None:

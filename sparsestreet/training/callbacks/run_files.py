@@ -18,7 +18,7 @@ from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene
 from sparsestreet.training.callbacks.clock import Clock
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.callbacks.resizing import RowListener
-from sparsestreet.training.lightning import data_of
+from sparsestreet.training.lightning import data_of, steps_for
 from sparsestreet.training.system import StreetSystem
 
 
@@ -72,7 +72,7 @@ class RunFiles(Callback, RowListener):
             device=device_name(system.device),
             threads=torch.get_num_threads(),
             steps=trainer.global_step,
-            max_steps=system.course.steps if system.course.changed else self.description.max_steps,
+            max_steps=system.course.steps if system.course.changed else steps_for(trainer, self.description.max_steps),
             training_seconds=self.clock.seconds,
             noise=None if before is None else noise_between(before, calibrate(system.device)),
             caps=dict(self.caps),

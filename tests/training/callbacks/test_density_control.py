@@ -5,6 +5,7 @@ import copy
 import pytest
 import torch
 
+from sparsestreet.ranks import Ranks
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_seed
@@ -319,3 +320,28 @@ def test_images_that_leave_no_time_to_refine_are_refused():
     trainer = StubTrainer(system, [drivestudio(every=10)], train=tuple(map(frame_at, range(12))))
     with pytest.raises(ValueError, match="the 12 training images fill the 10 steps between two opacity resets"):
         trainer.start()
+
+
+class Together(Ranks):
+    """One of two processes, of which the other says what it is told."""
+
+    def gathered(self, value):
+        return [value, {name: state | {"visits": state["visits"] + 5} for name, state in value.items()}]
+
+
+def resumed_by(rank: int, size: int) -> DensityControl:
+    """After a checkpoint of two processes: the first has seen its rows once, the other five times more."""
+    before = every_ten()
+    StubTrainer(make_system({"background": background(3, density=AskedStrategy())}), [before])
+    before.statistics["background"].visits += 1
+    before._ranks = Together(0, 2)
+    after = every_ten()
+    after.load_state_dict(copy.deepcopy(before.state_dict()))
+    after._take_own(Ranks(rank, size))
+    return after
+
+
+@pytest.mark.parametrize(("rank", "size", "visits"), [(0, 2, 1), (1, 2, 6), (0, 1, 7), (0, 3, 7), (2, 3, 0)])
+def test_processes_go_on_with_their_own_statistics_and_another_number_of_them_with_all(rank, size, visits):
+    statistics = resumed_by(rank, size).statistics["background"]
+    assert statistics.visits.tolist() == [visits] * 3
