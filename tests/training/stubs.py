@@ -163,6 +163,8 @@ class StubTrainer(Trainer):
     sanity_checking: bool = False
     interrupted: bool = False
     callback_metrics: Any = None
+    loggers: Sequence[Any] = ()
+    fit_loop: Any = SimpleNamespace(_data_fetcher=None)  # nothing is validated
 
     def __init__(
         self,
