@@ -15,6 +15,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet train method=3dgs sparsify=removal data=drivestudio data.root=DIR    on a drive of your own
   sparsestreet train -m sparsify=none,paper_short,removal seed=0,1,2                a sweep
   sparsestreet train +sweep=streets                   a sweep of conf/sweep; sparsestreet report sweep=DIR shows it
+  sparsestreet jobs +sweep=table1_waymo,table5_ablation data.root=DIR,DIR           what sweeps would train
   sparsestreet train resume=RUN                       go on after an interruption
   sparsestreet evaluate RUN                           measure a trained run again, without training
   sparsestreet report DIR [DIR ...]                   tables from the records of runs
@@ -30,7 +31,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
 Every command takes --help. Options of train are Hydra overrides; `sparsestreet train --cfg job` prints them all.
 """
 
-COMMANDS = ("demo", "train", "evaluate", "report", "render", "export", "data", "effects", "presets", "bench")
+COMMANDS = ("demo", "train", "jobs", "evaluate", "report", "render", "export", "data", "effects", "presets", "bench")
 
 
 READER_GONE = 128 + 13

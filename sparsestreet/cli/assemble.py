@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from hydra.utils import instantiate
 from lightning import Trainer
@@ -68,9 +69,9 @@ def with_images(cfg: DictConfig, images: int | None) -> DictConfig:
     return known
 
 
-def trainer_of(cfg: DictConfig) -> Callable[..., Trainer]:
-    """What makes Lightning's trainer, once its callbacks are there."""
-    return instantiate(cfg.trainer, _partial_=True)
+def trainer_of(cfg: DictConfig, devices: Any) -> Callable[..., Trainer]:
+    """What makes Lightning's trainer, on these devices, once its callbacks are there."""
+    return instantiate(cfg.trainer, _partial_=True, devices=devices)
 
 
 def logger_of(cfg: DictConfig) -> Logger | bool:

@@ -15,7 +15,7 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from sparsestreet.cli.device import device_of
+from sparsestreet.cli.device import device_problem
 from sparsestreet.cli.limits import limit_problem
 from sparsestreet.cli.preset import preset_problem
 
@@ -30,7 +30,8 @@ def config_problem(cfg: DictConfig) -> str | None:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         return _in_one_line(error)
-    return limit_problem(cfg) or next(_parts_without_keys(tree), None) or type_problem(tree) or _device_problem(cfg)
+    problem = limit_problem(cfg) or next(_parts_without_keys(tree), None) or type_problem(tree)
+    return problem or device_problem(cfg.trainer)
 
 
 def unresolvable(cfg: DictConfig) -> str | None:
@@ -128,18 +129,3 @@ def _any_fits(values: Iterable[Tree], hint: typing.Any) -> bool:
 
 def _in_words(hint: typing.Any) -> str:
     return hint.__name__ if inspect.isclass(hint) and not typing.get_args(hint) else str(hint).replace("typing.", "")
-
-
-def _device_problem(cfg: DictConfig) -> str | None:
-    devices = cfg.trainer.get("devices", 1)
-    if devices not in (1, "1", "auto"):
-        return (
-            f"training runs on one device, got trainer.devices={devices}: several would train on the same frames; "
-            "start one run a device, as a sweep does"
-        )
-    if cfg.trainer.get("accelerator") in ("gpu", "cuda"):
-        try:
-            device_of("cuda", "trainer=gpu", "train with trainer=cpu, or check the driver")
-        except ValueError as error:
-            return str(error)
-    return None

@@ -55,6 +55,7 @@ class TrainSchema:
     budget: Tree = MISSING
     resume: str | None = None
     overwrite: bool = False
+    reuse: bool = True
     checkpoint_every: Any = MISSING
     count_of: str | None = None
     data: Tree = MISSING

@@ -57,10 +57,14 @@ class Options:
 
 def evaluate(arguments: list[str]) -> int:
     """Open the run's scene and its log, write records and pictures; statuses as in ``run_command``."""
-    return run_command("evaluate", USAGE, arguments, Options, _evaluate, positional=("run",))
+    return run_command("evaluate", USAGE, arguments, Options, measure, positional=("run",))
 
 
-def _evaluate(options: Options) -> None:
+def measure(options: Options) -> None:
+    """Write records and pictures of a run anew, and say what they show.
+
+    Raises ValueError, OSError or ImportError where something is missing or malformed.
+    """
     run = options.run
     cfg, description = load_run_config(run), RUN.read(run)
     if "evaluation" not in cfg:

@@ -1,5 +1,6 @@
 """The folder of a run: refused where another run lies there, taken once the data is read, left as it was found."""
 
+import logging
 import os
 import shutil
 from pathlib import Path
@@ -7,12 +8,17 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.cli.compose import load_run_config, resolved
-from sparsestreet.cli.resume import run_of
+from sparsestreet.cli.resume import has_checkpoint, run_of
 from sparsestreet.records.configuration import Configuration, config_hash, flat_config, only
+from sparsestreet.records.costs import COSTS
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.records.strict_json import RecordError
+
+log = logging.getLogger(__name__)
 
 CONFIGURATION = ".hydra"
 OF_A_RUN = (
@@ -24,6 +30,7 @@ OF_A_RUN = (
     "predictions",
     "curves",
     "pictures",
+    "same_as.json",
 )
 """What a training leaves in its folder, besides its configuration and its log."""
 
@@ -36,19 +43,34 @@ def folder_problem(cfg: DictConfig, out: Path) -> str | None:
     there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
         return f"{out} cannot be written: name another place with out=..."
-    goes_on = cfg.get("resume") and run_of(Path(cfg.resume)).resolve() == out.resolve()
-    if goes_on or cfg.get("overwrite") or not holds_run(out):
+    if _is_resumed(cfg, out) or cfg.get("overwrite") or not holds_run(out):
         return None
     run = _description(out)
     if holds_same_run(cfg, out):
-        if run is not None and run.steps >= run.max_steps:
-            return (
-                f"{out} holds this very run, finished: sparsestreet evaluate run={out}, or replace it: overwrite=true"
-            )
-        if any((out / "checkpoints").glob("[!.]*.ckpt")):
-            return f"{out} holds this very run, unfinished: go on with resume={out}, or begin again: overwrite=true"
+        if run is None or run.steps < run.max_steps or not is_whole(out):
+            return None  # it goes on
+        return f"{out} holds this very run, finished: sparsestreet evaluate run={out}, or replace it: overwrite=true"
     said = f" ({run.label}, seed {run.seed})" if run else ""
     return f"{out} holds another run{said}: name another place with out=..., or replace it: overwrite=true"
+
+
+def start_of(cfg: DictConfig, out: Path) -> Path | None:
+    """The run or checkpoint that training in this folder goes on from; None: it begins.
+
+    A folder that holds this very run, unfinished, goes on from its newest checkpoint without being asked: so does a job
+    that was ended by others. One that was ended before its first checkpoint begins again.
+    """
+    own = holds_run(out) and not cfg.get("overwrite") and not _is_resumed(cfg, out) and holds_same_run(cfg, out)
+    if own and has_checkpoint(out):
+        log.info("%s holds this run, unfinished: it goes on from its newest checkpoint", out)
+        return out
+    if own:
+        log.info("%s holds this run, ended before its first checkpoint: it begins again", out)
+    return Path(cfg.resume) if cfg.get("resume") else None
+
+
+def _is_resumed(cfg: DictConfig, out: Path) -> bool:
+    return bool(cfg.get("resume")) and run_of(Path(cfg.resume)).resolve() == out.resolve()
 
 
 def holds_run(out: Path) -> bool:
@@ -56,39 +78,58 @@ def holds_run(out: Path) -> bool:
     return any((out / name).exists() for name in OF_A_RUN)
 
 
+def is_whole(out: Path) -> bool:
+    """Whether the command that trained a run came to its end; what it took is the last that it writes."""
+    try:
+        costs = COSTS.find(out)
+    except RecordError:
+        return False
+    return costs is not None and costs.wall_seconds is not None
+
+
 def holds_same_run(cfg: DictConfig, out: Path) -> bool:
     """Whether the run in a folder has this configuration, seed and drive."""
     try:
         before = flat_config(resolved(load_run_config(out)))
-    except (FileNotFoundError, OmegaConfBaseException, ValueError):
+    except (FileNotFoundError, OmegaConfBaseException, ValueError, YAMLError):
         return False
     return same_run(before, flat_config(resolved(cfg)))
 
 
 def same_run(config: Configuration, other: Configuration) -> bool:
     """Whether two flat configurations are of one run, wherever it writes."""
-    return config_hash(config) == config_hash(other) and only(config, _ALIKE) == only(other, _ALIKE)
+    return identity_of_run(config) == identity_of_run(other)
 
 
-def take_folder(cfg: DictConfig, out: Path) -> None:
+def identity_of_run(config: Configuration) -> tuple[str, ...]:
+    """What two flat configurations of one run have in common: options, seed, drive (by whatever path)."""
+    found = only(config, _ALIKE)
+    drive = {key: os.path.abspath(value) if isinstance(value, str) else value for key, value in found.items()}
+    return config_hash(config), *(f"{key}={value}" for key, value in sorted(drive.items()))
+
+
+def take_folder(cfg: DictConfig, out: Path, goes_on: bool) -> None:
     """Write the configuration of the run that begins or goes on; nothing of an earlier run stays beside a new one.
 
     Hydra would write it before the run is known to be one.
     """
-    if not cfg.resume:
+    if not goes_on:
         for name in OF_A_RUN:
             path = out / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     folder = out / CONFIGURATION
     folder.mkdir(parents=True, exist_ok=True)
-    hydra = HydraConfig.instance().cfg
-    OmegaConf.save(cfg, folder / "config.yaml")
-    OmegaConf.save(hydra, folder / "hydra.yaml")
-    OmegaConf.save(HydraConfig.get().overrides.task, folder / "overrides.yaml")
+    said = {"overrides": HydraConfig.get().overrides.task, "hydra": HydraConfig.instance().cfg, "config": cfg}
+    for name, part in said.items():
+        with atomic_file(folder / f"{name}.yaml") as temporary:
+            OmegaConf.save(part, temporary)
 
 
 def leave_folder(out: Path, log: str) -> None:
-    """Remove configuration, log and folder of a start that failed before its first step, if nothing else is there."""
+    """Remove configuration, log and folder of a start that failed before its first step, if nothing else is there.
+
+    What another process is at has its lock there.
+    """
     if out.is_dir() and {path.name for path in out.iterdir()} <= {CONFIGURATION, log}:
         shutil.rmtree(out)
 

@@ -1,8 +1,13 @@
-"""How this process takes memory and waits for its threads; said before torch is imported, which reads it once."""
+"""What this process is: how it takes memory and waits for its threads, and whether it is one of several of a run.
+
+Memory and threads are said before torch is imported, which reads them once.
+"""
 
 import ctypes
 import os
 import sys
+from collections.abc import Mapping
+from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 """Of glibc's mallopt (malloc.h)."""
@@ -40,3 +45,14 @@ def wait_politely() -> None:
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
+
+
+def shares_a_run(trainer: Mapping[str, Any]) -> bool:
+    """Whether several processes train one scene."""
+    return trainer.get("strategy") not in (None, "auto")
+
+
+def follows_another(trainer: Mapping[str, Any]) -> bool:
+    """Whether this process is one of those that a run's first one, or the cluster, started beside it."""
+    ranks = ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID")
+    return shares_a_run(trainer) and any(os.environ.get(name, "0") != "0" for name in ranks)

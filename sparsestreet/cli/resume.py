@@ -22,10 +22,10 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
         raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
     run = run_of(Path(given))
     load_run_config(run)  # says what a run's folder is, where this is none
-    if not any((run / "checkpoints").glob("[!.]*.ckpt")):
+    if not has_checkpoint(run):
         raise FileNotFoundError(
-            f"resume={given}: it was ended before its first checkpoint (checkpoint_every=...): start it again, into "
-            f"the same folder with out={run} overwrite=true"
+            f"resume={given}: it was ended before its first checkpoint (checkpoint_every=...): start it again with "
+            f"its own options and out={run}"
         )
     overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
     kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out=", "overwrite="))]
@@ -38,6 +38,11 @@ def run_of(path: Path) -> Path:
     if not path.exists():
         raise FileNotFoundError(f"resume={path}: there is nothing; give a run's folder or one of its checkpoints")
     return path if path.is_dir() else path.resolve().parents[1]
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Whether a run has one that is whole."""
+    return any((run / "checkpoints").glob("[!.]*.ckpt"))
 
 
 def check_resumed(config: dict[str, Any], run: Path) -> None:

@@ -10,9 +10,10 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of, with_views
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.folder import take_folder
+from sparsestreet.cli.device import devices_of_job
+from sparsestreet.cli.folder import start_of, take_folder
 from sparsestreet.cli.preset import preset_notes
-from sparsestreet.cli.process import keep_freed_memory
+from sparsestreet.cli.process import follows_another, keep_freed_memory
 from sparsestreet.evaluation.memory import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.run import train
@@ -47,21 +48,24 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
         recipe = recipe_of(known)
-        take_folder(cfg, out)
-    summary = train(
-        recipe,
-        data,
-        out,
-        max_steps=known.trainer.max_steps,
-        minutes=cfg.budget.minutes,
-        make_trainer=trainer_of(known),
-        logger=logger,
-        identity=identity,
-        extra=extra,
-        resume=Path(cfg.resume) if cfg.resume else None,
-        checkpoint_every=cfg.checkpoint_every,
-        stages=stages,
-    )
+        start = start_of(cfg, out)
+        if not follows_another(cfg.trainer):
+            take_folder(cfg, out, goes_on=start is not None)
+    with devices_of_job(cfg.trainer) as devices:
+        summary = train(
+            recipe,
+            data,
+            out,
+            max_steps=known.trainer.max_steps,
+            minutes=cfg.budget.minutes,
+            make_trainer=trainer_of(known, devices),
+            logger=logger,
+            identity=identity,
+            extra=extra,
+            resume=start,
+            checkpoint_every=cfg.checkpoint_every,
+            stages=stages,
+        )
     return 0.0 if summary is None else summary.mean("psnr_full")
 
 

@@ -9,6 +9,7 @@ from lightning import Callback
 from sparsestreet.cli.assemble import data_of, recipe_of, trainer_of, with_views
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import configuration
+from sparsestreet.cli.device import devices_of_job
 from sparsestreet.cli.run import silence_known_noise
 from sparsestreet.training.callbacks import PhaseTimes
 from sparsestreet.training.run import build, fit
@@ -38,7 +39,9 @@ def train_with(overrides: Sequence[str], folder: Path) -> Callable[[Callback], S
         system = build(recipe, data, recipe.plan(data))
         # One recorder at a time.
         callbacks = [callback for callback in recipe.callbacks.values() if not isinstance(callback, PhaseTimes)]
-        fit(system, data, [*callbacks, watch], trainer_of(known), folder, max_steps=known.trainer.max_steps)
+        with devices_of_job(known.trainer) as devices:
+            make = trainer_of(known, devices)
+            fit(system, data, [*callbacks, watch], make, folder, max_steps=known.trainer.max_steps)
         return system
 
     return train

@@ -16,7 +16,9 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.compose import configuration, resolved, without_flags
 from sparsestreet.cli.flags import SHOWS, SWEEPS, flags_of
-from sparsestreet.cli.folder import folder_problem, holds_same_run, same_run
+from sparsestreet.cli.folder import folder_problem, holds_same_run, is_whole, same_run
+from sparsestreet.cli.locks import FolderTakenError
+from sparsestreet.cli.signals import beside_each_other, end_with_jobs
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
@@ -35,6 +37,9 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         SweepFolder.folder = Path(config.hydra.sweep.dir)
+        if beside_each_other(config.hydra):
+            SweepFolder.folder.mkdir(parents=True, exist_ok=True)
+            end_with_jobs(SweepFolder.folder)
 
 
 def as_sweep(arguments: list[str]) -> list[str]:
@@ -85,8 +90,9 @@ def sweep_status() -> int:
 def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> float | None:
     """One job of a sweep: skipped where its folder holds its record, and written down where it fails.
 
-    Answers with the PSNR that ``train`` answered with or the record holds, NaN for a job that failed. Where the folder
-    holds another run, the whole sweep ends with status 2, so that nothing is written into that one.
+    Answers with the PSNR that ``train`` answered with or the record holds, NaN for a job that failed, or that another
+    process is at. Where the folder holds another run, the whole sweep ends with status 2, so that nothing is written
+    into that one.
     """
     from sparsestreet.cli.assemble import this_command
 
@@ -99,6 +105,9 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
             done = train()
         else:
             log.info("%s holds a complete record of this configuration: skipped", out)
+    except FolderTakenError as error:
+        log.error("%s", error)  # a word in that folder would speak of the run that is under way
+        return math.nan
     except Exception as error:  # a sweep goes on, whatever one job dies of
         log.exception("%s failed", out)
         command = this_command(["train", *HydraConfig.get().overrides.task])
@@ -118,6 +127,8 @@ def finished(cfg: DictConfig, out: Path) -> float | None:
     try:
         summary = SUMMARY.read(out)
     except RecordError:
+        return None
+    if not is_whole(out):
         return None
     seen = summary.run.config.get("training_views.images")
     config = flat_config(resolved(with_images(cfg, seen) if isinstance(seen, int) else cfg))

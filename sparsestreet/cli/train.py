@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import hydra
@@ -16,7 +17,11 @@ from sparsestreet.cli.compose import CONF, composed, override_problem, resolved,
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
+from sparsestreet.cli.locks import sole_writer
+from sparsestreet.cli.process import follows_another
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
+from sparsestreet.cli.reuse import finished_elsewhere, take_finished
+from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
 
 _started = 0.0
@@ -26,7 +31,7 @@ _started = 0.0
 def train(arguments: list[str]) -> int:
     """Run the Hydra app on these overrides.
 
-    Returns 2 if they are wrong, 1 if the data is or a job of a sweep failed, 130 or 143 if a signal ended it.
+    Returns 2 if they are wrong, 1 if the data is or a job of a sweep failed. A signal ends it with 128 + its number.
     """
     global _started
     _started = time.perf_counter()
@@ -48,7 +53,8 @@ def train(arguments: list[str]) -> int:
             print(f"sparsestreet train: {note}", file=sys.stderr)
     sys.argv = [sys.argv[0], *arguments]  # which Hydra reads
     SweepFolder.folder = None  # of an earlier command of this process
-    app()
+    with handlers_put_back():
+        app()
     return sweep_status()
 
 
@@ -87,7 +93,9 @@ def app(cfg: DictConfig) -> float | None:
     sys.argv = [sys.argv[0], "train", *HydraConfig.get().overrides.task]
     out = Path(HydraConfig.get().runtime.output_dir)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        return run_job(cfg, out, lambda: _run(cfg, out, started))
+        hydra = HydraConfig.get()
+        with job_beside_others(Path(hydra.sweep.dir)) if beside_each_other(hydra) else nullcontext():
+            return run_job(cfg, out, lambda: _run(cfg, out, started))
     try:
         # Again, because hydra.run.dir may lead elsewhere than out.
         if problem := folder_problem(cfg, out):
@@ -104,6 +112,10 @@ def app(cfg: DictConfig) -> float | None:
 
 
 def _run(cfg: DictConfig, out: Path, started: float) -> float | None:
-    from sparsestreet.cli.run import run  # torch and Lightning: seconds, which a refused start does not wait for
+    # The first of several processes of a run holds the folder for all.
+    with nullcontext() if follows_another(cfg.trainer) else sole_writer(out):
+        if HydraConfig.get().mode == RunMode.MULTIRUN and (standing := finished_elsewhere(cfg, out)):
+            return take_finished(cfg, standing, out)
+        from sparsestreet.cli.run import run  # torch and Lightning: seconds, which a refused start does not wait for
 
-    return run(cfg, out, started)
+        return run(cfg, out, started)

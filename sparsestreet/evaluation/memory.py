@@ -14,7 +14,8 @@ def forget_peaks() -> None:
     with suppress(OSError):  # not Linux, or not allowed: the peak is that of the process
         _FORGET.write_text("5")
     if torch.cuda.is_initialized():
-        torch.cuda.reset_peak_memory_stats()
+        for device in range(torch.cuda.device_count()):
+            torch.cuda.reset_peak_memory_stats(device)
 
 
 def peak_megabytes(device: torch.device) -> tuple[float, float | None]:

@@ -20,6 +20,7 @@ IDENTITY_KEYS = (
     "label",
     "resume",  # a resumed run is the same run
     "overwrite",
+    "reuse",
     "checkpoint_every",
     "out",
     "folder",
@@ -71,8 +72,20 @@ def config_hash(config: Configuration) -> str:
     >>> config_hash({"seed": 0, "schedule.max_steps": 100}) == config_hash({"seed": 1, "schedule.max_steps": 100})
     True
     """
-    text = "\n".join(f"{key}={_canonical(value)}" for key, value in sorted(without(config, IDENTITY_KEYS).items()))
+    identity = without(config, IDENTITY_KEYS)
+    if "trainer.devices" in identity:
+        identity["trainer.devices"] = _number_of_devices(config)
+    text = "\n".join(f"{key}={_canonical(value)}" for key, value in sorted(identity.items()))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _number_of_devices(config: Configuration) -> Setting:
+    """How many devices share a step, whichever they are; one, unless a strategy says how several do."""
+    devices = config["trainer.devices"]
+    if isinstance(devices, list):
+        return len(devices)
+    alone = config.get("trainer.strategy") in (None, "auto")
+    return 1 if alone and isinstance(devices, str) else devices
 
 
 def without(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
+from sparsestreet.records.same_as import SAME_AS
 from sparsestreet.records.strict_json import write_atomically
 from sparsestreet.report.arms import Arm, arms, incomplete, why_apart
 from sparsestreet.report.beside import beside_the_path
@@ -49,7 +50,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     grids = _grids(found, failures, protocol, name)
     folder = sweep / "report"
     figures, absent = _figures(found, protocol, folder / "figures")
-    notes = [*incomplete(found), *why_apart(found), *_caps(found), *_unfinished(records), *absent]
+    notes = [*incomplete(found), *why_apart(found), *_caps(found), *_unfinished(records), *_taken(records), *absent]
     write_atomically(folder / "tables.md", markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes))
     write_atomically(folder / "tables.tex", latex(grids))
     write_atomically(folder / "tables.csv", comma_separated(grids))
@@ -139,6 +140,11 @@ def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[li
 def _caps(found: Sequence[Arm]) -> list[str]:
     held = sorted({arm.title for arm in found for record in arm.records if record.summary.run.caps})
     return [f"counts held down by max_gaussians, so that shares of them say little: {', '.join(held)}"] if held else []
+
+
+def _taken(records: Sequence[RunRecord]) -> list[str]:
+    names = [record.folder.name for record in records if SAME_AS.exists(record.folder)]
+    return [f"trained by another sweep, whose runs these are: {', '.join(names)}"] if names else []
 
 
 def _unfinished(records: Sequence[RunRecord]) -> list[str]:

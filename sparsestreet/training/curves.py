@@ -4,7 +4,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sparsestreet.records.logged import LOGGED
+from sparsestreet.records.logged import LOGGED, Logged, LoggedFile
+
+EARLIER = LoggedFile("curves/earlier.csv")
+"""What a run logged before it went on, while it goes on: another kill must not lose it."""
 
 
 @contextmanager
@@ -14,9 +17,19 @@ def kept_curves(run: Path, resumed_at: int | None) -> Iterator[None]:
     Lightning's CSV logger begins its file anew. What an earlier part logged behind the checkpoint is left out: those
     steps are taken again.
     """
-    earlier = [] if resumed_at is None else [row for row in LOGGED.rows(run) if int(row["step"]) < resumed_at]
+    logged = [] if resumed_at is None else _joined(run)
+    earlier = [row for row in logged if resumed_at is not None and int(row["step"]) < resumed_at]
+    if earlier:
+        EARLIER.write(run, earlier)
     try:
         yield
     finally:
         if earlier:
-            LOGGED.write(run, earlier + LOGGED.rows(run))
+            LOGGED.write(run, _joined(run))
+            EARLIER.remove(run)
+
+
+def _joined(run: Path) -> list[Logged]:
+    """The rows of both files; a kill may leave a row in both."""
+    rows = [*EARLIER.rows(run), *LOGGED.rows(run)]
+    return list({tuple(sorted((name, text) for name, text in row.items() if text)): row for row in rows}.values())

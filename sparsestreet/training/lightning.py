@@ -16,6 +16,12 @@ def callbacks_of(trainer: Trainer) -> list[Callback]:
     return trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def validates_now(trainer: Trainer) -> bool:
+    """Whether validation follows the step that is ending; Lightning makes up for none when a run goes on."""
+    fetcher = trainer.fit_loop._data_fetcher
+    return fetcher is not None and trainer.fit_loop.epoch_loop._should_check_val_fx(fetcher)
+
+
 def is_dev_run(trainer: Trainer) -> bool:
     """Whether it only tries a few steps (``fast_dev_run``)."""
     return bool(trainer.fast_dev_run)  # pyright: ignore[reportAttributeAccessIssue]

@@ -133,6 +133,7 @@ def train(
                     system, data, callbacks, make_trainer, out, max_steps=max_steps, logger=logger, start=checkpoint
                 )
         except SystemExit:
+            stop.hand_on()
             sys.exit(stop.exit_status or 1)
         if is_dev_run(trainer):
             log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)

@@ -148,6 +148,12 @@ class StreetSystem(LightningModule):
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
         set_rates(self.trainer.optimizers[0], self.state().progress)
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["train_psnr"] = [value.cpu() for value in self.train_psnr]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.train_psnr.extend(value.to(self.device) for value in checkpoint.get("train_psnr", ()))
+
     def _logs(self) -> bool:
         """Whether Lightning's loggers will take what this step says; in other steps nothing is computed for them."""
         # Lightning's own word: in a resumed run its count of batches is not the step.

@@ -96,7 +96,8 @@ def test_a_run_is_called_what_its_configuration_says(log):
 
 
 def test_a_trainer_and_a_logger(tmp_path):
-    assert trainer_of(composed(*WORDS)).keywords["log_every_n_steps"] == 4
+    given = trainer_of(composed(*WORDS), [3]).keywords
+    assert (given["log_every_n_steps"], given["devices"]) == (4, [3])
     assert logger_of(composed("logger=none")) is False
     cfg = as_a(DictConfig, OmegaConf.merge(composed(), {"folder": str(tmp_path)}))
     assert Path(as_a(CSVLogger, logger_of(cfg)).log_dir) == tmp_path / "curves"
@@ -123,13 +124,18 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
     for name in ("keep_freed_memory", "forget_peaks", "silence_known_noise"):
         monkeypatch.setattr(run_module, name, lambda name=name: order.append(name))
     monkeypatch.setattr(run_module, "train", lambda *args, **how: called.append((args, how)) or summary)
-    monkeypatch.setattr(run_module, "take_folder", lambda cfg, out: order.append(f"take {out.name}"))
+    monkeypatch.setattr(run_module, "take_folder", lambda cfg, out, goes_on: order.append(f"take {out.name} {goes_on}"))
     task = OmegaConf.create({"overrides": {"task": ["seed=7", "out=a b"]}})
     monkeypatch.setattr(HydraConfig, "get", lambda: task)
     started = time.perf_counter() - 3
     assert run(composed(*words), tmp_path, started) == (21.5 if summary else 0.0)
     (((recipe, data, out), how),) = called
-    assert order == ["keep_freed_memory", "forget_peaks", "silence_known_noise", f"take {tmp_path.name}"]
+    assert order == [
+        "keep_freed_memory",
+        "forget_peaks",
+        "silence_known_noise",
+        f"take {tmp_path.name} {resume is not None}",
+    ]
     assert (recipe.seed, data.driving_log, out) == (7, log, tmp_path)
     assert (how["max_steps"], how["checkpoint_every"]) == (90, 30)
     assert how["make_trainer"].keywords["log_every_n_steps"] == 4

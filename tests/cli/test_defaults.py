@@ -25,7 +25,7 @@ def cfg():
 
 
 def test_the_trainer(cfg):
-    configured = trainer_of(cfg)
+    configured = trainer_of(cfg, cfg.trainer.devices)
     assert configured.func is CPU_TRAINER.func is Trainer
     # What is left out has these values by itself.
     plain = {"max_steps": cfg.schedule.max_steps, "precision": "32-true", "fast_dev_run": False}

@@ -1,5 +1,6 @@
 """Whose folder a run writes into: nobody else's unless asked, and none for a start that fails."""
 
+import math
 import os
 from pathlib import Path
 
@@ -8,17 +9,19 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli import folder
 from sparsestreet.cli.compose import composed, resolved
-from sparsestreet.cli.folder import OF_A_RUN, folder_problem, leave_folder, take_folder
+from sparsestreet.cli.folder import OF_A_RUN, folder_problem, leave_folder, start_of, take_folder
+from sparsestreet.cli.locks import sole_writer
 from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.sweep import run_job
 from sparsestreet.cli.train import train
 from sparsestreet.records.configuration import flat_config
+from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
 from tests.evaluation.frames import make_summary
 from tests.typed import there
 
 
-def a_run(out: Path, *overrides: str, steps: int | None = 60) -> Path:
+def a_run(out: Path, *overrides: str, steps: int | None = 60, measured: bool = True) -> Path:
     """A folder as training leaves it, after so many of 60 steps; None: killed before it could say how many."""
     cfg = composed(overrides)
     (out / "checkpoints").mkdir(parents=True)
@@ -29,7 +32,60 @@ def a_run(out: Path, *overrides: str, steps: int | None = 60) -> Path:
     if steps is not None:
         config = flat_config(resolved(cfg))
         RUN.write(out, make_summary(cfg.name, cfg.seed, config=config, steps=steps).run)
+    if steps == 60:
+        update_costs(out, wall_seconds=1.0 if measured else None, phases={"train": 1.0})
     return out
+
+
+@pytest.mark.parametrize(
+    ("made", "asked", "goes_on"),
+    [
+        ({"steps": 23}, (), True),
+        ({"steps": None}, (), True),  # killed between two checkpoints
+        ({"measured": False}, (), True),  # killed while it was measured
+        ({"steps": 23}, ("overwrite=true",), False),
+        ({"steps": 23}, ("seed=1",), False),
+    ],
+)
+def test_this_very_run_goes_on_without_being_asked(made, asked, goes_on, tmp_path):
+    out = a_run(tmp_path / "run", **made)
+    assert start_of(composed(asked), out) == (out if goes_on else None)
+    assert start_of(composed(asked), tmp_path / "new") is None
+
+
+def test_a_run_that_was_ended_before_its_first_checkpoint_begins_again(tmp_path, caplog):
+    out = a_run(tmp_path / "run", steps=None)
+    (out / "checkpoints/last.ckpt").rename(out / "checkpoints/.last.99.tmp.ckpt")
+    assert folder_problem(composed(()), out) is None
+    with caplog.at_level("INFO"):
+        assert start_of(composed(()), out) is None
+    assert "ended before its first checkpoint: it begins again" in caplog.text
+
+
+def test_a_run_that_is_led_elsewhere_goes_on_there(tmp_path):
+    """The same words again: what the second folder has by now is further than what it came from."""
+    run, led = a_run(tmp_path / "run", steps=23), tmp_path / "led"
+    cfg = composed([f"resume={run}"])
+    assert start_of(cfg, led) == run
+    a_run(led, steps=None)
+    assert start_of(cfg, led) == led
+    assert start_of(cfg, run) == run
+
+
+def test_a_drive_is_the_same_by_another_path(tmp_path, monkeypatch):
+    """A configuration is read back with whole paths."""
+    monkeypatch.chdir(tmp_path)
+    words = ("data=drivestudio", "data.root=drives/1")
+    a_run(Path("run"), *words, steps=23)
+    OmegaConf.save({"hydra": {"runtime": {"cwd": str(tmp_path)}}}, "run/.hydra/hydra.yaml")
+    assert start_of(composed(words), Path("run")) == Path("run")
+    assert "holds another run" in there(folder_problem(composed([words[0], "data.root=drives/2"]), Path("run")))
+
+
+def test_a_configuration_that_was_torn_is_another_run(tmp_path):
+    out = a_run(tmp_path / "run", steps=None)
+    (out / ".hydra/config.yaml").write_text('name: "str')
+    assert "holds another run" in there(folder_problem(composed(()), out))
 
 
 def contents(out: Path) -> dict[Path, int]:
@@ -40,8 +96,8 @@ def contents(out: Path) -> dict[Path, int]:
     ("words", "steps", "said"),
     [
         ((), 60, "holds this very run, finished: sparsestreet evaluate run={out}, or replace it: overwrite=true"),
-        ((), 23, "holds this very run, unfinished: go on with resume={out}, or begin again: overwrite=true"),
-        ((), None, "holds this very run, unfinished: go on with resume={out}, or begin again: overwrite=true"),
+        ((), 23, None),  # it goes on
+        ((), None, None),
         (("seed=1",), 60, "holds another run (streetgs, seed 0): name another place with out=..., or replace it: over"),
         (("sparsify=paper",), 23, "holds another run (streetgs, seed 0)"),
         (("data=drivestudio", "data.root=/drives/1"), None, "holds another run: name"),
@@ -68,7 +124,7 @@ def test_a_run_without_a_checkpoint_is_said_at_once(tmp_path, capsys):
     out = a_run(tmp_path / "run", steps=None)
     (out / "checkpoints/last.ckpt").rename(out / "checkpoints/.last.99.tmp.ckpt")  # killed while it wrote the first
     assert train([f"resume={out}"]) == 2
-    assert f"start it again, into the same folder with out={out} overwrite=true" in capsys.readouterr().err
+    assert f"start it again with its own options and out={out}" in capsys.readouterr().err
 
 
 def test_what_is_no_run_is_no_obstacle(tmp_path):
@@ -119,6 +175,32 @@ def test_a_job_of_a_sweep_replaces_itself_alone(tmp_path, capsys):
     assert run_job(composed(["sparsify=paper", "overwrite=true"]), out, lambda: 26.0) == 26.0
 
 
+def test_two_runs_in_one_folder(tmp_path, capsys):
+    """The second is told at once, before it reads anything; what the first has written by then stays."""
+    out = tmp_path / "run"
+    with sole_writer(out):
+        with pytest.raises(SystemExit) as ended:
+            train([f"out={out}"])
+        assert ended.value.code == 1
+        assert (out / ".lock").exists()
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith(f"sparsestreet train: {out} is being written by process {os.getpid()} on ")
+
+
+def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, caplog):
+    """Without a word in its folder, which would take that run out of reports."""
+
+    def trains() -> float:
+        with sole_writer(tmp_path):
+            return 25.0
+
+    with sole_writer(tmp_path):
+        assert math.isnan(there(run_job(composed(()), tmp_path, trains)))
+        assert [path.name for path in tmp_path.iterdir()] == [".lock"]
+    assert "is being written by process" in caplog.text
+
+
 @pytest.fixture
 def within_hydra(monkeypatch):
     """As within its app."""
@@ -131,10 +213,10 @@ def within_hydra(monkeypatch):
 def test_nothing_of_a_replaced_run_stays_beside_the_new_one(tmp_path):
     out = a_run(tmp_path / "run")
     for name in ("records", "pictures", "curves", "predictions"):
-        (out / name).mkdir()
+        (out / name).mkdir(exist_ok=True)
         (out / name / "old").touch()
     (out / "notes.txt").touch()
-    take_folder(composed(["overwrite=true", "seed=1"]), out)
+    take_folder(composed(["overwrite=true", "seed=1"]), out, goes_on=False)
     assert not [name for name in OF_A_RUN if (out / name).exists()]
     assert (out / "notes.txt").is_file()
     config, hydra, overrides = (
@@ -150,7 +232,7 @@ def test_nothing_of_a_replaced_run_stays_beside_the_new_one(tmp_path):
 @pytest.mark.usefixtures("within_hydra")
 def test_a_run_that_goes_on_keeps_its_files(tmp_path):
     out = a_run(tmp_path / "run", steps=23)
-    take_folder(composed([f"resume={out}"]), out)
+    take_folder(composed([f"resume={out}"]), out, goes_on=True)
     assert (out / "checkpoints/last.ckpt").is_file()
     assert RUN.read(out).steps == 23
 

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from sparsestreet.cli.process import SPINS, wait_politely
+from sparsestreet.cli.process import SPINS, follows_another, wait_politely
 
 
 @pytest.mark.parametrize(
@@ -19,3 +19,15 @@ def test_threads_sleep_unless_the_environment_says_otherwise(monkeypatch, given,
         monkeypatch.setenv(name, value)
     wait_politely()
     assert os.environ.get("GOMP_SPINCOUNT") == expected
+
+
+@pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"])
+def test_the_first_process_of_a_run_follows_nobody(name, monkeypatch):
+    """Nor does any that shares no run: a cluster numbers jobs that know nothing of each other as well."""
+    for one in ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"):
+        monkeypatch.setenv(one, "0")
+    assert not follows_another({"strategy": "ddp"})
+    monkeypatch.setenv(name, "1")
+    assert follows_another({"strategy": "ddp"})
+    for alone in ({}, {"strategy": "auto"}, {"strategy": None}):
+        assert not follows_another(alone)

@@ -1,6 +1,5 @@
 """Sweeps: what composes, what is skipped, what fails and stands."""
 
-import importlib
 import math
 
 import pytest
@@ -13,6 +12,7 @@ from sparsestreet.cli.compose import CONF, override_problem
 from sparsestreet.cli.report import sweep_name
 from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, note_of_sweep, run_job, sweep_problem, sweep_status
 from sparsestreet.cli.train import train
+from sparsestreet.records.costs import update_costs
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report.published import TABLES
@@ -168,13 +168,8 @@ def test_a_shown_sweep_says_what_its_jobs_differ_in():
 
 def test_launchers_compose_or_say_how_they_are_installed():
     assert override_problem(["-m", "+sweep=tiny", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]) is None
-    problem = override_problem(["hydra/launcher=submitit_slurm"])
-    try:
-        importlib.import_module("hydra_plugins.hydra_submitit_launcher")
-    except ImportError:
-        assert "pip install hydra-submitit-launcher" in there(problem)
-    else:
-        assert problem is None
+    assert override_problem(["-m", "+sweep=tiny", "hydra/launcher=submitit_slurm"]) is None
+    assert "pip install hydra-ray-launcher" in there(override_problem(["hydra/launcher=ray"]))
 
 
 @pytest.mark.parametrize(
@@ -191,11 +186,14 @@ def test_launchers_compose_or_say_how_they_are_installed():
 def test_a_job_is_done_where_its_folder_holds_its_complete_record(tmp_path, change, steps, done):
     summary = make_summary("plain", 0, 25.0, config={"data.root": "/drives/1"}, steps=steps)
     SUMMARY.write(tmp_path, summary)
+    update_costs(tmp_path, wall_seconds=1.0, phases={"train": 1.0})
     asked = OmegaConf.create()
     for key, value in (summary.run.config | change).items():
         OmegaConf.update(asked, key, value, force_add=True)
     assert finished(asked, tmp_path) == done
     assert finished(asked, tmp_path / "elsewhere") is None
+    update_costs(tmp_path, wall_seconds=None)  # killed while it was measured
+    assert finished(asked, tmp_path) is None
 
 
 def test_a_failure_stands_until_its_job_succeeds(tmp_path, monkeypatch, capsys):

@@ -30,6 +30,7 @@ def test_a_tree_becomes_flat():
         {"trainer.accelerator": "gpu"},
         {"trainer.val_check_interval": 5},
         {"evaluation.novel": [1, 2]},
+        {"reuse": False},
     ],
 )
 def test_what_names_or_places_a_run_is_no_part_of_its_identity(names):
@@ -51,6 +52,15 @@ def test_what_names_or_places_a_run_is_no_part_of_its_identity(names):
 )
 def test_every_other_option_is(changed):
     assert config_hash(CONFIG | changed) != config_hash(CONFIG)
+
+
+def test_which_devices_train_is_no_part_of_it_but_how_many_share_a_step_is():
+    one = config_hash(CONFIG | {"trainer.devices": 1})
+    for devices in ([3], "3,", "auto", "1"):
+        assert config_hash(CONFIG | {"trainer.devices": devices}) == one
+    shared = CONFIG | {"trainer.strategy": "ddp"}
+    assert config_hash(shared | {"trainer.devices": [2, 3]}) == config_hash(shared | {"trainer.devices": 2}) != one
+    assert config_hash(shared | {"trainer.devices": "auto"}) != config_hash(shared | {"trainer.devices": 1})
 
 
 def test_the_hash_knows_neither_order_nor_the_spelling_of_numbers():

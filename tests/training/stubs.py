@@ -166,6 +166,8 @@ class StubTrainer(Trainer):
     world_size: int = 1
     accumulate_grad_batches: int = 1
     strategy: Any = SimpleNamespace(broadcast=lambda value: value)
+    loggers: Sequence[Any] = ()
+    fit_loop: Any = SimpleNamespace(_data_fetcher=None)  # nothing is validated
 
     def __init__(
         self,

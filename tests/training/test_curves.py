@@ -39,6 +39,21 @@ def test_they_stay_where_training_stops_again_before_it_logs(tmp_path):
     assert path.read_text() == "psnr,step\n10,9\n"
 
 
+def test_a_kill_while_a_run_goes_on_takes_no_row(tmp_path):
+    """Twice: before Lightning begins its file anew, and when it has logged."""
+    path = tmp_path / "curves" / "metrics.csv"
+    write(path, "psnr,step\n10,9\n11,19\n")
+    killed = kept_curves(tmp_path, resumed_at=15)
+    killed.__enter__()
+    again = kept_curves(tmp_path, resumed_at=15)
+    again.__enter__()
+    write(path, "psnr,step,val/psnr\n21,19,\n,20,25\n22,29,\n")
+    with kept_curves(tmp_path, resumed_at=25):
+        write(path, "psnr,step\n32,29\n")
+    assert path.read_text() == "psnr,step,val/psnr\n10,9,\n21,19,\n,20,25\n32,29,\n"
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+
+
 def test_without_a_file_there_is_nothing_to_keep(tmp_path):
     with kept_curves(tmp_path, resumed_at=15):
         pass

@@ -8,7 +8,7 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
 from sparsestreet.training.callbacks.graceful_stop import TornStop
-from sparsestreet.training.lightning import ends_step, ranks_of
+from sparsestreet.training.lightning import ends_step, ranks_of, validates_now
 
 log = logging.getLogger(__name__)
 
@@ -20,14 +20,15 @@ class Checkpoints(Callback):
 
     Each is written beside its place and renamed: whole or not at all, also on a full disk. Where a periodic one cannot
     be written, training goes on; where the last one cannot, the error is raised. It stands behind the callbacks that
-    change rows, so that a checkpoint holds the rows as they left them. (Lightning's ModelCheckpoint has no notion of a
-    plain last state without a monitored metric, and its OnExceptionCheckpoint resumes from that file by itself in the
-    next run.)
+    change rows, so that a checkpoint holds the rows as they left them. It waits for the validation of its step, which
+    Lightning would not make up for when the run goes on. (Lightning's ModelCheckpoint has no notion of a plain last
+    state without a monitored metric, and its OnExceptionCheckpoint resumes from that file by itself in the next run.)
     """
 
     def __init__(self, folder: str | Path, every: int = 1000) -> None:
         self.folder = Path(folder)
         self.every = every
+        self._due = False
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remove what a process left that was killed while it wrote one: its name has the number of that process."""
@@ -37,11 +38,16 @@ class Checkpoints(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        if (
+        self._due = (
             ends_step(trainer, batch_idx)
             and trainer.global_step % self.every == 0
             and trainer.global_step < trainer.max_steps
-        ):
+        )
+        if self._due and not validates_now(trainer):
+            self._try_to_save(trainer, LAST)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._due and not trainer.sanity_checking:
             self._try_to_save(trainer, LAST)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -68,6 +74,8 @@ class Checkpoints(Callback):
         return True
 
     def _save(self, trainer: Trainer, name: str) -> None:
+        for logger in trainer.loggers:
+            logger.save()  # else a kill takes the rows of steps that are never taken again
         with stage("save"), atomic_file(self.folder / name) as temporary:
             trainer.save_checkpoint(temporary, weights_only=False)
 

@@ -54,7 +54,10 @@ def train(folder: Any, sends: Sends) -> tuple[Any, GracefulStop]:
     return system, stop
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138), (signal.SIGUSR2, 140)],
+)
 def test_a_signal_ends_training_after_its_step(tmp_path, handlers, number, status):
     stop = GracefulStop()
     system = make_system({"background": background(5)}, sh_interval=1.0)  # else some columns start late
@@ -67,6 +70,80 @@ def test_a_signal_ends_training_after_its_step(tmp_path, handlers, number, statu
     assert {float(moments["step"]) for moments in state.values()} == {2.0}  # the whole of the second step
     assert not (tmp_path / "last.ckpt").exists()
     assert present() == handlers
+
+
+def test_what_clusters_send_behind_the_first_asks_for_nothing_new(tmp_path):
+    stop = GracefulStop()
+    system = make_system({"background": background(5)})
+    with pytest.raises(SystemExit):
+        sends = Sends(2, signal.SIGUSR2, signal.SIGTERM, signal.SIGUSR2)
+        fit(system, [sends, Checkpoints(tmp_path), stop], STEPS, frame_at())
+    assert stop.exit_status == 140
+    assert torch.load(tmp_path / "interrupted.ckpt", weights_only=False)["global_step"] == 2
+
+
+def test_an_ignored_signal_stays_ignored(tmp_path):
+    """Of a run that nohup started, when its terminal closes."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    _, stop = train(tmp_path, Sends(2, signal.SIGHUP))
+    assert stop.exit_status == 0
+
+
+def test_a_signal_is_handed_on_to_whoever_waited_for_it(tmp_path):
+    """After the checkpoint is written; submitit requeues its job then."""
+    seen: list[tuple[int, bool]] = []
+    signal.signal(signal.SIGUSR2, lambda number, frame: seen.append((number, (tmp_path / "interrupted.ckpt").exists())))
+    stop = GracefulStop()
+    with pytest.raises(SystemExit):
+        fit(
+            make_system({"background": background(5)}),
+            [Sends(2, signal.SIGUSR2), Checkpoints(tmp_path), stop],
+            STEPS,
+            frame_at(),
+        )
+    assert seen == []
+    stop.hand_on()
+    assert seen == [(signal.SIGUSR2, True)]
+
+
+@pytest.mark.parametrize("number", [None, signal.SIGINT, signal.SIGTERM])
+def test_there_may_be_nobody_to_hand_it_on_to(number):
+    """Python's own answer to Ctrl-C is no answer to one that was heeded, and the system's would end the process."""
+    stop = GracefulStop()
+    stop.received = number
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    stop.hand_on()
+
+
+class Validated(Callback):
+    """At which steps validation ended."""
+
+    def __init__(self) -> None:
+        self.steps: list[int] = []
+
+    def on_validation_end(self, trainer: Trainer, pl_module: Any) -> None:
+        if not trainer.sanity_checking:
+            self.steps.append(trainer.global_step)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_stop_and_a_checkpoint_wait_for_the_validation_of_their_step(tmp_path, every):
+    """Lightning makes up for none when training goes on; what was counted, and what stood in its state."""
+    seen, stop, kept = Validated(), GracefulStop(), []
+
+    class Keeps(Checkpoints):
+        def _save(self, trainer: Trainer, name: str) -> None:
+            kept.append((name, trainer.global_step, list(seen.steps)))
+            super()._save(trainer, name)
+
+    system = make_system({"background": background(5)})
+    validated = {"limit_val_batches": 1, "val_check_interval": 2, "check_val_every_n_epoch": None}
+    with pytest.raises(SystemExit):
+        fit(system, [seen, Sends(4, signal.SIGTERM), Keeps(tmp_path, every), stop], 6, frame_at(), **validated)
+    assert seen.steps == [2, 4]
+    periodic = [("last.ckpt", 1, []), ("last.ckpt", 2, [2]), ("last.ckpt", 3, [2]), ("last.ckpt", 4, [2, 4])]
+    assert kept[:-1] == [one for one in periodic if one[1] % every == 0]
+    assert kept[-1] == ("interrupted.ckpt", 4, [2, 4])
 
 
 class SendsBefore(Callback):

@@ -1,0 +1,94 @@
+"""A sweep that is killed, whatever it was doing, ends with the records of one that nobody disturbed."""
+
+import csv
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.conftest import TIMED_ONCE
+
+KILLS = 5
+JOBS = 12
+TIMES = {"training_seconds", "seconds", "noise", "latency", "evaluated", "out"}
+"""Keys and columns of records that hold times, or when a run was made."""
+REPEATED = "train/moved"
+"""Columns of losses that most steps lack: Lightning writes the value of the last step that had one, and forgets it when
+a run goes on."""
+OF_TIMES = {"latency.csv", "phases.csv", "cost.json"}
+OF_WAYS = {".hydra", "checkpoints", "pictures", "counts.png", "held_out.png", "psnr.png", "train.log", "multirun.yaml"}
+"""Configurations and pictures hold times; a checkpoint is a way to the end."""
+
+
+def sweep(folder: Path, street: list[str]) -> list[str]:
+    return [
+        sys.executable, "-m", "sparsestreet", "train",
+        "+sweep=tiny", *street, "data.log.settings.seed=0", *TIMED_ONCE,
+        f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${name}_${seed}",
+        "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
+        "sparsify=none,removal", "seed=0,1,2,3,4,5", "schedule.max_steps=200", "checkpoint_every=10", "reuse=false",
+    ]  # fmt: skip
+
+
+def ended(command: list[str], after: float | None) -> bool:
+    """Whether it came to its end; all of its processes are killed after so many seconds."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        command, env=environment, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        _, errors = process.communicate(timeout=after)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return False
+    assert process.returncode == 0, errors
+    return True
+
+
+def content(folder: Path) -> dict[str, Any]:
+    """Each file that the runs of a sweep leave, but for its times."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in OF_TIMES)
+    of_runs = (path for path in files if not OF_WAYS & set(path.relative_to(folder).parts))
+    return {str(path.relative_to(folder)): _read(path, folder) for path in of_runs}
+
+
+def _read(path: Path, folder: Path) -> Any:
+    if path.suffix == ".json":
+        return _timeless(json.loads(path.read_text().replace(str(folder), "")))
+    if path.suffix == ".csv":
+        return [_timeless(row) for row in csv.DictReader(path.read_text().splitlines())]
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _timeless(one) for key, one in value.items() if key not in TIMES and not key.startswith(REPEATED)}
+    return [_timeless(one) for one in value] if isinstance(value, list) else value
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_at_random_ends_as_an_undisturbed_one(tiny_street, tmp_path):
+    """The whole group of processes dies five times, then the command comes to its end."""
+    street = [word for word in tiny_street if word.startswith(("data.", "image_points."))]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    started = time.monotonic()
+    assert ended(sweep(whole, street), after=None)
+    took = time.monotonic() - started
+    moments = random.Random(26)
+    for _ in range(KILLS):
+        # A start takes its seconds before the first job: kills that come earlier would disturb nothing.
+        assert not ended(sweep(killed, street), after=moments.uniform(0.1, 0.35) * took)
+    assert ended(sweep(killed, street), after=None)
+    expected, got = content(whole), content(killed)
+    assert len([name for name in expected if name.endswith("summary.json")]) == JOBS
+    assert sorted(expected) == sorted(got)
+    assert [name for name in expected if expected[name] != got[name]] == []
