@@ -33,8 +33,8 @@ class MadeUpDrive:
         say(f"writing {self.images} images of {self.width}x{self.height} into {folder}")
         canvas, generator = self._canvas(), np.random.default_rng(1)
         with atomic_folder(folder) as partial:
-            focal = [self.width, self.width, self.width / 2, self.height / 2, 0, 0, 0, 0, 0]
-            _write(partial / "intrinsics/0.txt", number_lines(focal))
+            intrinsics = np.array([self.width, self.width, self.width / 2, self.height / 2, 0, 0, 0, 0, 0], float)
+            _write(partial / "intrinsics/0.txt", number_lines(intrinsics))
             for frame in range(self.images):
                 top, left = generator.integers(0, (self.height, self.width))
                 window = canvas[top : top + self.height, left : left + self.width]

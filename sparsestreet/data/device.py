@@ -54,8 +54,11 @@ class CopyStream:
 
     def send(self, frame: Frame) -> Arriving:
         """Any thread may call it, and waits for the pinned copy on the host alone."""
+        done = torch.cuda.Event()
         with torch.cuda.stream(self._stream):
-            return Arriving(to_device(frame, self._device), self._stream.record_event())
+            moved = to_device(frame, self._device)
+            done.record(self._stream)
+        return Arriving(moved, done)
 
 
 def _tensors(frame: Frame) -> Iterator[torch.Tensor]:

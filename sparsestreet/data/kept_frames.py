@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from sparsestreet.data.free_memory import free_bytes
 from sparsestreet.data.lock import Lock
@@ -50,7 +50,7 @@ class KeptFrames:
     made way, as in most caches, almost every frame would be gone before it is asked for again.
     """
 
-    def __init__(self, load: Callable[[Hashable], Frame], room: int | None) -> None:
+    def __init__(self, load: Callable[[Any], Frame], room: int | None) -> None:
         """``room``: bytes of packed frames. None: as many as the machine has, while at least as many stay free; so
         of several processes with large logs each gets the same share."""
         self._load = load

@@ -38,10 +38,10 @@ class PackedFrame:
 
     def frame(self) -> Frame:
         """The frame. Its masks and its depth are new, its image is shared by all who ask."""
-        height, width = size = self.bare.image.shape[:2]
+        height, width, _ = self.bare.image.shape
         masks = torch.from_numpy(np.unpackbits(self.bits, count=len(self.masks) * height * width).view(np.bool_))
         planes = masks.view(len(self.masks), height, width)
-        depth = self.depth.image(size) if isinstance(self.depth, Returns) else self.depth
+        depth = self.depth.image((height, width)) if isinstance(self.depth, Returns) else self.depth
         return replace(self.bare, depth=depth, **dict(zip(self.masks, planes, strict=True)))
 
 

@@ -119,10 +119,10 @@ def test_room_for_none_and_for_one(room, reads):
 
 
 def test_auto_keeps_frames_while_as_much_memory_stays_free(monkeypatch):
-    """Ten frames' worth are free, and what is kept is free no more: five are kept, and five stay."""
+    """Eleven frames' worth are free, and what is kept is free no more: five are kept, for a sixth would leave five."""
     asked: list[int] = []
     frames = KeptFrames(counting(asked), None)
-    monkeypatch.setattr(kept_frames, "free_bytes", lambda: 10 * SIZE - SIZE * len(frames._kept))
+    monkeypatch.setattr(kept_frames, "free_bytes", lambda: 11 * SIZE - SIZE * len(frames._kept))
     for key in range(12):
         frames(key)
     assert len(frames._kept) == 5
