@@ -1,4 +1,4 @@
-"""``sparsestreet bench``: what the splat op and a training step cost in time, memory and accuracy."""
+"""``sparsestreet bench``: what the splat op, a training step and its frames cost in time, memory and accuracy."""
 
 import argparse
 import shlex
@@ -32,6 +32,7 @@ examples:
   sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
   sparsestreet bench step                       phases of a training step: time, operations, distance to their floors
   sparsestreet bench step sparsify=paper        the same of another training: options as those of train
+  sparsestreet bench data                       what a step waits for its frame beside a device of 5 ms a step
   sparsestreet bench masks                      a mask over time: its network a frame, and the bits that it leaves
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
@@ -48,6 +49,7 @@ def bench(arguments: list[str]) -> int:
         "knobs": _knobs,
         "blend": _blend,
         "step": _step,
+        "data": _data,
         "masks": _masks,
         "effects": _effects,
         "costs": _costs,
@@ -127,6 +129,13 @@ def _step(options: argparse.Namespace) -> bool:
     with TemporaryDirectory() as folder:
         train = train_with(options.overrides, Path(folder))
         step.run_step(" ".join(["train", *options.overrides]), train, window, _file(options), options.out)
+    return True
+
+
+def _data(options: argparse.Namespace) -> bool:
+    from sparsestreet.bench import data
+
+    data.run_data(data.QUICK if options.quick else data.FULL, options.out, _file(options))
     return True
 
 

@@ -1,5 +1,6 @@
 """Frames in the order that training and validation want them."""
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ from jaxtyping import Int
 from lightning import LightningDataModule
 from torch import Tensor
 
+from sparsestreet.data.ahead import ReadAhead, read_ahead
 from sparsestreet.data.device import to_device
 from sparsestreet.data.dirt import find_dirt
 from sparsestreet.data.hood import find_hoods, with_hoods
@@ -18,23 +20,30 @@ from sparsestreet.phases import phase
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.types import Frame
 
+logger = logging.getLogger(__name__)
+
+HOST = torch.device("cpu")
+
 
 class ShuffledFrames:
     """All frames in a new random order each epoch, given by seed and epoch alone; endless if asked again and again.
 
-    An iterator that is dropped half way is taken up again by the next one. The place is part of checkpoints (Lightning
-    asks for ``state_dict``): a resumed training sees the frames that an uninterrupted one would have seen.
+    The order is known ahead, so threads read the next frames while a step computes (``ReadAhead``). An iterator that is
+    dropped half way is taken up again by the next one. The place is part of checkpoints (Lightning asks for
+    ``state_dict``): a resumed training sees the frames that an uninterrupted one would have seen.
     """
 
     def __init__(
         self,
-        frames: Sequence[Frame],
+        frames: Frames,
         seed: int,
         finished: Callable[[], int] | None = None,
         *,
         with_replacement: bool = False,
         ranks: Ranks = ALONE,
         accumulated: int = 1,
+        device: torch.device = HOST,
+        threads: int | None = None,
     ) -> None:
         """
         Args:
@@ -46,33 +55,43 @@ class ShuffledFrames:
             ranks: the processes that take turns in one order; each iterator gives this one's frames.
             accumulated: frames of a process whose gradients a step takes. What an iterator gives are whole steps, as
                 many as there are frames, so that no step ends with an epoch.
+            device: where frames are wanted.
+            threads: as in ``ReadAhead``.
         """
         self.frames = frames
         self._ranks, self._accumulated = ranks, accumulated
-        self._newest: tuple[int, list[int]] = (-1, [])
         self.seed = seed
         self._drawn = 0
         self._finished = finished
         self._with_replacement = with_replacement
+        self._orders: dict[int, list[int]] = {}
+        self._ahead = ReadAhead(lambda draw: frames[self._place(draw)], device, threads)
 
     def __len__(self) -> int:
         return len(self.frames) * self._accumulated
 
     def __iter__(self) -> Iterator[Frame]:
         for drawn in range(self._drawn, (self._drawn // len(self) + 1) * len(self)):
-            epoch, position = divmod(drawn * self._ranks.size + self._ranks.rank, len(self.frames))
-            index = self._order(epoch)[position]
             self._drawn += 1
             with phase("data"):
-                frame = self.frames[index]
+                frame = self._ahead.take(drawn)
             yield frame
 
-    def _order(self, epoch: int) -> list[int]:
-        if self._newest[0] != epoch:
-            self._newest = epoch, self._permuted(epoch)
-        return self._newest[1]
+    def close(self) -> None:
+        """Ends the threads that read; another iteration starts new ones."""
+        self._ahead.close()
 
-    def _permuted(self, epoch: int) -> list[int]:
+    def _place(self, draw: int) -> int:
+        """Which frame a draw takes, of all draws since the start of training."""
+        epoch, position = divmod(draw * self._ranks.size + self._ranks.rank, len(self.frames))
+        order = self._orders.get(epoch)
+        if order is None:
+            order = self._order(epoch)
+            # Draws ahead are of this epoch and the next ones; earlier ones do not come again.
+            self._orders = {other: kept for other, kept in self._orders.items() if other == epoch - 1} | {epoch: order}
+        return order[position]
+
+    def _order(self, epoch: int) -> list[int]:
         # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
         generator = torch.Generator().manual_seed(self.seed)
         for _ in range(epoch):
@@ -93,23 +112,26 @@ class ShuffledFrames:
 
 
 class OrderedFrames:
-    """Frames as they come, from the start each time. (Lightning takes a bare sequence for several loaders.)"""
+    """Frames as they come, from the start each time, read ahead. (Lightning takes a bare sequence for several loaders.)
 
-    def __init__(self, frames: Frames, limit: int | None = None) -> None:
+    Threads read while an iteration lasts."""
+
+    def __init__(self, frames: Frames, limit: int | None = None, device: torch.device = HOST) -> None:
         """``limit``: so many of the frames, spread evenly over all of them, the first and the last included."""
         self.frames = frames if limit is None else frames.at(spread(len(frames), limit))
+        self._device = device
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
+        return read_ahead(self.frames, self._device)
 
 
 class StreetData(LightningDataModule):
     """A log, split into frames to train on and frames to hold out; each batch is one Frame, each step takes one.
 
-    The loaders are plain iterables: frames are decoded once and kept in memory, which worker processes do not share.
+    The loaders are plain iterables: frames are decoded by threads and kept in memory, which processes would not share.
     """
 
     def __init__(
@@ -160,25 +182,46 @@ class StreetData(LightningDataModule):
         self.seed = seed
         self.val_frames = val_frames
         self.with_replacement = with_replacement
+        self._training: ShuffledFrames | None = None
 
     def train_dataloader(self) -> ShuffledFrames:
         """One training frame a step; an epoch is all of them in random order."""
         trainer = self.trainer
-        if trainer is None:
-            return ShuffledFrames(self.split.train, self.seed, with_replacement=self.with_replacement)
-        accumulated = trainer.accumulate_grad_batches
-        return ShuffledFrames(
+        trainer = self.trainer
+        if self.split.train.forecast is not None:
+            logger.info("%s", self.split.train.forecast())
+        self._close()
+        accumulated = 1 if trainer is None else trainer.accumulate_grad_batches
+        self._training = ShuffledFrames(
             self.split.train,
             self.seed,
-            lambda: trainer.global_step * accumulated,
+            None if trainer is None else lambda: trainer.global_step * accumulated,
             with_replacement=self.with_replacement,
-            ranks=getattr(trainer.strategy, "ranks", ALONE),
+            ranks=ALONE if trainer is None else getattr(trainer.strategy, "ranks", ALONE),
             accumulated=accumulated,
+            device=self._device,
         )
+        return self._training
 
     def val_dataloader(self) -> OrderedFrames | list:
         """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out."""
-        return OrderedFrames(self.split.held_out, self.val_frames) if len(self.split.held_out) else []
+        held_out = self.split.held_out
+        return OrderedFrames(held_out, self.val_frames, self._device) if len(held_out) else []
+
+    def teardown(self, stage: str) -> None:
+        self._close()
+
+    def on_exception(self, exception: BaseException) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._training is not None:
+            self._training.close()
+
+    @property
+    def _device(self) -> torch.device:
+        """Where steps want their frames."""
+        return HOST if self.trainer is None else self.trainer.strategy.root_device
 
     def transfer_batch_to_device(self, batch: Frame, device: torch.device, dataloader_idx: int) -> Frame:
         """The frame on the device (Lightning itself cannot move a frozen dataclass)."""

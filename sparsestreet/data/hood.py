@@ -146,7 +146,7 @@ def with_hoods(frames: Frames, hoods: dict[int, Hood]) -> Frames:
             return frame
         return replace(frame, ego=mask if frame.ego is None else mask | frame.ego)
 
-    return Frames(frames.keys, load)
+    return Frames(frames.keys, load, frames.forecast)
 
 
 def driven(frames: Frames) -> float:

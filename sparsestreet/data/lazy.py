@@ -4,6 +4,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
+from sparsestreet.data.kept_frames import MemoryForecast
+from sparsestreet.data.lock import Lock
 from sparsestreet.types import Frame, Sweep, View
 
 K = TypeVar("K", bound=Hashable)
@@ -55,7 +57,18 @@ class LazySequence(Sequence):
 
 
 class Frames(LazySequence):
-    """Recorded views. Their pixels are read when a frame is indexed; ``views`` tells the rest without."""
+    """Recorded views. Their pixels are read when a frame is indexed; ``views`` tells the rest without.
+
+    Threads may index at the same time.
+    """
+
+    def __init__(
+        self, keys: Iterable[Any], load: Callable[[Any], Any], forecast: Callable[[], MemoryForecast] | None = None
+    ) -> None:
+        """``forecast``: how many frames of the whole log stay in memory once they were read; None: that has no
+        meaning here."""
+        super().__init__(keys, load)
+        self.forecast = forecast
 
     @classmethod
     def of(cls, frames: "Frames | Sequence[Frame]") -> "Frames":
@@ -66,6 +79,9 @@ class Frames(LazySequence):
     def views(self) -> tuple[View, ...]:
         """Cameras, times and indices of all frames."""
         return self.keys
+
+    def _of(self, keys: Iterable[Any]) -> "Frames":
+        return type(self)(keys, self.load, self.forecast)
 
 
 class Sweeps(LazySequence):
@@ -111,7 +127,10 @@ class Sweeps(LazySequence):
 
 
 class RecentlyUsed(Generic[K, T]):
-    """What ``load`` makes of a key, remembered while there is room; what was not used for longest makes way."""
+    """What ``load`` makes of a key, remembered while there is room; what was not used for longest makes way.
+
+    Threads may ask at the same time; each then loads what none remembers yet.
+    """
 
     def __init__(self, load: Callable[[K], T], size: Callable[[T], int], room: int) -> None:
         """``room`` is in the unit of ``size``; a value that is larger on its own is not remembered."""
@@ -120,17 +139,24 @@ class RecentlyUsed(Generic[K, T]):
         self._room = room
         self._held: OrderedDict[K, T] = OrderedDict()
         self._used = 0
+        self._lock = Lock()
 
     def __call__(self, key: K) -> T:
-        if key in self._held:
-            self._held.move_to_end(key)
-            return self._held[key]
+        with self._lock:
+            if key in self._held:
+                self._held.move_to_end(key)
+                return self._held[key]
         value = self._load(key)
         size = self._size(value)
-        if size > self._room:
-            return value
+        if size <= self._room:
+            with self._lock:
+                self._hold(key, value, size)
+        return value
+
+    def _hold(self, key: K, value: T, size: int) -> None:
+        if key in self._held:  # another thread was faster
+            return
         self._held[key] = value
         self._used += size
         while self._used > self._room:
             self._used -= self._size(self._held.popitem(last=False)[1])
-        return value

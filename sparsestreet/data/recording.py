@@ -18,6 +18,7 @@ from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.images import check_camera_images
+from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.notes import absence_notes
@@ -131,7 +132,7 @@ class RecordedReader(LogReader):
     masks: Path | str | None = None
     """Folder of masks that somebody made: ``sky``, ``human``, ``vehicle``, ``ego``, in each a folder a camera, in it
     PNGs with the stems of the images, white where the kind is. None: those of the data set, if it has any."""
-    cache_mb: int = 512
+    cache_mb: CacheSize = "auto"
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
     @property
@@ -173,15 +174,15 @@ class RecordedReader(LogReader):
         return self.check_contents()
 
     def read(self) -> DrivingLog:
-        return log_of(self.recording(), cache_bytes=1_000_000 * self.cache_mb, check=self.check_contents)
+        return log_of(self.recording(), cache_bytes=cache_bytes(self.cache_mb), check=self.check_contents)
 
 
-def log_of(recording: Recording, *, cache_bytes: int, check: Callable[[], list[Problem]]) -> DrivingLog:
+def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:
     """The log whose world has the data set's axes and its origin at the first camera of the first instant.
 
     Args:
         recording: what was found.
-        cache_bytes: of decoded frames that are kept in memory.
+        cache_bytes: of decoded frames that are kept in memory; None: as ``KeptFrames`` has it.
         check: finds everything that is wrong with pixels and points; it is asked once something is.
 
     Raises LogError for boxes that cannot be.

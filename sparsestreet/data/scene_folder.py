@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
+from sparsestreet.data.kept_frames import KeptFrames, MemoryForecast
 from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.problems import LogError, Problem
@@ -33,7 +34,7 @@ class SceneFolder:
         read_points: Callable[[int], Float[Tensor, "n 3"]] | None,
         *,
         clock: LogClock,
-        cache_bytes: int,
+        cache_bytes: int | None,
         check: Callable[[], list[Problem]],
         tracks: Sequence[Track] = (),
         sweep_stamps: Mapping[int, int] | None = None,
@@ -44,7 +45,7 @@ class SceneFolder:
             read_frame: decodes the image and the masks of a view; depth is added here.
             read_points: lidar points of a frame index in the log's world; None: the log has no lidar.
             clock: of the log.
-            cache_bytes: of decoded frames that are kept in memory.
+            cache_bytes: of decoded frames that are kept in memory; None: as ``KeptFrames`` has it.
             check: finds everything that is wrong with the folder; it is asked once something is.
             tracks: objects that carry points, with the times of their boxes.
             sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
@@ -64,7 +65,7 @@ class SceneFolder:
     def _use(self, others: Sequence[Track], held_out: frozenset[int]) -> None:
         """Sets the objects that carry points of frames which are not held out, and forgets what others carried."""
         self._others, self._held_out = tuple(others), held_out
-        self._frames = RecentlyUsed(self._read_frame, _count_bytes, self._cache_bytes)
+        self._frames = KeptFrames(self._read_frame, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
         read = self._read_points
         self._points = None if read is None else RecentlyUsed(self._carried(read), lambda points: 1, 1)
@@ -78,7 +79,10 @@ class SceneFolder:
     @property
     def frames(self) -> Frames:
         """Decoded when indexed; raises LogError then, with all problems of the folder, where a file is broken."""
-        return Frames([view for rig in self._views.values() for view in rig], self._frame)
+        return Frames([view for rig in self._views.values() for view in rig], self._frame, self._forecast)
+
+    def _forecast(self) -> MemoryForecast:
+        return self._frames.forecast([view.indices for rig in self._views.values() for view in rig])
 
     @property
     def sweeps(self) -> Sweeps:
@@ -138,8 +142,3 @@ class SceneFolder:
     def _moment(self, index: int) -> tuple[float | None, int | None]:
         """Seconds and stamp of a sweep."""
         return self._clock.moment(index, self._sweep_stamps.get(index))
-
-
-def _count_bytes(frame: Frame) -> int:
-    pixels = (frame.image, frame.sky, frame.human, frame.vehicle, frame.depth, frame.ego)
-    return sum(part.nbytes for part in pixels if part is not None)

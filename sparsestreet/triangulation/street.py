@@ -74,7 +74,7 @@ def _total(parts: Mapping[str, TriangulatedPoints]) -> int:
 
 def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
     """Sightings in the order of the frames. OpenCV releases the interpreter's lock, so threads run in parallel."""
-    reading = Lock()  # a log's memory of its frames is not safe for threads
+    reading = Lock()  # one frame is decoded at a time: the threads are for the features
 
     def sighting(index: int) -> Sighting:
         with reading:

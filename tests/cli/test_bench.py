@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sparsestreet.bench import blend, figures, gpu, knobs, masks, scaling, scenes, step, sweep
+from sparsestreet.bench import blend, data, figures, gpu, knobs, masks, scaling, scenes, step, sweep
 from sparsestreet.bench.scenes import Size
 from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.cli import bench as cli_bench
@@ -24,7 +24,9 @@ def test_help_teaches_by_example(capsys):
         bench(["--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    assert all(f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "step", "masks", "scaling", "gpu"))
+    assert all(
+        f"sparsestreet bench {mode}" in text for mode in ("knobs", "blend", "step", "data", "masks", "scaling", "gpu")
+    )
 
 
 def test_unknown_mode_is_refused(capsys):
@@ -121,7 +123,13 @@ def handed(monkeypatch):
     def replaced(module, name, answer):
         monkeypatch.setattr(module, name, lambda *args, **named: given.update({name: (args, named)}) or answer)
 
-    for module, name in ((sweep, "run_sweep"), (blend, "run_blend"), (masks, "run_masks"), (scaling, "run_scaling")):
+    for module, name in (
+        (sweep, "run_sweep"),
+        (blend, "run_blend"),
+        (masks, "run_masks"),
+        (data, "run_data"),
+        (scaling, "run_scaling"),
+    ):
         replaced(module, name, None)
     replaced(gpu, "run_gpu", True)
     replaced(step, "run_step", None)
@@ -181,6 +189,14 @@ def test_a_street_is_beside_the_sizes_of_a_gpu(handed, monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert bench(["gpu", "--street", "RUN", "--out", str(tmp_path)]) == 0
     assert (handed["run_gpu"][1], handed["street"]) == ({"street": "the street"}, Path("RUN"))
+
+
+def test_a_drive_is_made_up_beside_the_records(handed, tmp_path):
+    for words, drive in (([], data.FULL), (["--quick"], data.QUICK)):
+        assert bench(["data", *words, "--out", str(tmp_path)]) == 0
+        (given, folder, file), _ = handed["run_data"]
+        assert (given, folder, file.path) == (drive, tmp_path, tmp_path / "data.jsonl")
+    assert (data.FULL.images, data.FULL.width, data.FULL.height, data.STEP_MS) == (200, 1920, 1280, 5.0)
 
 
 def test_threads_and_words_stand_in_the_record(handed, monkeypatch, tmp_path):

@@ -19,6 +19,7 @@ from sparsestreet.data.drivestudio.layout import Layout, find_layout
 from sparsestreet.data.drivestudio.poses import first_pose, read_clock
 from sparsestreet.data.drivestudio.sweeps import read_points
 from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.notes import absence_notes
@@ -67,8 +68,8 @@ class DriveStudioReader(LogReader):
     """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
     flavor: FlavorName | None = None
     """The data set that the layout was made of; None: what the files tell, an error where they leave it open."""
-    cache_mb: int = 512
-    """Decoded frames kept in memory, MB (1e6 bytes); a frame takes about 10 bytes a pixel."""
+    cache_mb: CacheSize = "auto"
+    """Decoded frames kept in memory, MB (1e6 bytes)."""
 
     def __post_init__(self) -> None:
         if self.extent not in get_args(SceneExtent):
@@ -105,7 +106,7 @@ class DriveStudioReader(LogReader):
             partial(read_frame, layout, rig),
             partial(read_points, layout, origin, self.lidar_ahead) if layout.has_lidar else None,
             clock=clock,
-            cache_bytes=1_000_000 * self.cache_mb,
+            cache_bytes=cache_bytes(self.cache_mb),
             check=lambda: check_layout(layout, contents=True),
             tracks=tracks,
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.kept_frames import CacheSize
 from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
@@ -36,7 +37,7 @@ class StreetReader(LogReader):
     lidar_ahead: Sequence[float | int] | None = None
     extent: SceneExtent = "world"
     """This and the two above as ``DriveStudioReader`` has them."""
-    cache_mb: int = 512
+    cache_mb: CacheSize = "auto"
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
     @property

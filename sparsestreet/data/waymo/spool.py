@@ -7,6 +7,7 @@ from collections.abc import Hashable
 from pathlib import Path
 from typing import BinaryIO
 
+from sparsestreet.data.lock import Lock
 from sparsestreet.data.problems import fault
 
 
@@ -17,6 +18,7 @@ class Spool:
         self._file: BinaryIO | None = None
         self._places: dict[Hashable, tuple[int, int]] = {}
         self._end = 0
+        self._lock = Lock()
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._places
@@ -24,15 +26,16 @@ class Spool:
     def put(self, key: Hashable, data: bytes) -> None:
         """Raises LogError where the folder has no room."""
         try:
-            file = self._opened()
+            with self._lock:
+                file = self._opened()
+                start, self._end = self._end, self._end + len(data)
             done = 0
             while done < len(data):
-                done += os.pwrite(file.fileno(), data[done:], self._end + done)
+                done += os.pwrite(file.fileno(), data[done:], start + done)
         except OSError as error:
             folder, remedy = Path(tempfile.gettempdir()), "make room, or set TMPDIR to a folder with room"
             raise fault(folder, f"{len(data)} bytes of decoded data cannot be kept here ({error})", remedy) from error
-        self._places[key] = self._end, len(data)
-        self._end += len(data)
+        self._places[key] = start, len(data)
 
     def get(self, key: Hashable) -> bytes:
         start, length = self._places[key]

@@ -14,10 +14,9 @@ from PIL import ImageFile
 from sparsestreet.data.drivestudio import DriveStudioReader, frames
 from sparsestreet.data.log import split
 from sparsestreet.types import Frame, Sweep
-from tests.data.drivestudio.folders import HEIGHT, WIDTH, make_nuscenes, make_waymo, write_image
+from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_image
 
 FLAVOURS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
-FRAME_BYTES = 10 * WIDTH * HEIGHT  # three of color, three masks, four of depth
 
 
 @pytest.fixture
@@ -64,7 +63,7 @@ def test_each_image_is_decoded_once_while_there_is_room(tmp_path, decoded):
     log = DriveStudioReader(make_nuscenes(tmp_path)).read()
     first = list(log.frames)
     for frame, again in zip(first, log.frames, strict=True):
-        assert frame is again
+        assert same_frame(frame, again)
     assert len(list(log.sweeps)) == 3
     assert set(decoded.values()) == {1}
     assert len(decoded) == 6
@@ -98,20 +97,6 @@ def test_a_gray_sweep_is_the_sweep_without_its_colors(make, tmp_path):
         assert (gray.index, gray.points.tolist()) == (sweep.index, sweep.points.tolist())
         assert torch.equal(gray.colored, sweep.colored)
     assert len({int(gray.colored.sum()) for gray in log.sweeps.gray()}) > 1
-
-
-@pytest.mark.lengthy
-def test_the_room_is_counted_in_bytes_of_all_pixels(tmp_path, decoded):
-    """104 frames of 9,600 bytes fit into 1 MB."""
-    make_nuscenes(tmp_path, frames=105, cameras=1)
-    frames = DriveStudioReader(tmp_path, cache_mb=1).read().frames
-    assert 1_000_000 // FRAME_BYTES == 104
-    first = [frames[index] for index in range(104)]
-    assert all(frames[index] is first[index] for index in range(104))
-    assert frames[104].frame_index == 104
-    assert all(frames[index] is first[index] for index in range(1, 104))
-    assert frames[0] is not first[0]
-    assert decoded["000_0"] == 2
 
 
 MEASURE = """

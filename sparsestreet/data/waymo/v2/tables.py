@@ -6,6 +6,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from sparsestreet.data.lock import Lock
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.waymo.segment import REMEDY
 from sparsestreet.data.waymo.spool import Spool
@@ -27,6 +28,7 @@ class Table:
         self.path = path
         self._prefix = f"[{component}]."
         self._file = _opened(path)
+        self._reading = Lock()
         self.columns: set[str] = self._explained(lambda: set(self._file.schema_arrow.names))
 
     def column(self, name: str) -> str:
@@ -69,8 +71,9 @@ class Table:
                     spool.put(keys[place], pack(cells))
 
         def read(key: Any) -> bytes:
-            if key not in spool:
-                self._explained(lambda: keep(places[key]))
+            with self._reading:
+                if key not in spool:
+                    self._explained(lambda: keep(places[key]))
             return spool.get(key)
 
         return read
