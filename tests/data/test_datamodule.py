@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.datamodule import ShuffledFrames, StreetData
+from sparsestreet.data.datamodule import HOST, ShuffledFrames, StreetData
 from sparsestreet.data.device import to_device
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.lazy import Frames
@@ -44,7 +44,7 @@ def test_no_two_epochs_have_the_same_order():
 @pytest.mark.parametrize(("size", "accumulated"), [(1, 3), (2, 1), (3, 1), (2, 2)])
 def test_processes_take_turns_in_the_order_of_one(size, accumulated):
     """Seven frames, which no number divides: no step ends with an epoch, and none has a frame of its own order."""
-    frames = [frame_at(index) for index in range(7)]
+    frames = Frames.of([frame_at(index) for index in range(7)])
     alone = ShuffledFrames(frames, 3)
     images = [frame.frame_index for _ in range(4 * size * accumulated) for frame in alone]
     several = [ShuffledFrames(frames, 3, ranks=Ranks(rank, size), accumulated=accumulated) for rank in range(size)]
@@ -55,7 +55,7 @@ def test_processes_take_turns_in_the_order_of_one(size, accumulated):
 
 
 def test_a_process_goes_on_at_its_own_place():
-    frames = [frame_at(index) for index in range(7)]
+    frames = Frames.of([frame_at(index) for index in range(7)])
     whole = list(ShuffledFrames(frames, 3, ranks=Ranks(1, 2)))
     resumed = ShuffledFrames(frames, 3, ranks=Ranks(1, 2))
     resumed.load_state_dict({"finished": 4})
@@ -65,7 +65,8 @@ def test_a_process_goes_on_at_its_own_place():
 def test_a_step_that_accumulates_finishes_all_of_its_images():
     data = StreetData(make_log(), stride=4, offset=1)
     data.trainer = typing.cast(
-        lightning.Trainer, SimpleNamespace(global_step=4, accumulate_grad_batches=3, strategy=None)
+        lightning.Trainer,
+        SimpleNamespace(global_step=4, accumulate_grad_batches=3, strategy=SimpleNamespace(root_device=HOST)),
     )
     assert data.train_dataloader().state_dict() == {"finished": 12}
     assert len(data.train_dataloader()) == 3 * 18

@@ -9,7 +9,6 @@ import signal
 from types import FrameType
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.strategies import Strategy
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from sparsestreet.training.lightning import ends_step, validates_now
@@ -60,7 +59,7 @@ class GracefulStop(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        self._stops = ends_step(trainer, batch_idx) and self._agreed(trainer.strategy)
+        self._stops = ends_step(trainer, batch_idx) and self._agreed(trainer)
         if self._stops and not validates_now(trainer):
             raise KeyboardInterrupt
 
@@ -74,8 +73,9 @@ class GracefulStop(Callback):
             kinds = ((KeyboardInterrupt, signal.SIGINT), (SIGTERMException, signal.SIGTERM))
             self.received = next((number for kind, number in kinds if isinstance(exception, kind)), None)
 
-    def _agreed(self, strategy: Strategy) -> bool:
+    def _agreed(self, trainer: Trainer) -> bool:
         """Whether a signal came; of several processes all stop after the same step, whichever of them heard of it."""
+        strategy = trainer.strategy
         if isinstance(strategy, DataParallel):
             self.received, strategy.wish = strategy.agreed or self.received, self.received or 0
             return bool(strategy.agreed)
