@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
@@ -123,6 +124,23 @@ def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
     )
 
 
+def matrices(poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
+    """Returns poses as world_from_box, on the host."""
+    frames = np.tile(np.eye(4), (len(poses.quaternions), 1, 1))
+    frames[:, :3, :3] = quat.to_matrix(poses.quaternions.detach().double()).cpu().numpy()
+    frames[:, :3, 3] = poses.translations.detach().cpu().numpy()
+    return frames
+
+
+def moved_by_boxes(
+    means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], before: Poses, after: Poses
+) -> Float[Tensor, "n 3"]:
+    """Returns how far means in boxes, meters, move in the world as their boxes do."""
+    turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
+    shift = after.translations - before.translations
+    return (turn[instances] @ means[:, :, None]).squeeze(-1) + shift[instances]
+
+
 def _from_images(track: Track, data: TrainingData) -> Points:
     """Returns the points from images inside the track's box, in its frame."""
     if data.image_points is None:
@@ -209,13 +227,18 @@ class Tracked(Node):
         """Returns pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
+    def object_frames(self, poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
+        """Returns the frames of all objects at such poses: world_from_object, x ahead, y left, z up."""
+        return matrices(poses)
+
+    def frame_height(self, instance: int) -> float:
+        """Returns how far the origin of an object's frame is above the ground that it stands on, meters."""
+        return float(self.sizes[instance, 2]) / 2
+
     def displacements_over(self, span: float, view: View, raw: RawGaussians) -> Float[Tensor, "n 3"]:
         """Returns the motion of the rows' boxes; a body that walks meanwhile, or a network's change, is left out."""
-        table = self.keyframes, self.rotation_deltas, self.translation_deltas
-        before, after = (poses_at(*table, view.time + side * span / 2, self.max_gap) for side in (-1, 1))
-        turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
-        shift, instances = after.translations - before.translations, self.rows.instances
-        return (turn[instances] @ raw.means[:, :, None]).squeeze(-1) + shift[instances]
+        before, after = (self.pose_at(view.time + side * span / 2) for side in (-1, 1))
+        return moved_by_boxes(raw.means, self.rows.instances, before, after)
 
     def regularizers(
         self, view: View, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
