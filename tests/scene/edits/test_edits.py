@@ -21,6 +21,7 @@ from sparsestreet.scene.edits import (
     placed,
 )
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Tracked
 from sparsestreet.types import Shutter
 from tests.scene.people import smpl, walker
 from tests.scene.stored import NAMES, cars, pixels, stored, view
@@ -50,7 +51,9 @@ def of(scene: SceneGraph, node: str = "cars", time: float = TIME):
 
 
 def box(scene: SceneGraph, instance: int, time: float = TIME) -> np.ndarray:
-    poses = scene.nodes["cars"].pose_at(time)
+    node = scene.nodes["cars"]
+    assert isinstance(node, Tracked)
+    poses = node.pose_at(time)
     frame = np.eye(4)
     frame[:3, :3] = quat.to_matrix(poses.quaternions.detach().double())[instance].numpy()
     frame[:3, 3] = poses.translations.detach()[instance].numpy()
@@ -197,10 +200,11 @@ def test_a_held_person_stops_walking_and_a_copied_one_walks_on(people):
 
 
 def test_frames_of_a_request_are_turned_along_the_shorter_arc():
-    way = Given(placed(yaw=3.0), placed(1.0, 2.0, 3.0, -3.0), (0.2, 0.4))
+    end = placed(1.0, 2.0, 3.0, -3.0)
+    way = Given(placed(yaw=3.0), end, (0.2, 0.4))
     middle = way.frame(0.3, lambda time: np.eye(4))
     np.testing.assert_allclose(middle, placed(0.5, 1.0, 1.5, np.pi), atol=1e-12)
-    np.testing.assert_allclose(way.frame(9.0, lambda time: np.eye(4)), way.end, atol=1e-12)
+    np.testing.assert_allclose(way.frame(9.0, lambda time: np.eye(4)), end, atol=1e-12)
     assert Given(placed(1.0)).frame(0.3, lambda time: np.eye(4))[0, 3] == 1
 
 
