@@ -5,11 +5,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from sparsestreet.scene.edits.nodes import ALWAYS, AddedObject, Change, EditedNode, recorded_frames
-from sparsestreet.scene.edits.paths import AsRecorded, Frame, Held, Recorded
+from sparsestreet.scene.edits.paths import AsRecorded, Frame, Held, Moved, Recorded
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.nodes.rigid import Rigid
 from sparsestreet.scene.nodes.tracked import Tracked
+
+Object = tuple[str, Tracked, int]
+"""Name of a node, the node, and the number of one of its objects."""
 
 REMOVED = Change(hidden=(ALWAYS,))
 
@@ -49,16 +52,14 @@ def edited(scene: SceneGraph, edits: Edits) -> SceneGraph:
 
     Raises ValueError for an object that the scene has not, or a new one of a name that is taken.
     """
-    changes = {objects_of(scene, name): change for name, change in edits.changes.items()}
-    added = {name: _added(scene, name, one) for name, one in edits.added.items()}
+    objects = objects_of(scene)
+    added = {name: _added(objects, name, one) for name, one in edits.added.items()}
     in_place: dict[str, dict[int, Change]] = {}
-    for (node_name, instance), change in changes.items():
-        node = scene.nodes[node_name]
-        assert isinstance(node, Tracked), "objects are those of tracked nodes"
+    for name, change in edits.changes.items():
+        node_name, node, instance = found(objects, name)
         if isinstance(change.path, Held) and not isinstance(node, Rigid):
             # Its shape is held too, and a node has one time for all of its objects.
-            name, recorded = node.names[instance], recorded_frames(node, instance)
-            added[name] = AddedObject(node, instance, change, recorded, to_source=float)
+            added[name] = AddedObject(name, node, instance, change, recorded_frames(node, instance), to_source=float)
             change = REMOVED
         in_place.setdefault(node_name, {})[instance] = change
     nodes: dict[str, Node] = {}
@@ -66,34 +67,40 @@ def edited(scene: SceneGraph, edits: Edits) -> SceneGraph:
         nodes[name] = EditedNode(node, in_place[name]) if name in in_place and isinstance(node, Tracked) else node
     if taken := nodes.keys() & added.keys():
         raise ValueError(f"a node of the scene is named {min(taken)!r}: give the new object another name")
-    return scene.with_nodes(nodes | added).eval()
+    # A module's name has no dots; an object's may.
+    return scene.with_nodes(nodes | {name.replace(".", "_"): node for name, node in added.items()}).eval()
 
 
-def objects_of(scene: SceneGraph, name: str) -> tuple[str, int]:
-    """The node that has an object, and the object's number there. Raises ValueError, with the nearest names."""
-    names = {}
-    for node_name, node in scene.nodes.items():
-        found = node.instances()
-        names |= {} if found is None else {one: (node_name, number) for number, one in enumerate(found.names)}
-    if name not in names:
-        near = difflib.get_close_matches(name, names, n=3, cutoff=0.3) or list(names)[:3]
-        said = f"the nearest names are {', '.join(near)}" if names else "it has no objects at all"
+def objects_of(scene: SceneGraph) -> dict[str, Object]:
+    """The objects that can be edited, by the names of their tracks."""
+    return {
+        name: (node_name, node, number)
+        for node_name, node in scene.nodes.items()
+        if isinstance(node, Tracked)
+        for number, name in enumerate(node.names)
+    }
+
+
+def found(objects: Mapping[str, Object], name: str) -> Object:
+    """The object of a name. Raises ValueError, with the nearest names, where there is none."""
+    if name not in objects:
+        near = difflib.get_close_matches(name, objects, n=3, cutoff=0.3) or list(objects)[:3]
+        said = f"the nearest names are {', '.join(near)}" if objects else "it has no objects that move at all"
         raise ValueError(f"the scene has no object {name!r}: {said} (sparsestreet objects RUN lists all)")
-    return names[name]
+    return objects[name]
 
 
-def _added(scene: SceneGraph, name: str, one: Added) -> AddedObject:
-    source, instance = _object(one.scene or scene, one.of)
-    taken = [other for node in scene.nodes.values() if (found := node.instances()) for other in found.names]
-    if name in taken:
+def _added(objects: Mapping[str, Object], name: str, one: Added) -> AddedObject:
+    if name in objects:
         raise ValueError(f"the scene has an object {name!r} already: give the new one another name")
+    _, source, instance = found(objects if one.scene is None else objects_of(one.scene), one.of)
     change = one.change if one.change.path is not None else replace(one.change, path=AsRecorded())
     recorded = recorded_frames(source, instance)
     if one.instead_of is not None:
-        recorded = _on_the_same_ground(source, instance, *_object(scene, one.instead_of))
-    elif one.scene is not None and isinstance(change.path, AsRecorded):
+        recorded = _on_the_same_ground(source, instance, *found(objects, one.instead_of)[1:])
+    elif one.scene is not None and isinstance(change.path, AsRecorded | Moved | Held):
         raise ValueError(f"{name!r} comes from another scene, where its recorded way belongs: give it a way of its own")
-    return AddedObject(source, instance, change, recorded, to_source=lambda time: one.speed * time)
+    return AddedObject(name, source, instance, change, recorded, to_source=lambda time: one.speed * time)
 
 
 def _on_the_same_ground(source: Tracked, instance: int, other: Tracked, other_instance: int) -> Recorded:
@@ -107,10 +114,3 @@ def _on_the_same_ground(source: Tracked, instance: int, other: Tracked, other_in
         return frame
 
     return at
-
-
-def _object(scene: SceneGraph, name: str) -> tuple[Tracked, int]:
-    node_name, instance = objects_of(scene, name)
-    node = scene.nodes[node_name]
-    assert isinstance(node, Tracked), "objects are those of tracked nodes"
-    return node, instance

@@ -73,10 +73,17 @@ class AddedObject(Node):
     chosen: Tensor
 
     def __init__(
-        self, source: Tracked, instance: int, change: Change, recorded: Recorded, to_source: Callable[[float], float]
+        self,
+        name: str,
+        source: Tracked,
+        instance: int,
+        change: Change,
+        recorded: Recorded,
+        to_source: Callable[[float], float],
     ) -> None:
         """
         Args:
+            name: of the object.
             source: the node that has the object.
             instance: its number there.
             change: its way, and when it is hidden.
@@ -85,7 +92,7 @@ class AddedObject(Node):
         """
         chosen = source.rows.instances == instance
         super().__init__(source.settings, _only(source.rows, chosen))
-        self.source, self.instance, self.change = source, instance, change
+        self.name, self.source, self.instance, self.change = name, source, instance, change
         self.recorded, self.to_source = recorded, to_source
         self.register_buffer("chosen", chosen, persistent=False)
 
@@ -116,6 +123,10 @@ class AddedObject(Node):
     def displacements_over(self, span: float, view: View, raw: RawGaussians) -> Float[Tensor, "n 3"]:
         before, after = (self.pose_at(view.time + side * span / 2) for side in (-1, 1))
         return moved_by_boxes(raw.means, self._zeros(), before, after)
+
+    def instances(self) -> Instances:
+        one = slice(self.instance, self.instance + 1)
+        return Instances((self.name,), self._zeros(), self.source.sizes[one], classes=self.source.classes[one])
 
     @property
     def _path(self) -> Path:

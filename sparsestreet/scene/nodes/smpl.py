@@ -26,7 +26,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
 from sparsestreet.scene.nodes.regularizers import excess_volume
-from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, matrices, stored_keyframes
+from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, matrices, stored_keyframes, stored_objects
 from sparsestreet.scene.state import SceneState
 from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Track, View
@@ -99,6 +99,7 @@ class SmplSettings(TrackedSettings):
             torch.stack([track.size.float() for track in tracks]),
             anatomy=Anatomy.of(template, people),
             names=tuple(track.name for track in tracks),
+            classes=tuple(track.class_name for track in tracks),
             max_gap=self.max_gap / data.log.frame_periods + view_lag(tracks, data.log.views),
             mask=mask,
         )
@@ -108,8 +109,7 @@ class SmplSettings(TrackedSettings):
         anatomy = Anatomy(
             tensors["vertices"], tensors["attached"], tensors["weights"], tensors["joints"], tensors["joint_keyframes"]
         )
-        names, max_gap = tuple(header["names"]), header["max_gap"]
-        return Smpl(self, rows, trajectories, tensors["sizes"], anatomy=anatomy, names=names, max_gap=max_gap)
+        return Smpl(self, rows, trajectories, tensors["sizes"], anatomy=anatomy, **stored_objects(header))
 
     def _start(
         self,
@@ -204,11 +204,12 @@ class Smpl(Tracked):
         *,
         anatomy: Anatomy,
         names: Sequence[str] | None = None,
+        classes: Sequence[str] | None = None,
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
         """Takes the arguments of ``Tracked``; rows also have the buffer ``vertex_ids`` [n] int64, template vertices."""
-        super().__init__(settings, rows, keyframes, sizes, names=names, max_gap=max_gap, mask=mask)
+        super().__init__(settings, rows, keyframes, sizes, names=names, classes=classes, max_gap=max_gap, mask=mask)
         self.register_buffer("vertices", anatomy.vertices)
         self.register_buffer("attached", anatomy.attached)
         self.register_buffer("weights", anatomy.weights)

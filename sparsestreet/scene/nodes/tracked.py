@@ -93,14 +93,14 @@ class TrackedSettings(NodeSettings):
             keyframes,
             sizes,
             names=tuple(track.name for track in tracks),
+            classes=tuple(track.class_name for track in tracks),
             max_gap=self.max_gap / data.log.frame_periods + view_lag(tracks, data.log.views),
             mask=mask,
         )
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Tracked":
         trajectories = stored_keyframes(tensors)
-        names = tuple(header["names"])
-        return self.node_class(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
+        return self.node_class(self, rows, trajectories, tensors["sizes"], **stored_objects(header))
 
     def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
         """Returns one object's colored points in its box frame, filled up if there are too few."""
@@ -122,6 +122,12 @@ def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
         tensors["keyframe_valid"],
         tensors["spans"],
     )
+
+
+def stored_objects(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a scene file says of a node's objects, as ``Tracked`` takes it; older files have no classes."""
+    classes = tuple(header["classes"]) if "classes" in header else None
+    return {"names": tuple(header["names"]), "classes": classes, "max_gap": header["max_gap"]}
 
 
 def matrices(poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
@@ -171,6 +177,7 @@ class Tracked(Node):
         sizes: Float[Tensor, "i 3"],
         *,
         names: Sequence[str] | None = None,
+        classes: Sequence[str] | None = None,
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
@@ -182,6 +189,7 @@ class Tracked(Node):
             keyframes: training poses of every instance.
             sizes: length, width, height of every instance's box, meters.
             names: names of the instances' tracks; None: their numbers.
+            classes: class names of the tracks; None: not known.
             max_gap: normalized time to the nearest keyframe beyond which an instance counts as absent.
             mask: the mask, if the rows have its columns.
 
@@ -192,6 +200,7 @@ class Tracked(Node):
         super().__init__(settings, rows, mask)
         num_instances = keyframes.times.shape[0]
         self.names = tuple(str(index) for index in range(num_instances)) if names is None else tuple(names)
+        self.classes = ("",) * num_instances if classes is None else tuple(classes)
         if sizes.shape[0] != num_instances or len(self.names) != num_instances:
             raise ValueError(
                 f"every instance needs a box size and a name, got {sizes.shape[0]} sizes and {len(self.names)} names "
@@ -270,10 +279,10 @@ class Tracked(Node):
 
     def instances(self) -> Instances:
         """Returns the objects, named like their tracks."""
-        return Instances(self.names, self.rows.instances, self.sizes, self.spans)
+        return Instances(self.names, self.rows.instances, self.sizes, self.spans, self.classes)
 
     def header(self) -> dict[str, Any]:
-        return {"names": list(self.names), "max_gap": self.max_gap}
+        return {"names": list(self.names), "classes": list(self.classes), "max_gap": self.max_gap}
 
     def pose_bytes(self) -> int:
         """Returns the float32 bytes of the keyframes: each a time, a quaternion and a translation with corrections."""
