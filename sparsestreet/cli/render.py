@@ -37,6 +37,7 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   device    cpu or cuda (default: a GPU if there is one)
 """
 
+
 @dataclass(frozen=True)
 class RenderRequest:
     """The command's options. Raises ValueError where they contradict each other."""
