@@ -1,10 +1,23 @@
 """Positions of things over time: straight along the street, with one smooth change of lane, or straight across it."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from sparsestreet.data.synthetic.parts import Pose, at
+
+
+class Way(Protocol):
+    """Where a thing is over time."""
+
+    def traveled(self, time: float) -> float:
+        """Returns meters that its wheels or legs have moved since time 0."""
+        ...
+
+    def pose(self, time: float, height: float) -> Pose:
+        """Returns world from object, with the object's origin ``height`` meters above the road."""
+        ...
 
 
 @dataclass(frozen=True)
