@@ -35,7 +35,7 @@ KINDS = ("removed", "moved", "copied")
 
 
 @dataclass(frozen=True)
-class Beside:
+class Beside(Way):
     """An actor's path, moved to its right."""
 
     path: Way
