@@ -144,12 +144,7 @@ class AddedObject(Node):
 
 def recorded_frames(node: Tracked, instance: int) -> Recorded:
     """Where an object was at a time; before and after its life at its first and last place."""
-
-    def at(time: float) -> Frame:
-        start, end = node.spans[instance].tolist()
-        return node.object_frames(node.pose_at(min(max(time, start), end)))[instance]
-
-    return at
+    return lambda time: node.object_frames(node.pose_at(time))[instance]
 
 
 def _transported(poses: Poses, frames: Float64[np.ndarray, "i 4 4"], wanted: Mapping[int, Frame]) -> Poses:

@@ -242,7 +242,7 @@ class Smpl(Tracked):
 
     def frame_height(self, instance: int) -> float:
         """Returns how far the pelvis of a person at rest is above the soles."""
-        own = self.rows.means[self.rows.instances == instance, 1]
+        own = self.rows.means.detach()[self.rows.instances == instance, 1]
         # A few Gaussians may have left the body.
         return float(-own.quantile(0.005)) if len(own) else 0.0
 

@@ -129,6 +129,22 @@ def test_an_object_drives_a_way_of_its_own_and_is_there_at_all_times(scene):
     assert (of(scene, time=1.0)["opacities"][1::2] == 0).all()  # as recorded the car is gone by then
 
 
+def test_a_way_turns_at_its_corners_and_yaws_take_the_shorter_arc():
+    way = Driven([0.0, 0.2, 0.4, 0.6], [(0.0, 0.0), (1.0, 0.0), (1.0, 2.0), (1.0, 2.0)], heights=[0.0] * 4)
+    for time, yaw in ((-1.0, 0.0), (0.1, 0.0), (0.3, np.pi / 2), (0.5, np.pi / 2), (2.0, np.pi / 2)):
+        frame = way.frame(time, lambda time: np.eye(4))
+        np.testing.assert_allclose(frame[:3, :3], placed(yaw=yaw)[:3, :3], atol=1e-12)
+    turning = Driven([0.0, 1.0], [(0.0, 0.0), (1.0, 0.0)], yaws=[3.0, -3.0])
+    np.testing.assert_allclose(turning.frame(0.5, lambda time: placed(z=7.0)), placed(0.5, 0.0, 7.0, np.pi), atol=1e-12)
+
+
+def test_a_moved_object_waits_at_the_ends_of_its_recorded_way(scene):
+    there = edited(scene, Edits({CAR: Change(Moved(right=1.0))}))
+    end = float(scene.nodes["cars"].get_buffer("spans")[1, 1])
+    assert end < 0.9
+    np.testing.assert_allclose(of(there, time=1.0)["means"][1::2], of(there, time=end)["means"][1::2], atol=1e-6)
+
+
 def test_hidden_objects_come_back(scene):
     there = edited(scene, Edits({TRAM: Change(hidden=((0.3, 0.5),))}))
     shown = [bool((of(there, time=time)["opacities"][::2] > 0).all()) for time in (0.29, 0.3, 0.49, 0.5)]
@@ -146,11 +162,19 @@ def test_a_copy_is_the_object_once_more(scene):
         np.testing.assert_array_equal(values, before[name])
 
 
-def test_an_object_of_another_scene_keeps_its_own_clock_and_stands_on_the_ground(scene):
+def test_an_object_of_another_scene_keeps_its_own_clock_and_stands_on_the_ground(scene, monkeypatch):
     other = SceneGraph({"cars": cars(10, sh_degree=1)}).eval()
     added = Added(TRAM, Change(AsRecorded()), instead_of=CAR, scene=other, speed=0.5)
     there = edited(scene, Edits({CAR: REMOVED}, {"new": added}))
     before = of(other, time=0.2)["means"][::2]
+    asked = []
+    node = other.nodes["cars"]
+    monkeypatch.setattr(
+        node, "raw_at", lambda view, state, ask=node.raw_at: (asked.append(view.time), ask(view, state))[1]
+    )
+    of(there, "new", 0.4)
+    of(there, "new", -3.0)
+    assert asked == [0.2, 0.0]  # before it was there it has its first shape
     # The tram's box is 1.5 m high, that of the car 2 m.
     wanted = box(scene, 1, 0.4) @ placed(z=(1.5 - 2.0) / 2)
     np.testing.assert_allclose(of(there, "new", 0.4)["means"], carried(before, wanted, box(other, 0, 0.2)), atol=4e-6)
@@ -181,8 +205,22 @@ def test_people_keep_their_shape_and_stay_upright(people):
     old, new = before["means"][anna], after["means"][anna]
     np.testing.assert_allclose(new[:, 2], old[:, 2], atol=2e-6)
     frame = people.nodes["people"].object_frames(people.nodes["people"].pose_at(0.5))[0]
-    np.testing.assert_allclose(frame[:3, 2], [0, 0, 1], atol=1e-12)
+    # Anna has turned by 0.2 rad in each of two frames.
+    np.testing.assert_allclose(frame[:3, :3], placed(yaw=0.4)[:3, :3], atol=1e-6)
     np.testing.assert_allclose(new, carried(old, frame @ placed(y=-3.0, yaw=np.pi), frame), atol=4e-6)
+
+
+def test_a_person_stands_on_the_ground_that_another_stood_on(people):
+    other = SceneGraph({"people": smpl(walker("carl", height=1.2))}).eval()
+    there = edited(people, Edits({"anna": REMOVED}, {"carl": Added("carl", instead_of="anna", scene=other)}))
+    soles = [of(people, "people", 0.0)["means"], of(there, "carl", 0.0)["means"]]
+    # Limbs are bent at random, by up to a radian, and 1.2 m are 0.4 m less than 1.6.
+    heights = [float(means[:, 2].max()) for means in soles]
+    assert 0.25 < heights[0] - heights[1] < 0.55
+    node = people.nodes["people"]
+    assert isinstance(node, Tracked)
+    # The pelvis of a body of 1.6 m is a little above the middle.
+    assert 0.75 < node.frame_height(0) < 1.0
 
 
 def test_a_held_person_stops_walking_and_a_copied_one_walks_on(people):
