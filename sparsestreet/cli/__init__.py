@@ -20,6 +20,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet evaluate RUN                           measure a trained run again, without training
   sparsestreet report DIR [DIR ...]                   tables from the records of runs
   sparsestreet render RUN drive.mp4                   a video of a trained street, along its log or beside it
+  sparsestreet objects RUN                            what is in it that can be removed, moved or copied (edits=FILE)
   sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
   sparsestreet data check DIR                         everything that is wrong with a log, at once
   sparsestreet data convert from=DIR to=OUT           any log in DriveStudio's layout, or another data set's
@@ -31,7 +32,9 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
 Every command takes --help. Options of train are Hydra overrides; `sparsestreet train --cfg job` prints them all.
 """
 
-COMMANDS = ("demo", "train", "jobs", "evaluate", "report", "render", "export", "data", "effects", "presets", "bench")
+COMMANDS = (
+    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "data", "effects", "presets", "bench",
+)  # fmt: skip
 
 
 READER_GONE = 128 + 13

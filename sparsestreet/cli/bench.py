@@ -36,6 +36,7 @@ examples:
   sparsestreet bench masks                      a mask over time: its network a frame, and the bits that it leaves
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
+  sparsestreet bench edits --street RUN         objects removed, moved, copied, beside a street traced that way
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -53,6 +54,7 @@ def bench(arguments: list[str]) -> int:
         "masks": _masks,
         "effects": _effects,
         "costs": _costs,
+        "edits": _edits,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -77,7 +79,7 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument(
-        "--street", type=Path, metavar="RUN", help="knobs, gpu: the trained street of this run's folder"
+        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits: the trained street of this run's folder"
     )
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
@@ -163,6 +165,27 @@ def _costs(options: argparse.Namespace) -> bool:
     else:
         costs.run_costs(effects, data, street, costs.SCALES, costs.PROXIES, TimingBudget(60, 60.0), _file(options))
     return True
+
+
+def _edits(options: argparse.Namespace) -> bool:
+    from hydra.utils import instantiate
+
+    from sparsestreet.bench import edits
+    from sparsestreet.cli.compose import load_run_config
+    from sparsestreet.data.lazy import spread
+    from sparsestreet.data.synthetic import StreetReader
+    from sparsestreet.scene.storage import load_scene
+    from sparsestreet.scene.views import FILE_NAME, read_views
+
+    if options.street is None:
+        raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
+    reader = instantiate(load_run_config(options.street).data.log)
+    if not isinstance(reader, StreetReader):
+        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
+    views = read_views(options.street / FILE_NAME).held_out
+    chosen = [views[place] for place in spread(len(views), 4 if options.quick else 24)]
+    street_from_world = reader.read().dataset_from_world
+    return edits.run_edits(load_scene(options.street), chosen, reader.settings, street_from_world, _file(options)) > 0
 
 
 def _masks(options: argparse.Namespace) -> bool:

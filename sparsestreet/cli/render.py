@@ -20,6 +20,7 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN right.mp4 path=shifted offset=1.5       from 1.5 m farther to the right
   sparsestreet render outputs/RUN lane.mp4 path=lane_change offset=-3     three meters to the left on the way
   sparsestreet render outputs/RUN still frames=40:60 width=640            single PNGs in the folder still/
+  sparsestreet render outputs/RUN empty.mp4 edits=edits.yaml              without or with other objects
 
   scene     a run's folder, or a scene.safetensors; the first word without a key
   out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
@@ -32,11 +33,9 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
   views     the views.json that holds the cameras (default: the one beside the scene)
+  edits     edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   device    cpu or cuda (default: a GPU if there is one)
 """
-
-DEFAULT_LOG_FPS = 10.0
-"""Of Waymo, KITTI, PandaSet and Argoverse; said when it is used."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,7 @@ class RenderRequest:
     log_fps: float | None = None
     quality: float = 7.0
     views: Path | None = None
+    edits: Path | None = None
     device: str | None = None
 
     def __post_init__(self) -> None:
@@ -74,6 +74,7 @@ def render(arguments: list[str]) -> int:
 
 def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
+    from sparsestreet.cli.edits import DEFAULT_LOG_FPS, with_edits
     from sparsestreet.cli.progress import shown
     from sparsestreet.cli.scene import open_scene
     from sparsestreet.export.video import check_destination, path_pictures, write_pictures
@@ -85,6 +86,7 @@ def _render(request: RenderRequest) -> None:
     stored = open_scene(request.scene, request.device)
     beside = request.scene if request.scene.is_dir() else request.scene.parent
     views = read_views(request.views or beside / FILE_NAME)
+    stored = with_edits(stored, views, request.edits)
     log_fps = request.log_fps or views.frame_rate
     if log_fps is None:
         log_fps = DEFAULT_LOG_FPS

@@ -97,15 +97,30 @@ def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return picture.render, picture.error, picture.centers
 
 
+def tile_sheet(tiles: Sequence[Tile], *, title: str, columns: int, tile_width: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Returns a sheet of tiles in lines of so many, under a title."""
+    lines: list[list[Tile | None]] = [list(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
+    return np.asarray(_laid_out(lines, title, tile_width, foot=0)[0])
+
+
 def _sheet(
     lines: list[list[Tile | None]], title: str, legend: Legend, tile_width: int, lidar_end: bool
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Lays tiles out on dark paper under their headings, with the title on top and scale and legend at the foot."""
+    """Lays tiles out, with scale and legend at the foot."""
+    paper, top = _laid_out(lines, title, tile_width, foot=3 if legend else 2)
+    draw = ImageDraw.Draw(paper)
+    _draw_scale(paper, draw, _MARGIN, top + 14, lidar_end)
+    _draw_legend(draw, legend, _MARGIN, top + 14 + _HEADING)
+    return np.asarray(paper)
+
+
+def _laid_out(lines: list[list[Tile | None]], title: str, tile_width: int, foot: int) -> tuple[Image.Image, int]:
+    """Lays tiles out on dark paper under their headings, with the title on top, and says where the foot begins."""
     if not lines:
         raise ValueError("a sheet needs at least one picture")
     heights = [max(_fitted(tile.image, tile_width).height for tile in line if tile) for line in lines]
     width = max(len(line) for line in lines) * (tile_width + _GAP) - _GAP + 2 * _MARGIN
-    paper = Image.new("RGB", (width, _HEADING + sum(heights) + (len(lines) + (3 if legend else 2)) * _HEADING), _PAPER)
+    paper = Image.new("RGB", (width, _HEADING + sum(heights) + (len(lines) + foot) * _HEADING), _PAPER)
     draw = ImageDraw.Draw(paper)
     _write(draw, (_MARGIN, 5), title, _INK, 16, width - 2 * _MARGIN)
     top = _HEADING
@@ -116,9 +131,7 @@ def _sheet(
                 _write(draw, (x, top + 6), tile.heading, _INK, 14, tile_width)
                 paper.paste(_fitted(tile.image, tile_width), (x, top + _HEADING))
         top += _HEADING + height
-    _draw_scale(paper, draw, _MARGIN, top + 14, lidar_end)
-    _draw_legend(draw, legend, _MARGIN, top + 14 + _HEADING)
-    return np.asarray(paper)
+    return paper, top
 
 
 def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, lidar_end: bool) -> None:

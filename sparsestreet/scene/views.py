@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.records.strict_json import EXACT, json_line, read_json, version, write_atomically
 from sparsestreet.types import Camera, Shutter, Side, View
 
@@ -38,6 +39,20 @@ class RecordedViews:
     def all(self) -> tuple[View, ...]:
         """Training and held-out views in order of their frames, those of one frame in order of their cameras."""
         return tuple(sorted((*self.training, *self.held_out), key=lambda view: (view.frame_index, view.camera_index)))
+
+
+def seconds_of(views: RecordedViews, frame_rate: float) -> float:
+    """How many seconds of the log normalized time 0 to 1 is: by its clock, else at so many frames a second."""
+    with_clock = [view for view in views.all if view.seconds is not None]
+    if with_clock:
+        first, last = min(with_clock, key=_time), max(with_clock, key=_time)
+        if last.time > first.time and last.seconds is not None and first.seconds is not None:
+            return (last.seconds - first.seconds) / (last.time - first.time)
+    return frame_periods(views.all) / frame_rate
+
+
+def _time(view: View) -> float:
+    return view.time
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.scene.views import read_views, write_views
+from sparsestreet.scene.views import RecordedViews, read_views, seconds_of, write_views
 from sparsestreet.types import Camera, Frame, Shutter, View
 from tests.export.street import street_views
 from tests.typed import there
@@ -125,3 +125,11 @@ def test_a_damaged_file_names_the_place(tmp_path, change, said):
     path.write_text(json.dumps(file))
     with pytest.raises(ValueError, match=said):
         read_views(path)
+
+
+def test_seconds_of_a_log_are_those_of_its_clock_else_of_its_frames():
+    camera = Camera(torch.eye(4), torch.eye(3), 8, 6)
+    clock = [View(camera, time, place, 0, 10.0 * time) for place, time in enumerate((0.1, 0.3, 0.9))]
+    assert seconds_of(RecordedViews((clock[2], clock[0]), (clock[1],), 25.0), 5.0) == pytest.approx(10.0)
+    frames = [View(camera, place / 4, place, 0) for place in range(5)]
+    assert seconds_of(RecordedViews(tuple(frames), ()), 5.0) == pytest.approx(4 / 5)

@@ -1,5 +1,6 @@
 """Positions of things over time: straight along the street, with one smooth change of lane, or straight across it."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +9,20 @@ from sparsestreet.data.synthetic.parts import Pose, at
 from sparsestreet.data.synthetic.settings import TURNS, swing
 
 
+class Way(ABC):
+    """Where a thing is over time."""
+
+    @abstractmethod
+    def traveled(self, time: float) -> float:
+        """Returns meters that its wheels or legs have moved since time 0."""
+
+    @abstractmethod
+    def pose(self, time: float, height: float) -> Pose:
+        """Returns world from object, with the object's origin ``height`` meters above the road."""
+
+
 @dataclass(frozen=True)
-class Path:
+class Path(Way):
     """x = start + speed t; y moves by ``shift`` around ``shift_time`` (world frame, meters and seconds).
 
     >>> Path(start=5.0, y=1.0, speed=2.0).position(3.0)
@@ -54,7 +67,7 @@ class Path:
 
 
 @dataclass(frozen=True)
-class Crossing:
+class Crossing(Way):
     """Waits at one side of the lanes, walks straight across and stands at the other (world frame, meters and seconds).
 
     >>> Crossing(x=5.0, start=-3.0, end=8.0, speed=2.0, at=1.0).position(2.0)

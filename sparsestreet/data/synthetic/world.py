@@ -9,7 +9,7 @@ from sparsestreet.data.synthetic.models.car import random_car
 from sparsestreet.data.synthetic.models.model import Model
 from sparsestreet.data.synthetic.models.people import random_cyclist, random_pedestrian
 from sparsestreet.data.synthetic.models.roadside import bin_box, house, lamp_post, tree
-from sparsestreet.data.synthetic.motion import Crossing, EgoDrive, Path
+from sparsestreet.data.synthetic.motion import Crossing, EgoDrive, Path, Way
 from sparsestreet.data.synthetic.noise import stream
 from sparsestreet.data.synthetic.parts import Part, Pose, at, placed
 from sparsestreet.data.synthetic.settings import StreetSettings
@@ -28,7 +28,7 @@ class Actor:
 
     name: str
     model: Model
-    path: Path | Crossing
+    path: Way
     ground: float
     """Height of the ground under it, meters."""
 

@@ -166,6 +166,8 @@ class Instances:
     """Length, width, height of their boxes, meters."""
     spans: Float[Tensor, "i 2"] | None = None
     """Normalized times from when to when they may be there; None: unknown."""
+    classes: tuple[str, ...] | None = None
+    """Class names of their tracks, "" where they are not known; None: unknown."""
 
     def counts(self) -> Int[Tensor, " i"]:
         """Returns the number of rows of every instance."""

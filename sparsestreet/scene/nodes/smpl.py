@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
@@ -15,7 +15,7 @@ from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
-from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.ops.raw import Poses, RawGaussians
 from sparsestreet.scene.body import Body, BodyTemplate, BuiltinBody, surface
 from sparsestreet.scene.body.anatomy import Anatomy
 from sparsestreet.scene.body.people import People, people_of, trained_poses
@@ -26,7 +26,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
 from sparsestreet.scene.nodes.regularizers import excess_volume
-from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, stored_keyframes
+from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, matrices, stored_keyframes, stored_objects
 from sparsestreet.scene.state import SceneState
 from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Track, View
@@ -99,6 +99,7 @@ class SmplSettings(TrackedSettings):
             torch.stack([track.size.float() for track in tracks]),
             anatomy=Anatomy.of(template, people),
             names=tuple(track.name for track in tracks),
+            classes=tuple(track.class_name for track in tracks),
             max_gap=self.max_gap / data.log.frame_periods + view_lag(tracks, data.log.views),
             mask=mask,
         )
@@ -108,8 +109,7 @@ class SmplSettings(TrackedSettings):
         anatomy = Anatomy(
             tensors["vertices"], tensors["attached"], tensors["weights"], tensors["joints"], tensors["joint_keyframes"]
         )
-        names, max_gap = tuple(header["names"]), header["max_gap"]
-        return Smpl(self, rows, trajectories, tensors["sizes"], anatomy=anatomy, names=names, max_gap=max_gap)
+        return Smpl(self, rows, trajectories, tensors["sizes"], anatomy=anatomy, **stored_objects(header))
 
     def _start(
         self,
@@ -204,11 +204,12 @@ class Smpl(Tracked):
         *,
         anatomy: Anatomy,
         names: Sequence[str] | None = None,
+        classes: Sequence[str] | None = None,
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
         """Takes the arguments of ``Tracked``; rows also have the buffer ``vertex_ids`` [n] int64, template vertices."""
-        super().__init__(settings, rows, keyframes, sizes, names=names, max_gap=max_gap, mask=mask)
+        super().__init__(settings, rows, keyframes, sizes, names=names, classes=classes, max_gap=max_gap, mask=mask)
         self.register_buffer("vertices", anatomy.vertices)
         self.register_buffer("attached", anatomy.attached)
         self.register_buffer("weights", anatomy.weights)
@@ -227,6 +228,23 @@ class Smpl(Tracked):
         weights = self.weights[self.rows.vertex_ids]
         means, quaternions = skin(raw.means, raw.quaternions, all_bones, attached, weights)
         return replace(raw, means=means, quaternions=quaternions)
+
+    def object_frames(self, poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
+        """Returns upright frames at the pelvis; x is where its z points, seen from above."""
+        frames = matrices(poses)
+        ahead = frames[:, :2, 2]
+        yaws = np.arctan2(ahead[:, 1], ahead[:, 0])
+        frames[:, :3, :3] = np.eye(3)
+        frames[:, 0, 0] = frames[:, 1, 1] = np.cos(yaws)
+        frames[:, 1, 0] = np.sin(yaws)
+        frames[:, 0, 1] = -np.sin(yaws)
+        return frames
+
+    def frame_height(self, instance: int) -> float:
+        """Returns how far the pelvis of a person at rest is above the soles."""
+        own = self.rows.means.detach()[self.rows.instances == instance, 1]
+        # A few Gaussians may have left the body.
+        return float(-own.quantile(0.005)) if len(own) else 0.0
 
     def joint_rotations(self, time: float) -> Float[Tensor, "i 24 4"]:
         """Returns the joints of every person relative to their parents at a time; the pelvis is at rest."""

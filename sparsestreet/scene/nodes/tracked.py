@@ -5,8 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
@@ -93,14 +94,14 @@ class TrackedSettings(NodeSettings):
             keyframes,
             sizes,
             names=tuple(track.name for track in tracks),
+            classes=tuple(track.class_name for track in tracks),
             max_gap=self.max_gap / data.log.frame_periods + view_lag(tracks, data.log.views),
             mask=mask,
         )
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Tracked":
         trajectories = stored_keyframes(tensors)
-        names = tuple(header["names"])
-        return self.node_class(self, rows, trajectories, tensors["sizes"], names=names, max_gap=header["max_gap"])
+        return self.node_class(self, rows, trajectories, tensors["sizes"], **stored_objects(header))
 
     def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
         """Returns one object's colored points in its box frame, filled up if there are too few."""
@@ -122,6 +123,29 @@ def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
         tensors["keyframe_valid"],
         tensors["spans"],
     )
+
+
+def stored_objects(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a scene file says of a node's objects, as ``Tracked`` takes it; older files have no classes."""
+    classes = tuple(header["classes"]) if "classes" in header else None
+    return {"names": tuple(header["names"]), "classes": classes, "max_gap": header["max_gap"]}
+
+
+def matrices(poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
+    """Returns poses as world_from_box, on the host."""
+    frames = np.tile(np.eye(4), (len(poses.quaternions), 1, 1))
+    frames[:, :3, :3] = quat.to_matrix(poses.quaternions.detach().double()).cpu().numpy()
+    frames[:, :3, 3] = poses.translations.detach().cpu().numpy()
+    return frames
+
+
+def moved_by_boxes(
+    means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], before: Poses, after: Poses
+) -> Float[Tensor, "n 3"]:
+    """Returns how far means in boxes, meters, move in the world as their boxes do."""
+    turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
+    shift = after.translations - before.translations
+    return (turn[instances] @ means[:, :, None]).squeeze(-1) + shift[instances]
 
 
 def _from_images(track: Track, data: TrainingData) -> Points:
@@ -154,6 +178,7 @@ class Tracked(Node):
         sizes: Float[Tensor, "i 3"],
         *,
         names: Sequence[str] | None = None,
+        classes: Sequence[str] | None = None,
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
@@ -165,6 +190,7 @@ class Tracked(Node):
             keyframes: training poses of every instance.
             sizes: length, width, height of every instance's box, meters.
             names: names of the instances' tracks; None: their numbers.
+            classes: class names of the tracks; None: not known.
             max_gap: normalized time to the nearest keyframe beyond which an instance counts as absent.
             mask: the mask, if the rows have its columns.
 
@@ -175,6 +201,7 @@ class Tracked(Node):
         super().__init__(settings, rows, mask)
         num_instances = keyframes.times.shape[0]
         self.names = tuple(str(index) for index in range(num_instances)) if names is None else tuple(names)
+        self.classes = ("",) * num_instances if classes is None else tuple(classes)
         if sizes.shape[0] != num_instances or len(self.names) != num_instances:
             raise ValueError(
                 f"every instance needs a box size and a name, got {sizes.shape[0]} sizes and {len(self.names)} names "
@@ -217,13 +244,18 @@ class Tracked(Node):
         """Returns pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
+    def object_frames(self, poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
+        """Returns the frames of all objects at such poses: world_from_object, x ahead, y left, z up."""
+        return matrices(poses)
+
+    def frame_height(self, instance: int) -> float:
+        """Returns how far the origin of an object's frame is above the ground that it stands on, meters."""
+        return float(self.sizes[instance, 2]) / 2
+
     def displacements_over(self, span: float, view: View, raw: RawGaussians) -> Float[Tensor, "n 3"]:
         """Returns the motion of the rows' boxes; a body that walks meanwhile, or a network's change, is left out."""
-        table = self.keyframes, self.rotation_deltas, self.translation_deltas
-        before, after = (poses_at(*table, view.time + side * span / 2, self.max_gap) for side in (-1, 1))
-        turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
-        shift, instances = after.translations - before.translations, self.rows.instances
-        return (turn[instances] @ raw.means[:, :, None]).squeeze(-1) + shift[instances]
+        before, after = (self.pose_at(view.time + side * span / 2) for side in (-1, 1))
+        return moved_by_boxes(raw.means, self.rows.instances, before, after)
 
     def regularizers(
         self, view: View, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
@@ -255,10 +287,10 @@ class Tracked(Node):
 
     def instances(self) -> Instances:
         """Returns the objects, named like their tracks."""
-        return Instances(self.names, self.rows.instances, self.sizes, self.spans)
+        return Instances(self.names, self.rows.instances, self.sizes, self.spans, self.classes)
 
     def header(self) -> dict[str, Any]:
-        return {"names": list(self.names), "max_gap": self.max_gap}
+        return {"names": list(self.names), "classes": list(self.classes), "max_gap": self.max_gap}
 
     def pose_bytes(self) -> int:
         """Returns the float32 bytes of the keyframes: each a time, a quaternion and a translation with corrections."""

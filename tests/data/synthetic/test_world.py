@@ -108,6 +108,7 @@ def test_moving_actors_travel_at_their_speed_and_nobody_collides(settings):
         for a, b in itertools.combinations(range(len(centers)), 2):
             assert (np.abs(centers[a] - centers[b]) > halves[a] + halves[b]).any(), (frame, a, b)
         for actor in world.actors:
+            assert isinstance(actor.path, Path)
             moved = np.linalg.norm(actor.pose(time + 0.1)[:2, 3] - actor.pose(time)[:2, 3])
             assert moved >= abs(actor.path.speed) * 0.1 - 1e-9
             assert moved <= abs(actor.path.speed) * 0.1 * 1.15 + 1e-9

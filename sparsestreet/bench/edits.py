@@ -1,0 +1,168 @@
+"""Edits of a street that was traced: what the scene shows beside the street traced with the same edit.
+
+An object is removed, moved 3 m to its right, or copied 3 m to its right. The region are the pixels that the edit
+changes in the traced images. A ghost is what is left of an object where it was: the part of the error that looks like
+the object, by projection, and its energy as a share of the object's.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from sparsestreet.bench.records import RecordFile
+from sparsestreet.data.log import Truth
+from sparsestreet.data.synthetic.motion import Way
+from sparsestreet.data.synthetic.parts import Pose, at
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.truth import street_truth
+from sparsestreet.data.synthetic.world import Actor, World, build_world
+from sparsestreet.scene.edits import REMOVED, Added, Change, Edits, Moved, edited
+from sparsestreet.scene.edits.edits import objects_of
+from sparsestreet.scene.storage import StoredScene
+from sparsestreet.types import View
+
+RIGHT = 3.0
+"""Meters."""
+LEAST = 200
+"""Pixels that an edit must change for a view to count."""
+VIEWS = 6
+"""Views of each edit, those where it changes most of a spread of views."""
+KINDS = ("removed", "moved", "copied")
+
+
+@dataclass(frozen=True)
+class Beside(Way):
+    """An actor's path, moved to its right."""
+
+    path: Way
+    right: float
+
+    def traveled(self, time: float) -> float:
+        return self.path.traveled(time)
+
+    def pose(self, time: float, height: float) -> Pose:
+        return self.path.pose(time, height) @ at(0.0, -self.right, 0.0)
+
+
+@dataclass(frozen=True)
+class EditRecord:
+    """One edit of one object."""
+
+    edit: str
+    object: str
+    class_name: str
+    views: int
+    pixels: int
+    """That the edit changes, in all of these views."""
+    psnr: float
+    """In that region, of the edited scene beside the street traced with the edit, dB."""
+    psnr_before: float
+    """In the same region, of the scene beside the street as they were, dB."""
+    ghost: float | None
+    """Energy of what is left of the object, as a share of its own; None: nothing was taken away."""
+
+
+@torch.no_grad()
+def run_edits(
+    stored: StoredScene,
+    views: Sequence[View],
+    settings: StreetSettings,
+    street_from_world: Float64[Tensor, "4 4"],
+    file: RecordFile,
+    say: Callable[[str], None] = print,
+) -> int:
+    """Measures three edits of each object that is seen; returns the number of records."""
+    world, count = build_world(settings), 0
+    truth = street_truth(settings, street_from_world)
+    for name, actor, place in _pairs(stored, world, settings, street_from_world):
+        for kind in KINDS:
+            edits, actors = _edit(kind, name, actor, list(world.actors), place)
+            other = street_truth(settings, street_from_world, replace(world, actors=tuple(actors)))
+            scene = replace(stored, scene=edited(stored.scene, edits))
+            record = _compared(kind, name, actor, stored, scene, views, truth, other)
+            if record is not None:
+                file.write("edit", record)
+                ghost = "" if record.ghost is None else f", ghost {100 * record.ghost:.2f} %"
+                say(
+                    f"{kind:8} {name:16} {record.class_name:10} {record.psnr:5.1f} dB in {record.pixels:,} pixels of "
+                    f"{record.views} views (unedited {record.psnr_before:.1f}){ghost}"
+                )
+                count += 1
+    return count
+
+
+def _edit(kind: str, name: str, actor: Actor, actors: list[Actor], place: int) -> tuple[Edits, list[Actor]]:
+    beside = replace(actor, path=Beside(actor.path, RIGHT))
+    if kind == "removed":
+        return Edits({name: REMOVED}), [*actors[:place], *actors[place + 1 :]]
+    if kind == "moved":
+        return Edits({name: Change(Moved(right=RIGHT))}), [*actors[:place], beside, *actors[place + 1 :]]
+    return Edits(added={"copy": Added(name, Change(Moved(right=RIGHT)))}), [*actors, beside]
+
+
+def _compared(
+    kind: str,
+    name: str,
+    actor: Actor,
+    stored: StoredScene,
+    scene: StoredScene,
+    views: Sequence[View],
+    truth: Truth,
+    other: Truth,
+) -> EditRecord | None:
+    found = []
+    for view in views:
+        before, after = truth(view), other(view)
+        if before is None or after is None:
+            continue
+        pair = [frame.image.double().numpy() / 255 for frame in (before, after)]
+        changed = np.abs(pair[0] - pair[1]).max(-1) > 3 / 255
+        if changed.sum() >= LEAST:
+            found.append((int(changed.sum()), view, pair, changed))
+    found = sorted(found, key=lambda one: -one[0])[:VIEWS]
+    if not found:
+        return None
+    errors, old_errors, alike, own = 0.0, 0.0, 0.0, 0.0
+    for _, view, (before, after), changed in found:
+        error = (_image(scene, view) - after)[changed]
+        thing = (before - after)[changed]
+        errors += float((error**2).sum())
+        old_errors += float(((_image(stored, view) - before)[changed] ** 2).sum())
+        alike += float((error * thing).sum())
+        own += float((thing**2).sum())
+    pixels = sum(one[0] for one in found)
+    ghost = (max(alike, 0.0) / own) ** 2 if kind == "removed" else None
+    return EditRecord(
+        kind, name, actor.model.class_name, len(found), pixels, _db(errors, pixels), _db(old_errors, pixels), ghost
+    )
+
+
+def _image(stored: StoredScene, view: View) -> Float64[np.ndarray, "h w 3"]:
+    return stored.render(view).rgb.clamp(0, 1).double().cpu().numpy()
+
+
+def _db(squared: float, pixels: int) -> float:
+    return float(-10 * np.log10(squared / (3 * pixels)))
+
+
+def _pairs(
+    stored: StoredScene, world: World, settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]
+) -> Iterator[tuple[str, Actor, int]]:
+    """Yields the objects of the scene with the actors that they are: those whose paths are the nearest."""
+    first, last = settings.recorded
+    times = np.linspace(0.0, 1.0, 9)
+    for name, (_, node, instance) in objects_of(stored.scene).items():
+        start, end = node.spans[instance].tolist()
+        own = [time for time in times if start <= time <= end] or [(start + end) / 2]
+        moment = own[len(own) // 2]
+        frame = node.object_frames(node.pose_at(float(moment)))[instance]
+        place = street_from_world.numpy() @ np.append(frame[:3, 3], 1.0)
+        seconds = first + float(moment) * (last - first)
+        gaps = [float(np.linalg.norm(actor.pose(seconds)[:2, 3] - place[:2])) for actor in world.actors]
+        nearest = int(np.argmin(gaps))
+        if gaps[nearest] < 1.0:
+            yield name, world.actors[nearest], nearest

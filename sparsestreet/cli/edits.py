@@ -1,0 +1,48 @@
+"""``edits=FILE``: a trained scene as a file of edits leaves it, and what its user should know of that."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from sparsestreet.scene.edits import Edits, edited, read_edits
+from sparsestreet.scene.storage import StoredScene, load_scene
+from sparsestreet.scene.views import FILE_NAME, RecordedViews, read_views, seconds_of
+
+DEFAULT_LOG_FPS = 10.0
+"""Of Waymo, KITTI, PandaSet and Argoverse; said when it is used."""
+
+
+def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> StoredScene:
+    """The scene with the edits of a file, whose seconds are those of the log; None: as it is. Prints what to know.
+
+    Raises FileNotFoundError or ValueError for what is wrong with the file or a scene that it names.
+    """
+    if file is None:
+        return stored
+
+    def open_scene(path: Path) -> tuple[StoredScene, float]:
+        beside = path if path.is_dir() else path.parent
+        return load_scene(path, stored.scene.device), log_seconds(read_views(beside / FILE_NAME))
+
+    edits = read_edits(file, log_seconds(views), open_scene)
+    scene = edited(stored.scene, edits)
+    for note in _notes(edits):
+        print(note)
+    return replace(stored, scene=scene)
+
+
+def log_seconds(views: RecordedViews) -> float:
+    """How long a log lasts, at ten frames a second where it has no clock."""
+    return seconds_of(views, views.frame_rate or DEFAULT_LOG_FPS)
+
+
+def _notes(edits: Edits) -> list[str]:
+    gone = [name for name, change in edits.changes.items() if change.hidden or change.path is not None]
+    notes = []
+    if gone:
+        notes.append(
+            f"where {', '.join(gone[:3])}{' and others' if gone[3:] else ''} stood, the scene shows what was seen "
+            "there at other times; what never was is a guess, and shadows stay"
+        )
+    if foreign := [name for name, one in edits.added.items() if one.scene is not None]:
+        notes.append(f"{', '.join(foreign)}: lit as in the scene it comes from, without a shadow here")
+    return notes
