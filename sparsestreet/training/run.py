@@ -38,6 +38,7 @@ from sparsestreet.training.callbacks import (
     StageTimes,
     TrainingProgress,
     newest_checkpoint,
+    step_of,
 )
 from sparsestreet.training.costs import record_costs
 from sparsestreet.training.curves import kept_curves
@@ -199,12 +200,11 @@ def fit(
     if start is None:
         trainer.fit(system, datamodule=data)
         return trainer
-    # A checkpoint holds the state of callbacks and optimizer as well, so it is no file of weights only.
-    step = torch.load(start, map_location="cpu", weights_only=False)["global_step"]
+    step = step_of(start)
     if step >= max_steps:
         log.info("%s was finished: all %d steps are done, it is measured again", out, step)
     with kept_curves(out, step if trainer.is_global_zero else None):
-        trainer.fit(system, datamodule=data, ckpt_path=start, weights_only=False)
+        trainer.fit(system, datamodule=data, ckpt_path=start, weights_only=True)
     return trainer
 
 

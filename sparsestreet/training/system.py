@@ -15,6 +15,7 @@ from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
+from sparsestreet.training.finite import check_loss
 from sparsestreet.training.lightning import image_number, images_per_step
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
@@ -117,6 +118,7 @@ class StreetSystem(LightningModule):
             if self.moved_views is not None and self.moved_views.applies(state.step, state.progress):
                 with phase("moved view"):
                     terms |= self.moved_views(self.scene, self.rendering, frame)
+        check_loss(terms, self.scene, frame, self.global_step)
         if self._logs():
             with phase("logging"):
                 self._log_training(self.rendering, terms, frame)

@@ -6,7 +6,7 @@ through ``resizing``. ``row_ledger``, ``phase_times``, ``held_out_curve`` and ``
 ``checkpoints``, ``run_files`` and ``graceful_stop`` see to what a run leaves, also one that is interrupted.
 """
 
-from sparsestreet.training.callbacks.checkpoints import Checkpoints, newest_checkpoint
+from sparsestreet.training.callbacks.checkpoints import Checkpoints, newest_checkpoint, step_of
 from sparsestreet.training.callbacks.clock import Clock
 from sparsestreet.training.callbacks.density_control import DensityControl
 from sparsestreet.training.callbacks.graceful_stop import GracefulStop
@@ -35,4 +35,5 @@ __all__ = [
     "StageTimes",
     "TrainingProgress",
     "newest_checkpoint",
+    "step_of",
 ]

@@ -1,13 +1,16 @@
 """What training leaves to go on from: a checkpoint now and then, at the end, and when it is interrupted."""
 
 import logging
+import pickle
 from pathlib import Path
 
+import torch
 from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
 from sparsestreet.training.callbacks.graceful_stop import TornStop
+from sparsestreet.training.finite import check_parameters
 from sparsestreet.training.lightning import ends_step, ranks_of, validates_now
 
 log = logging.getLogger(__name__)
@@ -23,12 +26,21 @@ class Checkpoints(Callback):
     change rows, so that a checkpoint holds the rows as they left them. It waits for the validation of its step, which
     Lightning would not make up for when the run goes on. (Lightning's ModelCheckpoint has no notion of a plain last
     state without a monitored metric, and its OnExceptionCheckpoint resumes from that file by itself in the next run.)
+
+    What failed inside a step may have moved some parameters and others not: nothing is written then. Numbers that are
+    not finite are never written (``training/finite.py``). A checkpoint holds tensors and plain values alone, so that
+    opening one runs no code (``weights_only``).
     """
 
     def __init__(self, folder: str | Path, every: int = 1000) -> None:
         self.folder = Path(folder)
         self.every = every
         self._due = False
+        self._inside = False
+        """Whether a step has begun and not ended."""
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
+        self._inside = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remove what a process left that was killed while it wrote one: its name has the number of that process."""
@@ -38,46 +50,60 @@ class Checkpoints(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
+        self._inside = False
         self._due = (
             ends_step(trainer, batch_idx)
             and trainer.global_step % self.every == 0
             and trainer.global_step < trainer.max_steps
         )
         if self._due and not validates_now(trainer):
-            self._try_to_save(trainer, LAST)
+            self._try_to_save(trainer, pl_module, LAST)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._due and not trainer.sanity_checking:
-            self._try_to_save(trainer, LAST)
+            self._try_to_save(trainer, pl_module, LAST)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.interrupted:
-            self._save(trainer, LAST)
+            self._save(trainer, pl_module, LAST)
             if trainer.is_global_zero:
                 (self.folder / INTERRUPTED).unlink(missing_ok=True)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         # A process that fails by itself has no others to ask for their part of the state.
         alone = ranks_of(trainer).size > 1 and not isinstance(exception, KeyboardInterrupt)
-        if alone or isinstance(exception, TornStop):
+        if alone or self._inside or isinstance(exception, TornStop):
             log.warning("stopped inside step %d: go on from the checkpoint before it", trainer.global_step + 1)
-        elif trainer.global_step > 0 and self._try_to_save(trainer, INTERRUPTED):
+        elif trainer.global_step > 0 and self._try_to_save(trainer, pl_module, INTERRUPTED):
             log.warning("stopped after step %d; go on with resume=%s", trainer.global_step, self.folder.parent)
 
-    def _try_to_save(self, trainer: Trainer, name: str) -> bool:
+    def _try_to_save(self, trainer: Trainer, system: LightningModule, name: str) -> bool:
         try:
-            self._save(trainer, name)
+            self._save(trainer, system, name)
         except OSError as error:
             log.error("step %d: no checkpoint could be written (%s); the one before it is whole: %s",
                       trainer.global_step, error, self.folder)  # fmt: skip
             return False
         return True
 
-    def _save(self, trainer: Trainer, name: str) -> None:
+    def _save(self, trainer: Trainer, system: LightningModule, name: str) -> None:
+        check_parameters(system.named_parameters(), trainer.global_step)
         for logger in trainer.loggers:
             logger.save()  # else a kill takes the rows of steps that are never taken again
         with stage("save"), atomic_file(self.folder / name) as temporary:
             trainer.save_checkpoint(temporary, weights_only=False)
+
+
+def step_of(checkpoint: Path) -> int:
+    """After how many steps it was written. Raises ValueError for a file that is no checkpoint of plain values."""
+    try:
+        return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])
+    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(
+            f"{checkpoint} is no checkpoint of a training, is damaged, or holds what may run code, which is never "
+            f"opened ({type(error).__name__}: {reason}): go on from another one, or begin again with overwrite=true"
+        ) from error
 
 
 def newest_checkpoint(run: Path) -> Path:

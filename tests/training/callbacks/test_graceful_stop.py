@@ -132,9 +132,9 @@ def test_a_stop_and_a_checkpoint_wait_for_the_validation_of_their_step(tmp_path,
     seen, stop, kept = Validated(), GracefulStop(), []
 
     class Keeps(Checkpoints):
-        def _save(self, trainer: Trainer, name: str) -> None:
+        def _save(self, trainer: Trainer, system: Any, name: str) -> None:
             kept.append((name, trainer.global_step, list(seen.steps)))
-            super()._save(trainer, name)
+            super()._save(trainer, system, name)
 
     system = make_system({"background": background(5)})
     validated = {"limit_val_batches": 1, "val_check_interval": 2, "check_val_every_n_epoch": None}

@@ -1,0 +1,84 @@
+"""NaN and infinities stop a training in the step that shows them, with their names, and no checkpoint has them."""
+
+import logging
+import pickle
+
+import pytest
+import torch
+
+from sparsestreet.training.callbacks import Checkpoints, step_of
+from sparsestreet.training.finite import NotFiniteError, check_loss, not_finite
+from tests.scene.street import frame_at
+from tests.training.stubs import StubTrainer, background, make_system
+
+
+@pytest.fixture
+def system():
+    return make_system({"background": background(5)})
+
+
+def test_a_loss_that_is_not_finite_names_view_term_and_parameter(system):
+    frame, fine = frame_at(2), {"photometric": torch.tensor(1.0), "depth": torch.tensor(2.0)}
+    check_loss(fine, system.scene, frame, 7)
+    broken = fine | {"depth": torch.tensor(float("inf"))}
+    with pytest.raises(
+        NotFiniteError, match=r"step 8: the loss of frame 2, camera 0 .*depth = inf\); all param"
+    ):
+        check_loss(broken, system.scene, frame, 7)
+    with torch.no_grad():
+        system.scene.nodes["background"].rows.sh_dc[3, 0, 1] = torch.nan
+    with pytest.raises(NotFiniteError, match=r"parameters: nodes\.background\.rows\.sh_dc row 3 \(1 of 5 rows\)"):
+        check_loss(broken, system.scene, frame, 7)
+
+
+def test_opposite_infinities_and_sums_that_overflow():
+    opposite = torch.tensor([1.0, float("inf"), float("-inf")])
+    assert not_finite([("a", opposite)]) == ["a row 1 (2 of 3 rows)"]
+    assert not_finite([("a", torch.full((4,), 3e38)), ("b", torch.zeros(0, 3)), ("c", torch.tensor(2.0))]) == []
+    assert not_finite([("c", torch.tensor(torch.nan))]) == ["c row 0 (1 of 1 rows)"]
+
+
+def test_no_checkpoint_holds_what_is_not_finite(tmp_path):
+    trainer = StubTrainer(make_system({"background": background(5)}), [Checkpoints(tmp_path, 2)], max_steps=9)
+    trainer.walk(1)
+    trainer.walk(2)
+    before = (tmp_path / "last.ckpt").read_bytes()
+    with torch.no_grad():
+        trainer.system.scene.nodes["background"].rows.means[4, 2] = float("-inf")
+    trainer.walk(3)
+    with pytest.raises(NotFiniteError, match=r"after step 4 .*nodes\.background\.rows\.means row 4"):
+        trainer.walk(4)
+    assert (tmp_path / "last.ckpt").read_bytes() == before
+
+
+def test_what_fails_inside_a_step_leaves_no_checkpoint(tmp_path, caplog):
+    trainer = StubTrainer(make_system({"background": background(5)}), [Checkpoints(tmp_path, 9)], max_steps=9)
+    callback = trainer.callbacks[0]
+    trainer.walk(3)
+    callback.on_train_batch_start(trainer, trainer.system, None, 3)
+    with caplog.at_level(logging.WARNING):
+        callback.on_exception(trainer, trainer.system, RuntimeError("a kernel failed"))
+    assert "stopped inside step 4: go on from the checkpoint before it" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+
+
+class Hostile:
+    def __reduce__(self):
+        return exec, ("raise SystemExit('it ran')",)
+
+
+@pytest.mark.parametrize("content", [pickle.dumps(Hostile(), protocol=2), b"", b"PK\x03\x04 half a file", b"{}"])
+def test_a_file_that_is_no_checkpoint_is_refused_and_runs_nothing(content, tmp_path):
+    path = tmp_path / "last.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"last\.ckpt is no checkpoint .*overwrite=true"):
+        step_of(path)
+
+
+def test_a_checkpoint_with_an_object_in_it_is_refused(tmp_path):
+    path = tmp_path / "last.ckpt"
+    torch.save({"global_step": 3, "callbacks": {"evil": Hostile()}}, path)
+    with pytest.raises(ValueError, match="what may run code, which is never opened"):
+        step_of(path)
+    torch.save({"global_step": 3, "state_dict": {"a": torch.zeros(2)}}, path)
+    assert step_of(path) == 3
