@@ -230,7 +230,7 @@ def test_a_trainer_is_made_of_what_fit_is_given(tmp_path):
     curves.parent.mkdir(parents=True)
     curves.write_text("psnr,step\n10,2\n11,3\n")
     fit(system, frames, watch, Made, tmp_path / "o", **given, start=tmp_path / "c.ckpt")
-    assert fitted[1] == ((system,), {"datamodule": frames, "ckpt_path": tmp_path / "c.ckpt", "weights_only": False})
+    assert fitted[1] == ((system,), {"datamodule": frames, "ckpt_path": tmp_path / "c.ckpt", "weights_only": True})
     assert curves.read_text() == "psnr,step\n10,2\n11,3\n"  # nobody began the file anew
 
 
