@@ -19,8 +19,9 @@ STEPS = 4
 def handlers() -> Iterator[dict[int, Any]]:
     """Those of the process, put back whatever a test leaves."""
     before = {number: signal.getsignal(number) for number in SIGNALS}
-    # A shell starts its background jobs with SIGINT ignored, and Python then leaves it so.
+    # A shell starts its background jobs with SIGINT ignored, nohup with SIGHUP, and Python then leaves them so.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield {number: signal.getsignal(number) for number in SIGNALS}
     for number, handler in before.items():
         signal.signal(number, handler)
