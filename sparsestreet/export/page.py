@@ -69,7 +69,7 @@ def _recorded(server: Any, parts: Sequence[Part], seconds: Sequence[float], star
     # From an empty scene on: a page that starts anew repeats every message, also that something is visible.
     serializer = server.get_scene_serializer()
     center = start.camera.position.numpy()
-    _look_from(server, start, far=4 * (1.0 if dome is None else float(np.abs(dome.centers).max())))
+    look_from(server, start, far=4 * (1.0 if dome is None else float(np.abs(dome.centers).max())))
     if dome is not None:
         _add(server, f"/{SKY_PART}", dome, position=center)
     players = [_Player(server, part) for part in parts]
@@ -109,7 +109,7 @@ def _add(server: Any, name: str, cloud: Cloud, **place: Any) -> Any:
     )
 
 
-def _look_from(server: Any, view: View, far: float) -> None:
+def look_from(server: Any, view: View, far: float) -> None:
     world_from_camera = inverse(view.camera.camera_from_world.double()).numpy()
     position, ahead = world_from_camera[:3, 3], world_from_camera[:3, 2]
     server.scene.set_up_direction("+z")
