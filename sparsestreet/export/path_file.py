@@ -23,6 +23,7 @@ KINDS = ("poses", "keyframes", "camera_path")
 """The key of a file's list, which says what it is."""
 _KEYS = {"seconds", "world_from_camera", "intrinsics", "width", "height"}
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_LARGEST = 16384
 _RIGID = 1e-3
 """What numbers of a file may lack to a rotation; it is then made one."""
 
@@ -101,13 +102,12 @@ def _pose(entry: Any, said: Mapping[str, Any], like: View, where: str) -> _Pose:
         if key not in entry:
             raise ValueError(f"{where} lacks {key}")
     (fx, _, cx), (_, fy, cy), _ = like.camera.intrinsics.tolist()
-    size = [entry.get(key, said.get(key)) for key in ("width", "height")]
-    lens = entry.get("intrinsics", said.get("intrinsics"))
-    if (size[0] is None) != (size[1] is None) or (size[0] is not None and lens is None):
+    width, height, lens = (entry.get(key, said.get(key)) for key in ("width", "height", "intrinsics"))
+    if (width is None) != (height is None) or (width is not None and lens is None):
         raise ValueError(f"{where}: width, height and intrinsics go together, or intrinsics stand alone")
-    width, height = (like.camera.width, like.camera.height) if size[0] is None else size
-    if not all(isinstance(value, int) and 0 < value <= 16384 for value in (width, height)):
-        raise ValueError(f"{where}: width and height are pixels, got {width} and {height}")
+    if width is None:
+        width, height = like.camera.width, like.camera.height
+    width, height = _size(width, height, f"{where}: ")
     numbers = _numbers([fx, fy, cx, cy] if lens is None else lens, (4,), f"{where}: intrinsics").tolist()
     if not (numbers[0] > 0 and numbers[1] > 0):
         raise ValueError(f"{where}: focal lengths are above 0, got {numbers[:2]}")
@@ -146,9 +146,7 @@ def _nerfstudio(said: Mapping[str, Any], last: float, time_of: Callable[[float],
     kind = said.get("camera_type", "perspective")
     if kind != "perspective":
         raise ValueError(f"camera_type is {kind!r}, and only perspective cameras are rendered")
-    width, height = said.get("render_width"), said.get("render_height")
-    if not (isinstance(width, int) and isinstance(height, int) and 0 < width <= 16384 and 0 < height <= 16384):
-        raise ValueError(f"render_width and render_height are pixels, got {width!r} and {height!r}")
+    width, height = _size(said.get("render_width"), said.get("render_height"), "render_")
     fps = float(_numbers(said.get("fps", 24), (), "fps"))
     if fps <= 0:
         raise ValueError(f"fps is above 0, got {fps:g}")
@@ -168,6 +166,12 @@ def _nerfstudio(said: Mapping[str, Any], last: float, time_of: Callable[[float],
         lens = (focal, focal, width / 2, height / 2)
         rigs.append((_Pose(at, pose @ _OPENCV_FROM_OPENGL, lens, width, height).view(time_of),))
     return PathFile(tuple(rigs), fps)
+
+
+def _size(width: Any, height: Any, where: str) -> tuple[int, int]:
+    if not all(isinstance(side, int) and 0 < side <= _LARGEST for side in (width, height)):
+        raise ValueError(f"{where}width and height are pixels, 1 to {_LARGEST}, got {width!r} and {height!r}")
+    return width, height
 
 
 def _numbers(value: Any, shape: tuple[int, ...], where: str) -> Float64[np.ndarray, "..."]:

@@ -161,7 +161,8 @@ def _same_shape(one: RawGaussians, other: RawGaussians) -> bool:
 
 def _seen_colors(looks: Sequence[tuple[RawGaussians, Rig]]) -> Float[Tensor, "n 3"]:
     """Returns the mean color of each row as the cameras see it; that of its first harmonic where none does."""
-    total, weight = 0.0, 0.0
+    first = looks[0][0].sh_dc[:, 0]
+    total, weight = torch.zeros_like(first), torch.zeros_like(first[:, :1])
     for raw, rig in looks:
         world = activate([raw], sh_degree=FINISHED.sh_degree)
         for view in rig:
@@ -170,6 +171,5 @@ def _seen_colors(looks: Sequence[tuple[RawGaussians, Rig]]) -> Float[Tensor, "n 
             directions = world.means - view.camera.position.to(world.means)
             total = total + near * view_colors(world.sh, directions, clamped=True)
             weight = weight + near
-    first = looks[0][0].sh_dc
-    plain = view_colors(first, torch.ones_like(first[:, 0]), clamped=True)
-    return torch.where(weight > 0, total / torch.as_tensor(weight).clamp(min=1e-12), plain)
+    plain = view_colors(looks[0][0].sh_dc, torch.ones_like(first), clamped=True)
+    return torch.where(weight > 0, total / weight.clamp(min=1e-12), plain)

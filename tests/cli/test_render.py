@@ -201,7 +201,7 @@ def test_a_path_of_poses_of_ones_own(run, tmp_path, capsys):
     views = read_views(run / "views.json").all
     front = [view for view in views if view.camera_index == 0]
     poses = [
-        {"seconds": 0.1 * view.frame_index, "world_from_camera": inverse(view.camera.camera_from_world).tolist()}
+        {"seconds": 0.1 * view.indices[0], "world_from_camera": inverse(view.camera.camera_from_world).tolist()}
         for view in front[:3]
     ]
     (tmp_path / "poses.json").write_text(json.dumps({"poses": poses}))

@@ -117,11 +117,14 @@ SCALED = (2 * np.array(pose())).tolist()
         ({"poses": [ENTRY | {"world_from_camera": [1, 2]}]}, "has 4 x 4 finite numbers"),
         ({"poses": [ENTRY | {"width": 8}]}, "width, height and intrinsics go together"),
         ({"poses": [ENTRY | {"intrinsics": [0, 1, 1, 1]}]}, "focal lengths are above 0"),
-        ({"poses": [ENTRY | {"width": 10**6, "height": 1, "intrinsics": [1, 1, 1, 1]}]}, "are pixels, got 1000000"),
+        (
+            {"poses": [ENTRY | {"width": 10**6, "height": 1, "intrinsics": [1, 1, 1, 1]}]},
+            "are pixels, 1 to 16384, got 1000000",
+        ),
         ({"keyframes": [ENTRY]}, "two or more at increasing seconds"),
         ({"keyframes": [ENTRY, ENTRY]}, "two or more at increasing seconds"),
         ({"camera_path": [{}], "render_width": 8, "render_height": 8}, r"camera_path\[0\] has camera_to_world and fov"),
-        ({"camera_path": [{}]}, "render_width and render_height are pixels"),
+        ({"camera_path": [{}]}, "render_width and height are pixels"),
         ({"camera_path": [{}], "camera_type": "equirectangular"}, "only perspective cameras"),
     ],
 )
