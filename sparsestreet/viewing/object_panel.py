@@ -48,6 +48,11 @@ class ObjectPanel:
         """The name of the object that is chosen."""
         return self._names.get(self.choice.value)
 
+    def follow(self) -> None:
+        """Let the handle go along where the object is at another time."""
+        if self.handle.visible and self.stage.time != self._placed_at:
+            self._place_handle()
+
     def _label(self, name: str) -> str:
         kind = self.stage.edits.class_name(name)
         return f"{name} ({kind})" if kind else name
@@ -101,8 +106,8 @@ class ObjectPanel:
             self.stage.changed()
 
     def _place_handle(self) -> None:
-        name, edits = self.chosen, self.stage.edits
+        name, edits, self._placed_at = self.chosen, self.stage.edits, self.stage.time
         self.handle.visible = name is not None and self.drags.value and not edits.goes_its_own_way(name)
         if name is not None and self.handle.visible:
-            frame = edits.frame(name, self.stage.time) @ edits.offset(name).frame
+            frame = edits.frame(name, self._placed_at) @ edits.offset(name).frame
             self.handle.position, self.handle.wxyz = frame[:3, 3], wxyz_of(frame)

@@ -1,5 +1,6 @@
 """Cameras of viser's windows as poses, and back."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -8,12 +9,22 @@ from scipy.spatial.transform import Rotation
 
 from sparsestreet.viewing.stage import Eye
 
+_LARGEST = 16_384
+"""Pixels of a side of a window."""
 
-def eye_of(camera: Any) -> Eye:
-    """Where a window of viser looks from; its axes are OpenCV's, its field of view vertical."""
-    return Eye(
-        matrix(camera.wxyz, camera.position), float(camera.fov), int(camera.image_width), int(camera.image_height)
-    )
+
+def eye_of(camera: Any) -> Eye | None:
+    """Where a window of viser looks from; its axes are OpenCV's, its field of view vertical.
+
+    None where it has no size, as in a tab that nobody sees, or says what no camera is: anybody may write to a server.
+    """
+    numbers = np.array([*camera.wxyz, *camera.position, camera.fov], np.float64)
+    width, height = int(camera.image_width), int(camera.image_height)
+    if not np.isfinite(numbers).all() or not np.linalg.norm(numbers[:4]) > 0:
+        return None
+    if not (0 < numbers[7] < math.pi and 0 < width <= _LARGEST and 0 < height <= _LARGEST):
+        return None
+    return Eye(matrix(numbers[:4], numbers[4:7]), float(numbers[7]), width, height)
 
 
 def show_from(client: Any, eye: Eye) -> None:

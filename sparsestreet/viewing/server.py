@@ -70,8 +70,6 @@ class Viewer:
     def step(self) -> bool:
         """Draw what is due in all windows; whether anything was."""
         self.stage.tick(time.perf_counter())
-        if self.stage.playing:
-            self._slider.value = round(self.stage.seconds, 2)
         with self._lock:
             windows = list(self._windows.values())
         drew = False
@@ -82,11 +80,18 @@ class Viewer:
             if shot is not None:
                 self._draw(client, canvas, shot)
                 drew = True
+        if drew and self.stage.playing:
+            self._slider.value = round(self.stage.seconds, 2)
+        if drew:
+            self.objects.follow()
         return drew
 
     def _draw(self, client: Any, canvas: Canvas, shot: Shot) -> None:
         started = time.perf_counter()
         image = self.stage.picture(shot.eye, shot.width, shot.height)
+        with self._lock:
+            if client.client_id not in self._windows:  # closed meanwhile
+                return
         client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY[shot.whole])
         ended = time.perf_counter()
         canvas.drawn(shot, ended - started, ended)
@@ -100,8 +105,9 @@ class Viewer:
         @client.camera.on_update
         def _(camera: Any) -> None:
             # Who rides along is where the log was: the window only answers.
-            if not self._rides.value or canvas.eye is None:
-                canvas.look(eye_of(camera), time.perf_counter())
+            eye = eye_of(camera)
+            if eye is not None and (not self._rides.value or canvas.eye is None):
+                canvas.look(eye, time.perf_counter())
 
     def _left(self, client: Any) -> None:
         with self._lock:
@@ -134,15 +140,20 @@ class Viewer:
         def _(event: Any) -> None:
             self._ridden = int(self._jump.value)
             if event.client is not None:
-                camera, seen = self.stage.cameras[self._ridden], eye_of(event.client.camera)
-                show_from(event.client, Eye(camera.at(self.stage.time), camera.fov, seen.width, seen.height))
+                show_from(event.client, self._rider(1, 1))
 
     def _ride(self, client: Any, canvas: Canvas) -> None:
-        camera, seen = self.stage.cameras[self._ridden], eye_of(client.camera)
-        eye = Eye(camera.at(self.stage.time), camera.fov, seen.width, seen.height)
+        seen = eye_of(client.camera)
+        if seen is None:
+            return
+        eye = self._rider(seen.width, seen.height)
         if canvas.eye is None or not eye.same(canvas.eye):
             show_from(client, eye)
             canvas.look(eye, time.perf_counter())
+
+    def _rider(self, width: int, height: int) -> Eye:
+        camera = self.stage.cameras[self._ridden]
+        return Eye(camera.at(self.stage.time), camera.fov, width, height)
 
     def _save_panel(self) -> None:
         button = self.server.gui.add_button("Save edits", hint=f"writes {self.save}")
@@ -150,5 +161,9 @@ class Viewer:
 
         @button.on_click
         def _(event: Any) -> None:
-            self.write_edits()
+            try:
+                self.write_edits()
+            except OSError as error:
+                said.content = f"not saved: {error}"
+                return
             said.content = f"saved as `{self.save}`; `sparsestreet render ... edits={self.save}` uses it"

@@ -1,6 +1,7 @@
 """What a window shows: the scene at the time of the clock, as it is edited, from where the window looks."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.viewing.edit_state import EditState, Offset
-from sparsestreet.viewing.poses import matrix, wxyz_of
+from sparsestreet.viewing.poses import eye_of, matrix, wxyz_of
 from sparsestreet.viewing.stage import Eye, RecordedCamera, Stage
 from tests.export.street import stored_street, street_views
 
@@ -83,6 +84,17 @@ def test_poses_go_to_the_window_and_back():
     np.testing.assert_allclose(matrix(wxyz_of(pose), pose[:3, 3]), pose, atol=1e-6)  # the views are float32
     assert recorded_eye(3).same(recorded_eye(3))
     assert not recorded_eye(3).same(recorded_eye(2))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"fov": 0.0}, {"fov": 4.0}, {"fov": math.nan}, {"image_width": 0}, {"image_height": 10**6},
+     {"wxyz": np.zeros(4)}, {"position": np.array([0, math.inf, 0])}],
+)  # fmt: skip
+def test_what_is_no_camera_is_not_rendered(wrong):
+    right = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": 1.0, "image_width": 9, "image_height": 8}
+    assert eye_of(SimpleNamespace(**right)).same(Eye(np.eye(4), 1.0, 9, 8))
+    assert eye_of(SimpleNamespace(**right | wrong)) is None
 
 
 def test_a_camera_sees_the_whole_window():

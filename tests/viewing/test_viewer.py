@@ -58,6 +58,10 @@ def test_the_panel_edits_and_saves(viewer):
     panel._drag(event)
     assert viewer.stage.edits.said()["move"] == {"car": {"right": 2.0, "up": 1.0}}
     assert panel.sliders["up"].value == 1.0
+    before = panel.handle.position.copy()
+    viewer.stage.seek(0.2)
+    panel.follow()
+    np.testing.assert_allclose(panel.handle.position - before, [2.0, -1.0, 0.0], atol=1e-5)  # the car drove
     viewer.write_edits()
     assert yaml.safe_load(viewer.save.read_text()) == viewer.stage.edits.said()
     panel._reset()
