@@ -1,13 +1,16 @@
 """The page of a street: one file that asks no network for anything, with the clouds and their poses over time."""
 
 import base64
+import io
 import re
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sparsestreet.cli.export import export
 from sparsestreet.export.path import recorded
@@ -90,13 +93,11 @@ def test_without_viser_the_sentence_says_how_to_get_it(run, tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-def test_a_browser_plays_it_from_a_file(run, tmp_path):
-    import io
-
-    from PIL import Image
-
-    out = tmp_path / "street.html"
-    assert export([str(run), str(out)]) == 0
+def test_a_browser_draws_it_from_a_file_as_it_is_rendered(run, tmp_path):
+    """One instant, since a page of several plays."""
+    views, out = street_views(480, 320, cameras=(0,))[:1], tmp_path / "street.html"
+    write_views(tmp_path / "views.json", views, [])
+    assert export([str(run), str(out), f"views={tmp_path / 'views.json'}"]) == 0
     with browser() as chromium:
         # The sorter of the clouds must answer: Chromium starts no module worker out of a blob in a page of a file.
         chromium.call(
@@ -106,7 +107,11 @@ def test_a_browser_plays_it_from_a_file(run, tmp_path):
         )
         chromium.open(out.as_uri(), 480, 320)
         chromium.wait("window.sorted > 0 && !!document.querySelector('canvas')")
-        colors = np.asarray(Image.open(io.BytesIO(chromium.picture())).convert("RGB"), np.float64)
+        time.sleep(3)  # the clouds fade in
+        shown = Image.open(io.BytesIO(chromium.picture())).convert("RGB")
         outside = [one for one in chromium.requests if not one.startswith(("file:", "data:", "blob:"))]
     assert outside == []
-    assert colors.std() > 20
+    rendered = stored_street().render(views[0]).rgb.clamp(0, 1).numpy()
+    # Below the note that says that no GPU draws.
+    error = np.asarray(shown, np.float64)[200:] / 255 - rendered[200:]
+    assert -10 * np.log10(np.square(error).mean()) > 20
