@@ -8,6 +8,8 @@ from sparsestreet.viewing.stage import Stage
 
 _METERS, _HEIGHT, _DEGREES = 15.0, 3.0, 180.0
 """As far as the sliders go."""
+_HANDLE = 100.0
+"""Pixels of an arrow."""
 _NONE = "(none)"
 
 
@@ -33,7 +35,9 @@ class ObjectPanel:
             }
             self.drags = gui.add_checkbox("drag it in the picture", False)
             reset = gui.add_button("As recorded")
-        self.handle = server.scene.add_transform_controls("/chosen", scale=2.0, visible=False, depth_test=False)
+        self.handle = server.scene.add_transform_controls(
+            "/chosen", scale=_HANDLE, fixed=True, disable_rotations=True, visible=False, depth_test=False
+        )
         self.choice.on_update(lambda event: self._show())
         self.drags.on_update(lambda event: self._place_handle())
         self.hidden.on_update(self._hide)
