@@ -21,6 +21,8 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet report DIR [DIR ...]                   tables from the records of runs
   sparsestreet render RUN drive.mp4                   a video of a trained street, along its log or beside it
   sparsestreet objects RUN                            what is in it that can be removed, moved or copied (edits=FILE)
+  sparsestreet view RUN                               fly through it in the browser, hide and move objects
+  sparsestreet export RUN street.html                 one page that plays it, in any browser, offline
   sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
   sparsestreet data check DIR                         everything that is wrong with a log, at once
   sparsestreet data convert from=DIR to=OUT           any log in DriveStudio's layout, or another data set's
@@ -33,7 +35,8 @@ Every command takes --help. Options of train are Hydra overrides; `sparsestreet 
 """
 
 COMMANDS = (
-    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "data", "effects", "presets", "bench",
+    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "view", "data", "effects", "presets",
+    "bench",
 )  # fmt: skip
 
 

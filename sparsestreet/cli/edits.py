@@ -1,9 +1,11 @@
 """``edits=FILE``: a trained scene as a file of edits leaves it, and what its user should know of that."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from sparsestreet.scene.edits import Edits, edited, read_edits
+from sparsestreet.scene.edits.file import Open
 from sparsestreet.scene.storage import StoredScene, load_scene
 from sparsestreet.scene.views import FILE_NAME, RecordedViews, read_views, seconds_of
 
@@ -19,15 +21,22 @@ def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> 
     if file is None:
         return stored
 
-    def open_scene(path: Path) -> tuple[StoredScene, float]:
-        beside = path if path.is_dir() else path.parent
-        return load_scene(path, stored.scene.device), log_seconds(read_views(beside / FILE_NAME))
-
-    edits = read_edits(file, log_seconds(views), open_scene)
+    edits = read_edits(file, log_seconds(views), opener(stored))
     scene = edited(stored.scene, edits)
     for note in _notes(edits):
         print(note)
     return replace(stored, scene=scene)
+
+
+def opener(stored: StoredScene) -> Open:
+    """Opens other scenes on the device of a scene, each once: Gaussians and the seconds of its log."""
+
+    @cache
+    def open_scene(path: Path) -> tuple[StoredScene, float]:
+        beside = path if path.is_dir() else path.parent
+        return load_scene(path, stored.scene.device), log_seconds(read_views(beside / FILE_NAME))
+
+    return open_scene
 
 
 def log_seconds(views: RecordedViews) -> float:

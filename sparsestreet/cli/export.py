@@ -1,24 +1,41 @@
-"""``sparsestreet export scene=RUN time=0.5 out=street.ply``: Gaussians of a trained street for viewers."""
+"""``sparsestreet export RUN FILE``: Gaussians of a trained street for viewers, or a page that plays it."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sparsestreet.cli.options import run_command
 
+if TYPE_CHECKING:
+    from sparsestreet.scene.storage import StoredScene
+    from sparsestreet.scene.views import RecordedViews
+
 USAGE = """\
-sparsestreet export RUN FILE.ply [key=value ...]     Gaussians of a trained street, as viewers read them
+sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers read it
 
   sparsestreet export outputs/RUN street.ply                     the whole street, at the start of its log
   sparsestreet export outputs/RUN street.ply time=0.5            half way through the log
   sparsestreet export outputs/RUN empty.ply nodes=background     without what moves
   sparsestreet export outputs/RUN car.ply time=0.5 instance=12   one object, where it is at that time
+  sparsestreet export outputs/RUN street.html                    one page that plays the drive, in any browser, offline
+  sparsestreet export outputs/RUN empty.html edits=edits.yaml    without or with other objects
 
   scene      a run's folder, or a scene.safetensors; the first word without a key
-  out        (the second) a .ply in the layout of 3DGS (binary; opens in SuperSplat and others)
+  out        (the second) a .ply in the layout of 3DGS (binary; opens in SuperSplat and others), or an .html
+             (docs/viewing.md says what it shows)
+  edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
+  views      the views.json that holds the cameras (default: the one beside the scene); for .html and edits
+
+of a .ply:
   time       0 to 1: first to last frame of the log (default: 0)
   nodes      [background,rigid]: only these nodes of the scene
   instance   only this object, by the name of its track; a name that does not exist lists those that do
+
+of an .html:
+  shapes     shapes a second of what changes its shape, such as people (default: 4); more are smoother and larger
 """
+
+DEFAULT_SHAPES = 4.0
 
 
 @dataclass(frozen=True)
@@ -27,15 +44,24 @@ class ExportRequest:
 
     scene: Path
     out: Path
-    time: float = 0.0
+    time: float | None = None
     nodes: tuple[str, ...] | None = None
     instance: str | None = None
+    edits: Path | None = None
+    views: Path | None = None
+    shapes: float | None = None
 
     def __post_init__(self) -> None:
         if self.nodes is not None and self.instance is not None:
             raise ValueError("nodes and instance exclude each other: leave one out")
-        if self.out.suffix != ".ply":
-            raise ValueError(f"the file must end in .ply, got {self.out.name!r}")
+        if self.out.suffix not in (".ply", ".html"):
+            raise ValueError(f"the file must end in .ply or .html, got {self.out.name!r}")
+        others = ("time", "nodes", "instance") if self.out.suffix == ".html" else ("shapes",)
+        for name in others:
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name} is no option of a {self.out.suffix}: leave it out")
+        if self.shapes is not None and self.shapes <= 0:
+            raise ValueError(f"shapes must be above 0 a second, got {self.shapes:g}")
 
 
 def export(arguments: list[str]) -> int:
@@ -45,12 +71,47 @@ def export(arguments: list[str]) -> int:
 
 def _export(request: ExportRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
+    from sparsestreet.cli.edits import with_edits
     from sparsestreet.cli.scene import open_scene
-    from sparsestreet.export.ply import scene_gaussians, write_ply
+    from sparsestreet.scene.views import FILE_NAME, read_views
 
     stored = open_scene(request.scene, "cpu")
+    beside = request.scene if request.scene.is_dir() else request.scene.parent
+    if request.out.suffix == ".html" or request.edits is not None:
+        views = read_views(request.views or beside / FILE_NAME)
+        stored = with_edits(stored, views, request.edits)
+        if request.out.suffix == ".html":
+            return _export_page(request, stored, views)
+    _export_ply(request, stored)
+
+
+def _export_ply(request: ExportRequest, stored: "StoredScene") -> None:
+    from sparsestreet.export.ply import scene_gaussians, write_ply
+
+    time = request.time or 0.0
     instances = None if request.instance is None else [request.instance]
-    gaussians = scene_gaussians(stored, request.time, nodes=request.nodes, instances=instances)
+    gaussians = scene_gaussians(stored, time, nodes=request.nodes, instances=instances)
     count = write_ply(request.out, gaussians)
-    megabytes = request.out.stat().st_size / 1e6
-    print(f"{request.out}: {count:,} Gaussians at time {request.time:g}, {megabytes:.1f} MB")
+    print(f"{request.out}: {count:,} Gaussians at time {time:g}, {request.out.stat().st_size / 1e6:.1f} MB")
+
+
+def _export_page(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
+    from sparsestreet.cli.edits import log_seconds
+    from sparsestreet.export.page import viser_module, write_page
+    from sparsestreet.export.path import recorded
+    from sparsestreet.export.recording import recorded_parts
+    from sparsestreet.export.sky_dome import dome_around
+
+    viser_module()  # before the work
+    path = recorded(views.all)
+    seconds = [(rig[0].time - path[0][0].time) * log_seconds(views) for rig in path]
+    rate = (len(path) - 1) / seconds[-1] if seconds[-1] > 0 else 1.0
+    every = max(round(rate / (request.shapes or DEFAULT_SHAPES)), 1)
+    parts = recorded_parts(stored, path, every)
+    dome = dome_around(stored.scene, parts)
+    write_page(request.out, parts, seconds, path[0][0], dome=dome, title=stored.name)
+    moving = [part for part in parts if "/" in part.name]
+    print(
+        f"{request.out}: {sum(map(len, parts)):,} Gaussians, {len(moving)} objects, {seconds[-1]:.1f} s, "
+        f"{request.out.stat().st_size / 1e6:.1f} MB; open it in a browser"
+    )

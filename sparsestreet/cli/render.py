@@ -1,15 +1,17 @@
-"""``sparsestreet render scene=RUN out=drive.mp4``: a video of a trained street, along its log or beside it."""
+"""``sparsestreet render RUN drive.mp4``: videos and pictures of a trained street, along its log or any other path."""
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from sparsestreet.cli.options import run_command
 
 if TYPE_CHECKING:
     from sparsestreet.export.path import CameraPath
+    from sparsestreet.scene.storage import StoredScene
+    from sparsestreet.scene.views import RecordedViews
     from sparsestreet.types import View
 
 USAGE = """\
@@ -21,21 +23,39 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN lane.mp4 path=lane_change offset=-3     three meters to the left on the way
   sparsestreet render outputs/RUN still frames=40:60 width=640            single PNGs in the folder still/
   sparsestreet render outputs/RUN empty.mp4 edits=edits.yaml              without or with other objects
+  sparsestreet render outputs/RUN flight.mp4 path=keys.json               along poses of your own (docs/rendering.md)
+  sparsestreet render outputs/RUN truck.mp4 cameras=0 up=1.2 fov=100 width=960 height=400    another camera
+  sparsestreet render outputs/RUN labels layers=[rgb,depth,instances]     a folder of PNGs for each layer
 
   scene     a run's folder, or a scene.safetensors; the first word without a key
   out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
-  path      recorded (as the log was driven), shifted (beside it) or lane_change (from there to beside it)
+  edits     edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
+  device    cpu or cuda (default: a GPU if there is one)
+
+the way:
+  path      recorded (as the log was driven), shifted (beside it), lane_change (from there to beside it), or a .json:
+            poses, keyframes of a smooth path, or nerfstudio's camera_path.json
   offset    meters to the right that path=shifted or lane_change moves the car; negative: to the left
-  cameras   [1,0,2]: these of the log, shown in this order (default: all, the leftmost first)
   frames    40:60: only these frames of the log, the last one left out
+  views     the views.json that holds the cameras (default: the one beside the scene)
+
+the cameras:
+  cameras   [1,0,2]: these of the log, shown in this order (default: all, the leftmost first)
+  up        meters by which the cameras are higher
+  fov       degrees from left to right that pinholes in their place see (default: their own lenses)
   width     pixels of one camera's image (default: as recorded)
+  height    pixels; rows come or go above and below (default: in proportion)
+
+the pictures:
+  layers    [rgb,depth,alpha,nodes,instances]: in a .mp4 one below the other, in colors; in a folder one folder each,
+            exact: depth in millimeters, ids of nodes and objects with tables (default: rgb)
   fps       frames a second of the video; poses between the recorded ones are interpolated (default: as the log)
   log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
-  views     the views.json that holds the cameras (default: the one beside the scene)
-  edits     edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
-  device    cpu or cuda (default: a GPU if there is one)
 """
+
+PATHS = ("recorded", "shifted", "lane_change")
+LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
 
 
 @dataclass(frozen=True)
@@ -44,11 +64,15 @@ class RenderRequest:
 
     scene: Path
     out: Path
-    path: Literal["recorded", "shifted", "lane_change"] = "recorded"
+    path: str = "recorded"
     offset: float | None = None
     cameras: tuple[int, ...] | None = None
     frames: slice | None = None
+    up: float | None = None
+    fov: float | None = None
     width: int | None = None
+    height: int | None = None
+    layers: tuple[str, ...] = ("rgb",)
     fps: float | None = None
     log_fps: float | None = None
     quality: float = 7.0
@@ -57,14 +81,30 @@ class RenderRequest:
     device: str | None = None
 
     def __post_init__(self) -> None:
-        if (self.path != "recorded") != (self.offset is not None):
+        if self.path not in PATHS and not self.path.endswith(".json"):
+            raise ValueError(f"path must be one of {', '.join(PATHS)}, or a .json, got {self.path!r}")
+        if (self.path in ("shifted", "lane_change")) != (self.offset is not None):
             raise ValueError("a shifted path needs both: path=shifted offset=METERS, or path=lane_change")
-        for name in ("fps", "log_fps", "width"):
+        if self.path_file is not None:
+            for name in ("cameras", "frames"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name}= chooses of the log's, and {self.path} has poses of its own")
+        for name in ("fps", "log_fps", "width", "height"):
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"{name} must be above 0, got {value:g}")
+        if self.fov is not None and not 0 < self.fov < 180:
+            raise ValueError(f"fov lies between 0 and 180 degrees, got {self.fov:g}")
         if not 1 <= self.quality <= 10:
             raise ValueError(f"quality lies in 1 to 10, got {self.quality:g}")
+        for layer in self.layers:
+            if layer not in LAYERS or self.layers.count(layer) > 1:
+                raise ValueError(f"layers are {', '.join(LAYERS)}, each once, got {', '.join(self.layers)}")
+
+    @property
+    def path_file(self) -> Path | None:
+        """The file of poses; None: a way along the log."""
+        return None if self.path in PATHS else Path(self.path).expanduser()
 
 
 def render(arguments: list[str]) -> int:
@@ -75,10 +115,8 @@ def render(arguments: list[str]) -> int:
 def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.edits import DEFAULT_LOG_FPS, with_edits
-    from sparsestreet.cli.progress import shown
     from sparsestreet.cli.scene import open_scene
-    from sparsestreet.export.video import check_destination, path_pictures, write_pictures
-    from sparsestreet.geometry.trajectories import frame_periods
+    from sparsestreet.export.video import check_destination
     from sparsestreet.scene.views import FILE_NAME, read_views
 
     started = time.perf_counter()
@@ -91,16 +129,29 @@ def _render(request: RenderRequest) -> None:
     if log_fps is None:
         log_fps = DEFAULT_LOG_FPS
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
+    path, fps, what = _path(request, views, log_fps)
+    count = _write(request, stored, _seen_by(request, path), fps)
+    made = f"made in {time.perf_counter() - started:.0f} s"
+    print(f"{request.out}: {count} frames of {what} at {fps:g} a second{_speed(request, log_fps)}, {made}")
+
+
+def _path(request: RenderRequest, views: "RecordedViews", log_fps: float) -> "tuple[CameraPath, float, str]":
+    """The way of the cameras as recorded or read, frames a second, and in words whose it is."""
+    from sparsestreet.export.path_file import read_path
+    from sparsestreet.geometry.trajectories import frame_periods
+    from sparsestreet.scene.views import seconds_of
+
+    if request.path_file is not None:
+        fps = request.fps or log_fps
+        like = views.all[0]
+        read = read_path(request.path_file, like, seconds_of(views, log_fps), fps)
+        return read.path, request.fps or read.fps or fps, request.path
     fps = request.fps or log_fps
-    speed = f"the log's speed, {log_fps:g} of its frames a second"
-    path = _path(request, views.all, step=log_fps / fps / frame_periods(views.all))
-    pictures = shown(path_pictures(stored, path), len(path), "frames")
-    count = write_pictures(request.out, pictures, fps=fps, quality=request.quality)
-    cameras, seconds = ", ".join(str(view.camera_index) for view in path[0]), time.perf_counter() - started
-    print(f"{request.out}: {count} frames of camera {cameras} at {fps:g} a second ({speed}), made in {seconds:.0f} s")
+    path = _along_the_log(request, views.all, step=log_fps / fps / frame_periods(views.all))
+    return path, fps, "camera " + ", ".join(str(view.camera_index) for view in path[0])
 
 
-def _path(request: RenderRequest, views: "Sequence[View]", step: float) -> "CameraPath":
+def _along_the_log(request: RenderRequest, views: "Sequence[View]", step: float) -> "CameraPath":
     from sparsestreet.export import path as paths
 
     path = paths.recorded(views)
@@ -109,5 +160,35 @@ def _path(request: RenderRequest, views: "Sequence[View]", step: float) -> "Came
         path = paths.of_frames(path, request.frames)
     if request.offset is not None:
         path = paths.shifted(path, request.offset, gradually=request.path == "lane_change")
-    path = paths.resampled(paths.of_cameras(path, cameras), step)
-    return path if request.width is None else paths.resized(path, request.width)
+    return paths.resampled(paths.of_cameras(path, cameras), step)
+
+
+def _seen_by(request: RenderRequest, path: "CameraPath") -> "CameraPath":
+    """The path with the cameras that were asked for."""
+    from sparsestreet.export import rig
+    from sparsestreet.export.path import resized
+
+    path = path if request.up is None else rig.raised(path, request.up)
+    path = path if request.width is None else resized(path, request.width)
+    path = path if request.height is None else rig.cropped(path, request.height)
+    return path if request.fov is None else rig.pinholes(path, request.fov)
+
+
+def _write(request: RenderRequest, stored: "StoredScene", path: "CameraPath", fps: float) -> int:
+    from sparsestreet.cli.progress import shown
+    from sparsestreet.export import layers
+    from sparsestreet.export.video import path_pictures, write_pictures
+
+    if request.layers == ("rgb",):
+        pictures = path_pictures(stored, path)
+    elif request.out.suffix:
+        pictures = layers.layer_pictures(stored, path, request.layers)
+    else:
+        return layers.write_layers(
+            request.out, stored, path, request.layers, shown(range(len(path)), len(path), "frames")
+        )
+    return write_pictures(request.out, shown(pictures, len(path), "frames"), fps=fps, quality=request.quality)
+
+
+def _speed(request: RenderRequest, log_fps: float) -> str:
+    return "" if request.path_file else f" (the log's speed, {log_fps:g} of its frames a second)"

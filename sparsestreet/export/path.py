@@ -94,7 +94,7 @@ def shifted(path: CameraPath, offset: float, *, gradually: bool = False) -> Came
 
     def beside(rig: Rig) -> Rig:
         vector = share(rig) * offset * _view_of(rig, front).camera.camera_from_world[0, :3].double()
-        return tuple(replace(_bare(view), camera=moved(view.camera, vector), frame_index=None) for view in rig)
+        return tuple(replace(bare(view), camera=moved(view.camera, vector), frame_index=None) for view in rig)
 
     return tuple(beside(rig) for rig in path)
 
@@ -145,13 +145,13 @@ def _view_of(rig: Rig, camera: int) -> View:
     return found[0]
 
 
-def _bare(view: View) -> View:
+def bare(view: View) -> View:
     """Returns the view without a Frame's pixels, which belong to its recorded pose."""
     return View(view.camera, view.time, view.frame_index, view.camera_index, view.seconds, view.stamp)
 
 
 def _each_camera(path: CameraPath, change: Callable[[Camera], Camera]) -> CameraPath:
-    return tuple(tuple(replace(_bare(view), camera=change(view.camera)) for view in rig) for rig in path)
+    return tuple(tuple(replace(bare(view), camera=change(view.camera)) for view in rig) for rig in path)
 
 
 def _scaled(camera: Camera, width: int) -> Camera:

@@ -10,7 +10,8 @@ from plyfile import PlyData
 from sparsestreet.cli.export import USAGE, ExportRequest, export
 from sparsestreet.export.ply import scene_gaussians
 from sparsestreet.scene.storage import save_scene
-from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street
+from sparsestreet.scene.views import write_views
+from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street, street_views
 
 
 @pytest.fixture
@@ -39,11 +40,22 @@ def test_nodes_and_an_instance(run, tmp_path):
     assert np.array_equal(means(tmp_path / "car.ply"), expected)
 
 
+def test_edits_are_honored(run, tmp_path):
+    write_views(run / "views.json", street_views(), [], frame_rate=10.0)
+    (tmp_path / "edits.yaml").write_text("remove: [tram]")
+    assert export([f"{run}", f"{tmp_path / 'a.ply'}", f"edits={tmp_path / 'edits.yaml'}"]) == 0
+    assert len(means(tmp_path / "a.ply")) == ROAD_ROWS + CAR_ROWS
+
+
 @pytest.mark.parametrize(
     ("change", "status", "said"),
     [
         ({"tme": 0.5}, 2, "no key 'tme'; did you mean 'time'?"),
-        ({"out": "street.obj"}, 2, "must end in .ply, got 'street.obj'"),
+        ({"out": "street.html", "time": 1}, 2, "time is no option of a .html: leave it out"),
+        ({"shapes": 4}, 2, "shapes is no option of a .ply: leave it out"),
+        ({"out": "street.html", "shapes": 0}, 2, "shapes must be above 0 a second, got 0"),
+        ({"out": "street.html"}, 1, "training writes a views.json"),
+        ({"out": "street.obj"}, 2, "must end in .ply or .html, got 'street.obj'"),
         ({"nodes": "rigid", "instance": "car"}, 2, "exclude each other"),
         ({"instance": "bus"}, 1, "no instance 'bus'; it has car, tram"),
         ({"nodes": "roads"}, 1, "no node 'roads'; it has background, rigid"),

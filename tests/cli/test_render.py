@@ -1,5 +1,6 @@
 """``sparsestreet render`` on a hand-made scene; the run of a real training is rendered in test_train."""
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -9,8 +10,10 @@ from PIL import Image
 
 from sparsestreet.cli import scene
 from sparsestreet.cli.render import USAGE, RenderRequest, render
-from sparsestreet.export import video
-from sparsestreet.export.path import shifted
+from sparsestreet.export import rig, video
+from sparsestreet.export.layers import LAYERS, layer_values
+from sparsestreet.export.path import recorded, resized, shifted
+from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
@@ -114,6 +117,13 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
         ({"widht": 5}, 2, "did you mean 'width'?"),
         ({"offset": 1}, 2, "needs both: path=shifted offset=METERS"),
         ({"path": "shifted"}, 2, "needs both: path=shifted offset=METERS"),
+        ({"path": "circle"}, 2, "or a .json, got 'circle'"),
+        ({"path": "a.json", "frames": "0:2"}, 2, "frames= chooses of the log's"),
+        ({"path": "a.json"}, 1, "there is no path at a.json"),
+        ({"layers": "rgb,lidar"}, 2, "layers are rgb, depth, alpha, nodes, instances, each once"),
+        ({"layers": "rgb,rgb"}, 2, "each once, got rgb, rgb"),
+        ({"fov": 180}, 2, "fov lies between 0 and 180 degrees"),
+        ({"height": 0}, 2, "height must be above 0"),
         ({"fps": 0}, 2, "fps must be above 0, got 0"),
         ({"quality": 11}, 2, "quality lies in 1 to 10, got 11"),
         ({"out": "drive.avi"}, 1, "ends in .mp4"),
@@ -185,3 +195,63 @@ def test_everything_that_is_asked_for_arrives(run, tmp_path, monkeypatch, capsys
     assert out == tmp_path / "o"
     assert how == {"fps": expected["fps"], "quality": expected["quality"]}
     assert f"{tmp_path / 'o'}: 77 frames of camera 2, 0 at {expected['fps']:g} a second" in capsys.readouterr().out
+
+
+def test_a_path_of_poses_of_ones_own(run, tmp_path, capsys):
+    views = read_views(run / "views.json").all
+    front = [view for view in views if view.camera_index == 0]
+    poses = [
+        {"seconds": 0.1 * view.indices[0], "world_from_camera": inverse(view.camera.camera_from_world).tolist()}
+        for view in front[:3]
+    ]
+    (tmp_path / "poses.json").write_text(json.dumps({"poses": poses}))
+    assert render([f"{run}", f"{tmp_path / 'own'}", f"path={tmp_path / 'poses.json'}"]) == 0
+    shown = pictures(tmp_path / "own")
+    assert len(shown) == 3
+    for picture, view in zip(shown, front, strict=False):
+        # The pose goes through its inverse twice.
+        assert np.abs(picture.astype(int) - rendered(stored_street(), view)).max() <= 1
+    assert f"3 frames of {tmp_path / 'poses.json'} at 10 a second, made" in capsys.readouterr().out
+
+
+def test_nerfstudios_frame_rate_is_that_of_the_video(run, tmp_path, capsys):
+    entry = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 60}
+    path = tmp_path / "camera_path.json"
+    path.write_text(json.dumps({"camera_path": [entry] * 4, "render_width": 32, "render_height": 24, "fps": 8}))
+    assert render([f"{run}", f"{tmp_path / 'a'}", f"path={path}"]) == 0
+    assert "at 8 a second" in capsys.readouterr().out
+    assert pictures(tmp_path / "a")[0].shape == (24, 32, 3)
+
+
+def test_another_rig(run, tmp_path):
+    words = ["cameras=0", "frames=0:1", "up=1.0", "fov=100", "width=60", "height=30"]
+    assert render([f"{run}", f"{tmp_path / 'a'}", *words]) == 0
+    (shown,) = pictures(tmp_path / "a")
+    path = recorded(street_views(cameras=(0,)))[:1]
+    expected = rig.pinholes(rig.cropped(resized(rig.raised(path, 1.0), 60), 30), 100.0)[0][0]
+    assert np.array_equal(shown, rendered(stored_street(), expected))
+
+
+def test_layers_are_folders_of_exact_values_with_tables(run, tmp_path):
+    out = tmp_path / "layers"
+    words = ["layers=[rgb,depth,alpha,nodes,instances]", "cameras=[0,2]", "frames=1:3"]
+    assert render([f"{run}", f"{out}", *words]) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "alpha", "depth", "instances", "instances.json", "nodes", "nodes.json", "rgb",
+    ]  # fmt: skip
+    view = next(view for view in street_views() if view.indices == (2, 2))
+    expected = layer_values(stored_street(), view, LAYERS)
+    for layer in LAYERS:
+        found = np.asarray(Image.open(out / layer / "camera_2" / "00001.png"))
+        assert np.array_equal(found, expected[layer])
+        assert found.dtype == expected[layer].dtype
+    assert json.loads((out / "nodes.json").read_text()) == {"1": "background", "2": "rigid"}
+    assert json.loads((out / "instances.json").read_text())["2"]["name"] == "tram"
+
+
+def test_a_video_of_layers(run, tmp_path):
+    from tests.export.test_video import read_video
+
+    assert render([f"{run}", f"{tmp_path / 'a.mp4'}", "layers=[rgb,depth]", "cameras=0"]) == 0
+    _, frames = read_video(tmp_path / "a.mp4")
+    assert frames.shape == (5, 64, 48, 3)

@@ -40,16 +40,26 @@ def read_edits(path: FilePath | str, seconds: float, open_scene: Open) -> Edits:
     Raises FileNotFoundError where there is no file, ValueError, naming file and entry, for what is wrong in it.
     """
     path = FilePath(path)
+    said = read_values(path)
+    try:
+        return edits_of(said, seconds, lambda other: open_scene(beside(path, other)))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_values(path: FilePath | str) -> dict[str, Any]:
+    """The plain values of a file of edits, not yet checked. Raises as ``read_edits`` where it has none."""
+    path = FilePath(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of edits at {path}: write one (docs/editing.md has an example)")
     try:
         said = yaml.safe_load(path.read_text()) or {}
         _mapping(said, "the file")
-        return edits_of(said, seconds, lambda other: open_scene(_beside(path, other)))
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    return dict(said)
 
 
 def edits_of(said: Mapping[str, Any], seconds: float, open_scene: Open) -> Edits:
@@ -177,6 +187,6 @@ def _number(value: Any, where: str) -> float:
     return float(value)
 
 
-def _beside(path: FilePath, other: FilePath) -> FilePath:
+def beside(path: FilePath, other: FilePath) -> FilePath:
     """A path of the file: as it is, or else beside the file."""
     return other if other.is_absolute() or other.exists() else path.parent / other

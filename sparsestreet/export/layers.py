@@ -1,0 +1,192 @@
+"""What a picture is made of: depth, coverage, and which node or object each pixel shows."""
+
+import colorsys
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from PIL import Image
+from torch import Tensor
+
+from sparsestreet.atomic import atomic_folder
+from sparsestreet.export.path import CameraPath
+from sparsestreet.export.video import Picture, side_by_side
+from sparsestreet.ops import splat
+from sparsestreet.pictures.images import color_map
+from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.rendering import SceneRendering
+from sparsestreet.scene.storage import StoredScene
+from sparsestreet.types import View
+
+LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
+
+Values = Shaped[np.ndarray, "_h _w *_c"]
+"""rgb uint8 [h, w, 3]; depth uint16, millimeters; alpha uint8; ids of nodes uint8 and of instances uint16."""
+
+FARTHEST = 65_535
+"""Millimeters of a depth that is no smaller; 0 where more light passes than is kept."""
+_SOLID = 0.5
+"""Of alpha, from which a pixel has a depth."""
+_NEAR, _FAR = 1.0, 100.0
+"""Meters of the lightest and of the darkest color in a picture of depth."""
+_FIRST_HARMONIC = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A line of the table of objects."""
+
+    id: int
+    name: str
+    class_name: str
+    node: str
+
+
+def instance_table(stored: StoredScene) -> list[Instance]:
+    """Returns all objects of a scene; their ids start at 1, in the order of nodes and of their tracks."""
+    found: list[Instance] = []
+    for node_name, node in stored.scene.nodes.items():
+        objects = node.instances()
+        if objects is not None:
+            classes = objects.classes or ("",) * len(objects.names)
+            for name, kind in zip(objects.names, classes, strict=True):
+                found.append(Instance(len(found) + 1, name, kind, node_name))
+    return found
+
+
+@torch.no_grad()
+def layer_values(stored: StoredScene, view: View, layers: Sequence[str]) -> dict[str, Values]:
+    """Returns the layers of a view, by name; see ``Values``.
+
+    A pixel shows the node, or the object, that has the largest part of its color. Id 0 is what is none of them: the
+    sky, and for objects all that is no object.
+    """
+    rendering = stored.render(view)
+    found: dict[str, Values] = {}
+    for layer in layers:
+        if layer == "rgb":
+            found[layer] = (rendering.rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
+        elif layer == "alpha":
+            found[layer] = (rendering.alpha.clamp(0, 1) * 255).round().byte().cpu().numpy()
+        elif layer == "depth":
+            millimeters = (1000 * rendering.depth).round().clamp(1, FARTHEST)
+            shown = torch.where(rendering.alpha >= _SOLID, millimeters, 0.0)
+            found[layer] = shown.cpu().numpy().astype(np.uint16)
+        elif layer == "nodes":
+            found[layer] = _shown_ids(stored, view, rendering, _node_ids(rendering)).astype(np.uint8)
+        else:
+            found[layer] = _shown_ids(stored, view, rendering, _instance_ids(stored, rendering)).astype(np.uint16)
+    return found
+
+
+def layer_picture(layer: str, values: Values, nodes: Sequence[str]) -> Picture:
+    """Returns a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own."""
+    if layer == "rgb":
+        return values
+    if layer == "alpha":
+        return np.repeat(values[..., None], 3, axis=-1)
+    if layer == "depth":
+        closeness = 1 - np.log(np.maximum(values, 1) / 1000 / _NEAR) / np.log(_FAR / _NEAR)
+        return np.where(values[..., None] > 0, color_map(closeness), 0).astype(np.uint8)
+    if layer == "nodes":
+        colors = [(0, 0, 0), *node_legend(nodes).values()]
+    else:
+        # By the golden angle: neighbors differ.
+        hues = [colorsys.hsv_to_rgb((0.618034 * index) % 1, 0.75, 1.0) for index in range(1, int(values.max()) + 1)]
+        colors = [(0, 0, 0), *((round(255 * r), round(255 * g), round(255 * b)) for r, g, b in hues)]
+    return np.array(colors, np.uint8)[values]
+
+
+def layer_pictures(stored: StoredScene, path: CameraPath, layers: Sequence[str]) -> Iterator[Picture]:
+    """Yields one picture an instant: a row of cameras for each layer, one below the other."""
+    nodes = list(stored.scene.nodes)
+    for rig in path:
+        views = [layer_values(stored, view, layers) for view in rig]
+        rows = [side_by_side([layer_picture(layer, one[layer], nodes) for one in views]) for layer in layers]
+        yield np.concatenate(rows)
+
+
+def write_layers(
+    out: Path, stored: StoredScene, path: CameraPath, layers: Sequence[str], shown: Iterator[int] | range
+) -> int:
+    """Writes a folder of PNGs for each layer, the exact values, and tables of ids; whole or not at all.
+
+    Each camera of a rig has its own folder below if there are several. Returns the number of instants. ``shown`` runs
+    over the instants. Raises OSError if the folder is not empty or cannot be written.
+    """
+    count = 0
+    with atomic_folder(out) as temporary:
+        for index in shown:
+            rig = path[index]
+            for place, view in enumerate(rig):
+                camera = "" if len(rig) == 1 else f"camera_{place if view.camera_index is None else view.camera_index}"
+                for layer, values in layer_values(stored, view, layers).items():
+                    folder = temporary / layer / camera
+                    folder.mkdir(parents=True, exist_ok=True)
+                    Image.fromarray(values).save(folder / f"{index:05d}.png")
+            count += 1
+        for name, table in tables(stored, layers).items():
+            (temporary / f"{name}.json").write_text(json.dumps(table, indent=1, ensure_ascii=False), encoding="utf-8")
+    return count
+
+
+def tables(stored: StoredScene, layers: Sequence[str]) -> Mapping[str, Any]:
+    """Returns what ids mean, for the layers that have some."""
+    found: dict[str, Any] = {}
+    if "nodes" in layers:
+        found["nodes"] = {str(number): name for number, name in enumerate(stored.scene.nodes, start=1)}
+    if "instances" in layers:
+        found["instances"] = {
+            str(one.id): {"name": one.name, "class": one.class_name, "node": one.node} for one in instance_table(stored)
+        }
+    return found
+
+
+def _node_ids(rendering: SceneRendering) -> Int[Tensor, " n"]:
+    ids = torch.zeros(len(rendering.gaussians), dtype=torch.int64, device=rendering.alpha.device)
+    for number, rows in enumerate(rendering.spans.values(), start=1):
+        ids[rows] = number
+    return ids
+
+
+def _instance_ids(stored: StoredScene, rendering: SceneRendering) -> Int[Tensor, " n"]:
+    ids = torch.zeros(len(rendering.gaussians), dtype=torch.int64, device=rendering.alpha.device)
+    first = 1
+    for name, rows in rendering.spans.items():
+        objects = stored.scene.nodes[name].instances()
+        if objects is not None:
+            ids[rows] = first + objects.ids
+            first += len(objects.names)
+    return ids
+
+
+def _shown_ids(
+    stored: StoredScene, view: View, rendering: SceneRendering, ids: Int[Tensor, " n"]
+) -> Int[np.ndarray, "h w"]:
+    """Returns the id with the largest weight at each pixel, out of those in view; the rest of the light has id 0."""
+    known = [number for number in ids[rendering.splats.visible].unique().tolist() if number > 0]
+    seen = stored.scene.seen(view)
+    weights = []
+    for start in range(0, len(known), 3):
+        chunk = known[start : start + 3]
+        share = torch.stack([ids == number for number in (*chunk, -1, -1)[:3]], dim=1).float()
+        weights.append(_splatted(stored, seen, rendering, share)[..., : len(chunk)])
+    if not weights:
+        return np.zeros(rendering.alpha.shape, np.int64)
+    weight = torch.cat(weights, dim=-1)
+    best, place = weight.max(-1)
+    chosen = torch.tensor(known, device=place.device)[place]
+    return torch.where(best > 1 - weight.sum(-1), chosen, 0).cpu().numpy()
+
+
+def _splatted(
+    stored: StoredScene, seen: View, rendering: SceneRendering, share: Float[Tensor, "n 3"]
+) -> Float[Tensor, "h w 3"]:
+    """Returns the sum over the Gaussians of their weight at a pixel times their share: colors without harmonics."""
+    labeled = replace(rendering.gaussians, sh=((share - 0.5) / _FIRST_HARMONIC)[:, None])
+    return splat(labeled, seen.camera, settings=stored.options.settings, backend=stored.options.backend).rgb

@@ -1,0 +1,1 @@
+"""Looking at a trained street from a browser: rendered here, edited there."""

@@ -1,0 +1,169 @@
+"""The viewer: viser's window and panel in a browser, pictures rendered here."""
+
+import contextlib
+import io
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from sparsestreet.atomic import atomic_file
+from sparsestreet.export.page import look_from, viser_module
+from sparsestreet.types import View
+from sparsestreet.viewing.canvas import Canvas, Shot
+from sparsestreet.viewing.object_panel import ObjectPanel
+from sparsestreet.viewing.pace import Pace
+from sparsestreet.viewing.poses import eye_of, show_from
+from sparsestreet.viewing.stage import Eye, Stage
+
+_QUALITY = {False: 50, True: 85}
+"""Of a JPEG while something moves, and at rest."""
+_IDLE = 0.005
+"""Seconds to wait where nothing is due."""
+
+
+class Viewer:
+    """A stage on the web. ``run`` serves it until ``stop``; all windows show one time and the same edits."""
+
+    def __init__(
+        self, stage: Stage, start: View, *, title: str, host: str, port: int, frames_per_second: float, save: Path
+    ) -> None:
+        self.stage, self.save, self.frames_per_second = stage, save, frames_per_second
+        # viser says where it is in a box of its own.
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server = viser_module().ViserServer(host=host, port=port, label=title, verbose=False)
+        look_from(self.server, start, far=1000.0)
+        # Sharing would ask a server of viser's makers for a public address.
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._windows: dict[int, tuple[Any, Canvas]] = {}
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._clock_panel()
+        self._camera_panel()
+        self.objects = ObjectPanel(self.server, stage)
+        self._save_panel()
+        self.server.on_client_connect(self._joined)
+        self.server.on_client_disconnect(self._left)
+
+    @property
+    def port(self) -> int:
+        """Where it listens: the one that was asked for, or the next that is free."""
+        return self.server.get_port()
+
+    def run(self) -> None:
+        """Render what is due until ``stop``, then end the server."""
+        try:
+            while not self._ended.is_set():
+                if not self.step():
+                    self._ended.wait(_IDLE)
+        finally:
+            with contextlib.redirect_stdout(io.StringIO()):
+                self.server.stop()
+
+    def stop(self) -> None:
+        self._ended.set()
+
+    def write_edits(self) -> None:
+        """Write what was done as a file of edits, whole or not at all."""
+        with atomic_file(self.save) as temporary:
+            temporary.write_text(self.stage.edits.text(), encoding="utf-8")
+
+    def step(self) -> bool:
+        """Draw what is due in all windows; whether anything was."""
+        self.stage.tick(time.perf_counter())
+        with self._lock:
+            windows = list(self._windows.values())
+        drew = False
+        for client, canvas in windows:
+            if self._rides.value and canvas.eye is not None:
+                self._ride(client, canvas)
+            shot = canvas.due(self.stage.version, time.perf_counter())
+            if shot is not None:
+                self._draw(client, canvas, shot)
+                drew = True
+        if drew and self.stage.playing:
+            self._slider.value = round(self.stage.seconds, 2)
+        if drew:
+            self.objects.follow()
+        return drew
+
+    def _draw(self, client: Any, canvas: Canvas, shot: Shot) -> None:
+        started = time.perf_counter()
+        image = self.stage.picture(shot.eye, shot.width, shot.height)
+        with self._lock:
+            if client.client_id not in self._windows:  # closed meanwhile
+                return
+        client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY[shot.whole])
+        ended = time.perf_counter()
+        canvas.drawn(shot, ended - started, ended)
+        self._said.content = f"{shot.width} x {shot.height} in {1000 * (ended - started):.0f} ms"
+
+    def _joined(self, client: Any) -> None:
+        canvas = Canvas(Pace(self.frames_per_second))
+        with self._lock:
+            self._windows[client.client_id] = client, canvas
+
+        @client.camera.on_update
+        def _(camera: Any) -> None:
+            # Who rides along is where the log was: the window only answers.
+            eye = eye_of(camera)
+            if eye is not None and (not self._rides.value or canvas.eye is None):
+                canvas.look(eye, time.perf_counter())
+
+    def _left(self, client: Any) -> None:
+        with self._lock:
+            self._windows.pop(client.client_id, None)
+
+    def _clock_panel(self) -> None:
+        gui, stage = self.server.gui, self.stage
+        with gui.add_folder("Time"):
+            self._slider = gui.add_slider("seconds", 0.0, max(stage.duration, 0.01), 0.01, 0.0)
+            self._plays = gui.add_checkbox("play", False)
+            self._said = gui.add_markdown("")
+
+        @self._slider.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:  # not where the clock moves it
+                stage.seek(self._slider.value)
+
+        @self._plays.on_update
+        def _(event: Any) -> None:
+            stage.play(self._plays.value)
+
+    def _camera_panel(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Cameras of the log"):
+            self._jump = gui.add_button_group("jump to", [str(index) for index in self.stage.cameras])
+            self._rides = gui.add_checkbox("ride along", False, hint="stay on that camera while the log plays")
+        self._ridden = next(iter(self.stage.cameras))
+
+        @self._jump.on_click
+        def _(event: Any) -> None:
+            self._ridden = int(self._jump.value)
+            if event.client is not None:
+                show_from(event.client, self._rider(1, 1))
+
+    def _ride(self, client: Any, canvas: Canvas) -> None:
+        seen = eye_of(client.camera)
+        if seen is None:
+            return
+        eye = self._rider(seen.width, seen.height)
+        if canvas.eye is None or not eye.same(canvas.eye):
+            show_from(client, eye)
+            canvas.look(eye, time.perf_counter())
+
+    def _rider(self, width: int, height: int) -> Eye:
+        camera = self.stage.cameras[self._ridden]
+        return Eye(camera.at(self.stage.time), camera.fov, width, height)
+
+    def _save_panel(self) -> None:
+        button = self.server.gui.add_button("Save edits", hint=f"writes {self.save}")
+        said = self.server.gui.add_markdown("")
+
+        @button.on_click
+        def _(event: Any) -> None:
+            try:
+                self.write_edits()
+            except OSError as error:
+                said.content = f"not saved: {error}"
+                return
+            said.content = f"saved as `{self.save}`; `sparsestreet render ... edits={self.save}` uses it"
