@@ -22,6 +22,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet render RUN drive.mp4                   a video of a trained street, along its log or beside it
   sparsestreet objects RUN                            what is in it that can be removed, moved or copied (edits=FILE)
   sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
+  sparsestreet serve RUN[,RUN] port=50051             pictures for simulators (AlpaSim, NuRec's clients) over gRPC
   sparsestreet data check DIR                         everything that is wrong with a log, at once
   sparsestreet data convert from=DIR to=OUT           any log in DriveStudio's layout, or another data set's
   sparsestreet data make seed=1                       write a synthetic street to disk
@@ -33,7 +34,8 @@ Every command takes --help. Options of train are Hydra overrides; `sparsestreet 
 """
 
 COMMANDS = (
-    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "data", "effects", "presets", "bench",
+    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "serve", "data", "effects", "presets",
+    "bench",
 )  # fmt: skip
 
 
