@@ -8,7 +8,7 @@ from pathlib import Path
 from sparsestreet.cli.options import run_command
 
 USAGE = """\
-sparsestreet serve RUN[,RUN] [key=value ...]     pictures for simulators: AlpaSim, and clients of NuRec (docs/serving.md)
+sparsestreet serve RUN[,RUN] [key=value ...]     pictures for simulators over gRPC (docs/serving.md)
 
   sparsestreet serve outputs/RUN                                a street at 127.0.0.1:50051, until Ctrl-C
   sparsestreet serve outputs/A,outputs/B memory=4               two; scene files of at most 4 GB are open at a time

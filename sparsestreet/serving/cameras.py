@@ -36,7 +36,7 @@ READ_FIRST: dict[str, Side] = {
 }
 
 
-class NotServed(ValueError):
+class NotServedError(ValueError):
     """A request for something that other renderers may have and this one has not."""
 
 
@@ -68,19 +68,19 @@ def pose_message(pose: Pose) -> Any:
 def lens_of(spec: Any, height: int, width: int) -> Camera:
     """The camera of a message at the origin, with the pixels that are wanted instead of those of its calibration.
 
-    Raises NotServed for lenses that the splat op does not simulate, ValueError for numbers that cannot be.
+    Raises NotServedError for lenses that the splat op does not simulate, ValueError for numbers that cannot be.
     """
     name = spec.logical_id or "without a name"
     lens = spec.WhichOneof("camera_param")
     if lens is None:
         raise ValueError(f"camera {name} has no lens: send opencv_pinhole_param")
     if lens != "opencv_pinhole_param":
-        raise NotServed(
+        raise NotServedError(
             f"camera {name} has the lens {lens.removesuffix('_param')}, this server has pinholes with Brown-Conrady "
             "distortion: send opencv_pinhole_param"
         )
     if spec.WhichOneof("external_distortion") is not None:
-        raise NotServed(f"camera {name} looks through a windshield, which is not simulated: leave it out")
+        raise NotServedError(f"camera {name} looks through a windshield, which is not simulated: leave it out")
     sizes = spec.resolution_w or width, spec.resolution_h or height
     for side in (*sizes, width, height):
         if not 1 <= side <= LARGEST_SIDE:
@@ -178,7 +178,7 @@ def _distortion(param: Any, name: str) -> torch.Tensor | None:
         values[key] += [0.0] * (count - len(values[key]))
     k1, k2, k3, *rational = values["radial_coeffs"]
     if any(rational) or any(values["thin_prism_coeffs"]):
-        raise NotServed(
+        raise NotServedError(
             f"camera {name} has k4 to k6 or a thin prism, which are not simulated: fit k1, k2, p1, p2, k3 alone"
         )
     distortion = torch.tensor([k1, k2, *values["tangential_coeffs"], k3])

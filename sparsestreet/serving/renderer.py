@@ -12,7 +12,7 @@ from sparsestreet.scene.edits.edits import found
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.rendering import render
 from sparsestreet.serving import wire
-from sparsestreet.serving.cameras import NotServed, Pose, lens_of, matrix, posed
+from sparsestreet.serving.cameras import NotServedError, Pose, lens_of, matrix, posed
 from sparsestreet.serving.rig import Rig
 from sparsestreet.serving.scenes import ServedScene
 from sparsestreet.types import View
@@ -29,7 +29,7 @@ _FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 def view_of(request: Any, rig: Rig) -> View:
-    """What the camera of a request sees, and when. Raises ValueError, and NotServed for a lens that there is not."""
+    """What the camera of a request sees, and when. Raises ValueError, and NotServedError for a lens that there is not."""
     if request.insert_ego_mask:
         raise ValueError(
             "this server has no masks of the vehicle (get_available_ego_masks): send insert_ego_mask=false"
@@ -90,7 +90,7 @@ def picture(served: ServedScene, view: View, edits: Edits) -> Picture:
 
 
 def encoded(image: Picture, image_format: int, quality: float) -> bytes:
-    """A PNG or a JPEG; OpenCV lets other threads work meanwhile. Raises NotServed or ValueError."""
+    """A PNG or a JPEG; OpenCV lets other threads work meanwhile. Raises NotServedError or ValueError."""
     word, quality = _wanted(image_format, quality)
     turned = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     if word == "PNG":
@@ -107,7 +107,7 @@ def _wanted(image_format: int, quality: float) -> tuple[str, int]:
     if word == "UNDEFINED":
         raise ValueError(f"image_format is not said: send {' or '.join(_FORMATS)}")
     if word not in _FORMATS:
-        raise NotServed(f"pictures are {' or '.join(_FORMATS)}, got image_format {word}")
+        raise NotServedError(f"pictures are {' or '.join(_FORMATS)}, got image_format {word}")
     if not 0 <= quality <= 100:
         raise ValueError(f"image_quality lies in 1 to 100, or is 0 for {DEFAULT_QUALITY}, got {quality:g}")
     return word, max(round(quality), 1) if quality else DEFAULT_QUALITY

@@ -115,9 +115,9 @@ def rig_of(
     first: dict[int, View] = {}
     for view in views.all:
         first.setdefault(view.indices[1], view)
-    indices = sorted(first)
+    indices, clock = sorted(first), _clock(views, frame_rate)
     if record is not None and record.world_from_vehicle is not None and mount is None:
-        times, poses = _recorded(views, record)
+        times, poses = _recorded(views, record, clock)
     else:
         times, poses = _below_camera(views, indices[0], DEFAULT_MOUNT if mount is None else mount)
     known = list(record.camera_names) if record is not None and record.camera_names else None
@@ -127,7 +127,7 @@ def rig_of(
         rig_from_camera = np.linalg.inv(_interpolated(times, poses, first[index].time)) @ _pose(first[index])
         cameras.append(RigCamera(called[index], index, first[index].camera, rig_from_camera))
     shift = np.eye(4) if record is None else np.array(record.dataset_from_world)
-    return Rig(tuple(cameras), times, poses, _clock(views, frame_rate), shift)
+    return Rig(tuple(cameras), times, poses, clock, shift)
 
 
 def _names(indices: Sequence[int], names: Sequence[str] | None, known: Sequence[str] | None) -> list[str]:
@@ -149,15 +149,21 @@ def _clock(views: RecordedViews, frame_rate: float | None) -> Clock:
     return Clock(max(start, 0), seconds)
 
 
-def _recorded(views: RecordedViews, record: RigRecord) -> tuple[tuple[float, ...], Float64[np.ndarray, "n 4 4"]]:
-    """The vehicle at the first view of each of its frames."""
+def _recorded(
+    views: RecordedViews, record: RigRecord, clock: Clock
+) -> tuple[tuple[float, ...], Float64[np.ndarray, "n 4 4"]]:
+    """The vehicle at its own stamps, or at the first view of each of its frames."""
+    assert record.world_from_vehicle is not None
+    poses = np.array(record.world_from_vehicle)
+    if record.vehicle_stamps is not None:
+        after = (np.array(record.vehicle_stamps) / 1000 - clock.start) / 1e6
+        return tuple((after / clock.seconds).tolist()) if clock.seconds > 0 else (0.0,), poses
     starts: dict[int, float] = {}
     for view in views.all:
         frame = view.indices[0]
         starts[frame] = min(starts.get(frame, view.time), view.time)
-    assert record.world_from_vehicle is not None
-    frames = [frame for frame in sorted(starts) if frame < len(record.world_from_vehicle)]
-    return tuple(starts[frame] for frame in frames), np.array([record.world_from_vehicle[frame] for frame in frames])
+    frames = [frame for frame in sorted(starts) if frame < len(poses)]
+    return tuple(starts[frame] for frame in frames), poses[frames]
 
 
 def _below_camera(

@@ -20,7 +20,7 @@ from sparsestreet.serving.rig import Rig, rig_of
 Open = Callable[[Path], StoredScene]
 
 
-class UnknownScene(ValueError):
+class UnknownSceneError(ValueError):
     """A name that no scene has."""
 
 
@@ -113,14 +113,14 @@ class Scenes:
             return list(self._opened)
 
     def rig(self, name: str) -> Rig:
-        """The vehicle of a scene, which need not be open. Raises UnknownScene."""
+        """The vehicle of a scene, which need not be open. Raises UnknownSceneError."""
         name = self.known(name)
         if name not in self._rigs:
             self._rigs[name] = run_rig(self.runs[name], self._options)
         return self._rigs[name]
 
     def get(self, name: str) -> ServedScene:
-        """The scene, opened if need be; safe from many threads. Raises UnknownScene, ValueError, OSError."""
+        """The scene, opened if need be; safe from many threads. Raises UnknownSceneError, ValueError, OSError."""
         name = self.known(name)
         found = self._recent(name)
         if found is not None:
@@ -135,13 +135,13 @@ class Scenes:
         return found
 
     def known(self, name: str) -> str:
-        """The name itself; of "*" that of the only scene. Raises UnknownScene, or ValueError for no name at all."""
+        """The name itself; of "*" that of the only scene. Raises UnknownSceneError, or ValueError for no name at all."""
         if not name:
             raise ValueError(f"scene_id is empty: name one of {self._said}")
         if name == "*" and len(self.runs) == 1:
             return next(iter(self.runs))
         if name not in self.runs:
-            raise UnknownScene(f"there is no scene {name[:100]!r}: this server has {self._said}")
+            raise UnknownSceneError(f"there is no scene {name[:100]!r}: this server has {self._said}")
         return name
 
     @property

@@ -18,9 +18,9 @@ import grpc
 import sparsestreet
 from sparsestreet.records.provenance import this_source
 from sparsestreet.serving import wire
-from sparsestreet.serving.cameras import NotServed, camera_spec, pose_message
+from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
-from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownScene
+from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +33,8 @@ _MOST_CAMERAS = 64
 _LOOKS = 0.05
 """Seconds after which a request that waits for its device looks whether anybody still wants it."""
 _CODES = {
-    UnknownScene: grpc.StatusCode.NOT_FOUND,
-    NotServed: grpc.StatusCode.UNIMPLEMENTED,
+    UnknownSceneError: grpc.StatusCode.NOT_FOUND,
+    NotServedError: grpc.StatusCode.UNIMPLEMENTED,
     ValueError: grpc.StatusCode.INVALID_ARGUMENT,
     OSError: grpc.StatusCode.FAILED_PRECONDITION,
     MemoryError: grpc.StatusCode.RESOURCE_EXHAUSTED,
@@ -42,7 +42,7 @@ _CODES = {
 """The first that an error is one of; what is none of these is INTERNAL, and the server's log has its trace."""
 
 
-class Gone(Exception):
+class GoneError(Exception):
     """Nobody waits for the answer any more: the request was canceled, or its deadline passed."""
 
 
@@ -137,10 +137,10 @@ class Sensorsim:
         return wire.kind("AvailableEgoMasksReturn")()
 
     def render_lidar(self, request: Any, context: grpc.ServicerContext) -> Any:
-        raise NotServed("this server renders cameras, no lidar")
+        raise NotServedError("this server renders cameras, no lidar")
 
     def render_aggregated(self, request: Any, context: grpc.ServicerContext) -> Any:
-        raise NotServed("this server has no lidar, so nothing to aggregate: call batch_render_rgb")
+        raise NotServedError("this server has no lidar, so nothing to aggregate: call batch_render_rgb")
 
     def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, Spent]:
         served: ServedScene = self.scenes.get(request.scene_id)
@@ -191,7 +191,7 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
 
 def _health(request: Any, context: grpc.ServicerContext) -> Any:
     if request.service not in ("", *wire.SERVICES):
-        raise UnknownScene(f"there is no service {request.service!r}")
+        raise UnknownSceneError(f"there is no service {request.service!r}")
     return wire.kind("grpc.health.v1.HealthCheckResponse")(status=1)
 
 
@@ -210,7 +210,7 @@ def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:
     """The answer of a call; whatever goes wrong becomes a status."""
     try:
         return call(request, context)
-    except Gone:
+    except GoneError:
         _refuse(context, grpc.StatusCode.CANCELLED, "nobody waits for the answer any more")
     except Exception as error:
         for kind, code in _CODES.items():
@@ -227,7 +227,7 @@ def _refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> 
 
 def _check_wanted(context: grpc.ServicerContext) -> None:
     if not context.is_active():
-        raise Gone
+        raise GoneError
 
 
 def _tell(context: grpc.ServicerContext, spent: Spent) -> None:

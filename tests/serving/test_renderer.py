@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sparsestreet.scene.edits import Edits
 from sparsestreet.serving import wire
-from sparsestreet.serving.cameras import NotServed, pose_message
+from sparsestreet.serving.cameras import NotServedError, pose_message
 from sparsestreet.serving.renderer import edits_of, encoded, picture, view_of
 from tests.export.street import stored_street
 from tests.serving.street import START_US, as_sent, at, place, request_for, served, timed_views, world_from_camera
@@ -113,10 +113,10 @@ def test_rows_of_a_turning_car_are_what_each_of_them_saw(street):
     still.sensor_pose.end_pose.CopyFrom(pose_message(start))
     place(still, "car", at(9.0, 0.5, 1.0))
     frozen = np.abs(shown(street, still).astype(int) - expected)
-    # Motion on the screen is taken as even, which bends by far less than a pixel here; the frozen picture is off by
+    # Motion on the screen is taken as even: 2 of 255, and rounding. A picture of the first row alone is off by 85, and
     # more than ten times as much.
     assert difference.mean() < 0.1 * frozen.mean()
-    assert difference.max() <= 6
+    assert difference.max() <= 3
 
 
 def test_bytes_are_a_png_or_a_jpeg(street):
@@ -212,7 +212,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(street, change, said):
     change(request)
     with pytest.raises(ValueError, match=said) as caught:
         shown(street, request)
-    assert not isinstance(caught.value, NotServed)
+    assert not isinstance(caught.value, NotServedError)
 
 
 def _rational(request):
@@ -237,7 +237,7 @@ LACKING = {
 def test_what_there_is_not_is_said_to_be_so(street, change, said):
     request = request_for(timed_views()[0])
     change(request)
-    with pytest.raises(NotServed, match=said):
+    with pytest.raises(NotServedError, match=said):
         shown(street, request)
 
 
