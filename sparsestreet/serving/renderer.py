@@ -29,7 +29,7 @@ _FASTEST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 def view_of(request: Any, rig: Rig) -> View:
-    """What the camera of a request sees, and when. Raises ValueError, and NotServedError for a lens that there is not."""
+    """What the camera of a request sees, and when. Raises ValueError, NotServedError for a lens that there is not."""
     if request.insert_ego_mask:
         raise ValueError(
             "this server has no masks of the vehicle (get_available_ego_masks): send insert_ego_mask=false"

@@ -135,7 +135,7 @@ class Scenes:
         return found
 
     def known(self, name: str) -> str:
-        """The name itself; of "*" that of the only scene. Raises UnknownSceneError, or ValueError for no name at all."""
+        """The name itself; of "*" that of the only scene. Raises UnknownSceneError, ValueError for no name at all."""
         if not name:
             raise ValueError(f"scene_id is empty: name one of {self._said}")
         if name == "*" and len(self.runs) == 1:

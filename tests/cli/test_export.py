@@ -43,7 +43,7 @@ def test_nodes_and_an_instance(run, tmp_path):
     ("change", "status", "said"),
     [
         ({"tme": 0.5}, 2, "no key 'tme'; did you mean 'time'?"),
-        ({"out": "street.obj"}, 2, "must end in .ply, got 'street.obj'"),
+        ({"out": "street.obj"}, 2, "must end in .ply, or in .usdz, got 'street.obj'"),
         ({"nodes": "rigid", "instance": "car"}, 2, "exclude each other"),
         ({"instance": "bus"}, 1, "no instance 'bus'; it has car, tram"),
         ({"nodes": "roads"}, 1, "no node 'roads'; it has background, rigid"),

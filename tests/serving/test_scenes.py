@@ -63,7 +63,7 @@ def test_names_that_are_no_scene(folders):
 
 
 def test_folders_that_cannot_be_served(folders, tmp_path):
-    with pytest.raises(FileNotFoundError, match="scene.safetensors"):
+    with pytest.raises(FileNotFoundError, match=r"scene\.safetensors"):
         named_runs([tmp_path])
     with pytest.raises(ValueError, match="name of its own, got a, a"):
         named_runs([folders[0], folders[0]])

@@ -140,11 +140,11 @@ def test_a_camera_on_the_recorded_vehicle_sees_what_was_recorded(client):
 
 NAN = float("nan")
 STATUSES = {
-    "another scene": (dict(scene_id="elsewhere"), grpc.StatusCode.NOT_FOUND, "no scene 'elsewhere': this server has"),
-    "no scene": (dict(scene_id=""), grpc.StatusCode.INVALID_ARGUMENT, "scene_id is empty"),
-    "huge": (dict(resolution_h=10**6, resolution_w=10**6), grpc.StatusCode.INVALID_ARGUMENT, "8192 pixels a side"),
-    "video": (dict(image_format=5), grpc.StatusCode.UNIMPLEMENTED, "AVC"),
-    "quality": (dict(image_quality=NAN), grpc.StatusCode.INVALID_ARGUMENT, "image_quality"),
+    "another scene": ({"scene_id": "elsewhere"}, grpc.StatusCode.NOT_FOUND, "no scene 'elsewhere': this server has"),
+    "no scene": ({"scene_id": ""}, grpc.StatusCode.INVALID_ARGUMENT, "scene_id is empty"),
+    "huge": ({"resolution_h": 10**6, "resolution_w": 10**6}, grpc.StatusCode.INVALID_ARGUMENT, "8192 pixels a side"),
+    "video": ({"image_format": 5}, grpc.StatusCode.UNIMPLEMENTED, "AVC"),
+    "quality": ({"image_quality": NAN}, grpc.StatusCode.INVALID_ARGUMENT, "image_quality"),
 }
 
 

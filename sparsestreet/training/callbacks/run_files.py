@@ -27,7 +27,7 @@ from sparsestreet.training.system import StreetSystem
 
 
 class RunFiles(Callback, RowListener):
-    """Writes ``scene.safetensors``, ``views.json``, ``rig.json`` and ``run.json`` when training ends, or is interrupted.
+    """Writes the scene, ``views.json``, ``rig.json`` and ``run.json`` when training ends, or is interrupted.
 
     Of several processes only the first writes.
 
