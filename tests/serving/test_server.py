@@ -226,6 +226,18 @@ def test_health_and_what_a_picture_took(client):
     assert spent["render-ms"] > 0
 
 
+def test_a_client_finds_a_server_that_was_started_again(tmp_path):
+    scenes = Scenes(named_runs([write_run(tmp_path / "street")]), load_scene, memory=10**9)
+    server, port = start(scenes, "127.0.0.1", 0, workers=1)
+    client = Client(port)
+    first = picture(client, timed_views()[0])
+    server.stop(None).wait()
+    server, _ = start(scenes, "127.0.0.1", port, workers=1)
+    assert picture(client, timed_views()[0]) == first
+    client.channel.close()
+    server.stop(None).wait()
+
+
 def test_a_port_has_one_server(client):
     port = int(client.channel._channel.target().decode().rpartition(":")[2])
     with pytest.raises(OSError, match=f"nobody can listen on 127.0.0.1:{port}"):
