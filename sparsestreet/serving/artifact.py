@@ -74,7 +74,7 @@ def write_artifact(
         "rig_trajectories.json": json.dumps(_trajectories(served, views, car), allow_nan=False),
         "sequence_tracks.json": json.dumps({served.name: tracks}, allow_nan=False),
     }
-    with atomic_file(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+    with atomic_file(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, text in texts.items():
             archive.writestr(zipfile.ZipInfo(name, _WHEN), text)
     count = len(tracks["tracks_data"]["tracks_id"])

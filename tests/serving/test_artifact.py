@@ -47,6 +47,7 @@ def test_the_zip_is_not_compressed_and_has_three_texts(archive):
         assert found.testzip() is None
         assert found.namelist() == ["metadata.yaml", "rig_trajectories.json", "sequence_tracks.json"]
         assert {entry.compress_type for entry in found.infolist()} == {zipfile.ZIP_STORED}
+        assert {entry.date_time for entry in found.infolist()} == {(1980, 1, 1, 0, 0, 0)}  # equal bytes on any day
 
 
 def test_metadata_has_every_key_that_is_asked_for(archive):

@@ -241,6 +241,14 @@ def test_what_there_is_not_is_said_to_be_so(street, change, said):
         shown(street, request)
 
 
+def test_a_camera_of_the_log_is_known_by_its_name(street):
+    """Its exposure and its color are then those of this camera."""
+    request = request_for(timed_views()[6])
+    assert view_of(request, street.rig).camera_index == 2
+    request.camera_intrinsics.logical_id = "a camera of theirs"
+    assert view_of(request, street.rig).camera_index is None
+
+
 def test_no_edits_render_the_scene_itself(street):
     assert edits_of(request_for(timed_views()[0]), street) == Edits()
 

@@ -1,6 +1,7 @@
 """Scenes by name, and which of them are open."""
 
 import shutil
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -42,6 +43,7 @@ def test_one_scene_is_open_however_little_memory_there_is_and_read_once_by_many(
 
     def open_scene(run):
         opened.append(run.name)
+        time.sleep(0.05)  # long enough for the others to ask
         return load_scene(run)
 
     scenes = Scenes(named_runs(folders), open_scene, memory=1)

@@ -1,6 +1,7 @@
 """The server over a loopback, called by a client that was made of AlpaSim's messages."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -203,6 +204,7 @@ def test_a_request_whose_deadline_passes_while_it_waits_is_not_rendered(client, 
     assert late.code() == grpc.StatusCode.DEADLINE_EXCEEDED
     dropped.cancel()
     last = call.future(theirs(request_for(timed_views()[16])), timeout=60)
+    time.sleep(0.1)  # until the server has heard of it
     let_go.set()
     assert first.result().image_bytes
     assert last.result().image_bytes
