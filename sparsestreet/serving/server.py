@@ -32,6 +32,8 @@ _MOST_CAMERAS = 64
 """Of a batch."""
 _LOOKS = 0.05
 """Seconds after which a request that waits for its device looks whether anybody still wants it."""
+_LONGEST_DETAILS = 1000
+"""Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
 _CODES = {
     UnknownSceneError: grpc.StatusCode.NOT_FOUND,
     NotServedError: grpc.StatusCode.UNIMPLEMENTED,
@@ -221,7 +223,7 @@ def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:
 
 
 def _refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> NoReturn:
-    context.abort(code, said)
+    context.abort(code, said[:_LONGEST_DETAILS])
     raise AssertionError("abort raises")
 
 

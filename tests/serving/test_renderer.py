@@ -8,11 +8,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.scene.edits import Edits
+from sparsestreet.scene.edits import Edits, edited
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.storage import StoredScene
 from sparsestreet.serving import wire
+from sparsestreet.serving.artifact import box_center
 from sparsestreet.serving.cameras import NotServedError, pose_message
 from sparsestreet.serving.renderer import edits_of, encoded, picture, view_of
+from sparsestreet.serving.scenes import ServedScene
 from tests.export.street import stored_street
+from tests.scene.people import smpl, walker
 from tests.serving.street import START_US, as_sent, at, place, request_for, served, timed_views, world_from_camera
 
 
@@ -256,3 +262,27 @@ def test_no_edits_render_the_scene_itself(street):
 def test_instants_beside_the_log_show_its_ends(street):
     late = request_for(timed_views()[16], frame_start_us=START_US + 5_000_000, frame_end_us=START_US + 5_000_000)
     assert view_of(late, street.rig).time == 1.0
+
+
+def test_a_person_stands_on_the_ground_of_its_box(street):
+    """Messages place boxes by their centers, and a person's own frame is at the pelvis."""
+    node = smpl(walker("anna", spread=0.0), walker("berta", y=2.0, seed=1))
+    scene = SceneGraph({"people": node}).eval()
+    people = ServedScene("people", StoredScene(scene, RenderOptions(), "people", 5), street.rig)
+    view = timed_views()[8]
+    anna = node.rows.instances == 0
+
+    @torch.no_grad()
+    def means(request):
+        return edited(scene, edits_of(request, people)).gaussians_at(view).gaussians.means
+
+    request = request_for(view)
+    logged = means(request)
+    place(request, "anna", box_center(node, 0, view.time))
+    assert torch.allclose(means(request), logged, atol=1e-5)  # float32 of the message
+    request = request_for(view)
+    place(request, "anna", at(3.0, 0.0, 5.0 + float(node.sizes[0, 2]) / 2))
+    stands = means(request)
+    assert torch.equal(stands[~anna], logged[~anna])
+    # The soles of a body at rest, but for the 0.5 % of Gaussians that may have left it.
+    assert float(stands[anna][:, 2].quantile(0.01)) == pytest.approx(5.0, abs=0.02)

@@ -159,6 +159,15 @@ def test_errors_are_statuses_and_the_server_goes_on(client, changes, code, said)
     assert picture(client, view)
 
 
+def test_an_error_that_repeats_a_long_name_is_still_its_status(client):
+    request = request_for(timed_views()[0])
+    place(request, "x" * 100_000, at(0.0, 0.0, 0.0))
+    with pytest.raises(grpc.RpcError) as caught:
+        client.render_rgb(theirs(request))
+    assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert "no object 'xxx" in caught.value.details()
+
+
 @pytest.mark.parametrize("call", ["render_lidar", "render_aggregated"])
 def test_what_is_not_there_yet_is_unimplemented(client, call):
     request = pb2.LidarRenderRequest() if call == "render_lidar" else pb2.AggregatedRenderRequest()
