@@ -125,8 +125,8 @@ def posed(camera: Camera, start: Pose, end: Pose, shutter: str, seconds: float, 
     stretch = lines / (lines - 1) if lines > 1 else 1.0
     translation = stretch * (middle[:3, :3].T @ (end - start)[:3, 3])
     rotation = stretch * Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
-    motion = (torch.from_numpy(vector).float() for vector in (translation, rotation))
-    return _at(camera, middle, Shutter(*motion, side, stretch * seconds, stretch * span))
+    moved, turned = (torch.from_numpy(vector).float() for vector in (translation, rotation))
+    return _at(camera, middle, Shutter(moved, turned, side, stretch * seconds, stretch * span))
 
 
 def camera_spec(name: str, camera: Camera) -> Any:

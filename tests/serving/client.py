@@ -25,7 +25,7 @@ class Client:
         self.calls = {
             method.name: self.channel.unary_unary(
                 f"/{service}/{method.name}",
-                request_serializer=lambda message: message.SerializeToString(),
+                request_serializer=_bytes,
                 response_deserializer=message_factory.GetMessageClass(method.output_type).FromString,
             )
             for method in pb2.DESCRIPTOR.services_by_name["SensorsimService"].methods
@@ -35,6 +35,10 @@ class Client:
         return lambda request=None, **options: self.calls[name](
             common_pb2.Empty() if request is None else request, timeout=60, wait_for_ready=True, **options
         )
+
+
+def _bytes(message: Any) -> bytes:
+    return message.SerializeToString()
 
 
 def theirs(message: Any) -> Any:

@@ -9,6 +9,7 @@ import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.artifact import Provenance, write_artifact
 from sparsestreet.serving.renderer import edits_of, picture, view_of
@@ -22,6 +23,7 @@ VIEWS = RecordedViews(tuple(timed_views()), (), 4.0)
 def street(tmp_path_factory):
     made = served(tmp_path_factory.mktemp("runs") / "street")
     node = made.stored.scene.nodes["rigid"]
+    assert isinstance(node, Rigid)
     # A car of four annotated instants, which turns; the tram has two.
     node.keyframe_times = torch.tensor([[0.0, 0.25, 0.5, 1.0], [0.0, 0.5, 0.5, 0.5]])
     node.keyframe_valid = torch.tensor([[True] * 4, [True, True, False, False]])

@@ -60,8 +60,8 @@ def map_of(camera: Camera):
 
 def ncore_camera(shutter: str, lens: dict[str, list[float]]):
     pytest.importorskip("ncore.sensors", reason="pip install nvidia-ncore==19.8.3")
-    from ncore.impl.data import types
-    from ncore.impl.sensors.camera import CameraModel
+    from ncore.impl.data import types  # pyright: ignore[reportMissingImports]
+    from ncore.impl.sensors.camera import CameraModel  # pyright: ignore[reportMissingImports]
 
     coefficients = {name: np.array(values, np.float32) for name, values in lens.items()}
     return CameraModel.from_parameters(

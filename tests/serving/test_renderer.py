@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sparsestreet.scene.edits import Edits, edited
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.serving import wire
@@ -72,6 +73,7 @@ def test_a_moved_object_stands_where_it_was_put_also_after_its_recorded_life(str
     place(request, "tram", at(9.0, 0.5, 1.0, yaw=0.7))
     there = stored_street()
     node = there.scene.nodes["rigid"]
+    assert isinstance(node, Rigid)
     with torch.no_grad():
         node.spans[1] = torch.tensor([0.0, 1.0])
         node.keyframe_times[1] = torch.tensor([0.0, 1.0])

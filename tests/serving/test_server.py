@@ -16,6 +16,7 @@ from sparsestreet.serving.server import start
 from tests.export.street import stored_street
 from tests.serving.client import Client, common_pb2, pb2, theirs
 from tests.serving.street import START_US, STEP_US, as_sent, at, place, request_for, timed_views, write_run
+from tests.typed import there
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +156,7 @@ def test_errors_are_statuses_and_the_server_goes_on(client, changes, code, said)
     with pytest.raises(grpc.RpcError) as caught:
         picture(client, view, **changes)
     assert caught.value.code() == code
-    assert said in caught.value.details()
+    assert said in there(caught.value.details())
     assert picture(client, view)
 
 
@@ -165,7 +166,7 @@ def test_an_error_that_repeats_a_long_name_is_still_its_status(client):
     with pytest.raises(grpc.RpcError) as caught:
         client.render_rgb(theirs(request))
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
-    assert "no object 'xxx" in caught.value.details()
+    assert "no object 'xxx" in there(caught.value.details())
 
 
 @pytest.mark.parametrize("call", ["render_lidar", "render_aggregated"])
@@ -174,7 +175,7 @@ def test_what_is_not_there_yet_is_unimplemented(client, call):
     with pytest.raises(grpc.RpcError) as caught:
         getattr(client, call)(request)
     assert caught.value.code() == grpc.StatusCode.UNIMPLEMENTED
-    assert "lidar" in caught.value.details()
+    assert "lidar" in there(caught.value.details())
 
 
 def test_bytes_that_are_no_message_get_a_status(client):
@@ -190,7 +191,7 @@ def test_an_error_of_our_own_is_internal_and_the_server_goes_on(client, monkeypa
         with pytest.raises(grpc.RpcError) as caught:
             picture(client, timed_views()[0])
     assert caught.value.code() == grpc.StatusCode.INTERNAL
-    assert "ZeroDivisionError" in caught.value.details()
+    assert "ZeroDivisionError" in there(caught.value.details())
     assert "a request failed" in caplog.text
     assert picture(client, timed_views()[0])
 
