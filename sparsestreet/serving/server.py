@@ -1,11 +1,10 @@
 """The gRPC server: calls by their names, statuses for what goes wrong, one rendering at a time on a device.
 
-A picture is rendered under the lock of its device and encoded outside of it, so a device renders while the threads of
-other requests encode. No request ends the server.
+Requests take turns at rendering, in the order in which they came, and encode outside of them: a device renders while
+the threads of other requests encode. No request ends the server.
 """
 
 import logging
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,6 +20,7 @@ from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
 from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
+from sparsestreet.serving.turns import Turns
 
 log = logging.getLogger(__name__)
 
@@ -30,8 +30,6 @@ MOST_WAITING = 256
 """Requests at the same time; further ones get RESOURCE_EXHAUSTED."""
 _MOST_CAMERAS = 64
 """Of a batch."""
-_LOOKS = 0.05
-"""Seconds after which a request that waits for its device looks whether anybody still wants it."""
 _LONGEST_DETAILS = 1000
 """Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
 _CODES = {
@@ -63,7 +61,7 @@ class Sensorsim:
     def __init__(self, scenes: Scenes, encoders: int = 4) -> None:
         """``encoders``: threads that encode the pictures of batches."""
         self.scenes = scenes
-        self._device = threading.Lock()
+        self._device = Turns()
         self._encoders = ThreadPoolExecutor(encoders, "encode")
 
     def render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -148,14 +146,9 @@ class Sensorsim:
         served: ServedScene = self.scenes.get(request.scene_id)
         view, edits = view_of(request, served.rig), edits_of(request, served)
         asked = time.perf_counter()
-        while not self._device.acquire(timeout=_LOOKS):
-            _check_wanted(context)
-        try:
-            _check_wanted(context)
+        with self._device.turn(partial(_check_wanted, context)):
             started = time.perf_counter()
             image = picture(served, view, edits)
-        finally:
-            self._device.release()
         return image, Spent(1000 * (started - asked), 1000 * (time.perf_counter() - started))
 
 

@@ -65,11 +65,11 @@ def test_cameras_are_where_they_were(recording, shift):
 def test_the_vehicle_is_the_imu(recording, shift):
     """It has the axes of the lidar, which lies beside it."""
     assert recording.vehicle.stamps.tolist() == PLAN.stamps.tolist()
-    for stamp, pose in zip(PLAN.stamps.tolist(), recording.vehicle.poses.numpy(), strict=True):
+    for stamp, found in zip(PLAN.stamps.tolist(), recording.vehicle.poses.numpy(), strict=True):
         wanted = PLAN.world_from_vehicle(stamp)
         wanted[:3, 3] += shift
-        assert np.abs(pose[:3, :3] - wanted[:3, :3]).max() < 1e-9
-        assert np.abs(pose[:3, 3] - wanted[:3, 3]).max() < 3
+        assert np.abs(found[:3, :3] - wanted[:3, :3]).max() < 1e-9
+        assert np.abs(found[:3, 3] - wanted[:3, 3]).max() < 3
 
 
 def test_intrinsics_count_from_the_corner_of_the_image(recording):
