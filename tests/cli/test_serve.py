@@ -4,11 +4,12 @@ import signal
 import subprocess
 import sys
 import zipfile
+from dataclasses import fields
 
 import pytest
 
 from sparsestreet.cli.export import export
-from sparsestreet.cli.serve import serve
+from sparsestreet.cli.serve import USAGE, ServeRequest, serve
 from tests.serving.street import write_run
 
 
@@ -35,6 +36,11 @@ def test_a_server_serves_until_it_is_told_to_end(run):
         server.send_signal(signal.SIGTERM)
         assert server.wait(30) == 0
         assert "requests under way have 5 s" in server.stdout.read()
+
+
+def test_the_help_names_every_option():
+    for field in fields(ServeRequest):
+        assert f"\n  {field.name} " in USAGE
 
 
 @pytest.mark.parametrize(
