@@ -54,7 +54,7 @@ def test_a_step_of_the_car_is_a_piece_of_a_circle(examples):
     assert drive.steer(np.eye(4), np.array([radius, radius, 0.0])) == pytest.approx(0.3)
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 def test_another_packages_driver_stays_on_the_recorded_path(run, examples):
     """100 steps, in a street whose log ends long before; it stands still from there on."""
     import closed_loop  # pyright: ignore[reportMissingImports]
