@@ -23,7 +23,7 @@ def test_the_import_is_light():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("command", ["render", "export", "presets"])
+@pytest.mark.parametrize("command", ["render", "export", "serve", "presets"])
 def test_the_help_of_a_command_is_light(command):
     code = f"import sys; from sparsestreet.cli.{command} import {command} as run; run(['--help']); "
     code += "sys.exit('torch' in sys.modules)"

@@ -24,6 +24,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet view RUN                               fly through it in the browser, hide and move objects
   sparsestreet export RUN street.html                 one page that plays it, in any browser, offline
   sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
+  sparsestreet serve RUN[,RUN] port=50051             pictures for simulators (AlpaSim, NuRec's clients) over gRPC
   sparsestreet data check DIR                         everything that is wrong with a log, at once
   sparsestreet data convert from=DIR to=OUT           any log in DriveStudio's layout, or another data set's
   sparsestreet data make seed=1                       write a synthetic street to disk
@@ -35,7 +36,8 @@ Every command takes --help. Options of train are Hydra overrides; `sparsestreet 
 """
 
 COMMANDS = (
-    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "view", "data", "effects", "presets",
+    "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "view", "serve", "data", "effects",
+    "presets",
     "bench",
 )  # fmt: skip
 

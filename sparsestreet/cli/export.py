@@ -19,6 +19,7 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
   sparsestreet export outputs/RUN car.ply time=0.5 instance=12   one object, where it is at that time
   sparsestreet export outputs/RUN street.html                    one page that plays the drive, in any browser, offline
   sparsestreet export outputs/RUN empty.html edits=edits.yaml    without or with other objects
+  sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
 
   scene      a run's folder, or a scene.safetensors; the first word without a key
   out        (the second) a .ply in the layout of 3DGS (binary; opens in SuperSplat and others), or an .html
@@ -33,9 +34,17 @@ of a .ply:
 
 of an .html:
   shapes     shapes a second of what changes its shape, such as people (default: 4); more are smoother and larger
+
+of a .usdz:
+  car        [length,width,height] in meters of the recording car (default: 4.8,1.9,1.6)
+  mount      as sparsestreet serve takes it
+  names      as sparsestreet serve takes them
 """
 
 DEFAULT_SHAPES = 4.0
+
+_OWN = {".ply": ("time", "nodes", "instance"), ".html": ("shapes",), ".usdz": ("car", "mount", "names")}
+"""Ending of a file -> the options that it alone has."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +59,20 @@ class ExportRequest:
     edits: Path | None = None
     views: Path | None = None
     shapes: float | None = None
+    car: tuple[float, ...] | None = None
+    mount: tuple[float, ...] | None = None
+    names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.nodes is not None and self.instance is not None:
             raise ValueError("nodes and instance exclude each other: leave one out")
-        if self.out.suffix not in (".ply", ".html"):
-            raise ValueError(f"the file must end in .ply or .html, got {self.out.name!r}")
-        others = ("time", "nodes", "instance") if self.out.suffix == ".html" else ("shapes",)
-        for name in others:
+        if self.out.suffix not in _OWN:
+            raise ValueError(f"the file must end in {', '.join(_OWN)}, got {self.out.name!r}")
+        for name in (name for suffix, names in _OWN.items() if suffix != self.out.suffix for name in names):
             if getattr(self, name) is not None:
                 raise ValueError(f"{name} is no option of a {self.out.suffix}: leave it out")
+        if self.out.suffix == ".usdz" and self.edits is not None:
+            raise ValueError("edits is no option of a .usdz: leave it out")
         if self.shapes is not None and self.shapes <= 0:
             raise ValueError(f"shapes must be above 0 a second, got {self.shapes:g}")
 
@@ -71,6 +84,11 @@ def export(arguments: list[str]) -> int:
 
 def _export(request: ExportRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
+    if request.out.suffix == ".usdz":
+        from sparsestreet.cli.artifact import export_artifact
+
+        export_artifact(request.scene, request.out, request.car, request.mount, request.names)
+        return
     from sparsestreet.cli.edits import with_edits
     from sparsestreet.cli.scene import open_scene
     from sparsestreet.scene.views import FILE_NAME, read_views

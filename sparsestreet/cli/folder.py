@@ -24,6 +24,7 @@ CONFIGURATION = ".hydra"
 OF_A_RUN = (
     "scene.safetensors",
     "views.json",
+    "rig.json",
     "run.json",
     "checkpoints",
     "records",

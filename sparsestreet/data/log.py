@@ -34,6 +34,16 @@ car."""
 
 
 @dataclass(frozen=True)
+class VehiclePath:
+    """Where the recording car was: x ahead, y left, z up."""
+
+    poses: Float64[Tensor, "p 4 4"]
+    """world_from_vehicle, in the re-centered world; the origin is the data set's, mostly the rear axle."""
+    stamps: tuple[int, ...] | None = None
+    """Nanoseconds on the log's clock, increasing, one a pose; None: the poses are those of the frames, one each."""
+
+
+@dataclass(frozen=True)
 class DrivingLog:
     """Frames, lidar sweeps and object tracks of one drive in one metric world, re-centered near its start."""
 
@@ -65,6 +75,9 @@ class DrivingLog:
     carried_without: Callable[[frozenset[int]], tuple[Frames, Sweeps]] | None = None
     """Makes frames and sweeps of which those of other instants depend on no box of the given ones; None: none depends
     on a box of another instant anyway."""
+
+    vehicle: VehiclePath | None = None
+    """None: the log tells where its cameras were, but not the car that carried them."""
 
     def holding_out(self, frames: frozenset[int]) -> "DrivingLog":
         """The log, where depth and colors of other frames depend on no box of these.

@@ -19,7 +19,7 @@ from torch import Tensor
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.images import check_camera_images
 from sparsestreet.data.kept_frames import CacheSize, cache_bytes
-from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
@@ -111,6 +111,8 @@ class Recording:
     way from one to the next if both have it; boxes need stamps then."""
     sparse_points: Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]] | None = None
     """Positions in the data set's own world and RGB in [0, 1] of points that came with it, such as COLMAP's."""
+    vehicle: PosePath | None = None
+    """The car in the data set's own world, x ahead, y left, z up; None: the data set does not tell."""
     notes: tuple[str, ...] = ()
     """What a user should know about how it was read, one sentence each."""
 
@@ -219,8 +221,13 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         dataset_from_world=dataset_from_world(origin),
         carried_without=folder.holding_out,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
+        vehicle=_vehicle(recording.vehicle, origin),
         notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
     )
+
+
+def _vehicle(path: PosePath | None, origin: Float64[Tensor, "3"]) -> VehiclePath | None:
+    return None if path is None else VehiclePath(recentered(path.poses, origin), tuple(path.stamps.tolist()))
 
 
 def _clock(recording: Recording, num_frames: int) -> LogClock:

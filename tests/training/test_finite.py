@@ -21,9 +21,7 @@ def test_a_loss_that_is_not_finite_names_view_term_and_parameter(system):
     frame, fine = frame_at(2), {"photometric": torch.tensor(1.0), "depth": torch.tensor(2.0)}
     check_loss(fine, system.scene, frame, 7)
     broken = fine | {"depth": torch.tensor(float("inf"))}
-    with pytest.raises(
-        NotFiniteError, match=r"step 8: the loss of frame 2, camera 0 .*depth = inf\); all param"
-    ):
+    with pytest.raises(NotFiniteError, match=r"step 8: the loss of frame 2, camera 0 .*depth = inf\); all param"):
         check_loss(broken, system.scene, frame, 7)
     with torch.no_grad():
         system.scene.nodes["background"].rows.sh_dc[3, 0, 1] = torch.nan

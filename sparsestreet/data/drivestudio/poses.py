@@ -56,6 +56,11 @@ def first_pose(layout: Layout) -> Float64[Tensor, "4 4"]:
     return read_pose(layout.sweep_pose(first) if layout.flavor.mounted else layout.extrinsics(first, layout.front))
 
 
+def read_vehicle(layout: Layout) -> Float64[Tensor, "f 4 4"]:
+    """Poses of the vehicle that cameras are mounted on, one a frame of the window, in the data set's world."""
+    return torch.stack([read_pose(layout.sweep_pose(frame)) for frame in layout.frames])
+
+
 def read_clock(layout: Layout) -> LogClock:
     """The times of the frames of the window; raises LogError for stamps that cannot be those of the folder's frames."""
     stamps = _in_window(layout, layout.timestamps) if layout.has_clock else None

@@ -16,14 +16,14 @@ from sparsestreet.data.drivestudio.flavors import FlavorName
 from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
-from sparsestreet.data.drivestudio.poses import first_pose, read_clock
+from sparsestreet.data.drivestudio.poses import first_pose, read_clock, read_vehicle
 from sparsestreet.data.drivestudio.sweeps import read_points
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.kept_frames import CacheSize, cache_bytes
-from sparsestreet.data.log import DrivingLog, SceneExtent
+from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.notes import absence_notes
-from sparsestreet.data.poses import dataset_from_world
+from sparsestreet.data.poses import dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.scene_folder import SceneFolder
@@ -122,6 +122,7 @@ class DriveStudioReader(LogReader):
             carried_without=folder.holding_out,
             notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
+            vehicle=VehiclePath(recentered(read_vehicle(layout), origin)) if layout.flavor.mounted else None,
         )
 
     def files(self) -> LogFiles:

@@ -22,7 +22,7 @@ from sparsestreet.data.kitti.oxts import Oxts, read_oxts
 from sparsestreet.data.kitti.tracklets import Tracklet, read_tracklets
 from sparsestreet.data.kitti.velodyne import point_stamps, read_points
 from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import untwisted
+from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.geometry.transforms import transform_points
@@ -78,6 +78,9 @@ class KittiReader(RecordedReader):
             frame_stamps=parts.clock.stamps,
             sweeps=_sweeps(drive, parts) if self.lidar and drive.lidar.is_dir() else None,
             boxes=None if parts.tracklets is None else _boxes(drive, parts, parts.tracklets),
+            vehicle=PosePath(
+                torch.tensor(parts.clock.stamps), torch.stack([parts.poses[frame] for frame in drive.frames])
+            ),
             notes=(_POSES, *parts.clock.notes, *self._notes(drive, parts)),
         )
 

@@ -81,6 +81,7 @@ class NuScenesReader(RecordedReader):
             sweeps=self._sweeps(),
             boxes=boxes,
             annotated=frozenset(instant - chosen.window.start for instant in chosen.instants.of_samples.values()),
+            vehicle=chosen.vehicle(),
             notes=(*chosen.notes(), *notes),
         )
 

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.data.motion import PosePath
 from sparsestreet.data.nuscenes.choice import find_scene, find_tables
 from sparsestreet.data.nuscenes.instants import Instants, Rate, find_instants
 from sparsestreet.data.nuscenes.scene import DataFile, SceneFiles, pose_of, read_scene
@@ -67,6 +69,12 @@ class Selection:
         """At the file's own stamp: of an image its own row of ego_pose counts, not the lidar's."""
         ego = self.egos[file.row.text("ego_pose_token")]
         return pose_of(ego) @ pose_of(self.scene.calibrations[file.row.text("calibrated_sensor_token")])
+
+    def vehicle(self) -> PosePath:
+        """Where it was at the images of the first camera."""
+        files = self.images_of(0) or list(self.images.values())[:1]
+        poses = torch.stack([pose_of(self.egos[file.row.text("ego_pose_token")]) for file in files])
+        return PosePath(torch.tensor([file.stamp for file in files]), poses)
 
     def rows(self) -> list[Mapping[str, object]]:
         """What the tables say of the selection, in an order that follows from it."""

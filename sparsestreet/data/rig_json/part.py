@@ -39,8 +39,13 @@ class Part:
         """None: there is no clock."""
         return tuple(frame.stamp for frame in self.frames if frame.stamp is not None) or None
 
+    @property
+    def vehicle(self) -> PosePath | None:
+        """At the frames of the window; None: without a clock, or without poses."""
+        return _drive(self.frames)
+
     def shots(self) -> list[Shot]:
-        drive = _drive(self.table)
+        drive = _drive(self.table.frames)
         return [
             _shot(self.table, drive, entry, frame, index, name)
             for frame, entry in enumerate(self.frames)
@@ -52,7 +57,7 @@ class Part:
         """Of the frames that have one; None: no frame of the table has."""
         if not any(frame.sweep for frame in self.table.frames):
             return None
-        drive = _drive(self.table)
+        drive = _drive(self.table.frames)
         near = {shot.frame: shot.world_from_camera[:3, 3] for shot in reversed(shots)}
         sweeps = {}
         for index, frame in enumerate(self.frames):
@@ -112,11 +117,11 @@ def _shutter(camera: CameraEntry, drive: PosePath | None, image: ImageEntry, sta
         raise image.where.fault(f"is read out where no pose is known: {error}", remedy) from error
 
 
-def _drive(table: RigTable) -> PosePath | None:
+def _drive(frames: Sequence[FrameEntry]) -> PosePath | None:
     """Where the vehicle is over time, and a frame's step beyond; None: without a clock, or without poses."""
     known = [
         (frame.stamp, frame.world_from_vehicle)
-        for frame in table.frames
+        for frame in frames
         if frame.stamp is not None and frame.world_from_vehicle is not None
     ]
     if not known:

@@ -46,6 +46,7 @@ class RigJsonReader(RecordedReader):
             frame_stamps=part.stamps,
             sweeps=part.sweeps(shots) if self.lidar else None,
             boxes=part.boxes(),
+            vehicle=part.vehicle,
             notes=self._notes(part),
         )
 

@@ -15,6 +15,7 @@ from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.marks import Marks
+from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
@@ -55,6 +56,9 @@ class WaymoReader(RecordedReader):
             raise LogError(missing)
         labelled = segment.labelled & {shot.key for shot in shots if given is None}
         kinds = frozenset({"sky", "human", "vehicle"} if labelled else ())
+        # Behind the last image there are no frames.
+        seen = frames[: 1 + shots[-1].frame]
+        stamps = tuple(_instant(segment, frame) for frame in seen)
         return Recording(
             name=segment.name,
             rig=rig,
@@ -62,8 +66,8 @@ class WaymoReader(RecordedReader):
             read_image=partial(_read_image, segment, rig),
             read_masks=partial(_read_masks, segment, rig, labelled, given),
             mask_kinds=kinds if given is None else given.kinds,
-            # Behind the last image there are no frames.
-            frame_stamps=tuple(_instant(segment, frame) for frame in frames)[: 1 + shots[-1].frame],
+            frame_stamps=stamps,
+            vehicle=PosePath(torch.tensor(stamps), torch.stack([segment.world_from_vehicle(frame) for frame in seen])),
             sweeps=self._sweeps() if self.lidar else None,
             boxes=boxes,
             notes=(*segment_notes(segment, frames, cameras, shots, len(labelled)), *notes),

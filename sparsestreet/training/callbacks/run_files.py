@@ -5,12 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float64
 from lightning import Callback, Trainer
+from torch import Tensor
 
+from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.speed import device_name
 from sparsestreet.noise import Calibration, calibrate, noise_between
 from sparsestreet.phases import stage
 from sparsestreet.records.ledger import CountChange
+from sparsestreet.records.rig import RIG, Matrix, RigRecord
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.scene import views
 from sparsestreet.scene.gaussians import RowPlan
@@ -23,7 +27,7 @@ from sparsestreet.training.system import StreetSystem
 
 
 class RunFiles(Callback, RowListener):
-    """Writes ``scene.safetensors``, ``views.json`` and ``run.json`` when training ends, or is interrupted.
+    """Writes the scene, ``views.json``, ``rig.json`` and ``run.json`` when training ends, or is interrupted.
 
     Of several processes only the first writes.
 
@@ -85,6 +89,7 @@ class RunFiles(Callback, RowListener):
             views.write_views(
                 self.folder / views.FILE_NAME, split.train.views, split.held_out.views, frame_rate=log.frame_rate
             )
+            RIG.write(self.folder, _rig(log))
             RUN.write(self.folder, description)
 
     def state_dict(self) -> dict[str, Any]:
@@ -92,3 +97,17 @@ class RunFiles(Callback, RowListener):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.caps = dict(state_dict["caps"])
+
+
+def _rig(log: DrivingLog) -> RigRecord:
+    vehicle = log.vehicle
+    return RigRecord(
+        camera_names=log.camera_names,
+        dataset_from_world=_matrix(log.dataset_from_world),
+        world_from_vehicle=None if vehicle is None else tuple(_matrix(pose) for pose in vehicle.poses),
+        vehicle_stamps=None if vehicle is None else vehicle.stamps,
+    )
+
+
+def _matrix(pose: Float64[Tensor, "4 4"]) -> Matrix:
+    return tuple(tuple(row) for row in pose.tolist())

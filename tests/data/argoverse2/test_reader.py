@@ -38,6 +38,16 @@ def test_images_have_the_poses_of_their_own_stamps(log):
         assert np.abs(error).mean() < 2  # JPEG
 
 
+def test_the_vehicle_is_where_it_was_at_the_stamps_of_the_frames(log):
+    recording = Argoverse2Reader(root=log, cameras=list(CAMERAS), first_frame=1).recording()
+    vehicle = there(recording.vehicle)
+    assert tuple(vehicle.stamps.tolist()) == recording.frame_stamps
+    np.testing.assert_allclose(vehicle.poses.numpy(), PLAN.world_from_vehicle(vehicle.stamps.numpy()), atol=ARC)
+    driven = there(Argoverse2Reader(root=log, cameras=list(CAMERAS)).read())
+    origin = driven.dataset_from_world[:3, 3]
+    np.testing.assert_allclose(there(driven.vehicle).poses[1:, :3, 3] + origin, vehicle.poses[:, :3, 3], atol=1e-9)
+
+
 def test_pixels_have_their_centers_at_half_and_the_lens_is_not_applied(log):
     recording = Argoverse2Reader(root=log, cameras=list(CAMERAS)).recording()
     for camera, planned in zip(recording.rig, PLAN.cameras, strict=True):

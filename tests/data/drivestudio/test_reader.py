@@ -139,6 +139,14 @@ def test_the_waymo_world_starts_at_the_vehicle(tmp_path):
     assert torch.allclose(positions, torch.tensor([[0.0, 0, 1.5], [0, 1, 1.5], [0, 2, 1.5]]), atol=1e-5)
 
 
+def test_the_vehicle_is_known_where_cameras_are_mounted_on_it(tmp_path):
+    vehicle = there(DriveStudioReader(make_waymo(tmp_path / "waymo", offset=MAP), first_frame=1).read().vehicle)
+    assert vehicle.stamps is None  # those of the frames
+    assert vehicle.poses[:, :3, 3].tolist() == [[0, 0, 0], [0, 1, 0]]
+    assert vehicle.poses[0, :3, 0].tolist() == [0, 1, 0]  # ahead
+    assert DriveStudioReader(make_nuscenes(tmp_path / "nuscenes")).read().vehicle is None
+
+
 def test_the_window_and_the_cameras_are_counted_from_zero(tmp_path):
     whole = DriveStudioReader(make_nuscenes(tmp_path, frames=6)).read()
     part = DriveStudioReader(tmp_path, first_frame=2, last_frame=4, cameras=[1, 0]).read()

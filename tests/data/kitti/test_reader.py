@@ -62,6 +62,16 @@ def test_cameras_are_where_they_were(recording, shift):
     assert recording.frame_stamps == tuple(PLAN.stamps.tolist())
 
 
+def test_the_vehicle_is_the_imu(recording, shift):
+    """It has the axes of the lidar, which lies beside it."""
+    assert recording.vehicle.stamps.tolist() == PLAN.stamps.tolist()
+    for stamp, found in zip(PLAN.stamps.tolist(), recording.vehicle.poses.numpy(), strict=True):
+        wanted = PLAN.world_from_vehicle(stamp)
+        wanted[:3, 3] += shift
+        assert np.abs(found[:3, :3] - wanted[:3, :3]).max() < 1e-9
+        assert np.abs(found[:3, 3] - wanted[:3, 3]).max() < 3
+
+
 def test_intrinsics_count_from_the_corner_of_the_image(recording):
     for camera in recording.rig:
         assert np.abs(camera.intrinsics.numpy() - PLAN.cameras[0].intrinsics).max() < 1e-5  # float32

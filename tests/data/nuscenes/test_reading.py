@@ -42,6 +42,13 @@ def test_each_image_has_the_pose_and_the_stamp_of_its_own_instant(recording):
             assert np.allclose(shot.world_from_camera, PLAN.world_from_camera(frame, camera), rtol=0, atol=1e-11)
 
 
+def test_the_vehicle_is_where_it_was_at_the_images_of_the_first_camera(recording):
+    first = next(camera for camera in PLAN.cameras if CHANNELS[camera.name] == recording.rig[0].name)
+    stamps = np.array([PLAN.image_stamp(frame, first) for frame in range(4)])
+    assert recording.vehicle.stamps.tolist() == stamps.tolist()
+    assert np.allclose(recording.vehicle.poses, PLAN.world_from_vehicle(stamps), rtol=0, atol=1e-11)
+
+
 def test_intrinsics_have_pixel_centers_at_a_half(recording):
     for camera, planned in zip(recording.rig, PLAN.cameras, strict=True):
         assert (camera.name, camera.size, camera.distortion) == (CHANNELS[planned.name], (32, 24), None)

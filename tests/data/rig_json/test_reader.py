@@ -34,6 +34,12 @@ def log(root) -> DrivingLog:
     return RigJsonReader(root=root).read()
 
 
+def test_the_vehicle_is_where_it_was_at_the_frames_of_the_window(root):
+    vehicle = there(RigJsonReader(root=root, first_frame=1, last_frame=2).recording().vehicle)
+    assert vehicle.stamps.tolist() == PLAN.stamps[1:3].tolist()
+    assert np.allclose(vehicle.poses, PLAN.world_from_vehicle(PLAN.stamps[1:3]), rtol=0, atol=1e-9)
+
+
 def test_each_image_has_its_own_instant_and_pose(recording, log):
     assert [(shot.frame, shot.camera) for shot in recording.shots] == [(f, c) for f in range(4) for c in range(2)]
     for shot, frame in zip(recording.shots, log.frames, strict=True):

@@ -30,6 +30,13 @@ def test_poses_and_stamps(root, drive):
         assert shot.exposure == pytest.approx(EXPOSURE / 1e9)
 
 
+def test_the_vehicle_is_where_it_was(root, drive):
+    vehicle = there(WaymoReader(root=root, first_frame=1).recording().vehicle)
+    assert vehicle.stamps.tolist() == drive.stamps[1:].tolist()
+    expected = np.stack([drive.frame_pose(frame) for frame in (1, 2, 3)])
+    np.testing.assert_allclose(vehicle.poses.numpy(), expected, rtol=0, atol=PLACE)
+
+
 def test_a_pose_of_another_instant_is_moved_to_the_middle_of_the_readout(tmp_path):
     drive = Drive(pose_delays={"front": 4_400_000, "left": -3_100_000}, yaw_rate=0.6)
     records.write_drive(tmp_path, drive)

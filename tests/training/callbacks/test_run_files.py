@@ -8,8 +8,9 @@ import torch
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Frames, Sweeps
-from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.ops import SplatSettings
+from sparsestreet.records.rig import RIG
 from sparsestreet.records.run import RUN
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.rendering import RenderOptions
@@ -20,6 +21,7 @@ from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.callbacks.resizing import resize_rows
 from tests.evaluation.frames import make_run
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
+from tests.typed import there
 
 OPTIONS = RenderOptions(SplatSettings(near_plane=0.25), "reference")
 
@@ -37,7 +39,10 @@ def trainer(tmp_path) -> StubTrainer:
     clock.load_state_dict({"seconds": 12.5})
     trainer = StubTrainer(make_system(nodes, options=OPTIONS), [RunFiles(tmp_path, make_run(), clock)], max_steps=10)
     frames = tuple(replace(frame_at(index), seconds=0.25 * index, stamp=250_000_000 * index) for index in range(7))
-    log = DrivingLog("seven", Frames.of(frames), Sweeps.of(()), (), 7, 1, torch.eye(4).double())
+    shift, vehicle = torch.eye(4).double(), torch.eye(4).double().repeat(2, 1, 1)
+    shift[0, 3], vehicle[1, 2, 3] = 0.1 + 0.2, 0.125
+    path = VehiclePath(vehicle, (0, 250_000_000))
+    log = DrivingLog("seven", Frames.of(frames), Sweeps.of(()), (), 7, 1, shift, camera_names=("wide",), vehicle=path)
     trainer.datamodule = StreetData(log, stride=3, offset=1)
     trainer.walk(3)
     return trainer
@@ -48,7 +53,7 @@ def files(folder: Path) -> set[str]:
 
 
 def check_whole(trainer: StubTrainer, folder: Path) -> None:
-    assert files(folder) == {"scene.safetensors", "views.json", "run.json"}
+    assert files(folder) == {"scene.safetensors", "views.json", "rig.json", "run.json"}
     stored = load_scene(folder)
     assert stored.scene.counts() == trainer.system.scene.counts()
     assert (stored.name, stored.num_frames, stored.options) == ("seven", 7, OPTIONS)
@@ -56,6 +61,10 @@ def check_whole(trainer: StubTrainer, folder: Path) -> None:
     assert [view.frame_index for view in views.training] == [0, 2, 3, 5, 6]
     assert [view.frame_index for view in views.held_out] == [1, 4]
     assert (views.frame_rate, [view.seconds for view in views.held_out]) == (4.0, [0.25, 1.0])
+    rig = RIG.read(folder)
+    assert (rig.camera_names, rig.vehicle_stamps) == (("wide",), (0, 250_000_000))
+    assert rig.dataset_from_world[0] == (1.0, 0.0, 0.0, 0.1 + 0.2)  # as they are, not rounded
+    assert there(rig.world_from_vehicle)[1][2] == (0.0, 0.0, 1.0, 0.125)
     run = RUN.read(folder)
     assert (run.steps, run.training_seconds) == (trainer.global_step, 12.5)
     assert run.label == make_run().label

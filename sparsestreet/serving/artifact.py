@@ -1,0 +1,167 @@
+"""``street.usdz``: what AlpaSim loads of a scene beside its pictures. Three texts in a zip that is not compressed.
+
+The drive of the vehicle and the instants of its images, the tracks of the objects, and what the scene is called. There
+is no mesh and no map: physics and scores of leaving the road need other sources.
+"""
+
+import json
+import uuid
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+import sparsestreet
+from sparsestreet.atomic import atomic_file
+from sparsestreet.scene.edits import objects_of
+from sparsestreet.scene.nodes.tracked import Tracked
+from sparsestreet.scene.views import RecordedViews
+from sparsestreet.serving.cameras import Pose
+from sparsestreet.serving.renderer import frame_from_box
+from sparsestreet.serving.rig import Clock
+from sparsestreet.serving.scenes import ServedScene
+
+DEFAULT_CAR = (4.8, 1.9, 1.6)
+"""Length, width, height of the vehicle, meters; the rear axle is 1 m before its rear end."""
+_REAR = 1.0
+_LEAST_FRAME_US = 1
+"""AlpaSim asks for frames that end after they start."""
+_FEWEST_POSES = 4
+"""Of a track: AlpaSim draws a spline through them. Objects seen less often stay as they were recorded."""
+_WHEN = (1980, 1, 1, 0, 0, 0)
+"""Of the files in the zip: equal scenes give equal bytes."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What identifies the run."""
+
+    version: str
+    data_hash: str
+    seed: int
+
+
+def write_artifact(
+    path: Path, served: ServedScene, views: RecordedViews, provenance: Provenance, car: Sequence[float] = DEFAULT_CAR
+) -> dict[str, int]:
+    """Write the whole file or nothing.
+
+    Args:
+        path: ends in .usdz.
+        served: the scene; ``sparsestreet serve`` gives the pictures of it, by the same name.
+        views: of its log.
+        provenance: of its run.
+        car: length, width and height of the vehicle, meters.
+
+    Returns:
+        How many ``poses``, ``cameras`` and ``objects`` there are.
+
+    Raises ValueError for a scene of less than two instants, or a car that is none.
+    """
+    if len(car) != 3 or min(car) <= 0:
+        raise ValueError(f"car= is length, width and height in meters, got {list(car)}")
+    if len(served.rig.times) < 2:
+        raise ValueError("a drive has two instants or more, got one: train on more frames")
+    tracks = _tracks(served)
+    texts = {
+        "metadata.yaml": yaml.safe_dump(_metadata(served, provenance), sort_keys=False),
+        "rig_trajectories.json": json.dumps(_trajectories(served, views, car), allow_nan=False),
+        "sequence_tracks.json": json.dumps({served.name: tracks}, allow_nan=False),
+    }
+    with atomic_file(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, text in texts.items():
+            archive.writestr(zipfile.ZipInfo(name, _WHEN), text)
+    count = len(tracks["tracks_data"]["tracks_id"])
+    return {"poses": len(served.rig.times), "cameras": len(served.rig.cameras), "objects": count}
+
+
+def _metadata(served: ServedScene, provenance: Provenance) -> dict[str, Any]:
+    clock, names = served.rig.clock, [camera.name for camera in served.rig.cameras]
+    identity = f"{served.name} {provenance.data_hash} {provenance.version} {provenance.seed}"
+    return {
+        "scene_id": served.name,
+        "version_string": f"sparsestreet {sparsestreet.__version__}",
+        "training_date": "",
+        "dataset_hash": provenance.data_hash,
+        "uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, identity)),
+        "is_resumable": False,
+        "sensors": {"camera_ids": names, "lidar_ids": []},
+        "logger": {"name": None, "run_id": None, "run_url": None},
+        "time_range": {"start": clock.microseconds(0.0) / 1e6, "end": clock.microseconds(1.0) / 1e6},
+    }
+
+
+def _trajectories(served: ServedScene, views: RecordedViews, car: Sequence[float]) -> dict[str, Any]:
+    rig, (length, width, height) = served.rig, car
+    cameras = {f"{camera.name}@{served.name}": camera for camera in rig.cameras}
+    return {
+        "world_to_nre": {"matrix": np.linalg.inv(rig.dataset_from_world).tolist()},
+        "camera_calibrations": {key: {"logical_sensor_name": camera.name} for key, camera in cameras.items()},
+        "rig_trajectories": [
+            {
+                "sequence_id": served.name,
+                "T_rig_world_timestamps_us": [rig.clock.microseconds(time) for time in rig.times],
+                "T_rig_worlds": rig.poses.tolist(),
+                "cameras_frame_timestamps_us": {
+                    key: _frames(views, camera.index, rig.clock) for key, camera in cameras.items()
+                },
+                "rig_bbox": {
+                    "centroid": [length / 2 - _REAR, 0.0, height / 2],
+                    "dim": [length, width, height],
+                    "rot": [0.0, 0.0, 0.0],
+                },
+            }
+        ],
+    }
+
+
+def _frames(views: RecordedViews, camera: int, clock: Clock) -> list[list[int]]:
+    """Start and end of the readout of each image of a camera."""
+    frames = []
+    for view in views.all:
+        if view.indices[1] == camera:
+            shutter = view.camera.shutter
+            half = round(5e5 * shutter.seconds) if shutter is not None else 0
+            middle = clock.microseconds(view.time)
+            start = max(middle - half, 0)
+            frames.append([start, max(middle + half, start + _LEAST_FRAME_US)])
+    return frames
+
+
+def _tracks(served: ServedScene) -> dict[str, Any]:
+    names, classes, stamps, poses, sizes = [], [], [], [], []
+    for name, (_, node, instance) in objects_of(served.stored.scene).items():
+        times = node.keyframe_times[instance][node.keyframe_valid[instance]].tolist()
+        if len(times) < _FEWEST_POSES:
+            continue
+        names.append(name)
+        classes.append(node.classes[instance] or "automobile")
+        stamps.append([served.rig.clock.microseconds(time) for time in times])
+        poses.append([_position_and_turn(box_center(node, instance, time)) for time in times])
+        sizes.append([float(size) for size in node.sizes[instance]])
+    return {
+        "tracks_data": {
+            "tracks_id": names,
+            "tracks_label_class": classes,
+            "tracks_flags": ["CONTROLLABLE"] * len(names),
+            "tracks_timestamps_us": stamps,
+            "tracks_poses": poses,
+        },
+        "cuboidtracks_data": {"cuboids_dims": sizes},
+    }
+
+
+def box_center(node: Tracked, instance: int, time: float) -> Pose:
+    """world_from_box of an object at a time, upright: what a request would say of it to leave it where it is."""
+    return node.object_frames(node.pose_at(time))[instance] @ np.linalg.inv(frame_from_box(node, instance))
+
+
+def _position_and_turn(pose: Float64[np.ndarray, "4 4"]) -> list[float]:
+    """x, y, z, then the quaternion x, y, z, w."""
+    return [*pose[:3, 3].tolist(), *Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()]

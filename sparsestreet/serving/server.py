@@ -1,0 +1,231 @@
+"""The gRPC server: calls by their names, statuses for what goes wrong, one rendering at a time on a device.
+
+Requests take turns at rendering, in the order in which they came, and encode outside of them: a device renders while
+the threads of other requests encode. No request ends the server.
+"""
+
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NoReturn
+
+import grpc
+
+import sparsestreet
+from sparsestreet.records.provenance import this_source
+from sparsestreet.serving import wire
+from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
+from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
+from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
+from sparsestreet.serving.turns import Turns
+
+log = logging.getLogger(__name__)
+
+LARGEST_MESSAGE = 64 * 2**20
+"""Bytes: that of AlpaSim's channel to its renderer."""
+MOST_WAITING = 256
+"""Requests at the same time; further ones get RESOURCE_EXHAUSTED."""
+_MOST_CAMERAS = 64
+"""Of a batch."""
+_LONGEST_DETAILS = 1000
+"""Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
+_CODES = {
+    UnknownSceneError: grpc.StatusCode.NOT_FOUND,
+    NotServedError: grpc.StatusCode.UNIMPLEMENTED,
+    ValueError: grpc.StatusCode.INVALID_ARGUMENT,
+    OSError: grpc.StatusCode.FAILED_PRECONDITION,
+    MemoryError: grpc.StatusCode.RESOURCE_EXHAUSTED,
+}
+"""The first that an error is one of; what is none of these is INTERNAL, and the server's log has its trace."""
+
+
+class GoneError(Exception):
+    """Nobody waits for the answer any more: the request was canceled, or its deadline passed."""
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Milliseconds of one picture."""
+
+    waited: float
+    rendered: float
+    encoded: float = 0.0
+
+
+class Sensorsim:
+    """The calls of SensorsimService; each takes a message and gRPC's context, and returns a message."""
+
+    def __init__(self, scenes: Scenes, encoders: int = 4) -> None:
+        """``encoders``: threads that encode the pictures of batches."""
+        self.scenes = scenes
+        self._device = Turns()
+        self._encoders = ThreadPoolExecutor(encoders, "encode")
+
+    def render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
+        image, spent = self._rendered(request, context)
+        started = time.perf_counter()
+        data = encoded(image, request.image_format, request.image_quality)
+        _tell(context, Spent(spent.waited, spent.rendered, 1000 * (time.perf_counter() - started)))
+        return wire.kind("RGBRenderReturn")(image_bytes=data)
+
+    def batch_render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
+        """Each camera once; one that fails says why and leaves the others as they are."""
+        names = [item.camera_name for item in request.items]
+        if len(set(names)) < len(names) or len(names) > _MOST_CAMERAS:
+            raise ValueError(
+                f"a batch has at most {_MOST_CAMERAS} cameras, each once, got {names[: _MOST_CAMERAS + 1]}"
+            )
+        started: list[tuple[str, Future[bytes] | Exception]] = []
+        for item in request.items:
+            one = item.request
+            try:
+                image, _ = self._rendered(one, context)
+                data = self._encoders.submit(encoded, image, one.image_format, one.image_quality)
+                started.append((item.camera_name, data))
+            except (ValueError, OSError, MemoryError) as error:
+                started.append((item.camera_name, error))
+        answer = wire.kind("BatchRGBRenderReturn")()
+        for name, outcome in started:
+            item = answer.items.add(camera_name=name, success=isinstance(outcome, Future))
+            if isinstance(outcome, Future):
+                item.result.image_bytes = outcome.result()
+            else:
+                item.error_message = str(outcome)
+        return answer
+
+    def get_version(self, request: Any, context: grpc.ServicerContext) -> Any:
+        major, minor, patch = wire.API_VERSION
+        version = wire.kind("common.VersionId")(version_id=f"sparsestreet {sparsestreet.__version__}")
+        version.git_hash = this_source().commit or ""
+        version.grpc_api_version.major, version.grpc_api_version.minor, version.grpc_api_version.patch = (
+            major,
+            minor,
+            patch,
+        )
+        return version
+
+    def get_available_scenes(self, request: Any, context: grpc.ServicerContext) -> Any:
+        return wire.kind("common.AvailableScenesReturn")(scene_ids=self.scenes.names)
+
+    def get_loaded_scenes(self, request: Any, context: grpc.ServicerContext) -> Any:
+        answer = wire.kind("LoadedScenesReturn")(loaded_instance_capacity=len(self.scenes.names))
+        for name in self.scenes.opened:
+            answer.scenes.add(scene_id=name, loaded_instance_count=1, reusable_instance_count=1)
+        return answer
+
+    def get_available_cameras(self, request: Any, context: grpc.ServicerContext) -> Any:
+        answer = wire.kind("AvailableCamerasReturn")()
+        for one in self.scenes.rig(request.scene_id).cameras:
+            spec, mount = camera_spec(one.name, one.camera), pose_message(one.rig_from_camera)
+            answer.available_cameras.add(intrinsics=spec, rig_to_camera=mount, logical_id=one.name)
+        return answer
+
+    def get_available_trajectories(self, request: Any, context: grpc.ServicerContext) -> Any:
+        """The recorded drive of the vehicle."""
+        rig = self.scenes.rig(request.scene_id)
+        answer = wire.kind("AvailableTrajectoriesReturn")()
+        trajectory = answer.available_trajectories.add().trajectory
+        for instant, pose in zip(rig.times, rig.poses, strict=True):
+            trajectory.poses.add(pose=pose_message(pose), timestamp_us=rig.clock.microseconds(instant))
+        return answer
+
+    def get_available_ego_masks(self, request: Any, context: grpc.ServicerContext) -> Any:
+        """None: the vehicle is no part of a scene."""
+        return wire.kind("AvailableEgoMasksReturn")()
+
+    def render_lidar(self, request: Any, context: grpc.ServicerContext) -> Any:
+        raise NotServedError("this server renders cameras, no lidar")
+
+    def render_aggregated(self, request: Any, context: grpc.ServicerContext) -> Any:
+        raise NotServedError("this server has no lidar, so nothing to aggregate: call batch_render_rgb")
+
+    def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, Spent]:
+        served: ServedScene = self.scenes.get(request.scene_id)
+        view, edits = view_of(request, served.rig), edits_of(request, served)
+        asked = time.perf_counter()
+        with self._device.turn(partial(_check_wanted, context)):
+            started = time.perf_counter()
+            image = picture(served, view, edits)
+        return image, Spent(1000 * (started - asked), 1000 * (time.perf_counter() - started))
+
+
+def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Server, int]:
+    """A server that answers, and its port; port 0 takes a free one.
+
+    Args:
+        scenes: what is served.
+        host: the address that it listens on; there is no authentication, so 127.0.0.1 unless the network is yours.
+        port: where.
+        workers: requests that are worked on at the same time, and threads that encode batches.
+
+    Raises OSError where nobody can listen there.
+    """
+    service = Sensorsim(scenes, encoders=workers)
+    size = [(f"grpc.max_{way}_message_length", LARGEST_MESSAGE) for way in ("send", "receive")]
+    # Two servers on one port would share its requests.
+    server = grpc.server(
+        ThreadPoolExecutor(workers, "serve"),
+        options=[*size, ("grpc.so_reuseport", 0)],
+        maximum_concurrent_rpcs=MOST_WAITING,
+    )
+    calls = {name: _handler(getattr(service, name), *kinds) for name, kinds in wire.METHODS.items()}
+    handlers = [grpc.method_handlers_generic_handler(name, calls) for name in wire.SERVICES]
+    health = _handler(_health, "grpc.health.v1.HealthCheckRequest", "grpc.health.v1.HealthCheckResponse")
+    handlers.append(grpc.method_handlers_generic_handler("grpc.health.v1.Health", {"Check": health}))
+    server.add_generic_rpc_handlers(tuple(handlers))
+    try:
+        bound = server.add_insecure_port(f"{host}:{port}")
+    except RuntimeError as error:
+        raise OSError(f"nobody can listen on {host}:{port}: another server may, choose another port=") from error
+    server.start()
+    return server, bound
+
+
+def _health(request: Any, context: grpc.ServicerContext) -> Any:
+    if request.service not in ("", *wire.SERVICES):
+        raise UnknownSceneError(f"there is no service {request.service!r}")
+    return wire.kind("grpc.health.v1.HealthCheckResponse")(status=1)
+
+
+Call = Callable[[Any, grpc.ServicerContext], Any]
+
+
+def _handler(call: Call, request: str, answer: str) -> grpc.RpcMethodHandler:
+    return grpc.unary_unary_rpc_method_handler(
+        partial(_answered, call),
+        request_deserializer=wire.kind(request).FromString,
+        response_serializer=wire.kind(answer).SerializeToString,
+    )
+
+
+def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:
+    """The answer of a call; whatever goes wrong becomes a status."""
+    try:
+        return call(request, context)
+    except GoneError:
+        _refuse(context, grpc.StatusCode.CANCELLED, "nobody waits for the answer any more")
+    except Exception as error:
+        for kind, code in _CODES.items():
+            if isinstance(error, kind):
+                _refuse(context, code, str(error))
+        log.exception("a request failed")
+        _refuse(context, grpc.StatusCode.INTERNAL, f"{type(error).__name__}: {error}")
+
+
+def _refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> NoReturn:
+    context.abort(code, said[:_LONGEST_DETAILS])
+    raise AssertionError("abort raises")
+
+
+def _check_wanted(context: grpc.ServicerContext) -> None:
+    if not context.is_active():
+        raise GoneError
+
+
+def _tell(context: grpc.ServicerContext, spent: Spent) -> None:
+    """What a picture took, behind the answer: ``wait-ms``, ``render-ms``, ``encode-ms``."""
+    entries = (("wait-ms", spent.waited), ("render-ms", spent.rendered), ("encode-ms", spent.encoded))
+    context.set_trailing_metadata(tuple((name, f"{value:.3f}") for name, value in entries))

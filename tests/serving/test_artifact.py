@@ -1,0 +1,110 @@
+"""The file that AlpaSim loads, read back with the modules of Python alone."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scipy.spatial.transform import Rotation
+
+from sparsestreet.scene.nodes import Rigid
+from sparsestreet.scene.views import RecordedViews
+from sparsestreet.serving.artifact import Provenance, write_artifact
+from sparsestreet.serving.renderer import edits_of, picture, view_of
+from tests.serving.street import START_US, STEP_US, place, request_for, served, timed_views
+
+FROM = Provenance("1234", "abcd", 0)
+VIEWS = RecordedViews(tuple(timed_views()), (), 4.0)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    made = served(tmp_path_factory.mktemp("runs") / "street")
+    node = made.stored.scene.nodes["rigid"]
+    assert isinstance(node, Rigid)
+    # A car of four annotated instants, which turns; the tram has two.
+    node.keyframe_times = torch.tensor([[0.0, 0.25, 0.5, 1.0], [0.0, 0.5, 0.5, 0.5]])
+    node.keyframe_valid = torch.tensor([[True] * 4, [True, True, False, False]])
+    node.keyframe_translations = torch.tensor([[[8.0, 1, 1], [9, 1, 1], [10, 1.5, 1], [12, 2, 1]]] * 2)
+    turns = torch.tensor([0.0, 0.1, 0.2, 0.4])
+    zero = torch.zeros(4)
+    node.keyframe_quaternions = torch.stack((turns.cos(), zero, zero, turns.sin()), -1).repeat(2, 1, 1)
+    for name in ("rotation_deltas", "translation_deltas"):
+        setattr(node, name, torch.nn.Parameter(torch.zeros(2, 4, 3)))
+    node.sizes[0] = torch.tensor([4.0, 2.0, 1.5])
+    return made
+
+
+@pytest.fixture(scope="module")
+def archive(street, tmp_path_factory):
+    path = tmp_path_factory.mktemp("out") / "street.usdz"
+    assert write_artifact(path, street, VIEWS, FROM) == {"poses": 5, "cameras": 4, "objects": 1}
+    return path
+
+
+def test_the_zip_is_not_compressed_and_has_three_texts(archive):
+    with zipfile.ZipFile(archive) as found:
+        assert found.testzip() is None
+        assert found.namelist() == ["metadata.yaml", "rig_trajectories.json", "sequence_tracks.json"]
+        assert {entry.compress_type for entry in found.infolist()} == {zipfile.ZIP_STORED}
+        assert {entry.date_time for entry in found.infolist()} == {(1980, 1, 1, 0, 0, 0)}  # equal bytes on any day
+
+
+def test_metadata_has_every_key_that_is_asked_for(archive):
+    with zipfile.ZipFile(archive) as found:
+        metadata = yaml.safe_load(found.read("metadata.yaml"))
+    assert metadata["scene_id"] == "street"
+    texts = ("scene_id", "version_string", "training_date", "dataset_hash", "uuid")
+    assert all(isinstance(metadata[key], str) for key in texts)
+    assert metadata["is_resumable"] is False
+    assert metadata["sensors"] == {"camera_ids": ["0", "1", "2", "3"], "lidar_ids": []}
+    assert metadata["logger"] == {"name": None, "run_id": None, "run_url": None}
+    assert metadata["time_range"] == {"start": START_US / 1e6, "end": (START_US + 4 * STEP_US) / 1e6}
+
+
+def test_the_drive_is_that_of_the_rig(archive, street):
+    with zipfile.ZipFile(archive) as found:
+        said = json.loads(found.read("rig_trajectories.json"))
+    (drive,) = said["rig_trajectories"]
+    assert drive["sequence_id"] == "street"
+    assert drive["T_rig_world_timestamps_us"] == [START_US + STEP_US * frame for frame in range(5)]
+    assert np.array_equal(drive["T_rig_worlds"], street.rig.poses)
+    assert np.array_equal(said["world_to_nre"]["matrix"], np.eye(4))
+    assert [one["logical_sensor_name"] for one in said["camera_calibrations"].values()] == ["0", "1", "2", "3"]
+    assert drive["cameras_frame_timestamps_us"].keys() == said["camera_calibrations"].keys()
+    for frames in drive["cameras_frame_timestamps_us"].values():
+        assert [start for start, _ in frames] == [START_US + STEP_US * frame for frame in range(5)]
+        assert all(end > start for start, end in frames)
+    assert drive["rig_bbox"]["dim"] == [4.8, 1.9, 1.6]
+    assert drive["rig_bbox"]["centroid"] == pytest.approx([1.4, 0.0, 0.8])
+
+
+def test_a_track_sent_back_leaves_its_object_where_it_is(archive, street):
+    with zipfile.ZipFile(archive) as found:
+        tracks = json.loads(found.read("sequence_tracks.json"))["street"]
+    data = tracks["tracks_data"]
+    assert (data["tracks_id"], data["tracks_flags"]) == (["car"], ["CONTROLLABLE"])
+    assert tracks["cuboidtracks_data"]["cuboids_dims"] == [[4.0, 2.0, 1.5]]
+    assert data["tracks_timestamps_us"][0] == [START_US + STEP_US * frame for frame in (0, 1, 2, 4)]
+    pose = np.eye(4)
+    x, y, z, *turn = data["tracks_poses"][0][2]
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(turn).as_matrix(), (x, y, z)
+    assert np.allclose(pose[:3, 3], [10, 1.5, 1])
+    assert np.allclose(pose[:3, 0], [np.cos(0.4), np.sin(0.4), 0])
+    asked, placed = request_for(timed_views()[8]), request_for(timed_views()[8])
+    place(placed, "car", pose)
+    pictures = [picture(street, view_of(one, street.rig), edits_of(one, street)).astype(int) for one in (asked, placed)]
+    assert np.abs(pictures[0] - pictures[1]).max() <= 1  # float32 of the message
+
+
+def test_equal_scenes_give_equal_bytes(archive, street, tmp_path):
+    write_artifact(tmp_path / "again.usdz", street, VIEWS, FROM)
+    assert (tmp_path / "again.usdz").read_bytes() == archive.read_bytes()
+
+
+def test_a_car_that_is_none(street, tmp_path):
+    with pytest.raises(ValueError, match="length, width and height"):
+        write_artifact(tmp_path / "a.usdz", street, VIEWS, FROM, car=(1.0, 2.0))
+    assert not list(tmp_path.iterdir())
