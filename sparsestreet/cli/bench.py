@@ -171,7 +171,7 @@ def _edits(options: argparse.Namespace) -> bool:
     from hydra.utils import instantiate
 
     from sparsestreet.bench import edits
-    from sparsestreet.cli.compose import load_run_config
+    from sparsestreet.cli.compose import check_moved, load_run_config
     from sparsestreet.data.lazy import spread
     from sparsestreet.data.synthetic import StreetReader
     from sparsestreet.scene.storage import load_scene
@@ -179,7 +179,9 @@ def _edits(options: argparse.Namespace) -> bool:
 
     if options.street is None:
         raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
-    reader = instantiate(load_run_config(options.street).data.log)
+    config = load_run_config(options.street)
+    check_moved(config)
+    reader = instantiate(config.data.log)
     if not isinstance(reader, StreetReader):
         raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
     views = read_views(options.street / FILE_NAME).held_out
