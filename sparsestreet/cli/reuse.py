@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 _LARGE = ("scene.safetensors", "predictions")
 """Replaced as whole files whenever they change: two runs may share their bytes on the disk."""
-_SMALL = ("views.json", "curves", "pictures", "records")
+_SMALL = ("views.json", "rig.json", "curves", "pictures", "records")
 
 
 def finished_elsewhere(cfg: DictConfig, out: Path) -> Path | None:

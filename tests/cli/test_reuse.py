@@ -37,7 +37,7 @@ def standing(out: Path, *words: str, steps: int = 60, ended: bool = True) -> Pat
     RUN.write(out, summary.run)
     SUMMARY.write(out, summary)
     update_costs(out, wall_seconds=9.0 if ended else None, phases={"train": 9.0})
-    for name in ("scene.safetensors", "views.json", "predictions/held_out/005_0.png", "curves/metrics.csv"):
+    for name in ("scene.safetensors", "views.json", "rig.json", "predictions/held_out/005_0.png", "curves/metrics.csv"):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text(name)
     (out / "checkpoints").mkdir()

@@ -74,4 +74,4 @@ def test_the_artifact_of_a_run(run, tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "street.usdz") as found:
         assert len(found.namelist()) == 3
     assert export([str(run), str(tmp_path / "street.ply"), "car=4,1.8,1.5"]) == 2
-    assert "car, mount and names are of a .usdz" in capsys.readouterr().err
+    assert "car is no option of a .ply" in capsys.readouterr().err
