@@ -42,7 +42,7 @@ class AffineSettings(EffectSettings):
         return Finding(called_for=False, reason="one map of colors for all images is nothing that a log calls for")
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=12, ns_per_pixel=6.0, ms_per_frame=0.35)
+        return Cost(numbers=12, ns_per_pixel=4.8, ms_per_frame=0.12)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Affine":
         return Affine(self)

@@ -81,7 +81,7 @@ class CameraPosesSettings(EffectSettings):
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=6 * len(data.views), ms_per_frame=2.0)
+        return Cost(numbers=6 * len(data.views), ms_per_frame=1.53, ns_per_row=1.2)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "CameraPoses":
         """Corrections start where poses lie on smooth paths, if rays of points meet better from there; else at zero."""

@@ -68,7 +68,7 @@ class ExposureSettings(EffectSettings):
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=3 * len(data.views), ns_per_pixel=3.8, ms_per_frame=0.15)
+        return Cost(numbers=3 * len(data.views), ns_per_pixel=3.3)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Exposure":
         """Starts from the gains that are measured on all images; from none where nothing can be measured."""

@@ -13,7 +13,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Camera, View
 
-_NS_PER_ROW = 8.6
+_NS_PER_ROW = 7.4
 """The projection of a Gaussian through a lens, less that of a pinhole (docs/effects.md)."""
 
 
@@ -45,7 +45,7 @@ class LensSettings(EffectSettings):
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(ns_per_row=_NS_PER_ROW, ms_per_frame=0.5)
+        return Cost(ns_per_row=_NS_PER_ROW, ms_per_frame=0.41)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Lens":
         return Lens(self)

@@ -15,7 +15,7 @@ from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
 
-_NS_PER_ROW = 2.2
+_NS_PER_ROW = 2.1
 """The motion of a Gaussian during the readout, beside its projection (docs/effects.md)."""
 
 

@@ -20,7 +20,7 @@ from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.options import RenderOptions
 from sparsestreet.types import Rendering, View
 
-_NS_PER_PIXEL = 5.4
+_NS_PER_PIXEL = 4.8
 """Where light gets through a fourth of the pixels, as in trained streets (docs/effects.md)."""
 
 
@@ -59,7 +59,7 @@ class SkySettings(EffectSettings):
         )
 
     def cost(self, data: TrainingData) -> Cost:
-        return Cost(numbers=18 * self.resolution**2, ns_per_pixel=_NS_PER_PIXEL, ms_per_frame=0.4)
+        return Cost(numbers=18 * self.resolution**2, ns_per_pixel=_NS_PER_PIXEL, ms_per_frame=0.14)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Sky":
         return Sky(self)
