@@ -4,13 +4,11 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from sparsestreet.cli.scene import folder_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
 from sparsestreet.scene.edits.file import Open
 from sparsestreet.scene.storage import StoredScene, load_scene
-from sparsestreet.scene.views import FILE_NAME, RecordedViews, read_views, seconds_of
-
-DEFAULT_LOG_FPS = 10.0
-"""Of Waymo, KITTI, PandaSet and Argoverse; said when it is used."""
+from sparsestreet.scene.views import DEFAULT_FRAME_RATE, FILE_NAME, RecordedViews, read_views, seconds_of
 
 
 def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> StoredScene:
@@ -33,15 +31,14 @@ def opener(stored: StoredScene) -> Open:
 
     @cache
     def open_scene(path: Path) -> tuple[StoredScene, float]:
-        beside = path if path.is_dir() else path.parent
-        return load_scene(path, stored.scene.device), log_seconds(read_views(beside / FILE_NAME))
+        return load_scene(path, stored.scene.device), log_seconds(read_views(folder_of(path) / FILE_NAME))
 
     return open_scene
 
 
 def log_seconds(views: RecordedViews) -> float:
     """How long a log lasts, at ten frames a second where it has no clock."""
-    return seconds_of(views, views.frame_rate or DEFAULT_LOG_FPS)
+    return seconds_of(views, views.frame_rate or DEFAULT_FRAME_RATE)
 
 
 def _notes(edits: Edits) -> list[str]:

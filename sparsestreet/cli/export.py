@@ -90,13 +90,12 @@ def _export(request: ExportRequest) -> None:
         export_artifact(request.scene, request.out, request.car, request.mount, request.names)
         return
     from sparsestreet.cli.edits import with_edits
-    from sparsestreet.cli.scene import open_scene
+    from sparsestreet.cli.scene import folder_of, open_scene
     from sparsestreet.scene.views import FILE_NAME, read_views
 
     stored = open_scene(request.scene, "cpu")
-    beside = request.scene if request.scene.is_dir() else request.scene.parent
     if request.out.suffix == ".html" or request.edits is not None:
-        views = read_views(request.views or beside / FILE_NAME)
+        views = read_views(request.views or folder_of(request.scene) / FILE_NAME)
         stored = with_edits(stored, views, request.edits)
         if request.out.suffix == ".html":
             return _export_page(request, stored, views)

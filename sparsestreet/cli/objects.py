@@ -44,12 +44,12 @@ def objects(arguments: list[str]) -> int:
 
 def _objects(request: ObjectsRequest) -> None:
     from sparsestreet.cli.edits import log_seconds
-    from sparsestreet.cli.scene import open_scene
+    from sparsestreet.cli.scene import folder_of, open_scene
     from sparsestreet.export.objects import scene_objects
     from sparsestreet.scene.views import FILE_NAME, read_views
 
     stored = open_scene(request.scene, request.device)
-    folder = request.scene if request.scene.is_dir() else request.scene.parent
+    folder = folder_of(request.scene)
     views = read_views(folder / FILE_NAME)
     found = scene_objects(stored, views.all)
     if not found:

@@ -114,20 +114,19 @@ def render(arguments: list[str]) -> int:
 
 def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
-    from sparsestreet.cli.edits import DEFAULT_LOG_FPS, with_edits
-    from sparsestreet.cli.scene import open_scene
+    from sparsestreet.cli.edits import with_edits
+    from sparsestreet.cli.scene import folder_of, open_scene
     from sparsestreet.export.video import check_destination
-    from sparsestreet.scene.views import FILE_NAME, read_views
+    from sparsestreet.scene.views import DEFAULT_FRAME_RATE, FILE_NAME, read_views
 
     started = time.perf_counter()
     check_destination(request.out)
     stored = open_scene(request.scene, request.device)
-    beside = request.scene if request.scene.is_dir() else request.scene.parent
-    views = read_views(request.views or beside / FILE_NAME)
+    views = read_views(request.views or folder_of(request.scene) / FILE_NAME)
     stored = with_edits(stored, views, request.edits)
     log_fps = request.log_fps or views.frame_rate
     if log_fps is None:
-        log_fps = DEFAULT_LOG_FPS
+        log_fps = DEFAULT_FRAME_RATE
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
     path, fps, what = _path(request, views, log_fps)
     count = _write(request, stored, _seen_by(request, path), fps)

@@ -24,6 +24,11 @@ def open_scene(path: Path, device: str | None = None) -> StoredScene:
     return load_scene(path, device_of(device, f"device={device}", "say device=cpu, or check the driver"))
 
 
+def folder_of(scene: Path) -> Path:
+    """The folder of a run that was given as it is, or by its scene file."""
+    return scene if scene.is_dir() else scene.parent
+
+
 def import_parts(run: Path) -> None:
     """Make the classes of a run's nodes and effects known, and of what is set within them (density, masks, sources).
 

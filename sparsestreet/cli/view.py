@@ -51,7 +51,7 @@ def view(arguments: list[str]) -> int:
 def _view(request: ViewRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.edits import log_seconds, opener
-    from sparsestreet.cli.scene import open_scene
+    from sparsestreet.cli.scene import folder_of, open_scene
     from sparsestreet.scene.edits.file import beside, read_values
     from sparsestreet.scene.views import FILE_NAME, read_views
     from sparsestreet.viewing.edit_state import EditState
@@ -59,7 +59,7 @@ def _view(request: ViewRequest) -> None:
     from sparsestreet.viewing.stage import Stage
 
     stored = open_scene(request.scene, request.device)
-    folder = request.scene if request.scene.is_dir() else request.scene.parent
+    folder = folder_of(request.scene)
     views = read_views(request.views or folder / FILE_NAME)
     file, open_other = request.edits or folder / "edits.yaml", opener(stored)
     said = {} if request.edits is None else read_values(request.edits)

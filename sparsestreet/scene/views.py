@@ -17,6 +17,9 @@ FORMAT = 2
 FILE_NAME = "views.json"
 """Name of the file in a run's folder."""
 
+DEFAULT_FRAME_RATE = 10.0
+"""Frames a second that a log without a clock is taken to have: as Waymo, KITTI, PandaSet and Argoverse."""
+
 _REMEDY = (
     "one below 2 is of an earlier version, without the clock of the log: train again, or go on with the version that "
     "wrote it; one above 2 needs a newer version"

@@ -10,12 +10,10 @@ from jaxtyping import Float64
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.records.rig import RigRecord
 from sparsestreet.scene.edits.paths import between
-from sparsestreet.scene.views import RecordedViews, seconds_of
+from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of
 from sparsestreet.serving.cameras import Pose
 from sparsestreet.types import Camera, View
 
-DEFAULT_FRAME_RATE = 10.0
-"""Frames a second of a log without a clock: that of Waymo, KITTI, PandaSet and Argoverse."""
 DEFAULT_MOUNT = (1.5, 0.0, 1.6)
 """Meters ahead, left and up of the rear axle on the ground: about where a car's front camera is."""
 BEYOND = 60.0

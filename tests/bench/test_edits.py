@@ -1,0 +1,65 @@
+"""``bench edits``: what is compared where, and how much of a removed object is left."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sparsestreet.bench import edits
+from sparsestreet.bench.edits import Beside
+from sparsestreet.data.synthetic.models.car import STYLES, Car
+from sparsestreet.data.synthetic.motion import Path
+from sparsestreet.data.synthetic.world import Actor
+from sparsestreet.types import Frame
+from tests.export.street import stored_street, street_views
+
+CAR = Actor("car", Car(STYLES[0], (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)), Path(start=0.0, y=1.0, speed=4.0), 0.0)
+
+
+def traced(level: int):
+    """A street whose middle half, of 48 x 32 pixels, has a gray level."""
+
+    def truth(view):
+        image = torch.full((32, 48, 3), 40, dtype=torch.uint8)
+        image[8:24, 12:36] = level
+        return Frame.of(view, image=image)
+
+    return truth
+
+
+@pytest.mark.parametrize(
+    ("left", "ghost", "psnr"),
+    # What is left of the object, as a share of its contrast of 100 of 255: its energy, and the error in its region.
+    [(0.0, 0.0, np.inf), (0.1, 0.01, -20 * np.log10(10 / 255)), (1.0, 1.0, -20 * np.log10(100 / 255))],
+)
+def test_a_ghost_is_the_energy_of_what_is_left_of_an_object(left, ghost, psnr, monkeypatch):
+    monkeypatch.setattr(edits, "LEAST", 24 * 16)
+    before, after, views = traced(140), traced(40), street_views()[:3]
+    shown = traced(round(40 + 100 * left))
+    monkeypatch.setattr(edits, "_image", lambda stored, view: shown(view).image.double().numpy() / 255)
+    stored = stored_street()
+    with np.errstate(divide="ignore"):
+        record = edits._compared("removed", "car", CAR, stored, stored, views, before, after)
+    assert record is not None
+    assert (record.views, record.pixels) == (3, 3 * 24 * 16)
+    assert record.ghost == pytest.approx(ghost, abs=1e-12)
+    assert record.psnr == pytest.approx(psnr)
+    # What was rendered is also compared with the street as it was.
+    expected = np.inf if left == 1 else -20 * np.log10(100 * (1 - left) / 255)
+    assert record.psnr_before == pytest.approx(expected)
+
+
+def test_views_that_an_edit_hardly_changes_do_not_count(monkeypatch):
+    monkeypatch.setattr(edits, "LEAST", 24 * 16 + 1)
+    stored, views = stored_street(), street_views()[:2]
+    assert edits._compared("removed", "car", CAR, stored, stored, views, traced(140), traced(40)) is None
+
+
+def test_an_actor_beside_its_way_keeps_heading_and_steps():
+    beside = replace(CAR, path=Beside(CAR.path, 3.0))
+    for time in (0.0, 1.5):
+        moved, own = beside.pose(time), CAR.pose(time)
+        np.testing.assert_allclose(moved[:3, :3], own[:3, :3])
+        np.testing.assert_allclose(moved[:3, 3] - own[:3, 3], [0.0, -3.0, 0.0], atol=1e-12)
+        assert beside.path.traveled(time) == CAR.path.traveled(time)
