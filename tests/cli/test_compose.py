@@ -117,6 +117,10 @@ def test_numbers_out_of_their_limits_are_found_before_torch_is_imported(override
     assert config_problem(composed([override])) == problem  # of a job of a sweep
 
 
+def test_a_folder_that_would_lead_nowhere_is_refused():
+    assert "give out=DIR" in there(override_problem(["folder=outputs/mine"]))
+
+
 def test_the_first_checks_import_no_torch():
     code = (
         "import sys; from sparsestreet.cli.train import train; status = train(['schedule.max_steps=0'])\n"
