@@ -23,22 +23,14 @@ def test_a_reader_that_has_enough_ends_it_quietly(words):
     assert (ended.returncode, ended.stderr) == (READER_GONE, "")
 
 
-@pytest.fixture
-def broken(monkeypatch, capfd):
-    """Output that goes into a pipe which nobody reads."""
+def test_a_table_that_nobody_reads_ends_quietly(finished, tmp_path, capfd, monkeypatch):
+    """Its last lines come while pictures are made, and are written at once."""
     read, write = os.pipe()
     os.close(read)
     with open(write, "w") as pipe:
         monkeypatch.setattr(sys, "stdout", pipe)
-        yield
-        # Closing would write what is left.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), write)
-
-
-def test_a_table_that_nobody_reads_ends_quietly(broken, finished, tmp_path, capfd):
-    """Its last lines come while pictures are made, and are written at once."""
-    with pytest.raises(SystemExit) as ended:
-        main(["objects", str(finished), f"out={tmp_path / 'sheet.png'}"])
+        with pytest.raises(SystemExit) as ended:
+            main(["objects", str(finished), f"out={tmp_path / 'sheet.png'}"])
     assert ended.value.code == READER_GONE
     assert capfd.readouterr().err == ""
 
