@@ -14,6 +14,9 @@ from sparsestreet.cli.compose import override_problem
 from sparsestreet.records.provenance import this_machine, this_source
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sparsestreet.data.synthetic.settings import StreetSettings
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.types import View
 
@@ -37,6 +40,7 @@ examples:
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
   sparsestreet bench edits --street RUN         objects removed, moved, copied, beside a street traced that way
+  sparsestreet bench serve --street RUN         the render server: latency, memory, wrong requests, objects it places
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -55,6 +59,7 @@ def bench(arguments: list[str]) -> int:
         "effects": _effects,
         "costs": _costs,
         "edits": _edits,
+        "serve": _serve,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -79,7 +84,7 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument(
-        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits: the trained street of this run's folder"
+        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits, serve: the trained street of this run's folder"
     )
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
@@ -168,26 +173,33 @@ def _costs(options: argparse.Namespace) -> bool:
 
 
 def _edits(options: argparse.Namespace) -> bool:
-    from hydra.utils import instantiate
-
     from sparsestreet.bench import edits
-    from sparsestreet.cli.compose import check_moved, load_run_config
-    from sparsestreet.data.lazy import spread
-    from sparsestreet.data.synthetic import StreetReader
     from sparsestreet.scene.storage import load_scene
-    from sparsestreet.scene.views import FILE_NAME, read_views
 
     if options.street is None:
         raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
+    if (traced := _traced(options)) is None:
+        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
+    return edits.run_edits(load_scene(options.street), *traced, _file(options)) > 0
+
+
+def _traced(options: argparse.Namespace) -> "tuple[list[View], StreetSettings, Tensor] | None":
+    """Held-out views of a run, and how its street can be traced with other actors; None for a recorded drive."""
+    from hydra.utils import instantiate
+
+    from sparsestreet.cli.compose import check_moved, load_run_config
+    from sparsestreet.data.lazy import spread
+    from sparsestreet.data.synthetic import StreetReader
+    from sparsestreet.scene.views import FILE_NAME, read_views
+
     config = load_run_config(options.street)
     check_moved(config)
     reader = instantiate(config.data.log)
     if not isinstance(reader, StreetReader):
-        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
+        return None
     views = read_views(options.street / FILE_NAME).held_out
     chosen = [views[place] for place in spread(len(views), 4 if options.quick else 24)]
-    street_from_world = reader.read().dataset_from_world
-    return edits.run_edits(load_scene(options.street), chosen, reader.settings, street_from_world, _file(options)) > 0
+    return chosen, reader.settings, reader.read().dataset_from_world
 
 
 def _masks(options: argparse.Namespace) -> bool:
@@ -197,6 +209,24 @@ def _masks(options: argparse.Namespace) -> bool:
     sizes, budget = ((100,), TimingBudget(repeats=2, least=1)) if options.quick else (masks.ROWS, TimingBudget(100))
     masks.run_masks(sizes, masks.FRAMES, budget, _file(options))
     return True
+
+
+def _serve(options: argparse.Namespace) -> bool:
+    if options.street is None:
+        raise SystemExit("sparsestreet bench serve: --street RUN names the folder of a trained run")
+    try:
+        from sparsestreet.bench import serve, serve_client, serve_placed
+    except ModuleNotFoundError as error:
+        raise SystemExit(f"sparsestreet bench serve needs {error.name}: pip install 'sparsestreet[serve]'") from error
+    file = _file(options)
+    good = serve.run_serve(options.street, serve.QUICK if options.quick else serve.FULL, file)
+    traced = _traced(options)
+    if traced is None:
+        print("the street is no synthetic one: objects that a request places are compared with nothing")
+        return good
+    with serve_client.server(options.street, workers=1) as (client, _):
+        serve_placed.run_placed(client, *traced, file)
+    return good
 
 
 def _scaling(options: argparse.Namespace) -> bool:

@@ -12,7 +12,7 @@ from sparsestreet.data.synthetic.models.car import STYLES, Car
 from sparsestreet.data.synthetic.motion import Path
 from sparsestreet.data.synthetic.world import Actor
 from sparsestreet.types import Frame
-from tests.export.street import stored_street, street_views
+from tests.export.street import street_views
 
 CAR = Actor("car", Car(STYLES[0], (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)), Path(start=0.0, y=1.0, speed=4.0), 0.0)
 
@@ -37,10 +37,12 @@ def test_a_ghost_is_the_energy_of_what_is_left_of_an_object(left, ghost, psnr, m
     monkeypatch.setattr(edits, "LEAST", 24 * 16)
     before, after, views = traced(140), traced(40), street_views()[:3]
     shown = traced(round(40 + 100 * left))
-    monkeypatch.setattr(edits, "_image", lambda stored, view: shown(view).image.double().numpy() / 255)
-    stored = stored_street()
+
+    def show(view):
+        return shown(view).image.double().numpy() / 255
+
     with np.errstate(divide="ignore"):
-        record = edits._compared("removed", "car", CAR, stored, stored, views, before, after)
+        record = edits.compared("removed", "car", CAR, (show, show), views, (before, after))
     assert record is not None
     assert (record.views, record.pixels) == (3, 3 * 24 * 16)
     assert record.ghost == pytest.approx(ghost, abs=1e-12)
@@ -52,8 +54,12 @@ def test_a_ghost_is_the_energy_of_what_is_left_of_an_object(left, ghost, psnr, m
 
 def test_views_that_an_edit_hardly_changes_do_not_count(monkeypatch):
     monkeypatch.setattr(edits, "LEAST", 24 * 16 + 1)
-    stored, views = stored_street(), street_views()[:2]
-    assert edits._compared("removed", "car", CAR, stored, stored, views, traced(140), traced(40)) is None
+    views = street_views()[:2]
+
+    def show(view):
+        raise AssertionError("nothing is rendered")
+
+    assert edits.compared("removed", "car", CAR, (show, show), views, (traced(140), traced(40))) is None
 
 
 def test_an_actor_beside_its_way_keeps_heading_and_steps():
