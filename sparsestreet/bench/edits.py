@@ -87,7 +87,7 @@ def run_edits(
             edits, actors = _edit(kind, name, actor, list(world.actors), place)
             other = street_truth(settings, street_from_world, replace(world, actors=tuple(actors)))
             scene = replace(stored, scene=edited(stored.scene, edits))
-            shown = (partial(_image, stored), partial(_image, scene))
+            shown = (partial(shown_by, stored), partial(shown_by, scene))
             record = compared(kind, name, actor, shown, views, (truth, other))
             if record is not None:
                 file.write("edit", record)
@@ -147,7 +147,8 @@ def compared(
     )
 
 
-def _image(stored: StoredScene, view: View) -> Float64[np.ndarray, "h w 3"]:
+def shown_by(stored: StoredScene, view: View) -> Float64[np.ndarray, "h w 3"]:
+    """The image of a scene, RGB in [0, 1]."""
     return stored.render(view).rgb.clamp(0, 1).double().cpu().numpy()
 
 

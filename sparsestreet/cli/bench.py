@@ -40,6 +40,7 @@ examples:
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
   sparsestreet bench edits --street RUN         objects removed, moved, copied, beside a street traced that way
+  sparsestreet bench edits --street RUN --other RUN     and objects of another street inserted, beside its trace
   sparsestreet bench serve --street RUN         the render server: latency, memory, wrong requests, objects it places
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
@@ -85,6 +86,9 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument(
         "--street", type=Path, metavar="RUN", help="knobs, gpu, edits, serve: the trained street of this run's folder"
+    )
+    parser.add_argument(
+        "--other", type=Path, metavar="RUN", help="edits: a run on another synthetic street, whose objects are inserted"
     )
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
@@ -173,17 +177,26 @@ def _costs(options: argparse.Namespace) -> bool:
 
 
 def _edits(options: argparse.Namespace) -> bool:
-    from sparsestreet.bench import edits
+    from sparsestreet.bench import edits, edits_insert
     from sparsestreet.scene.storage import load_scene
 
     if options.street is None:
         raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
     if (traced := _traced(options)) is None:
         raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
-    return edits.run_edits(load_scene(options.street), *traced, _file(options)) > 0
+    views, settings, street_from_world = traced
+    stored, file = load_scene(options.street), _file(options)
+    count = edits.run_edits(stored, views, settings, street_from_world, file)
+    if options.other is not None:
+        if (foreign := _traced(options, options.other)) is None:
+            raise SystemExit(f"sparsestreet bench edits: {options.other} was not trained on a synthetic street")
+        street = edits_insert.TracedStreet(stored, settings, street_from_world)
+        other = edits_insert.TracedStreet(load_scene(options.other), *foreign[1:])
+        count += edits_insert.run_inserts(street, other, views, file)
+    return count > 0
 
 
-def _traced(options: argparse.Namespace) -> "tuple[list[View], StreetSettings, Tensor] | None":
+def _traced(options: argparse.Namespace, run: Path | None = None) -> "tuple[list[View], StreetSettings, Tensor] | None":
     """Held-out views of a run, and how its street can be traced with other actors; None for a recorded drive."""
     from hydra.utils import instantiate
 
@@ -192,12 +205,13 @@ def _traced(options: argparse.Namespace) -> "tuple[list[View], StreetSettings, T
     from sparsestreet.data.synthetic import StreetReader
     from sparsestreet.scene.views import FILE_NAME, read_views
 
-    config = load_run_config(options.street)
+    run = run or options.street
+    config = load_run_config(run)
     check_moved(config)
     reader = instantiate(config.data.log)
     if not isinstance(reader, StreetReader):
         return None
-    views = read_views(options.street / FILE_NAME).held_out
+    views = read_views(run / FILE_NAME).held_out
     chosen = [views[place] for place in spread(len(views), 4 if options.quick else 24)]
     return chosen, reader.settings, reader.read().dataset_from_world
 

@@ -8,11 +8,15 @@ import torch
 
 from sparsestreet.bench import edits
 from sparsestreet.bench.edits import Beside
+from sparsestreet.bench.edits_insert import TracedStreet, _is_free, _way, run_inserts
+from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.data.synthetic.models.car import STYLES, Car
 from sparsestreet.data.synthetic.motion import Path
-from sparsestreet.data.synthetic.world import Actor
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.world import Actor, build_world
+from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.types import Frame
-from tests.export.street import street_views
+from tests.export.street import stored_street, street_views
 
 CAR = Actor("car", Car(STYLES[0], (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)), Path(start=0.0, y=1.0, speed=4.0), 0.0)
 
@@ -69,3 +73,40 @@ def test_an_actor_beside_its_way_keeps_heading_and_steps():
         np.testing.assert_allclose(moved[:3, :3], own[:3, :3])
         np.testing.assert_allclose(moved[:3, 3] - own[:3, 3], [0.0, -3.0, 0.0], atol=1e-12)
         assert beside.path.traveled(time) == CAR.path.traveled(time)
+
+
+def test_an_object_of_another_street_goes_its_actors_way():
+    """Both worlds are turned and shifted; the trained frame is half a meter above the middle of the actor's box."""
+    settings = StreetSettings(num_frames=11)
+
+    def street(yaw: float, x: float) -> TracedStreet:
+        street_from_world = torch.eye(4, dtype=torch.float64)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        street_from_world[:2, :2], street_from_world[0, 3] = torch.from_numpy(turn), x
+        return TracedStreet(stored_street(), settings, street_from_world)
+
+    here, other = street(0.5, 3.0), street(-0.7, 20.0)
+    actor = replace(CAR, ground=1.0 - 0.5 - CAR.model.size[2] / 2)  # the trained car is 1 m above the ground
+    way = _way(here, other, "car", actor)
+    for time in (0.0, 0.3, 1.0):
+        expected = np.linalg.inv(here.street_from_world.numpy()) @ actor.pose(time * settings.recorded[1])
+        expected[2, 3] += 0.5
+        np.testing.assert_allclose(way.frame(time, lambda _: np.eye(4)), expected, atol=1e-6)
+
+
+def test_who_stands_in_another_actor_is_not_compared():
+    settings = StreetSettings()
+    street = TracedStreet(stored_street(), settings, torch.eye(4, dtype=torch.float64))
+    world = build_world(settings)
+    near, far = (replace(world, actors=(replace(CAR, path=Beside(CAR.path, right)),)) for right in (2.0, 6.0))
+    assert not _is_free(street, near, CAR, 0.5)
+    assert _is_free(street, far, CAR, 0.5)
+
+
+def test_streets_of_two_lengths_are_refused(tmp_path):
+    short, long = (
+        TracedStreet(stored_street(), StreetSettings(num_frames=count), torch.eye(4, dtype=torch.float64))
+        for count in (10, 20)
+    )
+    with pytest.raises(ValueError, match="both logs must last as long"):
+        run_inserts(short, long, [], RecordFile(tmp_path / "a", Provenance("", 1, this_machine(), this_source())))
