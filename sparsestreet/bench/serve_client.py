@@ -47,7 +47,7 @@ class Client:
         channel = grpc.insecure_channel(f"127.0.0.1:{port}", options=_LIMITS)
         self._render = channel.unary_unary(
             f"/{wire.SERVICES[0]}/render_rgb",
-            request_serializer=lambda message: message.SerializeToString(),
+            request_serializer=wire.kind("RGBRenderRequest").SerializeToString,
             response_deserializer=wire.kind("RGBRenderReturn").FromString,
         )
 

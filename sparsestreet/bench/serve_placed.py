@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from io import BytesIO
 
-import cv2
 import numpy as np
 from jaxtyping import Float64
+from PIL import Image
 from torch import Tensor
 
 from sparsestreet.bench.edits import Beside, Show, actors_of, compared, in_words
@@ -57,7 +58,7 @@ def _shown(client: Client, name: str | None, left: float, down: float) -> Show:
             offset = np.eye(4)
             offset[1, 3], offset[2, 3] = left, -down
             place(request, name, box @ offset)
-        image = cv2.imdecode(np.frombuffer(client.ask(request).image, np.uint8), cv2.IMREAD_COLOR)
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float64) / 255
+        with Image.open(BytesIO(client.ask(request).image)) as image:
+            return np.asarray(image, dtype=np.float64) / 255
 
     return show

@@ -182,13 +182,13 @@ def _edits(options: argparse.Namespace) -> bool:
 
     if options.street is None:
         raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
-    if (traced := _traced(options)) is None:
+    if (traced := _traced(options.street, options.quick)) is None:
         raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
     views, settings, street_from_world = traced
     stored, file = load_scene(options.street), _file(options)
     count = edits.run_edits(stored, views, settings, street_from_world, file)
     if options.other is not None:
-        if (foreign := _traced(options, options.other)) is None:
+        if (foreign := _traced(options.other, options.quick)) is None:
             raise SystemExit(f"sparsestreet bench edits: {options.other} was not trained on a synthetic street")
         street = edits_insert.TracedStreet(stored, settings, street_from_world)
         other = edits_insert.TracedStreet(load_scene(options.other), *foreign[1:])
@@ -196,7 +196,7 @@ def _edits(options: argparse.Namespace) -> bool:
     return count > 0
 
 
-def _traced(options: argparse.Namespace, run: Path | None = None) -> "tuple[list[View], StreetSettings, Tensor] | None":
+def _traced(run: Path, quick: bool) -> "tuple[list[View], StreetSettings, Tensor] | None":
     """Held-out views of a run, and how its street can be traced with other actors; None for a recorded drive."""
     from hydra.utils import instantiate
 
@@ -205,14 +205,13 @@ def _traced(options: argparse.Namespace, run: Path | None = None) -> "tuple[list
     from sparsestreet.data.synthetic import StreetReader
     from sparsestreet.scene.views import FILE_NAME, read_views
 
-    run = run or options.street
     config = load_run_config(run)
     check_moved(config)
     reader = instantiate(config.data.log)
     if not isinstance(reader, StreetReader):
         return None
     views = read_views(run / FILE_NAME).held_out
-    chosen = [views[place] for place in spread(len(views), 4 if options.quick else 24)]
+    chosen = [views[place] for place in spread(len(views), 4 if quick else 24)]
     return chosen, reader.settings, reader.read().dataset_from_world
 
 
@@ -234,7 +233,7 @@ def _serve(options: argparse.Namespace) -> bool:
         raise SystemExit(f"sparsestreet bench serve needs {error.name}: pip install 'sparsestreet[serve]'") from error
     file = _file(options)
     good = serve.run_serve(options.street, serve.QUICK if options.quick else serve.FULL, file)
-    traced = _traced(options)
+    traced = _traced(options.street, options.quick)
     if traced is None:
         print("the street is no synthetic one: objects that a request places are compared with nothing")
         return good

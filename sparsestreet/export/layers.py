@@ -2,6 +2,7 @@
 
 import colorsys
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +34,7 @@ Values = Shaped[np.ndarray, "_h _w *_c"]
 _SOLID = 0.5
 """Of alpha, from which a pixel has a depth."""
 _DOTS = 320
-"""Dots of the lidar that fit side by side into a picture, at least."""
+"""Dots of the lidar that fit side by side into a picture, at most."""
 _NEAR, _FAR = 1.0, 100.0
 """Meters of the lightest and of the darkest color in a picture of depth."""
 _FIRST_HARMONIC = 0.28209479177387814
@@ -96,7 +97,7 @@ def layer_values(
 def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Picture | None = None) -> Picture:
     """Returns a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own.
 
-    Returns of the lidar are dots on the picture ``under`` them, on black without one.
+    Returns of the lidar are dots on the picture ``under`` them, darkened to half, or on black without one.
     """
     if layer == "rgb":
         return values
@@ -105,8 +106,8 @@ def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Pictu
     if layer == "depth":
         return np.where(values[..., None] > 0, _by_distance(values), 0).astype(np.uint8)
     if layer == "lidar":
-        dots = enlarged(values, max(values.shape[1] // _DOTS, 1))
-        return np.where(dots[..., None] > 0, _by_distance(dots), 0 if under is None else under).astype(np.uint8)
+        dots = enlarged(values, math.ceil(values.shape[1] / _DOTS))
+        return np.where(dots[..., None] > 0, _by_distance(dots), 0 if under is None else under // 2).astype(np.uint8)
     if layer == "nodes":
         colors = [(0, 0, 0), *node_legend(nodes).values()]
     else:

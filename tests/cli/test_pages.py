@@ -3,6 +3,7 @@
 import importlib
 import re
 import shlex
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -36,6 +37,7 @@ def commands_of(page: Path) -> list[str]:
     return [line for line in found if "..." not in line and "COMMAND" not in line]
 
 
+@cache
 def problem_of(command: str) -> str | None:
     """Why a command cannot be followed; it is parsed or composed, and does nothing."""
     name, *words = shlex.split(command)[1:]
@@ -138,6 +140,7 @@ def test_the_page_of_python_runs_from_top_to_bottom(finished, tiny_street, tmp_p
     assert "'background': 5000" in trained
 
 
+@pytest.mark.slow
 def test_the_tour_of_editing_and_driving_runs(finished, tmp_path, monkeypatch, capsys):
     """But for the viewer and the server, which go on until they are told to end (test_view, test_serve)."""
     monkeypatch.chdir(tmp_path)
