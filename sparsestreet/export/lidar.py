@@ -1,7 +1,6 @@
 """Returns of a log's lidar as a camera sees them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -15,20 +14,20 @@ FARTHEST = 65_535
 """Millimeters of a depth that is no smaller; 0 where there is none."""
 
 
-@dataclass
 class LidarReturns:
     """The sweeps of a log, each at its time."""
 
-    sweeps: Sweeps
-    times: Mapping[int, float]
-    """Frame of each sweep -> normalized time."""
-    _read: tuple[int, Float[Tensor, "n 3"]] | None = field(default=None, init=False)
+    def __init__(self, sweeps: Sweeps, times: Mapping[int, float]) -> None:
+        """``times``: frame of each sweep -> normalized time."""
+        self.times = times
+        self._load = sweeps.load_gray
+        self._read: tuple[int, Float[Tensor, "n 3"]] | None = None
 
     def points(self, time: float) -> Float[Tensor, "n 3"]:
         """Returns of the sweep that is nearest in time, in the world; cameras of an instant share one reading."""
         frame = min(self.times, key=lambda frame: abs(self.times[frame] - time))
         if self._read is None or self._read[0] != frame:
-            self._read = frame, self.sweeps.load_gray(frame).points
+            self._read = frame, self._load(frame).points
         return self._read[1]
 
     def millimeters(self, camera: Camera, time: float) -> UInt16[np.ndarray, "h w"]:
