@@ -14,6 +14,9 @@ from sparsestreet.cli.compose import override_problem
 from sparsestreet.records.provenance import this_machine, this_source
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sparsestreet.data.synthetic.settings import StreetSettings
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.types import View
 
@@ -37,6 +40,8 @@ examples:
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
   sparsestreet bench edits --street RUN         objects removed, moved, copied, beside a street traced that way
+  sparsestreet bench edits --street RUN --other RUN     and objects of another street inserted, beside its trace
+  sparsestreet bench serve --street RUN         the render server: latency, memory, wrong requests, objects it places
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
 
@@ -55,6 +60,7 @@ def bench(arguments: list[str]) -> int:
         "effects": _effects,
         "costs": _costs,
         "edits": _edits,
+        "serve": _serve,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -79,7 +85,10 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument(
-        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits: the trained street of this run's folder"
+        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits, serve: the trained street of this run's folder"
+    )
+    parser.add_argument(
+        "--other", type=Path, metavar="RUN", help="edits: a run on another synthetic street, whose objects are inserted"
     )
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
@@ -168,26 +177,42 @@ def _costs(options: argparse.Namespace) -> bool:
 
 
 def _edits(options: argparse.Namespace) -> bool:
-    from hydra.utils import instantiate
-
-    from sparsestreet.bench import edits
-    from sparsestreet.cli.compose import check_moved, load_run_config
-    from sparsestreet.data.lazy import spread
-    from sparsestreet.data.synthetic import StreetReader
+    from sparsestreet.bench import edits, edits_insert
     from sparsestreet.scene.storage import load_scene
-    from sparsestreet.scene.views import FILE_NAME, read_views
 
     if options.street is None:
         raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
-    config = load_run_config(options.street)
+    if (traced := _traced(options.street, options.quick)) is None:
+        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
+    views, settings, street_from_world = traced
+    stored, file = load_scene(options.street), _file(options)
+    count = edits.run_edits(stored, views, settings, street_from_world, file)
+    if options.other is not None:
+        if (foreign := _traced(options.other, options.quick)) is None:
+            raise SystemExit(f"sparsestreet bench edits: {options.other} was not trained on a synthetic street")
+        street = edits_insert.TracedStreet(stored, settings, street_from_world)
+        other = edits_insert.TracedStreet(load_scene(options.other), *foreign[1:])
+        count += edits_insert.run_inserts(street, other, views, file)
+    return count > 0
+
+
+def _traced(run: Path, quick: bool) -> "tuple[list[View], StreetSettings, Tensor] | None":
+    """Held-out views of a run, and how its street can be traced with other actors; None for a recorded drive."""
+    from hydra.utils import instantiate
+
+    from sparsestreet.cli.compose import check_moved, load_run_config
+    from sparsestreet.data.lazy import spread
+    from sparsestreet.data.synthetic import StreetReader
+    from sparsestreet.scene.views import FILE_NAME, read_views
+
+    config = load_run_config(run)
     check_moved(config)
     reader = instantiate(config.data.log)
     if not isinstance(reader, StreetReader):
-        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
-    views = read_views(options.street / FILE_NAME).held_out
-    chosen = [views[place] for place in spread(len(views), 4 if options.quick else 24)]
-    street_from_world = reader.read().dataset_from_world
-    return edits.run_edits(load_scene(options.street), chosen, reader.settings, street_from_world, _file(options)) > 0
+        return None
+    views = read_views(run / FILE_NAME).held_out
+    chosen = [views[place] for place in spread(len(views), 4 if quick else 24)]
+    return chosen, reader.settings, reader.read().dataset_from_world
 
 
 def _masks(options: argparse.Namespace) -> bool:
@@ -197,6 +222,24 @@ def _masks(options: argparse.Namespace) -> bool:
     sizes, budget = ((100,), TimingBudget(repeats=2, least=1)) if options.quick else (masks.ROWS, TimingBudget(100))
     masks.run_masks(sizes, masks.FRAMES, budget, _file(options))
     return True
+
+
+def _serve(options: argparse.Namespace) -> bool:
+    if options.street is None:
+        raise SystemExit("sparsestreet bench serve: --street RUN names the folder of a trained run")
+    try:
+        from sparsestreet.bench import serve, serve_client, serve_placed
+    except ModuleNotFoundError as error:
+        raise SystemExit(f"sparsestreet bench serve needs {error.name}: pip install 'sparsestreet[serve]'") from error
+    file = _file(options)
+    good = serve.run_serve(options.street, serve.QUICK if options.quick else serve.FULL, file)
+    traced = _traced(options.street, options.quick)
+    if traced is None:
+        print("the street is no synthetic one: objects that a request places are compared with nothing")
+        return good
+    with serve_client.server(options.street, workers=1) as (client, _):
+        serve_placed.run_placed(client, *traced, file)
+    return good
 
 
 def _scaling(options: argparse.Namespace) -> bool:
