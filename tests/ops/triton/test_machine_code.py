@@ -19,7 +19,8 @@ import torch
 
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.settings import StopRule
-from sparsestreet.ops.triton import parts, rasterizer
+from sparsestreet.ops.triton import rasterizer
+from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
@@ -80,9 +81,9 @@ def launches_of(monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tupl
         rasterizer.leave_one_out(scene, background, weights, STILL, SplatSettings())
     for stop in stops:
         contribution(scene, STILL, settings=SplatSettings(stop=stop), backend="triton")
-    monkeypatch.setattr(parts, "PART_LENGTH", 1)
-    for stop in stops:
-        splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()
+    with tuned(Tuning(shortest_part=1, fewest_parts=2)):
+        for stop in stops:
+            splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()
     unique = {json.dumps(dataclasses.asdict(launch), sort_keys=True): launch for launch in launches}
     return list(unique.values())
 

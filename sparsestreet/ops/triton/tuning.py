@@ -1,0 +1,46 @@
+"""What only a device can decide: where long tiles are split, and which variant of a pixel kernel runs.
+
+Every choice draws the same image and the same gradients, up to rounding where a field says so. The defaults come from a
+model of the device (tests/ops/triton/device_model.py) and from machine code. **None has been measured.**
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """One choice of each. Gains are modelled for two trained streets at 960x640 (docs/gpu_model.md)."""
+
+    most_parts: int = 6144
+    """Most parts of a view, 7 kB each, so a part has at least this fraction of all pairs; 1: no tile is split.
+
+    A street lasts as long as its longest tile: split, its pixels are modelled to take half the time and less. Moves
+    images by rounding, as the light before a part is a product of other parts' products."""
+    shortest_part: int = 128
+    """Least number of pairs of a part. It bounds what parts cost in small views."""
+    fewest_parts: int = 3
+    """Parts of the shortest tile that is split. What a split costs is too much for two parts."""
+
+    def __post_init__(self) -> None:
+        if self.most_parts < 1 or self.shortest_part < 1 or self.fewest_parts < 2:
+            raise ValueError(f"a view has at least 1 part of 1 pair, a split tile at least 2 parts, got {self}")
+
+
+_tunings = [Tuning()]
+
+
+def tuning() -> Tuning:
+    """The choices that hold now."""
+    return _tunings[-1]
+
+
+@contextmanager
+def tuned(choices: Tuning) -> Iterator[None]:
+    """Other choices, for benchmarks and tests. All threads get them, because autograd has threads of its own."""
+    _tunings.append(choices)
+    try:
+        yield
+    finally:
+        _tunings.pop()
