@@ -53,7 +53,7 @@ class PartLayers:
     """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
 
     products: Float[Tensor, "s 256"]
-    """Light that the part alone lets through."""
+    """Light that the part alone lets through; unwritten for the last part of a tile."""
     rgb: Float[Tensor, "s 256 3"]
     transmittance: Float[Tensor, "s 256"]
     depth_sum: Float[Tensor, "s 256"]
@@ -139,17 +139,19 @@ def list_parts(
 
 @jit
 def thin_parts(
-    records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
+    records, pair_rows, tiles, begins, ends, nexts, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each needed part, or some value below the limit once it is below."""
+    """Writes the product of 1 - alpha over each part, or some value below the limit once it is below.
+
+    Nothing is blended behind the last part of a tile, so its product is not needed."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
     x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
     passed = tl.where(inside, 1.0, 0.0)
     k, end = tl.load(begins + part), tl.load(ends + part)
-    needed = k < end
+    needed = part + 1 < tl.load(nexts + part)
     unfinished = needed
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
@@ -188,7 +190,7 @@ def merge_parts(
         rest = tl.where(reached, tl.load(part_transmittance + at), rest)
         if LASTS:
             last = tl.where(reached, tl.load(part_lasts + at), last)
-        passed *= tl.load(products + at)
+        passed *= tl.load(products + at, i + 1 < end, 0.0)
     at = y * width + x
     written = inside & (end > part)
     tl.store(rgb + 3 * at, red, written)

@@ -67,7 +67,7 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
     part_layers = (part.rgb, part.transmittance, part.depth_sum, part.lasts)
     launch(
         thin_parts, len(parts), 1,
-        screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, part.products,
+        screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, parts.nexts, part.products,
         *pixel_arguments(view), limit, options=ONE_WARP,
     )  # fmt: skip
     blend_each(parts.begins, parts.ends, parts.tiles, parts.firsts, part.products, *part_layers, split=True)

@@ -9,6 +9,7 @@ from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import blend_backward, pixels, rasterizer
 from sparsestreet.ops.triton.parts import part_length, split_length, split_tiles
 from sparsestreet.ops.triton.tuning import Tuning, tuned
+from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -115,21 +116,38 @@ def test_any_length_draws_the_same(length):
         assert relative_error(split.gradients[field], gradient) <= 1e-5, field
 
 
-def test_two_runs_are_bitwise_equal_and_read_nothing_unwritten(short_parts, monkeypatch):
-    scene = stack(13, 0.9)
-    plain = render(scene, VIEW, "triton", torch.float32)
+@pytest.fixture
+def poisoned(monkeypatch):
     empty = torch.Tensor.new_empty
 
-    def poisoned(*args, **kwargs):
+    def filled(*args, **kwargs):
         tensor = empty(*args, **kwargs)
         return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
 
-    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
+    monkeypatch.setattr(torch.Tensor, "new_empty", filled)
+
+
+def test_two_runs_are_bitwise_equal_and_read_nothing_unwritten(short_parts, request):
+    scene = stack(13, 0.9)
+    plain = render(scene, VIEW, "triton", torch.float32)
+    request.getfixturevalue("poisoned")
     again = render(scene, VIEW, "triton", torch.float32)
     for name, image in plain.images.items():
         assert torch.equal(again.images[name], image), name
     for field in FIELDS:
         assert torch.equal(again.gradients[field], plain.gradients[field]), field
+
+
+def test_nothing_is_multiplied_for_what_lies_behind_a_tile(short_parts, poisoned):
+    view = KernelView(VIEW, SplatSettings())
+    screen = rasterizer.project(cast(stack(13), torch.float32, device=DEVICE), view)
+    layers, split = pixels.blend_view(screen, view, lasts=False), screen.lists.parts
+    assert layers.rgb.isfinite().all()
+    last = split.nexts == torch.arange(len(split), device=DEVICE) + 1
+    assert last.any()
+    written = layers.ends.parts.products.isfinite()
+    assert torch.equal(written.all(1), written.any(1))
+    assert torch.equal(written.all(1), (split.begins < split.ends) & ~last)
 
 
 def test_counting_and_removal_walk_whole_tiles(short_parts):
