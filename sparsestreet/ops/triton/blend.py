@@ -55,14 +55,17 @@ def part_pixels(part):
 
 
 @jit
-def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr):
-    """Indices at which a quadrant's pixels are written, in the image or in the layers of parts, and a mask; [64]."""
+def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the image, and which of them lie in it; [64]."""
     x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
-    at, inside = y * width + x, (x < width) & (y < height)
-    if PARTS:
-        # Pixels outside the image are written too, because they are read.
-        at, inside = tl.program_id(0) * PIXELS + y % TILE * TILE + x % TILE, inside | True
-    return at, inside
+    return y * width + x, (x < width) & (y < height)
+
+
+@jit
+def part_places(part, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the layers of parts [64], of all, because those outside the image are read."""
+    x, y = quadrant_pixels(0, 1, QUADRANT)
+    return part * PIXELS + y * TILE + x
 
 
 @jit
@@ -111,12 +114,12 @@ def open_quadrant(
     """A quadrant before its first splat: light, color, depth, and the index after the last pair each pixel was open to.
 
     Light is 0 for pixels outside the image; color and depth are 0."""
-    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
-    passed = tl.where((x < width) & (y < height), 1.0, 0.0)
+    _, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT)
+    passed = tl.where(inside, 1.0, 0.0)
     if PARTS:
         part = tl.program_id(0)
         for before in range(tl.load(firsts + part), part):
-            passed *= tl.load(products + before * PIXELS + y % TILE * TILE + x % TILE)
+            passed *= tl.load(products + part_places(before, QUADRANT))
     nothing = tl.zeros_like(passed)
     return passed, nothing, nothing, nothing, nothing, nothing.to(tl.int32) + first_pair
 
@@ -155,7 +158,9 @@ def store_quadrant(
     QUADRANT: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr,
 ):  # fmt: skip
     passed, red, green, blue, depth, last = quadrant
-    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, PARTS)
+    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT)
+    if PARTS:
+        at, inside = part_places(tl.program_id(0), QUADRANT), inside | True
     tl.store(rgb + 3 * at, red, inside)
     tl.store(rgb + 3 * at + 1, green, inside)
     tl.store(rgb + 3 * at + 2, blue, inside)

@@ -13,7 +13,7 @@ from functools import partial
 
 import triton.language as tl
 
-from sparsestreet.ops.triton.blend import pairs_of, quadrant_places
+from sparsestreet.ops.triton.blend import pairs_of, part_places, quadrant_places
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.quadrants import (
     WARP,
@@ -113,7 +113,7 @@ def last_quadrant(
     """A quadrant after its last splat: the light left, and the light behind times the cotangents.
 
     Then what stays the same: the cotangents of color and depth, and the index after the last pair of each pixel."""
-    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, False)
+    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT)
     red = tl.load(v_rgb + 3 * at, inside, 0.0)
     green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
     blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
@@ -121,7 +121,7 @@ def last_quadrant(
     passed = tl.load(transmittance + at, inside, 0.0)
     behind = passed * tl.load(v_transmittance + at, inside, 0.0)
     if PARTS:
-        at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, True)
+        at = part_places(tl.program_id(0), QUADRANT)
         behind += light_behind(part_rgb, part_depth, nexts, v, at, DEPTH)
         passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
     else:

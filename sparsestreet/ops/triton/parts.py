@@ -1,11 +1,9 @@
 """Long tiles in parts, so that a few deep tiles do not keep the device waiting for one warp each.
 
 A part starts with the light that the parts before it let through. ``thin_parts`` computes the light that each part
-alone
-lets through, for all parts at once. Then every part is blended from its true start, with the stop rule of the whole
-tile, and ``merge_parts`` adds up the parts. The image differs from that of an unsplit tile only by rounding. In
-backward
-the light behind a part is the sum of the parts behind it.
+alone lets through, for all parts at once. Then every part is blended from its true start, with the stop rule of the
+whole tile, and ``merge_parts`` adds up the parts. The image differs from that of an unsplit tile only by rounding. In
+backward the light behind a part is the sum of the parts behind it.
 
 A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The parts'
 transmittance is computed twice, which pays only if other warps would wait.
@@ -19,12 +17,11 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS, part_pixels, pixels_of
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.quadrants import row_of
 from sparsestreet.ops.triton.search import first_at_least
+from sparsestreet.ops.triton.thin import thin_pairs
 from sparsestreet.ops.triton.tuning import tuning
 
 _BLOCK = 128
@@ -142,27 +139,14 @@ def thin_parts(
     records, pair_rows, tiles, begins, ends, nexts, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each part, or some value below the limit once it is below.
-
-    Nothing is blended behind the last part of a tile, so its product is not needed."""
+    """Writes what each part lets through alone, but for the last parts of tiles, behind which nothing is blended."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
-    x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
-    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    passed = tl.where(inside, 1.0, 0.0)
-    k, end = tl.load(begins + part), tl.load(ends + part)
-    needed = part + 1 < tl.load(nexts + part)
-    unfinished = needed
-    while unfinished:
-        stop = tl.minimum(k + LOOK, end)
-        for i in range(k, stop):
-            s = record.record_of(records, row_of(tl.load(pair_rows + i)))
-            _, _, _, _, exponent = whitened(s, px, py)
-            alpha = tl.minimum(tl.exp2(exponent), alpha_max)
-            passed -= tl.where(exponent >= tl.load(s + record.CUTOFF), alpha, 0.0) * passed
-        k = stop
-        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    tl.store(products + part_pixels(part), passed, needed)
+    if part + 1 < tl.load(nexts + part):
+        thin_pairs(
+            records, pair_rows, tl.load(begins + part), tl.load(ends + part), tl.load(tiles + part), part, products,
+            width, height, tiles_x, alpha_max, transmittance_min,
+        )  # fmt: skip
 
 
 @jit

@@ -94,14 +94,21 @@ def of_lane(values):
 
 
 @jit
-def load_splat(records, row):
-    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth."""
+def load_shape(records, row):
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff."""
     s = record.record_of(records, row)
     geometry = (
         tl.load(s + record.X), tl.load(s + record.Y),
         tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
     )  # fmt: skip
-    ends = tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF)
+    return geometry, (tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF))
+
+
+@jit
+def load_splat(records, row):
+    """The shape of the row's splat (``load_shape``), its color and depth."""
+    geometry, ends = load_shape(records, row)
+    s = record.record_of(records, row)
     return geometry, ends, (
         tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
         tl.load(s + record.DEPTH),
