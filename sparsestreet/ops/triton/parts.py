@@ -40,6 +40,8 @@ class Parts:
     """The part after the last one of the same tile."""
     whole_ends: Int[Tensor, " t"]
     """End of each tile's pairs; their beginning where the tile is split."""
+    ahead: Int[Tensor, " 1"]
+    """Number of tiles that are at least about as long as a part, and start before the parts."""
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -94,11 +96,11 @@ def split_tiles(
     # No more tiles can be that long. Shorter ones come last, so they do not shift the parts of others.
     most, split = pairs // length, pairs // least
     nexts = (lengths.index_select(0, order[:split]) // length).cumsum(0, dtype=torch.int32)
-    parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends))
+    parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends), begins.new_empty(1))
     launch(
         list_parts, max(most, len(order)), _BLOCK,
         begins, ends, order, lengths, nexts,
-        parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.whole_ends,
+        parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.whole_ends, parts.ahead,
         len(order), len(nexts), len(nexts).bit_length(), most, length, least,
     )  # fmt: skip
     return parts
@@ -106,7 +108,7 @@ def split_tiles(
 
 @partial(jit, do_not_specialize=["tile_count", "split_count", "steps", "part_count", "length", "least"])
 def list_parts(
-    begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends,
+    begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends, ahead,
     tile_count, split_count, steps, part_count, length, least, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One lane per part and per tile. ``split_nexts``: the part after the last of each of the first tiles in order."""
@@ -115,6 +117,11 @@ def list_parts(
     tile = tl.load(order + number, given, 0)
     begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
     tl.store(whole_ends + tile, tl.where(end - begin < least, end, begin), given)
+
+    following = tl.load(lengths + tl.load(order + number + 1, number + 1 < tile_count, 0), number + 1 < tile_count, 0)
+    is_long = given & (4 * (end - begin) >= least)
+    tl.store(ahead + 0 * number, number + 1, is_long & (4 * following < least))
+    tl.store(ahead + 0 * number, 0, (number == 0) & (4 * (end - begin) < least))
 
     # The first tile whose parts end after this one.
     rank = first_at_least(split_nexts, number + 1, split_count, steps)

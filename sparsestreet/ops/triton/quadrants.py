@@ -75,6 +75,20 @@ def quadrant_pixels(tile, tiles_x, QUADRANT: tl.constexpr):
 
 
 @jit
+def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the image, and which of them lie in it; [64]."""
+    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
+    return y * width + x, (x < width) & (y < height)
+
+
+@jit
+def part_places(part, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the layers of parts [64], of all, because those outside the image are read."""
+    x, y = quadrant_pixels(0, 1, QUADRANT)
+    return part * TILE * TILE + y * TILE + x
+
+
+@jit
 def centers(tile, tiles_x):
     """Centers of the upper left quadrant's pixels. For other quadrants kernels move the splat by SIDE."""
     x, y = quadrant_pixels(tile, tiles_x, 0)

@@ -2,9 +2,21 @@
 
 import triton.language as tl
 
-from sparsestreet.ops.triton.blend import LOOK, part_places, quadrant_places
-from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.quadrants import across, centers, load_shape, of_lines, row_of, touches
+from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.quadrants import (
+    across,
+    centers,
+    load_shape,
+    of_lines,
+    part_places,
+    quadrant_places,
+    row_of,
+    touches,
+)
+
+# Number of pairs between two checks whether the whole tile is finished.
+LOOK_LENGTH = 32
+LOOK = constant(LOOK_LENGTH)
 
 
 @jit

@@ -1,5 +1,7 @@
 """Long tiles in parts: the same image and gradients as in one piece, for any length of the parts."""
 
+import dataclasses
+
 import pytest
 import torch
 from hypothesis import example, given, settings
@@ -8,11 +10,10 @@ from hypothesis import strategies as st
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import blend_backward, pixels, rasterizer
 from sparsestreet.ops.triton.parts import part_length, split_length, split_tiles
-from sparsestreet.ops.triton.tuning import Tuning, tuned
+from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
-    FIELDS,
     camera,
     cast,
     device_of,
@@ -97,7 +98,8 @@ def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatc
     monkeypatch.setattr(pixels, "launch", launch)
     gaussians = cast(stack(13), torch.float32, requires_grad=True, device=DEVICE)
     # Wider than VIEW: one tile is not split.
-    splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
+    with tuned(dataclasses.replace(tuning(), two_launches=False)):
+        splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
     assert written[True].any()
     assert written[False].any()
     assert torch.equal(written[False], ~written[True])
@@ -127,27 +129,32 @@ def poisoned(monkeypatch):
     monkeypatch.setattr(torch.Tensor, "new_empty", filled)
 
 
-def test_two_runs_are_bitwise_equal_and_read_nothing_unwritten(short_parts, request):
-    scene = stack(13, 0.9)
-    plain = render(scene, VIEW, "triton", torch.float32)
-    request.getfixturevalue("poisoned")
-    again = render(scene, VIEW, "triton", torch.float32)
-    for name, image in plain.images.items():
-        assert torch.equal(again.images[name], image), name
-    for field in FIELDS:
-        assert torch.equal(again.gradients[field], plain.gradients[field]), field
+def test_each_launch_does_what_no_other_does(short_parts, poisoned, monkeypatch):
+    """Whole tiles, first parts and what later ones let through; then these, but nothing behind the last of a tile."""
+    started, blended, multiplied = pixels.launch, [], []
 
+    def launch(kernel, items, block, *arguments, **options):
+        started(kernel, items, block, *arguments, **options)
+        (rgb,) = (a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256, 3))
+        products = next(a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256,))
+        for written, layer in ((blended, rgb.flatten(1)), (multiplied, products)):
+            finite = layer.isfinite()
+            assert torch.equal(finite.all(1), finite.any(1))
+            written.append(finite.all(1))
+        rgb.fill_(torch.nan if len(blended) == 1 else 0.0)
 
-def test_nothing_is_multiplied_for_what_lies_behind_a_tile(short_parts, poisoned):
     view = KernelView(VIEW, SplatSettings())
     screen = rasterizer.project(cast(stack(13), torch.float32, device=DEVICE), view)
+    monkeypatch.setattr(pixels, "launch", launch)
     layers, split = pixels.blend_view(screen, view, lasts=False), screen.lists.parts
     assert layers.rgb.isfinite().all()
-    last = split.nexts == torch.arange(len(split), device=DEVICE) + 1
-    assert last.any()
-    written = layers.ends.parts.products.isfinite()
-    assert torch.equal(written.all(1), written.any(1))
-    assert torch.equal(written.all(1), (split.begins < split.ends) & ~last)
+    part = torch.arange(len(split), device=DEVICE)
+    first, last, used = split.firsts == part, split.nexts == part + 1, split.nexts > part
+    assert int(used.sum()) > int((first & used).sum()) + int((last & used).sum()) > 0
+    assert torch.equal(blended[0], used & first)
+    assert torch.equal(blended[1], used & ~first)
+    assert torch.equal(multiplied[0], used & ~last)
+    assert torch.equal(multiplied[1], used & ~last)
 
 
 def test_counting_and_removal_walk_whole_tiles(short_parts):
@@ -194,6 +201,9 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest):
         assert not long
         return
     assert len(found) <= limit
+    starts = [4 * counts[tile] >= least for tile in order] + [False]
+    assert int(found.ahead) in [place for place in range(len(counts) + 1) if not starts[place]]
+    assert all(starts[: int(found.ahead)][-1:])
     listed: dict[int, list[int]] = {}
     for part, (tile, begin, end) in enumerate(zip(found.tiles, found.begins, found.ends, strict=True)):
         if found.nexts[part] > part:
