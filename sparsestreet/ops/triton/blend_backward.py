@@ -177,12 +177,14 @@ def differentiate_quadrant(
 def blend_tiles_backward(
     records, pair_rows, pair_slots, begins, ends, order, ahead, part_tiles, part_begins, part_ends, nexts,
     transmittance, lasts, part_rgb, part_depth, part_transmittance, part_lasts,
-    v_rgb, v_transmittance, v_depth_sum, slots, width, height, tiles_x, part_count, alpha_max,
-    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr, BLOCK: tl.constexpr,
+    v_rgb, v_transmittance, v_depth_sum, slots, walked, width, height, tiles_x, part_count, alpha_max,
+    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr, MARKED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the slots of all pairs of one tile, or (PARTS; TOGETHER: both) of one part of a tile.
 
-    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given.
+    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given; MARKED: sets ``walked`` of each slot that it
+    writes, and leaves the slots behind the last pair that a pixel was open to.
     """
     tl.static_assert(BLOCK == 1)
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
@@ -202,7 +204,8 @@ def blend_tiles_backward(
     # A split tile leaves no pair to this program: its ``lasts`` are those of all parts together. A part that is not
     # needed has written nothing.
     latest = tl.maximum(tl.minimum(latest, end), begin)
-    zero_slots(slots, pair_slots, latest, end, SLOT)
+    if not MARKED:
+        zero_slots(slots, pair_slots, latest, end, SLOT)
     pair = tl.load(pair_rows + latest - 1, latest > begin, 0)
     k = latest - 1
     while k >= begin:
@@ -218,5 +221,8 @@ def blend_tiles_backward(
         line = of_lines(y, splat[0], splat[1][0], 1)
         q2, s = differentiate_quadrant(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more)
         q3, s = differentiate_quadrant(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more)
-        store_sums(slots + tl.load(pair_slots + k) * SLOT, s)
+        slot = tl.load(pair_slots + k)
+        store_sums(slots + slot * SLOT, s)
+        if MARKED:
+            tl.store(walked + slot, 1)
         k -= 1

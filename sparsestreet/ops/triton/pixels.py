@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sparsestreet.ops.triton import blend, blend_backward
@@ -94,10 +95,13 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
 
 def differentiate_view(
     screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
-) -> Float[Tensor, "p 12"]:
-    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
+) -> tuple[Float[Tensor, "p 12"], UInt8[Tensor, " p"] | None]:
+    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means.
+
+    Also which slots are written, as bytes; None: all."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
     slots = passed.new_empty(len(lists.slots), blend_backward.SLOT_LENGTH)
+    walked = slots.new_zeros(len(slots), dtype=torch.uint8) if tuning().marked_slots else None
     parts, part = lists.parts, ends.parts
     nexts, part_layers = lists.order, (passed, passed, passed, lists.order)
     if parts is not None and part is not None:
@@ -107,8 +111,9 @@ def differentiate_view(
         launch(
             blend_backward.blend_tiles_backward, count, 1,
             screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
-            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots,
-            *sizes(view, parts), view.settings.alpha_max, DEPTH=depth, ABSOLUTE=absolute, **work,
+            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, given_or(walked, lists.order),
+            *sizes(view, parts), view.settings.alpha_max,
+            DEPTH=depth, ABSOLUTE=absolute, MARKED=walked is not None, **work,
             options=ONE_WARP | {"maxnreg": blend_backward.registers(depth)},
         )  # fmt: skip
 
@@ -120,7 +125,7 @@ def differentiate_view(
     else:
         differentiate_each(tiles, WHOLE_TILES)
         differentiate_each(len(parts), PARTS)
-    return slots
+    return slots, walked
 
 
 def work_tables(lists: Lists) -> tuple[Tensor, ...]:

@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+import triton.language as tl
 from torch import Tensor
 
 from sparsestreet.ops import SplatSettings
-from sparsestreet.ops.triton import pixels
+from sparsestreet.ops.triton import pixels, rasterizer
 from sparsestreet.ops.triton.screen import Screen, project
 from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.ops.triton.view import KernelView
+from sparsestreet.types import Gaussians
 from tests.ops.scenes import cast, device_of, first_interpreted, front_camera, one_gaussian
 from tests.ops.triton.test_parts import stack
 
@@ -18,7 +20,9 @@ DEVICE = device_of("triton")
 ONE_BY_ONE = Tuning(shortest_part=3, two_launches=False)
 """Whole tiles, products and parts after each other."""
 VARIANTS = {
+    "all": {"two_launches": True, "marked_slots": True},
     "two launches": {"two_launches": True},
+    "marked slots": {"marked_slots": True},
 }
 STOPS = {
     "exclusive": SplatSettings(stop="exclusive", transmittance_min=0.02),
@@ -27,12 +31,19 @@ STOPS = {
 }
 # Sides that are no multiples of a tile's: four tiles, split and not.
 VIEW = front_camera(27, 17, 22.0)
-CASES = [(stop, "split") for stop in STOPS] + [("exclusive", "whole"), ("exclusive", "nothing")]
+CASES = [
+    *((stop, "split", name) for stop in STOPS for name in VARIANTS),
+    *(("exclusive", kind, "all") for kind in ("whole", "nothing")),
+]
 
 
 def project_case(stop: str, kind: str) -> tuple[Screen, KernelView, Tuning]:
     """The records and lists of a view, and how its tiles are split."""
-    scene = stack(10, 0.8)
+    # Three that close the right tile, whose other pairs are not walked.
+    wall = [
+        one_gaussian(means=[[0.36, 0.0, 1 + 0.01 * k]], scales=[[0.42, 1.0, 0.01]], opacities=[1.0]) for k in range(3)
+    ]
+    scene = Gaussians.concatenate([*wall, stack(7, 0.8)])
     if kind == "nothing":
         scene = one_gaussian(means=[[0.0, 0.0, -5.0]])
     view = KernelView(VIEW, STOPS[stop])
@@ -42,28 +53,28 @@ def project_case(stop: str, kind: str) -> tuple[Screen, KernelView, Tuning]:
 
 
 def drawn(screen: Screen, view: KernelView, choices: Tuning, cotangents: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Layers, where pixels end, and the slots of all pairs."""
+    """Layers, where pixels end, the slots of all pairs, and their sums."""
     with tuned(choices):
         layers = pixels.blend_view(screen, view, lasts=True)
         images = {"rgb": layers.rgb, "transmittance": layers.ends.transmittance, "depth_sum": layers.depth_sum}
-        slots = pixels.differentiate_view(screen, view, layers.ends, pixels.Cotangents(**cotangents), absolute=True)
-    return {**images, "lasts": layers.ends.lasts, "slots": slots}
+        v = pixels.Cotangents(**cotangents)
+        slots, walked = pixels.differentiate_view(screen, view, layers.ends, v, absolute=True)
+        sums = slots.new_zeros(len(screen.records), slots.shape[1])
+        rasterizer._sum_slots(slots, screen.lists, sums, 16, tl.float32, walked)
+    if walked is not None:
+        print(walked.sum(), len(walked))
+        assert torch.equal(slots.isfinite().all(1), walked.bool())
+        slots = torch.where(walked[:, None] != 0, slots, 0.0)
+    return {**images, "lasts": layers.ends.lasts, "slots": slots, "sums": sums}
 
 
 @pytest.mark.parametrize("case", first_interpreted(*CASES), ids=" ".join)
 def test_every_choice_draws_the_same_bits(case, monkeypatch):
-    stop, kind = case
+    stop, kind, variant = case
     screen, view, choices = project_case(stop, kind)
     generator = torch.Generator().manual_seed(2)
     shapes = {"rgb": (17, 27, 3), "transmittance": (17, 27), "depth_sum": (17, 27)}
     cotangents = {name: torch.randn(*shape, generator=generator).to(DEVICE) for name, shape in shapes.items()}
-    expected = drawn(screen, view, choices, cotangents)
-    if kind == "split":
-        assert (screen.lists.ends - screen.lists.begins).tolist() == [10, 11, 6, 0]
-        # The first tile's pixels end in its first part, in a later one, and not at all.
-        ends = set(expected["lasts"][:16, :16].flatten().tolist())
-        assert 10 in ends
-        assert stop == "never" or (min(ends) < 4 and ends & {5, 6, 7, 8, 9})
     empty = torch.Tensor.new_empty
 
     def poisoned(*args, **kwargs):
@@ -71,8 +82,17 @@ def test_every_choice_draws_the_same_bits(case, monkeypatch):
         return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
 
     monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
+    expected = drawn(screen, view, choices, cotangents)
     assert all(image.isfinite().all() for image in expected.values())
-    for name, changes in ({"again": {}} | VARIANTS).items():
-        found = drawn(screen, view, replace(choices, **changes), cotangents)
-        for image, values in expected.items():
-            assert torch.equal(found[image], values), (name, image)
+    if kind == "split":
+        assert (screen.lists.ends - screen.lists.begins).tolist() == [10, 11, 6, 3]
+        # The first tile's pixels end in its first part, in a later one, and not at all.
+        ends = set(expected["lasts"][:16, :16].flatten().tolist())
+        print(ends, screen.lists.ends - screen.lists.begins)
+        assert 10 in ends
+        assert stop == "never" or (min(ends) < 4 and ends & {5, 6, 7, 8, 9})
+        zeros = (expected["slots"] == 0).all(1)
+        assert zeros.any() == (stop != "never")
+    found = drawn(screen, view, replace(choices, **VARIANTS[variant]), cotangents)
+    for image, values in expected.items():
+        assert torch.equal(found[image], values), image
