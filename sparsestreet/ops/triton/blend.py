@@ -16,6 +16,8 @@ from sparsestreet.ops.triton.quadrants import (
     WARP,
     across,
     centers,
+    held_splat,
+    hold_splats,
     load_splat,
     of_lines,
     part_places,
@@ -30,9 +32,9 @@ PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
 
 
-def registers(exclusive: bool) -> int:
+def registers(exclusive: bool, staged: bool) -> int:
     """Fewest registers of a lane without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
-    return 88 if exclusive else 80
+    return 96 if staged else 88 if exclusive else 80
 
 
 @jit
@@ -173,13 +175,13 @@ def blend_tiles(
     rgb, transmittance, depth_sum, lasts, part_rgb, part_transmittance, part_depth, part_lasts,
     width, height, tiles_x, part_count, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
-    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, BLOCK: tl.constexpr,
+    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, STAGED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes every pixel of one tile; with PARTS those of one part, if needed, into the layers of parts (parts.py).
 
     ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins. TOGETHER:
     whole tiles and parts. Of parts the first ones of tiles are then blended, and of the others it is computed what they
-    let through. REST: parts but the first ones.
+    let through. REST: parts but the first ones. STAGED: each lane fetches the record of one of the next pairs.
     """
     tl.static_assert(BLOCK == 1)
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
@@ -206,8 +208,11 @@ def blend_tiles(
     pair = tl.load(pair_rows + k, written, 0)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
+        if STAGED:
+            held = hold_splats(records, pair_rows, k, end)
         for i in range(k, stop):
-            splat, touched = load_splat(records, row_of(pair)), pair
+            touched = pair
+            splat = held_splat(held, i - k) if STAGED else load_splat(records, row_of(pair))
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(y, splat[0], splat[1][0], 0)

@@ -61,13 +61,15 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
         part_layers = (part.rgb, part.transmittance, part.depth_sum, part.lasts)
         neighbors = (parts.firsts, parts.nexts, part.products)
 
+    staged = len(lists.order) <= tuning().staged_tiles
+
     def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
         launch(
             blend.blend_tiles, count, 1,
             screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers,
             *sizes(view, parts), view.settings.alpha_max, limit,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, **work,
-            options=ONE_WARP | {"maxnreg": blend.registers(view.exclusive)},
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, **work,
+            options=ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged)},
         )  # fmt: skip
 
     tiles = len(lists.order)

@@ -130,6 +130,38 @@ def load_splat(records, row):
 
 
 @jit
+def hold_splats(records, pair_rows, k, end):
+    """Of WARP pairs from ``k`` on one splat in each lane: the eleven numbers of ``load_splat`` and whatever behind
+    ``end``."""
+    pair = k + tl.arange(0, WARP)
+    given = pair < end
+    s = record.record_of(records, row_of(tl.load(pair_rows + pair, given, 0)))
+    return (
+        tl.load(s + record.X, given, 0.0), tl.load(s + record.Y, given, 0.0),
+        tl.load(s + record.L11, given, 0.0), tl.load(s + record.L21, given, 0.0), tl.load(s + record.L22, given, 0.0),
+        tl.load(s + record.LOG2_OPACITY, given, 0.0), tl.load(s + record.CUTOFF, given, 0.0),
+        tl.load(s + record.COLOR, given, 0.0), tl.load(s + record.COLOR + 1, given, 0.0),
+        tl.load(s + record.COLOR + 2, given, 0.0), tl.load(s + record.DEPTH, given, 0.0),
+    )  # fmt: skip
+
+
+@jit
+def handed(values, lane):
+    """The value of one lane, to all pixels of a quadrant [64]."""
+    value = tl.gather(values, tl.zeros((WARP,), tl.int32) + lane, 0)
+    return tl.reshape(tl.broadcast_to(value[None, :], (PIXELS // WARP, WARP)), (PIXELS,))
+
+
+@jit
+def held_splat(held, lane):
+    """As ``load_splat``, of the splat that a lane holds."""
+    x, y, l11, l21, l22, log2_opacity, cutoff, red, green, blue, depth = held
+    geometry = (handed(x, lane), handed(y, lane), handed(l11, lane), handed(l21, lane), handed(l22, lane))
+    color = (handed(red, lane), handed(green, lane), handed(blue, lane), handed(depth, lane))
+    return geometry, (handed(log2_opacity, lane), handed(cutoff, lane)), color
+
+
+@jit
 def of_lines(y, geometry, log2_opacity, LOWER: tl.constexpr):
     """What the pixels of a line share: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1.
 

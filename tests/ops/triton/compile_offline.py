@@ -144,20 +144,22 @@ def _tiles(ttgir: str) -> list[dict]:
 def _loops(instructions: list[tuple[int, str]]) -> list[dict[str, int]]:
     """The innermost loops around powers of two, of which each (splat, pixel) sample takes one, the longest last.
 
-    Counted are all their instructions, the powers, loads from memory, and exchanges between lanes."""
+    Counted are all their instructions, the powers, loads from memory, exchanges between lanes, and what reads or
+    writes spilled registers."""
     jumps = [(at, re.match(r"BRA\S*\s+.*?(0x[0-9a-f]+)", text)) for at, text in instructions]
     ranges = sorted({(int(jump[1], 16), at) for at, jump in jumps if jump and int(jump[1], 16) < at})
     loops = []
     for first, last in ranges:
         body = [text for at, text in instructions if first <= at <= last]
-        kinds = {"powers": "MUFU.EX2", "loads": "LDG", "exchanges": "SHFL"}
+        kinds = {"powers": "MUFU.EX2", "loads": "LDG", "exchanges": "SHFL", "spilled": ("LDL", "STL")}
         counts = {name: sum(text.startswith(kind) for text in body) for name, kind in kinds.items()}
         if counts["powers"]:
             loops.append((first, last, {"instructions": len(body)} | counts))
+    # The shortest of those that overlap.
     inner = [
         counts
         for first, last, counts in loops
-        if not any((first, last) != (a, b) and first <= a and b <= last for a, b, _ in loops)
+        if not any(a <= last and first <= b and b - a < last - first for a, b, _ in loops)
     ]
     return sorted(inner, key=lambda counts: counts["instructions"])
 

@@ -20,9 +20,10 @@ DEVICE = device_of("triton")
 ONE_BY_ONE = Tuning(shortest_part=3, two_launches=False)
 """Whole tiles, products and parts after each other."""
 VARIANTS = {
-    "all": {"two_launches": True, "marked_slots": True},
+    "all": {"two_launches": True, "marked_slots": True, "staged_tiles": 4},
     "two launches": {"two_launches": True},
     "marked slots": {"marked_slots": True},
+    "staged": {"staged_tiles": 4},
 }
 STOPS = {
     "exclusive": SplatSettings(stop="exclusive", transmittance_min=0.02),
