@@ -144,12 +144,11 @@ def store_quadrant(quadrant, at, inside, layers, DEPTH: tl.constexpr, LASTS: tl.
 
 @jit
 def store_in_image(
-    wanted, quadrants, layers, order, ahead, width, height, tiles_x, part_count,
-    DEPTH: tl.constexpr, LASTS: tl.constexpr, TOGETHER: tl.constexpr,
-):  # fmt: skip
+    wanted, quadrants, layers, order, place, width, height, tiles_x, DEPTH: tl.constexpr, LASTS: tl.constexpr
+):
     if wanted:
         # Volatile, so that the compiler computes indices anew instead of keeping them in registers through the loop.
-        tile = tl.load(order + place_of(ahead, part_count, TOGETHER), volatile=True)
+        tile = tl.load(order + place, volatile=True)
         for i in tl.static_range(4):
             at, inside = quadrant_places(tile, width, height, tiles_x, i)
             store_quadrant(quadrants[i], at, inside, layers, DEPTH, LASTS)
@@ -224,9 +223,12 @@ def blend_tiles(
         k = stop
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     quadrants = (q0, q1, q2, q3)
+    place, part, is_part = place_of(ahead, part_count, TOGETHER)
     if PARTS or TOGETHER:
         layers = (part_rgb, part_transmittance, part_depth, part_lasts)
         store_in_part(written & is_part, quadrants, layers, part, products, DEPTH, LASTS, TOGETHER)
     if not PARTS:
-        layers, size = (rgb, transmittance, depth_sum, lasts), (width, height, tiles_x, part_count)
-        store_in_image(not is_part, quadrants, layers, order, ahead, *size, DEPTH, LASTS, TOGETHER)
+        layers, is_whole = (rgb, transmittance, depth_sum, lasts), place >= 0
+        if TOGETHER:
+            is_whole = not is_part
+        store_in_image(is_whole, quadrants, layers, order, place, width, height, tiles_x, DEPTH, LASTS)

@@ -11,11 +11,19 @@ from sparsestreet.ops.triton.language import jit
 
 @jit
 def place_of(ahead, part_count, TOGETHER: tl.constexpr):
-    """Place of this program's tile in the order; ``ahead[0]``: number of tiles that start before the parts."""
-    number = tl.program_id(0)
+    """Place of this program's tile in the order, and whether and which part it has instead.
+
+    ``ahead[0]``: number of tiles that start before the parts. Volatile, so that the compiler computes all this anew
+    after a loop instead of keeping it in registers."""
+    place = tl.program_id(0)
+    part = place
+    is_part = place >= 0
     if TOGETHER:
-        number = tl.where(number < tl.load(ahead), number, number - part_count)
-    return number
+        part = place - tl.load(ahead, volatile=True)
+        is_part = (part >= 0) & (part < part_count)
+        place = tl.where(is_part, 0, tl.where(part < 0, place, place - part_count))
+        part = tl.where(is_part, part, 0)
+    return place, part, is_part
 
 
 @jit
@@ -26,20 +34,14 @@ def work_of(
     """Tile, number of the part, first pair, the one after the last, and whether it is a part.
 
     PARTS: parts alone; TOGETHER: whole tiles and parts; else whole tiles alone."""
-    part = tl.program_id(0)
-    is_part = part >= 0
+    place, part, is_part = place_of(ahead, part_count, TOGETHER)
     if TOGETHER:
-        part -= tl.load(ahead)
-        is_part = (part >= 0) & (part < part_count)
-        part = tl.where(is_part, part, 0)
-        place = tl.where(is_part, 0, place_of(ahead, part_count, TOGETHER))
         tile = tl.where(is_part, tl.load(part_tiles + part), tl.load(order + place))
         begin = tl.where(is_part, tl.load(part_begins + part), tl.load(begins + tile))
         end = tl.where(is_part, tl.load(part_ends + part), tl.load(ends + tile))
     elif PARTS:
         tile, begin, end = tl.load(part_tiles + part), tl.load(part_begins + part), tl.load(part_ends + part)
     else:
-        is_part = part < 0
-        tile = tl.load(order + part)
+        tile = tl.load(order + place)
         begin, end = tl.load(begins + tile), tl.load(ends + tile)
     return tile, part, begin, end, is_part

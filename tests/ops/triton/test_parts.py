@@ -59,7 +59,7 @@ def short_parts():
 
 @pytest.mark.parametrize("name", first_interpreted(*STOPS))
 def test_against_the_reference(name, short_parts):
-    scene, seen = stack(13), []
+    scene, seen = stack(10), []
     truth = render(scene, VIEW, "reference", torch.float64, STOPS[name])
     original = rasterizer.blend_view
 
