@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tuning:
-    """One choice of each. Gains are modelled for two trained streets at 960x640 (docs/gpu_model.md)."""
+    """One choice of each. Gains are modelled for two trained streets at 960x640 (docs/gpu_variants.md)."""
 
     most_parts: int = 6144
     """Most parts of a view, 7 kB each, so a part has at least this fraction of all pairs; 1: no tile is split.
@@ -26,7 +26,7 @@ class Tuning:
     """Forward in two launches and the sum: whole tiles, the first parts and what later ones let through; then those.
     Backward in one. Otherwise whole tiles, products and parts wait for each other.
 
-    Modelled: pixels of a street forward 1.1 to 0.9 ms, backward 1.6 to 1.0. The first kernel keeps the registers of the
+    Modelled: pixels of a street forward 0.9 to 0.8 ms, backward 1.3 to 0.9. The first kernel keeps the registers of the
     blend also while it computes products. The same bits in the interpreter."""
     marked_slots: bool = False
     """Backward marks the slots that it writes, a byte each, and writes no zeros into those behind closed pixels.
@@ -36,7 +36,7 @@ class Tuning:
     staged_tiles: int = 0
     """Forward fetches the records of 32 pairs at once, one a lane, in views of at most so many tiles; 0: in none.
 
-    A lone warp then waits for memory once in 32 pairs. Modelled: pixels of a street 0.9 to 0.6 ms. Where many warps
+    A lone warp then waits for memory once in 32 pairs. Modelled: pixels of a street 0.8 to 0.6 ms. Where many warps
     hide the wait it only costs registers and exchanges between lanes. The same bits."""
 
     def __post_init__(self) -> None:

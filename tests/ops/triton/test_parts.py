@@ -147,6 +147,7 @@ def test_each_launch_does_what_no_other_does(short_parts, poisoned, monkeypatch)
     screen = rasterizer.project(cast(stack(13), torch.float32, device=DEVICE), view)
     monkeypatch.setattr(pixels, "launch", launch)
     layers, split = pixels.blend_view(screen, view, lasts=False), screen.lists.parts
+    assert split is not None
     assert layers.rgb.isfinite().all()
     part = torch.arange(len(split), device=DEVICE)
     first, last, used = split.firsts == part, split.nexts == part + 1, split.nexts > part
@@ -223,9 +224,9 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest):
 
 
 def test_a_tuning_that_splits_nothing_into_nothing_is_refused():
-    for wrong in ({"most_parts": 0}, {"shortest_part": 0}, {"fewest_parts": 1}):
+    for wrong in ((0, 1, 2), (1, 0, 2), (1, 1, 1)):
         with pytest.raises(ValueError, match="at least 2 parts, got Tuning"):
-            Tuning(**wrong)
+            Tuning(*wrong)
 
 
 def test_a_tuning_holds_in_its_block_alone():

@@ -66,6 +66,7 @@ def drawn(screen: Screen, view: KernelView, choices: Tuning, cotangents: dict[st
         print(walked.sum(), len(walked))
         assert torch.equal(slots.isfinite().all(1), walked.bool())
         slots = torch.where(walked[:, None] != 0, slots, 0.0)
+    assert layers.ends.lasts is not None
     return {**images, "lasts": layers.ends.lasts, "slots": slots, "sums": sums}
 
 
