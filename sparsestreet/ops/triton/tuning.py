@@ -32,7 +32,7 @@ class Tuning:
     """Backward marks the slots that it writes, a byte each, and writes no zeros into those behind closed pixels.
 
     Modelled: nothing for a street, which closes few tiles early; perhaps 1.6 of 2.6 ms for 5 M random splats at
-    960x640. Costs three instructions a pair and a fill of the bytes. The same bits."""
+    960x640. Costs 2 to 14 instructions a pair and a fill of the bytes. The same bits."""
     staged_tiles: int = 0
     """Forward fetches the records of 32 pairs at once, one a lane, in views of at most so many tiles; 0: in none.
 
