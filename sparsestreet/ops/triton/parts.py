@@ -1,12 +1,12 @@
 """Long tiles in parts, so that a few deep tiles do not keep the device waiting for one warp each.
 
-A part starts with the light that the parts before it let through. ``thin_parts`` computes the light that each part
-alone lets through, for all parts at once. Then every part is blended from its true start, with the stop rule of the
-whole tile, and ``merge_parts`` adds up the parts. The image differs from that of an unsplit tile only by rounding. In
-backward the light behind a part is the sum of the parts behind it.
+A part starts with the light that the parts before it let through. First it is computed for all parts at once what each
+lets through alone: a first part is blended for that, behind a last one nothing lies. Then the other parts are blended
+from their true start, with the stop rule of the whole tile, and ``merge_parts`` adds up the parts. The image differs
+from that of an unsplit tile only by rounding. In backward the light behind a part is the sum of the parts behind it.
 
-A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The parts'
-transmittance is computed twice, which pays only if other warps would wait.
+A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The
+transmittance of parts in the middle is computed twice, which pays only if other warps would wait.
 """
 
 from dataclasses import dataclass

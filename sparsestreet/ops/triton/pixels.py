@@ -1,4 +1,4 @@
-"""Runs the pixel kernels of a view: one over whole tiles and, if there may be long ones, some over parts."""
+"""Runs the pixel kernels of a view: over whole tiles and, if there may be long ones, over parts (parts.py)."""
 
 from dataclasses import dataclass
 

@@ -14,7 +14,7 @@ class Tuning:
     """One choice of each. Gains are modelled for two trained streets at 960x640 (docs/gpu_variants.md)."""
 
     most_parts: int = 6144
-    """Most parts of a view, 7 kB each, so a part has at least this fraction of all pairs; 1: no tile is split.
+    """Most parts of a view, 7 kB each. A part has at least one of so many shares of all pairs; 1: no tile is split.
 
     A street lasts as long as its longest tile: split, its pixels are modelled to take half the time and less. Moves
     images by rounding, as the light before a part is a product of other parts' products."""
