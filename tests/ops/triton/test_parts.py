@@ -118,17 +118,6 @@ def test_any_length_draws_the_same(length):
         assert relative_error(split.gradients[field], gradient) <= 1e-5, field
 
 
-@pytest.fixture
-def poisoned(monkeypatch):
-    empty = torch.Tensor.new_empty
-
-    def filled(*args, **kwargs):
-        tensor = empty(*args, **kwargs)
-        return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
-
-    monkeypatch.setattr(torch.Tensor, "new_empty", filled)
-
-
 def test_each_launch_does_what_no_other_does(short_parts, poisoned, monkeypatch):
     """Whole tiles, first parts and what later ones let through; then these, but nothing behind the last of a tile."""
     started, blended, multiplied = pixels.launch, [], []
