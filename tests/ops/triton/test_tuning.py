@@ -1,4 +1,6 @@
-"""Every choice of the pixel kernels draws the same bits and the same slots, and reads nothing that is not written."""
+"""Every choice of the pixel kernels draws the same bits and the same slots, and reads nothing that is not written.
+
+On a device up to rounding."""
 
 from dataclasses import replace
 
@@ -90,4 +92,6 @@ def test_every_choice_draws_the_same_bits(case, poisoned):
         assert zeros.any() == (stop != "never")
     found = drawn(screen, view, replace(choices, **VARIANTS[variant]), cotangents)
     for image, values in expected.items():
-        assert torch.equal(found[image], values), image
+        # On a device the compiler contracts other products in other kernels.
+        rounding = 0.0 if DEVICE.type == "cpu" else 1e-6 * float(values.abs().max())
+        torch.testing.assert_close(found[image], values, rtol=0.0, atol=rounding, msg=image)
