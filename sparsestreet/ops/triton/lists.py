@@ -17,7 +17,7 @@ from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.parts import Parts, part_length, split_tiles
+from sparsestreet.ops.triton.parts import Parts, split_length, split_tiles
 from sparsestreet.ops.triton.quadrants import MOST_ROWS, QUADRANT_SHIFT, WARP, half_spans, touched_quadrants
 from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.tiles import tile_columns, tile_rows
@@ -198,7 +198,7 @@ def list_tiles(
     launch(
         bound_tiles, max(pairs, len(lengths)), _BLOCK,
         keys, slots, unsorted_rows, pair_rows, begins, ends, lengths, classes, pairs, len(lengths), pairs.bit_length(),
-        2 * part_length(pairs),
+        split_length(pairs),
     )  # fmt: skip
     # Within a class neighboring tiles follow each other. They share splats, which are then still in the caches.
     order = torch.sort(classes, descending=True, stable=True).indices.int()

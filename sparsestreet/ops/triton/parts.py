@@ -1,14 +1,12 @@
 """Long tiles in parts, so that a few deep tiles do not keep the device waiting for one warp each.
 
-A part starts with the light that the parts before it let through. ``thin_parts`` computes the light that each part
-alone
-lets through, for all parts at once. Then every part is blended from its true start, with the stop rule of the whole
-tile, and ``merge_parts`` adds up the parts. The image differs from that of an unsplit tile only by rounding. In
-backward
-the light behind a part is the sum of the parts behind it.
+A part starts with the light that the parts before it let through. First it is computed for all parts at once what each
+lets through alone: a first part is blended for that, behind a last one nothing lies. Then the other parts are blended
+from their true start, with the stop rule of the whole tile, and ``merge_parts`` adds up the parts. The image differs
+from that of an unsplit tile only by rounding. In backward the light behind a part is the sum of the parts behind it.
 
-A tile is split only if it is much longer than the device's share of all pairs. The parts' transmittance is computed
-twice, which pays only if other warps would wait.
+A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The
+transmittance of parts in the middle is computed twice, which pays only if other warps would wait.
 """
 
 from dataclasses import dataclass
@@ -19,26 +17,19 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS, part_pixels, pixels_of
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.quadrants import row_of
 from sparsestreet.ops.triton.search import first_at_least
+from sparsestreet.ops.triton.thin import thin_pairs
+from sparsestreet.ops.triton.tuning import tuning
 
-PART_LENGTH = 256
-"""Least number of pairs of a part; no part has more than one and a half times this."""
-PART_LIMIT = 4096
-"""Most parts of a view, 7 kB each.
-
-It is a little more than the warps that a large GPU runs at once (20 to 24 on each of 108 to 132 multiprocessors). So no
-part takes longer than the device's share of the whole view."""
 _BLOCK = 128
 
 
 @dataclass(frozen=True)
 class Parts:
-    """The tile and the pairs of each part. Parts after the last needed one are empty and never read."""
+    """The tile and the pairs of each part. Those after the last needed one are empty, of no tile, and never read."""
 
     tiles: Int[Tensor, " s"]
     begins: Int[Tensor, " s"]
@@ -49,6 +40,8 @@ class Parts:
     """The part after the last one of the same tile."""
     whole_ends: Int[Tensor, " t"]
     """End of each tile's pairs; their beginning where the tile is split."""
+    ahead: Int[Tensor, " 1"]
+    """Number of tiles that are at least about as long as a part, and start before the parts."""
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -59,7 +52,7 @@ class PartLayers:
     """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
 
     products: Float[Tensor, "s 256"]
-    """Light that the part alone lets through."""
+    """Light that the part alone lets through; unwritten for the last part of a tile."""
     rgb: Float[Tensor, "s 256 3"]
     transmittance: Float[Tensor, "s 256"]
     depth_sum: Float[Tensor, "s 256"]
@@ -76,95 +69,91 @@ class PartLayers:
 
 
 def part_length(pairs: int) -> int:
-    """Least number of pairs of a part, for a view with ``pairs``; a tile with twice that many is split.
+    """Least number of pairs of a part, for a view with ``pairs``; parts of a tile differ by at most one."""
+    return max(tuning().shortest_part, -(-pairs // tuning().most_parts))
+
+
+def split_length(pairs: int) -> int:
+    """Least number of pairs of a tile that is split, for a view with ``pairs``.
 
     Views of 2,400 tiles (960x640) or more of similar length have no split tile. A part does not know which of its
-    pixels
-    earlier parts have closed, so in an opaque tile it computes hidden splats once in vain.
+    pixels earlier parts have closed, so in an opaque tile it computes hidden splats once in vain.
     """
-    return max(PART_LENGTH, -(-pairs // PART_LIMIT))
+    return tuning().fewest_parts * part_length(pairs)
 
 
 def split_tiles(
     begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], order: Int[Tensor, " t"], lengths: Int[Tensor, " t"], pairs: int
 ) -> Parts | None:
-    """Parts of all tiles that are long enough for two; None if there are too few pairs for that.
+    """Parts of all tiles of ``split_length`` and more; None if there are too few pairs for one.
 
     ``order`` holds the tiles, split ones first, and ``lengths`` the number of pairs of each tile. It does not wait for
     the device, but makes room for the most parts that this number of pairs could need.
     """
-    length = part_length(pairs)
-    most = pairs // length
-    if most < 2:
+    length, least = part_length(pairs), split_length(pairs)
+    if pairs < least:
         return None
-    # No more tiles can have two parts. Tiles too short for two come last, so they do not shift the parts of others.
-    nexts = (lengths.index_select(0, order[: most // 2]) // length).cumsum(0, dtype=torch.int32)
-    parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends))
+    # No more tiles can be that long. Shorter ones come last, so they do not shift the parts of others.
+    most, split = pairs // length, pairs // least
+    nexts = (lengths.index_select(0, order[:split]) // length).cumsum(0, dtype=torch.int32)
+    parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends), begins.new_empty(1))
     launch(
         list_parts, max(most, len(order)), _BLOCK,
         begins, ends, order, lengths, nexts,
-        parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.whole_ends,
-        len(order), len(nexts), len(nexts).bit_length(), most, length,
+        parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.whole_ends, parts.ahead,
+        len(order), len(nexts), len(nexts).bit_length(), most, length, least,
     )  # fmt: skip
     return parts
 
 
-@partial(jit, do_not_specialize=["tile_count", "split_count", "steps", "part_count", "length"])
+@partial(jit, do_not_specialize=["tile_count", "split_count", "steps", "part_count", "length", "least"])
 def list_parts(
-    begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends,
-    tile_count, split_count, steps, part_count, length, BLOCK: tl.constexpr,
+    begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends, ahead,
+    tile_count, split_count, steps, part_count, length, least, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """One lane per part and per tile. ``split_nexts``: the part after the last of each of the first tiles in order."""
     number = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = number < tile_count
     tile = tl.load(order + number, given, 0)
     begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
-    tl.store(whole_ends + tile, tl.where(end - begin < 2 * length, end, begin), given)
+    tl.store(whole_ends + tile, tl.where(end - begin < least, end, begin), given)
+
+    following = tl.load(lengths + tl.load(order + number + 1, number + 1 < tile_count, 0), number + 1 < tile_count, 0)
+    is_long = given & (4 * (end - begin) >= least)
+    tl.store(ahead + 0 * number, number + 1, is_long & (4 * following < least))
+    tl.store(ahead + 0 * number, 0, (number == 0) & (4 * (end - begin) < least))
 
     # The first tile whose parts end after this one.
     rank = first_at_least(split_nexts, number + 1, split_count, steps)
     tile = tl.load(order + rank, rank < split_count, 0)
     pairs = tl.load(lengths + tile, rank < split_count, 0)
-    used = pairs >= 2 * length
-    tile, count = tl.where(used, tile, 0), tl.where(used, pairs // length, 1)
-    first = tl.where(used, tl.load(split_nexts + rank, used, 0) - count, number)
-    share = tl.cdiv(pairs, count)
-    # Shares are rounded up, so the last parts may get nothing; these are not needed and never read.
-    next_part = tl.where(used, first + tl.cdiv(pairs, tl.maximum(share, 1)), number)
-    end = tl.load(ends + tile, used, 0)
-    begin = tl.minimum(tl.load(begins + tile, used, 0) + (number - first) * share, end)
+    used = pairs >= least
+    tile, pairs, count = tl.where(used, tile, 0), tl.where(used, pairs, 0), tl.where(used, pairs // length, 1)
+    next_part = tl.where(used, tl.load(split_nexts + rank, used, 0), number)
+    first = tl.where(used, next_part - count, number)
+    share, longer, place = pairs // count, pairs % count, number - first
+    begin = tl.load(begins + tile, used, 0) + place * share + tl.minimum(place, longer)
     given = number < part_count
     tl.store(tiles + number, tile, given)
     tl.store(part_begins + number, begin, given)
-    tl.store(part_ends + number, tl.minimum(begin + share, end), given)
+    tl.store(part_ends + number, begin + share + (place < longer), given)
     tl.store(firsts + number, first, given)
     tl.store(nexts + number, next_part, given)
 
 
 @jit
 def thin_parts(
-    records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
+    records, pair_rows, tiles, begins, ends, nexts, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each needed part, or some value below the limit once it is below."""
+    """Writes what each part lets through alone, but for the last parts of tiles, behind which nothing is blended."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
-    x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
-    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    passed = tl.where(inside, 1.0, 0.0)
-    k, end = tl.load(begins + part), tl.load(ends + part)
-    needed = k < end
-    unfinished = needed
-    while unfinished:
-        stop = tl.minimum(k + LOOK, end)
-        for i in range(k, stop):
-            s = record.record_of(records, row_of(tl.load(pair_rows + i)))
-            _, _, _, _, exponent = whitened(s, px, py)
-            alpha = tl.minimum(tl.exp2(exponent), alpha_max)
-            passed -= tl.where(exponent >= tl.load(s + record.CUTOFF), alpha, 0.0) * passed
-        k = stop
-        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    tl.store(products + part_pixels(part), passed, needed)
+    if part + 1 < tl.load(nexts + part):
+        thin_pairs(
+            records, pair_rows, tl.load(begins + part), tl.load(ends + part), tl.load(tiles + part), part, products,
+            width, height, tiles_x, alpha_max, transmittance_min,
+        )  # fmt: skip
 
 
 @jit
@@ -192,7 +181,7 @@ def merge_parts(
         rest = tl.where(reached, tl.load(part_transmittance + at), rest)
         if LASTS:
             last = tl.where(reached, tl.load(part_lasts + at), last)
-        passed *= tl.load(products + at)
+        passed *= tl.load(products + at, i + 1 < end, 0.0)
     at = y * width + x
     written = inside & (end > part)
     tl.store(rgb + 3 * at, red, written)

@@ -16,9 +16,9 @@ pytestmark = pytest.mark.lengthy
 
 FORWARD = [
     "project_rows", "list_visible", "list_counts", "list_pairs", "bound_tiles", "list_parts", "blend_tiles",
-    "thin_parts", "blend_tiles", "merge_parts",
+    "blend_tiles", "merge_parts",
 ]  # fmt: skip
-BACKWARD = ["blend_tiles_backward", "blend_tiles_backward", "sum_slots", "project_rows_backward"]
+BACKWARD = ["blend_tiles_backward", "sum_slots", "project_rows_backward"]
 CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
 DAILY = CASE | {"width": 1920, "height": 1280}
 SLOW = [

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.ops.triton import parts
+from sparsestreet.ops.triton.parts import split_length
 from sparsestreet.ops.triton.screen import Screen, project
+from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.scenes import camera, cast, device_of, first_interpreted, front_camera, one_gaussian, random_gaussians
@@ -122,13 +123,12 @@ def test_tiles_are_walked_nearest_first():
 
 
 @pytest.mark.parametrize("rows", [40, 700])
-def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_each_other(rows, monkeypatch):
-    monkeypatch.setattr(parts, "PART_LENGTH", 3)
+def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_each_other(rows):
     view = camera(WIDTH, HEIGHT)
-    screen = project(
-        cast(random_gaussians(rows, view), torch.float32, device=DEVICE), KernelView(view, SplatSettings())
-    )
-    lists, whole = screen.lists, 2 * parts.part_length(len(screen.lists.slots))
+    scene = cast(random_gaussians(rows, view), torch.float32, device=DEVICE)
+    with tuned(Tuning(shortest_part=2)):
+        screen = project(scene, KernelView(view, SplatSettings()))
+        lists, whole = screen.lists, split_length(len(screen.lists.slots))
     lengths = (lists.ends - lists.begins).tolist()
 
     def key(tile: int) -> tuple[float, int]:

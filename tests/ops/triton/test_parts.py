@@ -1,16 +1,19 @@
 """Long tiles in parts: the same image and gradients as in one piece, for any length of the parts."""
 
+import dataclasses
+
 import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
-from sparsestreet.ops.triton import blend_backward, parts, pixels, rasterizer
-from sparsestreet.ops.triton.parts import part_length, split_tiles
+from sparsestreet.ops.triton import blend_backward, pixels, rasterizer
+from sparsestreet.ops.triton.parts import part_length, split_length, split_tiles
+from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
+from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
-    FIELDS,
     camera,
     cast,
     device_of,
@@ -49,13 +52,14 @@ VIEW = front_camera(27, 11, 22.0)
 
 
 @pytest.fixture
-def short_parts(monkeypatch):
-    monkeypatch.setattr(parts, "PART_LENGTH", 3)
+def short_parts():
+    with tuned(Tuning(shortest_part=3)):
+        yield
 
 
 @pytest.mark.parametrize("name", first_interpreted(*STOPS))
 def test_against_the_reference(name, short_parts):
-    scene, seen = stack(13), []
+    scene, seen = stack(10), []
     truth = render(scene, VIEW, "reference", torch.float64, STOPS[name])
     original = rasterizer.blend_view
 
@@ -94,40 +98,53 @@ def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatc
     monkeypatch.setattr(pixels, "launch", launch)
     gaussians = cast(stack(13), torch.float32, requires_grad=True, device=DEVICE)
     # Wider than VIEW: one tile is not split.
-    splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
+    with tuned(dataclasses.replace(tuning(), two_launches=False)):
+        splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
     assert written[True].any()
     assert written[False].any()
     assert torch.equal(written[False], ~written[True])
 
 
 @pytest.mark.parametrize("length", first_interpreted(4, 1))
-def test_any_length_draws_the_same(length, monkeypatch):
+def test_any_length_draws_the_same(length):
     view = camera(19, 17)
     scene = random_gaussians(12, view)
     whole = render(scene, view, "triton", torch.float32)
-    monkeypatch.setattr(parts, "PART_LENGTH", length)
-    split = render(scene, view, "triton", torch.float32)
+    with tuned(Tuning(shortest_part=length, fewest_parts=2)):
+        split = render(scene, view, "triton", torch.float32)
     for name, image in whole.images.items():
         torch.testing.assert_close(split.images[name], image, rtol=1e-6, atol=1e-6)
     for field, gradient in whole.gradients.items():
         assert relative_error(split.gradients[field], gradient) <= 1e-5, field
 
 
-def test_two_runs_are_bitwise_equal_and_read_nothing_unwritten(short_parts, monkeypatch):
-    scene = stack(13, 0.9)
-    plain = render(scene, VIEW, "triton", torch.float32)
-    empty = torch.Tensor.new_empty
+def test_each_launch_does_what_no_other_does(short_parts, poisoned, monkeypatch):
+    """Whole tiles, first parts and what later ones let through; then these, but nothing behind the last of a tile."""
+    started, blended, multiplied = pixels.launch, [], []
 
-    def poisoned(*args, **kwargs):
-        tensor = empty(*args, **kwargs)
-        return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
+    def launch(kernel, items, block, *arguments, **options):
+        started(kernel, items, block, *arguments, **options)
+        (rgb,) = (a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256, 3))
+        products = next(a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256,))
+        for written, layer in ((blended, rgb.flatten(1)), (multiplied, products)):
+            finite = layer.isfinite()
+            assert torch.equal(finite.all(1), finite.any(1))
+            written.append(finite.all(1))
+        rgb.fill_(torch.nan if len(blended) == 1 else 0.0)
 
-    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
-    again = render(scene, VIEW, "triton", torch.float32)
-    for name, image in plain.images.items():
-        assert torch.equal(again.images[name], image), name
-    for field in FIELDS:
-        assert torch.equal(again.gradients[field], plain.gradients[field]), field
+    view = KernelView(VIEW, SplatSettings())
+    screen = rasterizer.project(cast(stack(13), torch.float32, device=DEVICE), view)
+    monkeypatch.setattr(pixels, "launch", launch)
+    layers, split = pixels.blend_view(screen, view, lasts=False), screen.lists.parts
+    assert split is not None
+    assert layers.rgb.isfinite().all()
+    part = torch.arange(len(split), device=DEVICE)
+    first, last, used = split.firsts == part, split.nexts == part + 1, split.nexts > part
+    assert int(used.sum()) > int((first & used).sum()) + int((last & used).sum()) > 0
+    assert torch.equal(blended[0], used & first)
+    assert torch.equal(blended[1], used & ~first)
+    assert torch.equal(multiplied[0], used & ~last)
+    assert torch.equal(multiplied[1], used & ~last)
 
 
 def test_counting_and_removal_walk_whole_tiles(short_parts):
@@ -136,68 +153,73 @@ def test_counting_and_removal_walk_whole_tiles(short_parts):
     truth = contribution(scene, VIEW, backend="reference")
     counted = contribution(single, VIEW, backend="triton")
     assert torch.equal(counted.dominant.cpu(), truth.dominant)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parts, "PART_LENGTH", 256)
+    with tuned(Tuning()):
         whole = rasterizer.leave_one_out(single, None, None, VIEW, SplatSettings())
     split = rasterizer.leave_one_out(single, None, None, VIEW, SplatSettings())
     torch.testing.assert_close(split.squared_change, whole.squared_change, rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(split.max_abs_change, whole.max_abs_change, rtol=1e-5, atol=1e-7)
 
 
-def test_parts_longer_than_a_look(monkeypatch):
+@pytest.mark.parametrize("staged", first_interpreted(1, 0))
+def test_parts_longer_than_a_look(staged):
     # Both parts hold 35 splats and are looked at after 32, when half the light still passes.
-    monkeypatch.setattr(parts, "PART_LENGTH", 33)
     layers = [
         one_gaussian(means=[[0.0, 0.0, 2 + 0.1 * k]], scales=[[90.0] * 3], opacities=[0.02], sh=[[[0.01 * k] * 3]])
         for k in range(70)
     ]
     scene, view = Gaussians.concatenate(layers), front_camera(3, 2, 20.0)
-    drawn = splat(cast(scene, torch.float32, device=DEVICE), view, backend="triton")
+    with tuned(Tuning(shortest_part=33, fewest_parts=2, staged_tiles=staged)):
+        drawn = splat(cast(scene, torch.float32, device=DEVICE), view, backend="triton")
     truth = splat(scene, view, backend="reference")
     assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6
 
 
 @settings(deadline=None, max_examples=100)
-@given(st.lists(st.integers(0, 40), min_size=1, max_size=9), st.integers(1, 7), st.integers(2, 12))
+@given(st.lists(st.integers(0, 40), min_size=1, max_size=9), st.integers(1, 7), st.integers(1, 12), st.integers(2, 4))
 # More parts, and more tiles, than a program has lanes.
-@example([300], 1, 400)
-@example([5] + [0] * 299, 2, 12)
-def test_parts_cover_long_tiles_once(counts, length, limit):
+@example([300], 1, 400, 3)
+@example([5] + [0] * 299, 2, 12, 2)
+def test_parts_cover_long_tiles_once(counts, length, limit, fewest):
     ends = torch.tensor(counts).cumsum(0).int()
     begins, pairs = ends - torch.tensor(counts, dtype=torch.int32), sum(counts)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parts, "PART_LENGTH", length)
-        patch.setattr(parts, "PART_LIMIT", limit)
-        share, lengths = part_length(pairs), ends - begins
+    with tuned(Tuning(most_parts=limit, shortest_part=length, fewest_parts=fewest)):
+        share, least, lengths = part_length(pairs), split_length(pairs), ends - begins
         # Those that are split come first; the others in any order.
-        order = torch.sort(lengths >= 2 * share, descending=True, stable=True).indices.int()
+        order = torch.sort(lengths >= least, descending=True, stable=True).indices.int()
         found = split_tiles(begins.to(DEVICE), ends.to(DEVICE), order.to(DEVICE), lengths.to(DEVICE), pairs)
-    long = [tile for tile, count in enumerate(counts) if count >= 2 * share]
+    long = [tile for tile, count in enumerate(counts) if count >= least]
     if found is None:
         assert not long
         return
     assert len(found) <= limit
+    starts = [4 * counts[tile] >= least for tile in order] + [False]
+    assert int(found.ahead) in [place for place in range(len(counts) + 1) if not starts[place]]
+    assert all(starts[: int(found.ahead)][-1:])
     listed: dict[int, list[int]] = {}
     for part, (tile, begin, end) in enumerate(zip(found.tiles, found.begins, found.ends, strict=True)):
-        assert int(end - begin) < 2 * share
         if found.nexts[part] > part:
-            # Pixel kernels write nothing for an empty part, but what is before nexts is read.
-            assert begin < end
+            assert share <= int(end - begin) < (fewest + 1) / fewest * share + 1
             listed.setdefault(int(tile), []).extend(range(int(begin), int(end)))
-            assert (found.tiles[found.firsts[part] : found.nexts[part]] == tile).all()
+            first, following = int(found.firsts[part]), int(found.nexts[part])
+            assert following - first >= fewest
+            assert (found.tiles[first:following] == tile).all()
         else:
             assert begin == end
+            assert found.firsts[part] == part
     assert listed == {tile: list(range(int(begins[tile]), int(ends[tile]))) for tile in long}
     assert [int(end) for end in found.whole_ends] == [
         int(begins[tile] if tile in long else ends[tile]) for tile in range(len(counts))
     ]
 
 
-@pytest.mark.parametrize("tiles", [2400, 9600])
-def test_no_tile_is_split_of_many_alike(tiles):
-    """Means of 300 to 6,000 pairs; fluctuations of a sixth."""
-    assert all(7 * mean // 6 <= 2 * part_length(mean * tiles) for mean in (300, 1000, 6000))
+def test_a_tuning_that_splits_nothing_into_nothing_is_refused():
+    for wrong in ((0, 1, 2), (1, 0, 2), (1, 1, 1)):
+        with pytest.raises(ValueError, match="at least 2 parts, got Tuning"):
+            Tuning(*wrong)
 
 
-def test_few_tiles_are_split_to_occupy_a_device():
-    assert part_length(60 * 5000) == 256
+def test_a_tuning_holds_in_its_block_alone():
+    with tuned(Tuning(shortest_part=3)), pytest.raises(KeyError), tuned(Tuning(shortest_part=4)):
+        assert part_length(10) == 4
+        raise KeyError
+    assert part_length(10) == 128
