@@ -39,6 +39,7 @@ examples:
   sparsestreet bench edits --street RUN         objects removed, moved, copied, beside a street traced that way
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
+  sparsestreet bench gpu --street RUN --refine 3   and a trained street, each splat as 3 x 3, the image 3 times as wide
 
 Records go to OUT/MODE.jsonl, one JSON object a line; figures beside them as SVG and PNG.
 """
@@ -62,6 +63,8 @@ def bench(arguments: list[str]) -> int:
     options = parser.parse_intermixed_args(arguments)
     if options.overrides and options.mode != "step":
         parser.error(f"{options.mode} takes no options of train, got {' '.join(options.overrides)}")
+    if options.refine is not None and (options.mode != "gpu" or options.street is None or options.refine < 1):
+        parser.error("--refine N, at least 1, makes the street of gpu --street RUN finer")
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     options.command = shlex.join(["sparsestreet", "bench", *arguments])
@@ -80,6 +83,9 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument(
         "--street", type=Path, metavar="RUN", help="knobs, gpu, edits: the trained street of this run's folder"
+    )
+    parser.add_argument(
+        "--refine", type=int, metavar="N", help="gpu: N x N smaller splats for each of the street's, N times the image"
     )
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
@@ -218,11 +224,25 @@ def _gpu(options: argparse.Namespace) -> bool:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu" and not options.quick:
         raise SystemExit("sparsestreet bench gpu: no CUDA device is available; --quick runs it on the CPU, tiny")
-    sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
-    street = None if options.street is None else trained_street(options.street)
+    streets = [] if options.street is None else front_streets(options.street, options.refine or 1)
     if options.quick:
-        return gpu.run_gpu([Size(64, 48, 500)], device, TimingBudget(repeats=2, least=1), _file(options))
-    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), street=street)
+        once = TimingBudget(repeats=2, least=1)
+        return gpu.run_gpu([Size(64, 48, 500)], device, once, _file(options), streets=streets)
+    sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
+    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), streets=streets)
+
+
+def front_streets(run: Path, refine: int) -> list[BenchScene]:
+    """A trained run as its camera of the least number sees it in its first and in its middle frame, refined.
+
+    Raises FileNotFoundError if the folder holds no scene or no views.
+    """
+    from sparsestreet.bench.refine import refined
+
+    stored, views = _scene_and_views(run)
+    front = [view for view in views if view.camera_index == min(view.indices[1] for view in views)]
+    chosen = {place: front[place] for place in (0, len(front) // 2)}
+    return [refined(_street(run, stored, view), refine) for view in chosen.values()]
 
 
 def trained_street(run: Path) -> BenchScene:
@@ -230,7 +250,10 @@ def trained_street(run: Path) -> BenchScene:
 
     Raises FileNotFoundError if the folder holds no scene or no views.
     """
-    stored, view = _stored(run)
+    return _street(run, *_stored(run))
+
+
+def _street(run: Path, stored: "StoredScene", view: "View") -> BenchScene:
     with torch.no_grad():
         placed = stored.scene.gaussians_at(view)
     source = f"trained: {run.name} on {stored.name}, frame {view.frame_index}"
@@ -238,11 +261,15 @@ def trained_street(run: Path) -> BenchScene:
 
 
 def _stored(run: Path) -> "tuple[StoredScene, View]":
+    stored, views = _scene_and_views(run)
+    return stored, views[len(views) // 2]
+
+
+def _scene_and_views(run: Path) -> "tuple[StoredScene, tuple[View, ...]]":
     from sparsestreet.scene.storage import load_scene
     from sparsestreet.scene.views import FILE_NAME, read_views
 
-    stored, views = load_scene(run), read_views(run / FILE_NAME).all
-    return stored, views[len(views) // 2]
+    return load_scene(run), read_views(run / FILE_NAME).all
 
 
 def _file(options: argparse.Namespace) -> RecordFile:
