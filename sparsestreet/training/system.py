@@ -169,5 +169,6 @@ class StreetSystem(LightningModule):
         image = rendering.rgb.detach().clamp(0, 1)
         self.train_psnr.append(psnr_on_device(image, frame.image.to(image.dtype) / 255))
         self.log("psnr", torch.stack(tuple(self.train_psnr)).mean(), batch_size=1)
-        self.log("gaussians", float(sum(self.scene.counts().values())), batch_size=1)
+        # A tensor of the host: Lightning would copy a number to the device, and wait for that.
+        self.log("gaussians", torch.tensor(float(sum(self.scene.counts().values()))), batch_size=1)
         self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()}, batch_size=1)
