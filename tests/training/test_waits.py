@@ -3,12 +3,18 @@
 The steps are whole: the scene, the op's host side, losses, regularizers, logging, backward, statistics, optimizer.
 """
 
+import csv
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.accelerators.cpu import CPUAccelerator
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
@@ -41,8 +47,8 @@ from tests.scene.nodes.test_vibrating import vibrating
 from tests.scene.people import smpl, walker
 from tests.scene.street import POSE_RATES, RATES
 from tests.training.moved_views.test_term import street, wall
-from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
-from tests.training.waiting import META, pretended, waits
+from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system, rigid
+from tests.training.waiting import META, Waits, pretended, waits
 
 SIZE = (16, 32)
 SPLAT = "ops/triton/screen.py:project: splat"
@@ -50,14 +56,6 @@ RATE = LearningRate(0.01)
 ALL_LOSSES = {name: getattr(losses, name)() for name in losses.__all__ if name != "Loss"}
 
 __all__ = ["pretended"]  # a fixture
-
-
-class Logged(StubTrainer):
-    """Takes what is logged as Lightning does, which reads it later."""
-
-    def _log(self, name: str, value: Any, *places: Any, **how: Any) -> None:
-        assert isinstance(value, Tensor)  # a number would be copied to the device
-        self.callback_metrics[name] = value
 
 
 def masked(weight: float = 1.0) -> dict[str, Node]:
@@ -123,7 +121,7 @@ def frame_with(**changes: Any) -> Frame:
 def places_of_a_step(system: StreetSystem, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Where the second step waits: the first makes tables that stay."""
     every = Interval(0.0, 1.0, 100)
-    trainer = Logged(system.to(META), [DensityControl(every, 1.0, Interval(0.0, 1.0, 1000))], max_steps=12)
+    trainer = StubTrainer(system.to(META), [DensityControl(every, 1.0, Interval(0.0, 1.0, 1000))], max_steps=12)
     trainer.global_step = 9
     with waits(monkeypatch) as found:
         frame = to_device(frame, META)
@@ -131,6 +129,7 @@ def places_of_a_step(system: StreetSystem, frame: Frame, monkeypatch: pytest.Mon
         trainer.train(1, frame)
         found.places.clear()
         trainer.train(1, frame)
+    assert [how["step"] for name, _, how in trainer.log_calls if name == "psnr"] == [9]
     return found.places
 
 
@@ -159,6 +158,35 @@ def test_a_mask_over_time_does_not_wait(pretended: None, monkeypatch: pytest.Mon
     mask = {"mask": TemporalMaskSettings(1.0), "masked": True, "learning_rates": learned}
     system = make_system({"people": smpl(walker(), **mask)}, {"sparsity": MaskSparsity()})
     assert places_of_a_step(system, frame_with(), monkeypatch) == [SPLAT]
+
+
+@pytest.mark.filterwarnings("ignore")  # of an epoch of one frame, and workers
+def test_lightning_and_its_loggers_add_no_wait(pretended: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Its own loop on the pretended device, which validates nothing; two of seven steps log."""
+    monkeypatch.setattr(CPUAccelerator, "setup_device", lambda self, device: None)
+    monkeypatch.setattr("lightning.pytorch.loops.fit_loop.has_len_all_ranks", lambda *_, **__: True)
+    strategy = SingleDeviceStrategy(device=META, accelerator=CPUAccelerator())
+    settings: dict[str, Any] = {"logger": CSVLogger(tmp_path, "", ""), "log_every_n_steps": 3, "accelerator": "auto"}
+    with waits(monkeypatch) as found:
+        ends = Ends(found)
+        fit(make_system(nodes()), [ends], 7, to_device(frame_with(), META), strategy=strategy, **settings)
+    assert ends.places == [[SPLAT]] * 7
+    rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
+    assert [(row["step"], row["gaussians"]) for row in rows] == [("2", "30.0"), ("5", "30.0")]
+
+
+class Ends(Callback):
+    """Where each step has waited, from the end of the one before."""
+
+    def __init__(self, waits: Waits) -> None:
+        self.waits, self.places = waits, []
+
+    def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
+        self.waits.places.clear()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: StreetSystem, *step: Any) -> None:
+        self.places.append(self.waits.places.copy())
+        self.waits.places.clear()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,10 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import sparsestreet
+from sparsestreet.data.device import OnItsWay
 from sparsestreet.ops import backend, fused, triton
 from sparsestreet.ops.triton import launch, rasterizer, screen
+from sparsestreet.training import said_later
 
 META = torch.device("meta")
 PACKAGE = Path(sparsestreet.__file__).parent
@@ -39,6 +42,8 @@ class Waits:
 
     def __init__(self) -> None:
         self.places: list[str] = []
+        self.renderings = 0
+        """How often the splat op has waited."""
 
     def note(self, what: str) -> None:
         frames = [frame for frame in traceback.extract_stack() if Path(frame.filename).is_relative_to(PACKAGE)]
@@ -167,8 +172,28 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 
     def counted(numbers: Tensor) -> list[int]:
         found.note("splat")
+        found.renderings += 1
         return [40, 5, 0]
+
+    @dataclass(frozen=True)
+    class Queued(OnItsWay):
+        """A copy that has arrived once a later rendering has waited."""
+
+        before: int = 0
+
+        @property
+        def is_there(self) -> bool:
+            return found.renderings > self.before
+
+        def arrived(self) -> Tensor:
+            if not self.is_there:
+                found.note("arrival")
+            return self.values
+
+    def queued(values: Tensor) -> OnItsWay:
+        return Queued(torch.zeros(values.shape), None, found.renderings)
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
         patch.setattr(screen, "wait_for", counted)
+        patch.setattr(said_later, "on_its_way", queued)
         yield found

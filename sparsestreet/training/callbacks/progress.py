@@ -70,7 +70,7 @@ class TrainingProgress(Callback):
         now = time.perf_counter()
         self._since = (trainer.global_step, now)
         parts = [f"{(trainer.global_step - first) / max(now - then, 1e-9):.1f} steps/s"]
-        metrics = trainer.callback_metrics
+        metrics = {**trainer.callback_metrics, **system.said.newest}
         parts += [f"{label} {float(metrics[key]):.2f} dB" for key, label in LABELS.items() if key in metrics]
         parts += [f"{name} {rows:,}" for name, rows in system.scene.counts().items()]
         return ", ".join(parts)
