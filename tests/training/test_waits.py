@@ -18,6 +18,8 @@ from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
+from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.density.vibrating import VibratingDensity
 from sparsestreet.scene.effects import (
     Affine,
     AffineSettings,
@@ -64,7 +66,8 @@ def masked(weight: float = 1.0) -> dict[str, Node]:
 
 
 def nodes(sharp_shape: float = 0.0) -> dict[str, Node]:
-    return {"background": background(20, sharp_shape=sharp_shape), "rigid": rigid(10, sharp_shape=sharp_shape)}
+    shared = {"density": GradientDensity(), "sharp_shape": sharp_shape}
+    return {"background": background(20, **shared), "rigid": rigid(10, **shared)}
 
 
 def poses() -> CameraPoses:
@@ -92,7 +95,7 @@ CASES: Mapping[str, tuple[Callable[[], StreetSystem], list[str]]] = {
         [SPLAT],
     ),
     "deformable": (lambda: make_system({"objects": objects()}), [SPLAT]),
-    "vibrating": (lambda: make_system({"street": vibrating()}), [SPLAT]),
+    "vibrating": (lambda: make_system({"street": vibrating(density=VibratingDensity())}), [SPLAT]),
     "people": (lambda: make_system({"people": smpl(walker())}), [SPLAT]),
     "field": (lambda: make_system({"field": field(reach=None, deform_from=0.0)}), [SPLAT]),
     # The network is most of the step, and rows that are not near would cost more than a look at their number.
@@ -130,6 +133,7 @@ def places_of_a_step(system: StreetSystem, frame: Frame, monkeypatch: pytest.Mon
         found.places.clear()
         trainer.train(1, frame)
     assert [how["step"] for name, _, how in trainer.log_calls if name == "psnr"] == [9]
+    assert system.screen_gradients == any(node.settings.density for node in system.scene.nodes.values())
     return found.places
 
 
