@@ -50,10 +50,9 @@ from tests.scene.people import smpl, walker
 from tests.scene.street import POSE_RATES, RATES
 from tests.training.moved_views.test_term import street, wall
 from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system, rigid
-from tests.training.waiting import META, Waits, pretended, waits
+from tests.training.waiting import META, SPLAT, Waits, pretended, waits
 
 SIZE = (16, 32)
-SPLAT = "ops/triton/screen.py:project: splat"
 RATE = LearningRate(0.01)
 ALL_LOSSES = {name: getattr(losses, name)() for name in losses.__all__ if name != "Loss"}
 

@@ -29,6 +29,9 @@ from sparsestreet.training import said_later
 META = torch.device("meta")
 PACKAGE = Path(sparsestreet.__file__).parent
 
+SPLAT = "splat"
+"""The op's own wait, for the numbers of its rows and pairs."""
+
 NUMBERS = {"_local_scalar_dense", "is_nonzero", "equal", "_linalg_check_errors"}
 """Operations that need a number of the device on the host."""
 SIZES = {"nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "unique_consecutive", "bincount"}
@@ -171,7 +174,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
     found = Waits()
 
     def counted(numbers: Tensor) -> list[int]:
-        found.note("splat")
+        found.places.append(SPLAT)
         found.renderings += 1
         return [40, 5, 0]
 
