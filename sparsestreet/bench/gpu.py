@@ -135,7 +135,7 @@ def _measure_all(
         return
     for mode in modes:
         record = replace(blank, renderer=f"gsplat {gsplat_peer.version(peer)} {mode}")
-        record = measure(record, _theirs(workload, peer, mode), workload, budget)
+        record = _listed(measure(record, _theirs(workload, peer, mode), workload, budget), workload, peer)
         record = stepped(record, their_render(peer, camera, workload.device, mode), workload, budget)
         if is_compared:
             record = compared(record, partial(gsplat_peer.parity, peer, workload.rows, workload.camera, backend))
@@ -155,6 +155,16 @@ def _counted(record: GpuRecord, workload: Workload, backend: str) -> GpuRecord:
     given = (workload.rows, workload.camera, gsplat_peer.SETTINGS, backend)
     pairs, samples = work_of(*given)
     return replace(record, pairs=pairs, samples=samples, tiles=loads_of(*given))
+
+
+def _listed(record: GpuRecord, workload: Workload, peer: ModuleType) -> GpuRecord:
+    if record.failed is not None:
+        return record
+    try:
+        pairs, tiles = gsplat_peer.loads_of(peer, workload.rows, workload.camera)
+    except Exception as error:  # a peer may raise anything
+        return replace(record, failed=_reason(error))
+    return replace(record, pairs=pairs, tiles=tiles)
 
 
 def _ours(workload: Workload, backend: str) -> Draw:

@@ -18,8 +18,9 @@ class GpuRecord:
     width: int
     height: int
     pairs: int | None = None
-    """(splat, tile) pairs, and (splat, pixel) samples of the forward pass; None for gsplat."""
+    """(splat, tile) pairs."""
     samples: int | None = None
+    """(splat, pixel) samples of the forward pass; None for gsplat."""
     failed: str | None = None
     """Why a measurement is missing; earlier measurements stay."""
     inference: TimeSpread | None = None
@@ -36,7 +37,7 @@ class GpuRecord:
     """Kernels, copies and fills of one forward and backward, and how often the host waits in them."""
     waits: int | None = None
     tiles: TileLoads | None = None
-    """How the pairs lie on the tiles; of our kernels alone."""
+    """How the pairs lie on the tiles; gsplat splits none."""
     memory_before: float | None = None
     memory_peak: float | None = None
     """Peak during one forward and backward, including what was there before: the Gaussians."""
@@ -58,8 +59,10 @@ def line(record: GpuRecord) -> str:
     text = f"{start} forward {_short(record.forward)}  backward {_short(record.backward)}  no grad {inference} ms"
     if record.step is not None:
         text += f"  step {_short(record.step)}"
-    if record.pairs is not None and record.samples is not None:
-        text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
+    if record.pairs is not None:
+        text += f"  {1e-6 * record.pairs:.2f} M pairs"
+    if record.samples is not None:
+        text += f", {1e-6 * record.samples:.0f} M samples"
     if record.tiles is not None:
         tiles = record.tiles
         text += f"  tiles {tiles.mean:.0f} pairs, longest {tiles.longest}, {tiles.split} split in {tiles.parts} parts"

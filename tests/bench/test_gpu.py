@@ -49,7 +49,10 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
             absgrad = property(lambda self: rendering.screen_offsets.grad[None])
 
         radii = rendering.radii[None, :, None].expand(-1, -1, 2)
+        # Six tiles of 16x16, of which the third and the last are empty.
+        offsets = torch.tensor([[[0, 2, 3], [3, 4, 7]]], dtype=torch.int32)
         meta = {"flatten_ids": torch.zeros(7, dtype=torch.int32), "means2d": Means(), "radii": radii}
+        meta |= {"isect_offsets": offsets}
         return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
 
     module = ModuleType("gsplat")
@@ -121,7 +124,11 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
         assert record["inference"]["repeats"] == 1
         assert record["stages"] is None  # no device, no kernels
     assert [record["agrees"] for record in records] == [True] * 3
-    assert [record["pairs"] is None for record in records] == [False, True, True]
+    assert [record["pairs"] for record in records[1:]] == [7, 7]
+    assert [record["samples"] is None for record in records] == [False, True, True]
+    # 2, 1, 0, 1, 3 and 0 pairs.
+    said_of_theirs = {"mean": 1.16667, "median": 1.0, "longest": 3, "split": 0, "parts": 0, "longest_part": 0}
+    assert [record["tiles"] for record in records] == [None, said_of_theirs, said_of_theirs]
     assert records[0]["samples"] > records[0]["pairs"] >= 60
     assert any("agrees: equal" in line for line in said)
 
@@ -389,8 +396,9 @@ def test_every_number_of_a_record_is_in_its_line():
     assert gpu_record.line(busy) == gpu_record.line(whole).replace(
         "  peak     345 MB", f"{said}  peak     345 MB  31 launches, 1 waits"
     )
-    for one in ("pairs", "samples"):
-        assert " M pairs" not in gpu_record.line(dataclasses.replace(whole, **{one: None}))
+    without = dataclasses.replace(whole, samples=None)
+    assert gpu_record.line(without) == gpu_record.line(whole).replace(", 70 M samples", "")
+    assert " M " not in gpu_record.line(dataclasses.replace(without, pairs=None))
 
 
 def test_a_record_is_of_its_workload(tmp_path, monkeypatch):
