@@ -161,11 +161,13 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fused, "_on_gpu", lambda tensors: all(tensor.device == META for tensor in tensors))
     monkeypatch.setattr(rasterizer, "_check", lambda gaussians: None)
     monkeypatch.setattr(sys.modules["torch.optim.adam"], "_device_dtype_check_for_fused", lambda parameter: None)
-    launched = launch.launch
+    of_a_driver = {"launch": lambda *arguments, **constants: None, "stream_of": lambda device: 0}
+    real = {name: getattr(launch, name, None) for name in of_a_driver}
     for found in pkgutil.iter_modules(triton.__path__, "sparsestreet.ops.triton."):
         module = importlib.import_module(found.name)
-        if getattr(module, "launch", None) is launched:
-            monkeypatch.setattr(module, "launch", lambda *arguments, **constants: None)
+        for name, stand_in in of_a_driver.items():
+            if real[name] is not None and getattr(module, name, None) is real[name]:
+                monkeypatch.setattr(module, name, stand_in)
 
 
 @contextmanager
