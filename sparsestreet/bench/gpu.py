@@ -1,7 +1,7 @@
 """``sparsestreet bench gpu``: stage times and peak memory at sizes of real scenes, with gsplat in the same run."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import ModuleType
@@ -33,9 +33,12 @@ from sparsestreet.bench.timing import (
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu.library import find_library
 from sparsestreet.ops.splat import splat
+from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.phases import clock_of
 from sparsestreet.types import Camera, Gaussians
 
+DEFAULT = {"": Tuning()}
+"""The kernels as they are chosen without a word."""
 ROWS = (1_500_000, 500_000, 5_000_000, 100_000, 1_000)
 """Numbers of rows. The last is almost no work for a device, so it measures the host."""
 IMAGES = ((1920, 1280), (960, 640))
@@ -78,11 +81,13 @@ def run_gpu(
     file: RecordFile,
     say: Callable[[str], None] = print,
     streets: Sequence[BenchScene] = (),
+    tunings: Mapping[str, Tuning] = DEFAULT,
 ) -> bool:
     """Measures every size, and trained streets after the first; returns False if a renderer failed or gsplat
     disagrees.
 
-    A failure does not stop the other measurements. gsplat runs in both of its modes at the first size, then in the
+    ``tunings``, by their names in the table, are compared at every size. A failure does not stop the other
+    measurements. gsplat runs in both of its modes at the first size, then in the
     faster one. Each record is on disk as soon as it is measured.
     """
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
@@ -94,7 +99,7 @@ def run_gpu(
     records: list[GpuRecord] = []
     peer, modes = (None, ()) if isinstance(found, str) else (found, gsplat_peer.MODES)
     for workload in _workloads(sizes, streets, device):
-        for record in _measure_all(workload, name, backend, peer, modes, budget):
+        for record in _measure_all(workload, name, backend, tunings, peer, modes, budget):
             file.write("gpu", record)
             say(line(record))
             records.append(record)
@@ -118,19 +123,22 @@ def _measure_all(
     workload: Workload,
     name: str,
     backend: str,
+    tunings: Mapping[str, Tuning],
     peer: ModuleType | None,
     modes: Sequence[str],
     budget: TimingBudget,
 ) -> Iterator[GpuRecord]:
     rows, camera = workload.rows, workload.camera
     blank = GpuRecord("", name, workload.scene, len(rows), camera.width, camera.height)
-    record = replace(blank, renderer=f"sparsestreet {backend}")
-    record = _counted(measure(record, _ours(workload, backend), workload, budget), workload, backend)
-    record = stepped(record, our_render(camera, backend), workload, budget)
     is_compared = len(rows) <= TRUTH_ROWS
-    if is_compared and find_library() is not None:
-        record = compared(record, partial(_against_truth, workload, backend))
-    yield record
+    for words, choices in tunings.items():
+        record = replace(blank, renderer=" ".join(["sparsestreet", backend, *words.split()]), tuning=vars(choices))
+        with tuned(choices):
+            record = _counted(measure(record, _ours(workload, backend), workload, budget), workload, backend)
+            record = stepped(record, our_render(camera, backend), workload, budget)
+            if is_compared and find_library() is not None:
+                record = compared(record, partial(_against_truth, workload, backend))
+        yield record
     if peer is None:
         return
     for mode in modes:

@@ -17,6 +17,8 @@ class GpuRecord:
     rows: int
     width: int
     height: int
+    tuning: dict[str, int | bool] | None = None
+    """The choices of our kernels; None for gsplat."""
     pairs: int | None = None
     """(splat, tile) pairs."""
     samples: int | None = None

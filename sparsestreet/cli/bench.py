@@ -40,6 +40,7 @@ examples:
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
   sparsestreet bench gpu --street RUN --refine 3   and a trained street, each splat as 3 x 3, the image 3 times as wide
+  sparsestreet bench gpu --tuning most_parts=1 --tuning two_launches=false   and other choices of the kernels
 
 Records go to OUT/MODE.jsonl, one JSON object a line; figures beside them as SVG and PNG.
 """
@@ -65,6 +66,8 @@ def bench(arguments: list[str]) -> int:
         parser.error(f"{options.mode} takes no options of train, got {' '.join(options.overrides)}")
     if options.refine is not None and (options.mode != "gpu" or options.street is None or options.refine < 1):
         parser.error("--refine N, at least 1, makes the street of gpu --street RUN finer")
+    if options.tuning and options.mode != "gpu":
+        parser.error("--tuning compares choices of the kernels of gpu")
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     options.command = shlex.join(["sparsestreet", "bench", *arguments])
@@ -87,6 +90,10 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument(
         "--refine", type=int, metavar="N", help="gpu: N x N smaller splats for each of the street's, N times the image"
     )
+    parser.add_argument(
+        "--tuning", action="append", default=[], metavar="NAME=VALUE,...",
+        help="gpu: other choices of the kernels beside today's (ops/triton/tuning.py); once for each",
+    )  # fmt: skip
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
     return parser
@@ -220,16 +227,21 @@ def _scaling(options: argparse.Namespace) -> bool:
 def _gpu(options: argparse.Namespace) -> bool:
     from sparsestreet.bench import gpu
     from sparsestreet.bench.timing import TimingBudget
+    from sparsestreet.bench.tunings import tuning_of
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu" and not options.quick:
         raise SystemExit("sparsestreet bench gpu: no CUDA device is available; --quick runs it on the CPU, tiny")
+    try:
+        tunings = gpu.DEFAULT | {words: tuning_of(words) for words in options.tuning}
+    except ValueError as error:
+        raise SystemExit(f"sparsestreet bench gpu: {error}") from error
     streets = [] if options.street is None else front_streets(options.street, options.refine or 1)
     if options.quick:
         once = TimingBudget(repeats=2, least=1)
-        return gpu.run_gpu([Size(64, 48, 500)], device, once, _file(options), streets=streets)
+        return gpu.run_gpu([Size(64, 48, 500)], device, once, _file(options), streets=streets, tunings=tunings)
     sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
-    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), streets=streets)
+    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), streets=streets, tunings=tunings)
 
 
 def front_streets(run: Path, refine: int) -> list[BenchScene]:

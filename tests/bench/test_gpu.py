@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from sparsestreet.bench.scenes import BenchScene, Size
 from sparsestreet.bench.tile_loads import TileLoads
 from sparsestreet.bench.timing import TimeSpread, TimingBudget, leaves
 from sparsestreet.ops import splat
+from sparsestreet.ops.triton.tuning import Tuning, tuning
 from sparsestreet.phases import WallClock
 from sparsestreet.types import Camera, Gaussians
 from tests.bench.test_records import PROVENANCE
@@ -399,6 +401,29 @@ def test_every_number_of_a_record_is_in_its_line():
     without = dataclasses.replace(whole, samples=None)
     assert gpu_record.line(without) == gpu_record.line(whole).replace(", 70 M samples", "")
     assert " M " not in gpu_record.line(dataclasses.replace(without, pairs=None))
+
+
+def test_every_choice_of_the_kernels_is_measured_as_it_says(tmp_path, monkeypatch):
+    """Forward, backward, step and counts see it; gsplat is measured once."""
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: fake_gsplat())
+    held = []
+    counted = gpu.work_of
+
+    def counts(*given: Any) -> tuple[int | None, int | None]:
+        held.append(tuning())
+        return counted(*given)
+
+    monkeypatch.setattr(gpu, "work_of", counts)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    other = Tuning(most_parts=1)
+    tunings = {"": Tuning(), "most_parts=1": other}
+    assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append, tunings=tunings)
+    ours, changed, *theirs = read_records(file.path)
+    assert (ours["renderer"], changed["renderer"]) == ("sparsestreet cpu", "sparsestreet cpu most_parts=1")
+    assert (ours["tuning"], changed["tuning"]) == (vars(Tuning()), vars(other))
+    assert [record["tuning"] for record in theirs] == [None, None]
+    assert held == [Tuning(), other]
+    assert tuning() == Tuning()
 
 
 def test_a_record_is_of_its_workload(tmp_path, monkeypatch):

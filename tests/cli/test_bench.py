@@ -13,6 +13,7 @@ from sparsestreet.cli import bench as cli_bench
 from sparsestreet.cli import step as cli_step
 from sparsestreet.cli.bench import bench, trained_street
 from sparsestreet.ops import splat
+from sparsestreet.ops.triton.tuning import Tuning
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import read_views, write_views
@@ -91,7 +92,7 @@ def test_gpu_without_a_device_is_an_error_and_quick_is_not(tmp_path, capsys, mon
         bench(["gpu", "--out", str(tmp_path)])
     assert bench(["gpu", "--quick", "--out", str(tmp_path)]) == 0
     assert "no GPU timings" in capsys.readouterr().out
-    monkeypatch.setattr(gpu, "run_gpu", lambda *arguments, streets: False)
+    monkeypatch.setattr(gpu, "run_gpu", lambda *arguments, **named: False)
     assert bench(["gpu", "--quick", "--out", str(tmp_path)]) == 1
 
 
@@ -176,7 +177,7 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
     file, *folder = args[len(expected) :]
     assert file.path == tmp_path / "o" / f"{mode}.jsonl"
     assert folder == ([tmp_path / "o"] if mode in ("scaling", "step") else [])
-    assert named == ({"streets": []} if words[0] == "gpu" else {})
+    assert named == ({"streets": [], "tunings": gpu.DEFAULT} if words[0] == "gpu" else {})
     if mode == "knobs":
         assert handed["drawn"] == ([], tmp_path / "o")
         assert handed.get("street") == (Path("RUN") if "--street" in words else None)
@@ -190,7 +191,26 @@ def test_a_street_is_beside_the_sizes_of_a_gpu(handed, monkeypatch, tmp_path):
     monkeypatch.setattr(cli_bench, "front_streets", lambda run, refine: [(run, refine)])
     for words, refine in (([], 1), (["--quick", "--refine", "3"], 3)):
         assert bench(["gpu", "--street", "RUN", *words, "--out", str(tmp_path)]) == 0
-        assert handed["run_gpu"][1] == {"streets": [(Path("RUN"), refine)]}
+        assert handed["run_gpu"][1]["streets"] == [(Path("RUN"), refine)]
+
+
+def test_other_choices_of_the_kernels_are_beside_todays(handed, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    words = ["--tuning", "most_parts=1,two_launches=false", "--tuning", "shortest_part=64"]
+    assert bench(["gpu", *words, "--out", str(tmp_path)]) == 0
+    today, whole, short = handed["run_gpu"][1]["tunings"].items()
+    assert today == ("", Tuning())
+    assert whole == (words[1], Tuning(most_parts=1, two_launches=False))
+    assert short == (words[3], Tuning(shortest_part=64))
+    with pytest.raises(SystemExit, match="bench gpu: no choice 'most_part' of the kernels: name one of most_parts, "):
+        bench(["gpu", "--tuning", "most_part=1"])
+    for wrong, said in (("most_parts=many", "most_parts is a number, got 'many'"), ("most_parts=0", "at least 1 part"),
+                        ("two_launches=1", "two_launches is true or false, got '1'")):  # fmt: skip
+        with pytest.raises(SystemExit, match=said):
+            bench(["gpu", "--tuning", wrong])
+    with pytest.raises(SystemExit) as ended:
+        bench(["knobs", "--tuning", "most_parts=1"])
+    assert ended.value.code == 2
 
 
 @pytest.mark.parametrize("words", [["gpu"], ["knobs", "--street", "RUN"], ["gpu", "--street", "RUN", "--refine", "0"]])
