@@ -54,7 +54,7 @@ class GpuRecord:
 
 def line(record: GpuRecord) -> str:
     """One row of the table: medians and inter-quartile ranges."""
-    start = f"{record.renderer:<24}{record.scene:<16}{record.rows:>9} {record.width}x{record.height:<6}"
+    start = f"{record.renderer:<23} {record.scene:<16}{record.rows:>9} {record.width}x{record.height:<6}"
     if record.forward is None or record.backward is None:
         return f"{start} FAILED: {record.failed}"
     inference = _short(record.inference) if record.inference else "-"
