@@ -197,7 +197,9 @@ def test_a_gpu_that_is_not_there(monkeypatch):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "trainer=gpu needs a CUDA device" in there(config_problem(composed(["trainer=gpu"])))
+    assert "trainer=gpu needs a CUDA device and torch sees none: sparsestreet check says why" in there(
+        config_problem(composed(["trainer=gpu"]))
+    )
 
 
 def folder_of_the_log(run: Path, started: Path, *overrides: str) -> Path:
