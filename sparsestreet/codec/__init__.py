@@ -1,0 +1,1 @@
+"""Arrays as few bytes: quantizers, entropy coding, and a container that says when a file is damaged."""

@@ -1,0 +1,123 @@
+"""A trained scene, what a file says of it, and how it is made from that again."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sparsestreet.scene.effects.effect import Effect, EffectSettings
+from sparsestreet.scene.encoding import decode_as, encode
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.masks import BakedMaskSettings
+from sparsestreet.scene.nodes.node import Node, NodeSettings
+from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
+from sparsestreet.types import View
+
+VERSION = 3
+"""Raised when an older program could not read the description, or this one no older description."""
+
+ROWS = "rows."
+"""Begins the names of a node's tensors that are columns."""
+
+
+@dataclass(frozen=True)
+class StoredScene:
+    """A trained scene, and how it is rendered."""
+
+    scene: SceneGraph
+    options: RenderOptions
+    name: str
+    """Of the log that it was trained on."""
+    num_frames: int
+    """Of that log: time 0 is its first frame, 1 its last."""
+
+    @torch.no_grad()
+    def render(self, view: View) -> SceneRendering:
+        """The image of any view, without gradients."""
+        return render(self.scene, view, options=self.options)
+
+
+def description(stored: StoredScene) -> dict[str, Any]:
+    """What the tensors of a scene mean, for JSON. Raises TypeError for settings that are no plain values."""
+    scene = stored.scene
+    return {
+        "version": VERSION,
+        "name": stored.name,
+        "num_frames": stored.num_frames,
+        "options": encode(stored.options),
+        "nodes": {
+            name: {
+                "settings": encode(node.settings),
+                "header": node.header(),
+                "columns": sorted(node.rows.columns()),
+                "mask": None if node.mask is None else encode(node.mask.settings),
+            }
+            for name, node in scene.nodes.items()
+        },
+        "effects": {
+            name: {"settings": encode(effect.settings), "header": effect.header()}
+            for name, effect in scene.effects.items()
+        },
+    }
+
+
+def scene_of(header: Mapping[str, Any], tensors: dict[str, Tensor]) -> StoredScene:
+    """The scene that was described, from all its tensors by name. Raises ValueError for another version, and what not
+    else for a description that does not say what the tensors are.
+    """
+    if header["version"] > VERSION:
+        raise ValueError(f"the file has version {header['version']}, this program reads {VERSION}: update it")
+    if header["version"] < VERSION:
+        raise ValueError(
+            f"the file has version {header['version']}, this program reads {VERSION}: train the scene again, or open "
+            "it with the version that wrote it"
+        )
+    nodes = {name: _restored(entry, _below(f"nodes.{name}.", tensors)) for name, entry in header["nodes"].items()}
+    effects = {
+        name: _restored_effect(entry, _below(f"effects.{name}.", tensors)) for name, entry in header["effects"].items()
+    }
+    scene = SceneGraph(nodes, effects)
+    scene.load_state_dict(tensors)
+    options = decode_as(RenderOptions, header["options"])
+    return StoredScene(scene.eval(), options, header["name"], header["num_frames"])
+
+
+def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
+    columns = {name: tensors[ROWS + name] for name in entry["columns"]}
+    rows = Rows(
+        {name: column for name, column in columns.items() if column.is_floating_point()},
+        {name: column for name, column in columns.items() if not column.is_floating_point()},
+    )
+    node = decode_as(NodeSettings, entry["settings"]).restore(rows, tensors, entry["header"])
+    if entry["mask"] is not None:
+        node.mask = decode_as(BakedMaskSettings, entry["mask"]).restored(tensors["mask.times"])
+    return node
+
+
+def _restored_effect(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Effect:
+    settings = decode_as(EffectSettings, entry["settings"])
+    found = settings.left_out() if settings.when == "off" else settings.restore(tensors, entry["header"])
+    if found is None:
+        raise ValueError(f"{type(settings).__name__} leaves nothing in its place where it is off: write the file again")
+    return found
+
+
+def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+@torch.no_grad()
+def without_masks(scene: SceneGraph) -> SceneGraph:
+    """A copy in which the masks have done their work; the scene itself where it has none."""
+    if not any(node.mask is not None and node.mask.columns for node in scene.nodes.values()):
+        return scene
+    scene = copy.deepcopy(scene)
+    for node in scene.nodes.values():
+        if node.mask is not None and node.mask.columns:
+            node.rows.resize(node.mask.keep(node.rows).plan())
+            node.finish_mask()
+    return scene
