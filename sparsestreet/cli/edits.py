@@ -4,11 +4,11 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from sparsestreet.cli.scene import folder_of
+from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
 from sparsestreet.scene.edits.file import Open
 from sparsestreet.scene.storage import StoredScene, load_scene
-from sparsestreet.scene.views import DEFAULT_FRAME_RATE, FILE_NAME, RecordedViews, read_views, seconds_of
+from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of
 
 
 def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> StoredScene:
@@ -31,7 +31,7 @@ def opener(stored: StoredScene) -> Open:
 
     @cache
     def open_scene(path: Path) -> tuple[StoredScene, float]:
-        return load_scene(path, stored.scene.device), log_seconds(read_views(folder_of(path) / FILE_NAME))
+        return load_scene(path, stored.scene.device), log_seconds(views_of(path))
 
     return open_scene
 

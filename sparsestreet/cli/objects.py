@@ -44,13 +44,12 @@ def objects(arguments: list[str]) -> int:
 
 def _objects(request: ObjectsRequest) -> None:
     from sparsestreet.cli.edits import log_seconds
-    from sparsestreet.cli.scene import folder_of, open_scene
+    from sparsestreet.cli.scene import folder_of, open_scene, recorded_views
     from sparsestreet.export.objects import scene_objects
-    from sparsestreet.scene.views import FILE_NAME, read_views
 
     stored = open_scene(request.scene, request.device)
     folder = folder_of(request.scene)
-    views = read_views(folder / FILE_NAME)
+    views = recorded_views(request.scene)
     found = scene_objects(stored, views.all)
     if not found:
         print("the scene has no objects of their own: 3dgs, deformgs and pvg have none, streetgs and omnire do")

@@ -29,7 +29,7 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN labels layers=[rgb,depth,instances]     a folder of PNGs for each layer
   sparsestreet render outputs/RUN lidar.mp4 layers=[rgb,lidar] cameras=0  the log's lidar on the picture
 
-  scene     a run's folder, or a scene.safetensors; the first word without a key
+  scene     a run's folder, a scene.safetensors, or a .street; the first word without a key
   out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
   edits     edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   device    cpu or cuda (default: a GPU if there is one)
@@ -39,7 +39,7 @@ the way:
             poses, keyframes of a smooth path, or nerfstudio's camera_path.json
   offset    meters to the right that path=shifted or lane_change moves the car; negative: to the left
   frames    40:60: only these frames of the log, the last one left out
-  views     the views.json that holds the cameras (default: the one beside the scene)
+  views     the views.json that holds the cameras (default: the one beside the scene, or in it)
 
 the cameras:
   cameras   [1,0,2]: these of the log, shown in this order (default: all, the leftmost first)
@@ -119,14 +119,14 @@ def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.edits import with_edits
     from sparsestreet.cli.returns import returns_of
-    from sparsestreet.cli.scene import folder_of, open_scene
+    from sparsestreet.cli.scene import folder_of, open_scene, recorded_views
     from sparsestreet.export.video import check_destination
-    from sparsestreet.scene.views import DEFAULT_FRAME_RATE, FILE_NAME, read_views
+    from sparsestreet.scene.views import DEFAULT_FRAME_RATE
 
     started = time.perf_counter()
     check_destination(request.out)
     stored = open_scene(request.scene, request.device)
-    views = read_views(request.views or folder_of(request.scene) / FILE_NAME)
+    views = recorded_views(request.scene, request.views)
     stored = with_edits(stored, views, request.edits)
     log_fps = request.log_fps or views.frame_rate
     if log_fps is None:

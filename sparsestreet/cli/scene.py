@@ -10,7 +10,9 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.device import device_of
+from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.storage import StoredScene, load_scene
+from sparsestreet.scene.views import RecordedViews, read_views
 
 
 def open_scene(path: Path, device: str | None = None) -> StoredScene:
@@ -27,6 +29,11 @@ def open_scene(path: Path, device: str | None = None) -> StoredScene:
 def folder_of(scene: Path) -> Path:
     """The folder of a run that was given as it is, or by its scene file."""
     return scene if scene.is_dir() else scene.parent
+
+
+def recorded_views(scene: Path, file: Path | None = None) -> RecordedViews:
+    """The views of a file, or those of the scene. Raises FileNotFoundError or ValueError for none or damaged ones."""
+    return views_of(scene) if file is None else read_views(file)
 
 
 def import_parts(run: Path) -> None:

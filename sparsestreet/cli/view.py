@@ -12,11 +12,11 @@ sparsestreet view RUN [key=value ...]     a trained street in the browser: fly, 
   sparsestreet view outputs/RUN edits=edits.yaml        go on editing
   sparsestreet view outputs/RUN fps=25                  smoother and coarser while the camera moves
 
-  scene     a run's folder, or a scene.safetensors; the first word without a key
+  scene     a run's folder, a scene.safetensors, or a .street; the first word without a key
   edits     edits.yaml to start from (docs/editing.md)
   save      where "Save edits" writes (default: the file of edits=, else edits.yaml beside the scene)
   fps       pictures a second that it aims at while something moves (default: 15); at rest they have full size
-  views     the views.json that holds the cameras (default: the one beside the scene)
+  views     the views.json that holds the cameras (default: the one beside the scene, or in it)
   device    cpu or cuda (default: a GPU if there is one)
   host      whom it answers (default: 127.0.0.1, this machine alone); anybody who reaches it can use it
   port      default: 8080, or the next that is free
@@ -51,16 +51,15 @@ def view(arguments: list[str]) -> int:
 def _view(request: ViewRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.edits import log_seconds, opener
-    from sparsestreet.cli.scene import folder_of, open_scene
+    from sparsestreet.cli.scene import folder_of, open_scene, recorded_views
     from sparsestreet.scene.edits.file import beside, read_values
-    from sparsestreet.scene.views import FILE_NAME, read_views
     from sparsestreet.viewing.edit_state import EditState
     from sparsestreet.viewing.server import Viewer
     from sparsestreet.viewing.stage import Stage
 
     stored = open_scene(request.scene, request.device)
     folder = folder_of(request.scene)
-    views = read_views(request.views or folder / FILE_NAME)
+    views = recorded_views(request.scene, request.views)
     file, open_other = request.edits or folder / "edits.yaml", opener(stored)
     said = {} if request.edits is None else read_values(request.edits)
     edits = EditState(stored.scene, said, log_seconds(views), lambda path: open_other(beside(file, path)))

@@ -60,7 +60,12 @@ def read_json(path: Path, kind: type[Record]) -> Record:
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, UnicodeDecodeError) as error:
         raise RecordError(f"{path}: cannot be read ({error}); write the record again") from error
-    return _decoded(kind, parsed(text, str(path)), str(path))
+    return decoded_json(text, kind, str(path))
+
+
+def decoded_json(text: str, kind: type[Record], where: str) -> Record:
+    """Does the same with a JSON text. Raises RecordError naming ``where`` and the entry."""
+    return _decoded(kind, parsed(text, where), where)
 
 
 def parsed(text: str, where: str) -> Json:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.trajectories import frame_periods
-from sparsestreet.records.strict_json import EXACT, json_line, read_json, version, write_atomically
+from sparsestreet.records.strict_json import EXACT, decoded_json, json_line, version, write_atomically
 from sparsestreet.types import Camera, Shutter, Side, View
 
 FORMAT = 2
@@ -119,12 +119,17 @@ def read_views(path: Path | str) -> RecordedViews:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no {path}: training writes a {FILE_NAME} into the folder of its run")
-    file = read_json(path, _File)
+    return parsed_views(path.read_text(encoding="utf-8"), str(path))
+
+
+def parsed_views(text: str, where: str) -> RecordedViews:
+    """Does the same with the text of such a file. Raises ValueError naming ``where`` and the entry."""
+    file = decoded_json(text, _File, where)
     views: dict[str, list[View]] = {"training": [], "held_out": []}
     for index, entry in enumerate(file.views):
         if entry.split not in views:
-            raise ValueError(f"{path}: view {index} has split {entry.split!r}, which is none of {', '.join(views)}")
-        views[entry.split].append(_view(entry, f"{path}: view {index}"))
+            raise ValueError(f"{where}: view {index} has split {entry.split!r}, which is none of {', '.join(views)}")
+        views[entry.split].append(_view(entry, f"{where}: view {index}"))
     return RecordedViews(tuple(views["training"]), tuple(views["held_out"]), file.frame_rate)
 
 

@@ -6,15 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sparsestreet.records.rig import RIG
 from sparsestreet.records.run import RUN
+from sparsestreet.scene.beside import rig_record, views_of
 from sparsestreet.scene.effects.lens import Pinhole
 from sparsestreet.scene.effects.shutter import GlobalShutter
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.storage import FILE_NAME as SCENE_FILE
-from sparsestreet.scene.storage import StoredScene
+from sparsestreet.scene.storage import SMALL_FILE_NAME, StoredScene, scene_path
 from sparsestreet.scene.views import FILE_NAME as VIEWS_FILE
-from sparsestreet.scene.views import read_views
 from sparsestreet.serving.rig import Rig, rig_of
 
 Open = Callable[[Path], StoredScene]
@@ -56,8 +55,8 @@ def open_run(run: Path, name: str, open_scene: Open, options: RigOptions) -> Ser
 def run_rig(run: Path, options: RigOptions) -> Rig:
     """The vehicle of a run, from what training left in its folder."""
     return rig_of(
-        read_views(run / VIEWS_FILE),
-        RIG.find(run),
+        views_of(run),
+        rig_record(run),
         mount=options.mount,
         names=options.names,
         frame_rate=options.frame_rate,
@@ -71,15 +70,24 @@ def named_runs(runs: Sequence[Path]) -> dict[str, Path]:
     """
     logs = []
     for run in runs:
-        for file in (SCENE_FILE, VIEWS_FILE):
-            if not (run / file).is_file():
-                raise FileNotFoundError(f"there is no {run / file}: give the folder of a finished run")
+        if not run.is_file() and not ((run / SCENE_FILE).is_file() and (run / VIEWS_FILE).is_file()):
+            _check_small(run)
         description = RUN.find(run)
-        logs.append(run.resolve().name if description is None else description.scene)
-    names = [log if logs.count(log) == 1 else run.resolve().name for log, run in zip(logs, runs, strict=True)]
+        logs.append(_called(run) if description is None else description.scene)
+    names = [log if logs.count(log) == 1 else _called(run) for log, run in zip(logs, runs, strict=True)]
     if len(set(names)) < len(names):
         raise ValueError(f"each scene needs a name of its own, got {', '.join(names)}: rename a folder")
     return dict(zip(names, runs, strict=True))
+
+
+def _check_small(run: Path) -> None:
+    if (run / SCENE_FILE).is_file() or not (run / SMALL_FILE_NAME).is_file():
+        missing = run / (VIEWS_FILE if (run / SCENE_FILE).is_file() else SCENE_FILE)
+        raise FileNotFoundError(f"there is no {missing}: give the folder of a finished run, or a .street")
+
+
+def _called(run: Path) -> str:
+    return run.stem if run.is_file() else run.resolve().name
 
 
 class Scenes:
@@ -97,7 +105,7 @@ class Scenes:
         """
         self.runs, self.memory = runs, memory
         self._open_scene, self._options = open_scene, options or RigOptions()
-        self._sizes = {name: (run / SCENE_FILE).stat().st_size for name, run in runs.items()}
+        self._sizes = {name: scene_path(run).stat().st_size for name, run in runs.items()}
         self._opened: OrderedDict[str, ServedScene] = OrderedDict()
         self._rigs: dict[str, Rig] = {}
         self._reading, self._changing = threading.Lock(), threading.Lock()

@@ -65,6 +65,9 @@ class SkySettings(EffectSettings):
         return Sky(self)
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Sky":
+        found, wanted = tuple(tensors["texels"].shape), (6, self.resolution, self.resolution, 3)
+        if found != wanted:  # before a damaged resolution allocates what no machine has
+            raise ValueError(f"the sky has texels of shape {found}, its settings say {wanted}: write the file again")
         return Sky(self)
 
 
