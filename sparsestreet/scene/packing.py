@@ -62,7 +62,7 @@ def packed_blocks(node: Node, form: Form) -> Iterator[list[bytes]]:
 def columns_of(blocks: Sequence[Block], form: Form) -> dict[str, Tensor]:
     """Returns the columns of a node's rows, float32 as they are learned."""
     harmonics = _joined([block.harmonics for block in blocks], len(form.axes))
-    colors = harmonics.reshape(len(harmonics), -1, 3)
+    colors = harmonics.reshape(len(harmonics), len(form.axes) // 3, 3)
     columns = {
         "means": _joined([block.means for block in blocks], 3),
         "log_scales": _joined([block.log_scales for block in blocks], 3),
@@ -144,6 +144,6 @@ def _step(node: Node, name: str) -> float | None:
     return Steps.log_scale if name == "log_life_spans" else None
 
 
-def _joined(parts: Sequence[Float64[np.ndarray, "n ..."]], *shape: int) -> Tensor:
+def _joined(parts: Sequence[Float64[np.ndarray, "..."]], *shape: int) -> Tensor:
     whole = np.concatenate(parts) if parts else np.zeros((0, *shape))
     return torch.from_numpy(whole).float()
