@@ -19,18 +19,23 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
   sparsestreet export outputs/RUN car.ply time=0.5 instance=12   one object, where it is at that time
   sparsestreet export outputs/RUN street.html                    one page that plays the drive, in any browser, offline
   sparsestreet export outputs/RUN empty.html edits=edits.yaml    without or with other objects
+  sparsestreet export outputs/RUN street.street                  all of it, small; every command opens it like a run
+  sparsestreet export outputs/RUN street.spz time=0.5            one frame for viewers (also .compressed.ply)
+  sparsestreet export outputs/RUN street.spz check=true          what the file keeps and loses, measured
   sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
 
-  scene      a run's folder, or a scene.safetensors; the first word without a key
-  out        (the second) a .ply in the layout of 3DGS (binary; opens in SuperSplat and others), or an .html
-             (docs/viewing.md says what it shows)
+  scene      a run's folder, a scene.safetensors, or a .street; the first word without a key
+  out        (the second) the ending says what: a .street, the whole scene; .ply in the layout of 3DGS, .spz or
+             .compressed.ply, one frame; an .html (docs/viewing.md). docs/shipping.md says what each keeps
   edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
-  views      the views.json that holds the cameras (default: the one beside the scene); for .html and edits
+  views      the views.json that holds the cameras (default: the one beside the scene, or in it)
 
-of a .ply:
+of a .ply, .spz or .compressed.ply:
   time       0 to 1: first to last frame of the log (default: 0)
   nodes      [background,rigid]: only these nodes of the scene
   instance   only this object, by the name of its track; a name that does not exist lists those that do
+  sky        true: the sky as 12,000 discs far away; .spz and .compressed.ply alone (default: true)
+  check      true: read the file again, by splat-transform where it is installed, and say what it lost
 
 of an .html:
   shapes     shapes a second of what changes its shape, such as people (default: 4); more are smoother and larger
@@ -43,8 +48,16 @@ of a .usdz:
 
 DEFAULT_SHAPES = 4.0
 
-_OWN = {".ply": ("time", "nodes", "instance"), ".html": ("shapes",), ".usdz": ("car", "mount", "names")}
-"""Ending of a file -> the options that it alone has."""
+_FRAME = ("time", "nodes", "instance")
+_OWN = {
+    ".street": (),
+    ".ply": _FRAME,
+    ".compressed.ply": (*_FRAME, "sky", "check"),
+    ".spz": (*_FRAME, "sky", "check"),
+    ".html": ("shapes",),
+    ".usdz": ("car", "mount", "names"),
+}
+"""Ending of a file -> the options that not every file has."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +75,24 @@ class ExportRequest:
     car: tuple[float, ...] | None = None
     mount: tuple[float, ...] | None = None
     names: tuple[str, ...] | None = None
+    sky: bool | None = None
+    check: bool | None = None
+
+    @property
+    def kind(self) -> str:
+        """The file's ending."""
+        return ".compressed.ply" if self.out.name.endswith(".compressed.ply") else self.out.suffix
 
     def __post_init__(self) -> None:
         if self.nodes is not None and self.instance is not None:
             raise ValueError("nodes and instance exclude each other: leave one out")
-        if self.out.suffix not in _OWN:
+        if self.kind not in _OWN:
             raise ValueError(f"the file must end in {', '.join(_OWN)}, got {self.out.name!r}")
-        for name in (name for suffix, names in _OWN.items() if suffix != self.out.suffix for name in names):
+        others = {name for names in _OWN.values() for name in names} - set(_OWN[self.kind])
+        others |= {"edits"} if self.kind in (".usdz", ".street") else set()
+        for name in sorted(others):
             if getattr(self, name) is not None:
-                raise ValueError(f"{name} is no option of a {self.out.suffix}: leave it out")
-        if self.out.suffix == ".usdz" and self.edits is not None:
-            raise ValueError("edits is no option of a .usdz: leave it out")
+                raise ValueError(f"{name} is no option of a {self.kind}: leave it out")
         if self.shapes is not None and self.shapes <= 0:
             raise ValueError(f"shapes must be above 0 a second, got {self.shapes:g}")
 
@@ -90,16 +110,30 @@ def _export(request: ExportRequest) -> None:
         export_artifact(request.scene, request.out, request.car, request.mount, request.names)
         return
     from sparsestreet.cli.edits import with_edits
-    from sparsestreet.cli.scene import folder_of, open_scene
-    from sparsestreet.scene.views import FILE_NAME, read_views
+    from sparsestreet.cli.scene import open_scene, recorded_views
 
     stored = open_scene(request.scene, "cpu")
+    if request.kind == ".street":
+        return _export_street(request, stored)
     if request.out.suffix == ".html" or request.edits is not None:
-        views = read_views(request.views or folder_of(request.scene) / FILE_NAME)
+        views = recorded_views(request.scene, request.views)
         stored = with_edits(stored, views, request.edits)
         if request.out.suffix == ".html":
             return _export_page(request, stored, views)
-    _export_ply(request, stored)
+    if request.kind == ".ply":
+        return _export_ply(request, stored)
+    from sparsestreet.cli.shipping import export_frame
+
+    export_frame(request, stored)
+
+
+def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
+    from sparsestreet.scene.beside import files_beside
+    from sparsestreet.scene.street_file import save_street
+
+    save_street(request.out, stored, files_beside(request.scene, request.views))
+    count, size = sum(stored.scene.counts().values()), request.out.stat().st_size
+    print(f"{request.out}: {count:,} Gaussians, {size / 1e6:.2f} MB, {size / max(count, 1):.1f} bytes a Gaussian")
 
 
 def _export_ply(request: ExportRequest, stored: "StoredScene") -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from sparsestreet.records.rig import RIG, RigRecord
 from sparsestreet.records.strict_json import decoded_json
 from sparsestreet.scene.storage import scene_path
-from sparsestreet.scene.street_file import SUFFIX, attached_file
+from sparsestreet.scene.street_file import ATTACHED, SUFFIX, attached_file
 from sparsestreet.scene.views import FILE_NAME, RecordedViews, parsed_views, read_views
 
 
@@ -26,6 +26,22 @@ def rig_record(scene: Path) -> RigRecord | None:
     folder = scene if scene.is_dir() else scene.parent
     packed = _attached(scene, RIG.name)
     return RIG.find(folder) if packed is None else decoded_json(packed, RigRecord, f"{scene}: {RIG.name}")
+
+
+def files_beside(scene: Path, views: Path | None = None) -> dict[str, bytes]:
+    """The files that go into a .street of a scene; ``views``: another file of views.
+
+    Raises FileNotFoundError where that file is not there.
+    """
+    folder = scene if scene.is_dir() else scene.parent
+    found = {}
+    for name in ATTACHED:
+        packed = _attached(scene, name)
+        if packed is not None:
+            found[name] = packed.encode("utf-8")
+        elif (folder / name).is_file():
+            found[name] = (folder / name).read_bytes()
+    return found if views is None else found | {FILE_NAME: views.read_bytes()}
 
 
 def _attached(scene: Path, name: str) -> str | None:

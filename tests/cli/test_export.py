@@ -55,7 +55,7 @@ def test_edits_are_honored(run, tmp_path):
         ({"shapes": 4}, 2, "shapes is no option of a .ply: leave it out"),
         ({"out": "street.html", "shapes": 0}, 2, "shapes must be above 0 a second, got 0"),
         ({"out": "street.html"}, 1, "training writes a views.json"),
-        ({"out": "street.obj"}, 2, "must end in .ply, .html, .usdz, got 'street.obj'"),
+        ({"out": "street.obj"}, 2, "must end in .street, .ply, .compressed.ply, .spz, .html, .usdz, got 'street.obj'"),
         ({"out": "street.ply", "car": "[4,2,1]"}, 2, "car is no option of a .ply: leave it out"),
         ({"nodes": "rigid", "instance": "car"}, 2, "exclude each other"),
         ({"instance": "bus"}, 1, "no instance 'bus'; it has car, tram"),

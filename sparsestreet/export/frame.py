@@ -1,0 +1,103 @@
+"""Gaussians of one moment as viewers of single objects want them: upright, with the sky as a dome, none unseen.
+
+Files of 3DGS have x to the right, y down and z ahead, because the cameras that they were trained with do; viewers turn
+them over. A street has x ahead, y to the left and z up.
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.export.ply import scene_gaussians
+from sparsestreet.export.recording import Cloud
+from sparsestreet.export.sky_dome import sky_dome
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.ops.spherical_harmonics import basis
+from sparsestreet.scene.effects import Sky
+from sparsestreet.scene.storage import StoredScene
+from sparsestreet.types import Gaussians
+
+VIEWER_FROM_WORLD = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""x ahead, y left, z up to x right, y down, z ahead."""
+
+_UNSEEN = 1 / 255
+"""Opacity below which no viewer draws anything."""
+_NEAREST, _FARTHEST = 500.0, 2000.0
+"""Meters of the dome; within 2,048 a .spz keeps a fourth of a millimeter."""
+_FIRST = 0.5 / np.sqrt(np.pi)
+"""The first harmonic."""
+
+
+@torch.no_grad()
+def frame_gaussians(
+    stored: StoredScene,
+    time: float,
+    *,
+    nodes: Collection[str] | None = None,
+    instances: Collection[str] | None = None,
+    sky: bool = True,
+) -> Gaussians:
+    """Returns the scene at a time in [0, 1] in the axes of viewers, those that are never seen left out.
+
+    ``sky`` adds the dome where the whole scene is taken. Raises as ``scene_gaussians``, and ValueError where nothing is
+    left.
+    """
+    found = scene_gaussians(stored, time, nodes=nodes, instances=instances)
+    found = selected(found, found.opacities >= _UNSEEN)
+    if not len(found):
+        raise ValueError("no Gaussian has an opacity of 1 / 255 or more: choose more, or another time")
+    skies = [effect for effect in stored.scene.effects.values() if isinstance(effect, Sky)]
+    if sky and skies and nodes is None and instances is None:
+        reach = float(found.means.abs().max())
+        dome = sky_dome(skies[0], min(max(2 * reach, _NEAREST), _FARTHEST))
+        found = Gaussians.concatenate([found, _discs(dome, found.sh.shape[1])])
+    return turned(found, VIEWER_FROM_WORLD)
+
+
+def selected(gaussians: Gaussians, rows: Tensor) -> Gaussians:
+    """Returns some rows, on the host."""
+    names = ("means", "quaternions", "scales", "opacities", "sh")
+    return Gaussians(*(getattr(gaussians, name)[rows].detach().cpu() for name in names))
+
+
+def turned(gaussians: Gaussians, rotation: Float[Tensor, "3 3"]) -> Gaussians:
+    """Returns the Gaussians as they are seen from axes that are turned: new = rotation @ old, harmonics as well."""
+    turn = quat.from_matrix(rotation[None].double()).to(gaussians.quaternions)
+    terms = gaussians.sh.shape[1]
+    return replace(
+        gaussians,
+        means=gaussians.means @ rotation.T.to(gaussians.means),
+        quaternions=quat.multiply(turn.expand(len(gaussians), 4), quat.normalized(gaussians.quaternions)),
+        sh=torch.einsum("ij,njc->nic", turned_harmonics(rotation, terms).to(gaussians.sh), gaussians.sh),
+    )
+
+
+def turned_harmonics(rotation: Float[Tensor, "3 3"], terms: int) -> Float[Tensor, "k k"]:
+    """Returns the matrix that turns coefficients: colors along ``rotation @ d`` are those along d before.
+
+    Solved from the basis at many directions, which no convention of signs can get wrong.
+    """
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
+    before = basis(directions, terms)
+    after = basis(directions @ rotation.T.double(), terms)
+    return torch.linalg.lstsq(after, before).solution
+
+
+def _discs(cloud: Cloud, terms: int) -> Gaussians:
+    """Returns the discs of a dome, whose thin axis is the last one."""
+    variances, axes = torch.linalg.eigh(torch.from_numpy(cloud.covariances).double())
+    axes = torch.where(torch.linalg.det(axes)[:, None, None] < 0, -axes, axes)
+    colors = torch.zeros(len(cloud), terms, 3)
+    colors[:, 0] = (torch.from_numpy(cloud.colors) - 0.5) / _FIRST
+    return Gaussians(
+        torch.from_numpy(cloud.centers),
+        quat.from_matrix(axes).float(),
+        variances.clamp(min=0).sqrt().float(),
+        torch.from_numpy(cloud.opacities),
+        colors,
+    )

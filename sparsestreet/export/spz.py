@@ -1,0 +1,137 @@
+"""``.spz``, version 3: Niantic's format of one frame (github.com/nianticlabs/spz, README, "File Format"; MIT).
+
+A gzip stream: a header of 16 bytes, then attribute by attribute: positions as 24-bit fixed point, alphas, colors,
+scales, rotations as the smallest three parts, harmonics. Axes are right, up, back.
+"""
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from sparsestreet.atomic import atomic_file
+from sparsestreet.export.frame import turned
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.types import Gaussians
+
+MAGIC, VERSION = 0x5053474E, 3
+LARGEST_COUNT = 10_000_000
+"""Gaussians that other programs take."""
+
+_HEADER = struct.Struct("<IIIBBBB")
+_RIGHT_UP_BACK = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+"""From x right, y down, z ahead; its own inverse."""
+_FRACTION_BITS = 12
+_COLOR_SCALE = 0.15
+_ANTIALIASED = 1
+_HALF = np.sqrt(0.5)
+"""Largest value of the second largest part of a unit quaternion."""
+
+
+def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
+    """Writes Gaussians with x right, y down, z ahead; returns their number; the whole file or nothing.
+
+    Rounding: positions 2**-13 m within 2,048 m (twice that for each time it is twice as far), log scales 1 / 32 in
+    [-10, 5.9], opacities 1 / 510, parts of quaternions 0.0007, the first harmonic 1 / 77 in [-3.3, 3.3], the others
+    1 / 256 in [-1, 1). Raises ValueError for more than ``LARGEST_COUNT`` Gaussians or numbers that are not finite.
+    """
+    found = turned(gaussians, _RIGHT_UP_BACK)
+    if len(found) > LARGEST_COUNT:
+        raise ValueError(
+            f"a .spz holds at most {LARGEST_COUNT:,} Gaussians, got {len(found):,}: prune, or choose nodes"
+        )
+    means, sh = found.means.double().numpy(), found.sh.double().numpy()
+    if not (np.isfinite(means).all() and np.isfinite(sh).all()):
+        raise ValueError("all values of a .spz must be finite: the scene is damaged, train it again")
+    bits = _fraction_bits(float(np.abs(means).max(initial=0)))
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
+    logs = np.log(np.maximum(found.scales.double().numpy(), 1e-30))
+    columns = [
+        np.ascontiguousarray(np.rint(means * 2**bits).astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3],
+        _bytes(found.opacities.double().numpy() * 255),
+        _bytes(sh[:, 0] * _COLOR_SCALE * 255 + 127.5),
+        _bytes((logs + 10) * 16),
+        _smallest_three(quat.normalized(found.quaternions.double()).numpy()),
+        _bytes(sh[:, 1:] * 128 + 128),
+    ]
+    header = _HEADER.pack(MAGIC, VERSION, len(found), degree, bits, _ANTIALIASED if antialiased else 0, 0)
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(gzip.compress(header + b"".join(column.tobytes() for column in columns), 9, mtime=0))
+    return len(found)
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Returns the Gaussians of such a file, x right, y down, z ahead. Raises ValueError for one that is none."""
+    # Above what the largest file unpacks to, zlib stops.
+    with gzip.open(path) as stream:
+        try:
+            head = stream.read(_HEADER.size)
+            magic, version, count, degree, bits, _, _ = _HEADER.unpack(head)
+            terms = (degree + 1) ** 2
+            if magic != MAGIC or version != VERSION or degree > 3 or bits > 23 or count > LARGEST_COUNT:
+                raise ValueError(f"{path} is no .spz of version {VERSION} with at most {LARGEST_COUNT:,} Gaussians")
+            size = count * (20 + 3 * (terms - 1))
+            content = stream.read(size + 1)
+        except (OSError, EOFError, struct.error) as error:
+            raise ValueError(f"{path} is no .spz or is damaged ({error})") from error
+    if len(content) != size:
+        raise ValueError(f"{path} is damaged: {count} Gaussians take {size} bytes, got {len(content)}")
+    widths = (9, 1, 3, 3, 4, 3 * (terms - 1))
+    ends = count * np.cumsum(widths)
+    table = np.frombuffer(content, np.uint8)
+    parts = [part.reshape(count, width) for part, width in zip(np.split(table, ends[:-1]), widths, strict=True)]
+    whole = np.zeros((count, 3, 4), np.uint8)
+    whole[:, :, 1:] = parts[0].reshape(count, 3, 3)
+    sh = np.concatenate([(parts[2] / 255 - 0.5) / _COLOR_SCALE, (parts[5].astype(float) - 128) / 128], axis=1)
+    values = (
+        (whole.view("<i4")[:, :, 0] >> 8) / 2**bits,
+        _from_smallest_three(parts[4]),
+        np.exp(parts[3] / 16 - 10.0),
+        parts[1][:, 0] / 255,
+        sh.reshape(count, terms, 3),
+    )
+    return turned(Gaussians(*(torch.from_numpy(value).float() for value in values)), _RIGHT_UP_BACK)
+
+
+def _fraction_bits(reach: float) -> int:
+    """Returns how many bits stand behind the point: fewer where 24 bits do not reach as far."""
+    bits = _FRACTION_BITS
+    while bits and reach * 2**bits >= 2**23 - 1:
+        bits -= 1
+    if reach * 2**bits >= 2**23 - 1:
+        raise ValueError(f"a .spz reaches 8,388 km, a Gaussian is {reach:g} m away: choose nodes")
+    return bits
+
+
+def _bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _smallest_three(unit: Float[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
+    """Returns 32 bits a quaternion: two for the place of the largest part among x, y, z, w, and ten for each other."""
+    xyzw = unit[:, [1, 2, 3, 0]]
+    largest = np.abs(xyzw).argmax(1)
+    xyzw = np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -xyzw, xyzw)
+    packed = largest.astype(np.uint32)
+    for place in range(4):
+        part = xyzw[:, place]
+        sizes = np.minimum(np.rint(np.abs(part) / _HALF * 511), 511).astype(np.uint32)
+        bits = (packed << np.uint32(10)) | ((part < 0).astype(np.uint32) << np.uint32(9)) | sizes
+        packed = np.where(largest == place, packed, bits)
+    return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def _from_smallest_three(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    packed = np.ascontiguousarray(stored).view("<u4")[:, 0]
+    largest, xyzw = packed >> np.uint32(30), np.zeros((len(packed), 4))
+    rest = packed.copy()
+    for place in range(3, -1, -1):
+        values = (rest & np.uint32(511)) * (_HALF / 511) * np.where(rest & np.uint32(512), -1.0, 1.0)
+        xyzw[:, place] = np.where(largest == place, 0, values)
+        rest = np.where(largest == place, rest, rest >> np.uint32(10))
+    others = np.sqrt(np.maximum(1 - (xyzw**2).sum(1), 0))
+    np.put_along_axis(xyzw, largest[:, None].astype(np.int64), others[:, None], 1)
+    return xyzw[:, [3, 0, 1, 2]]
