@@ -22,11 +22,13 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
   sparsestreet export outputs/RUN street.street                  all of it, small; every command opens it like a run
   sparsestreet export outputs/RUN street.spz time=0.5            one frame for viewers (also .compressed.ply)
   sparsestreet export outputs/RUN street.spz check=true          what the file keeps and loses, measured
+  sparsestreet export outputs/RUN objects/                       each object in a file, and poses.json, for engines
   sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
 
   scene      a run's folder, a scene.safetensors, or a .street; the first word without a key
   out        (the second) the ending says what: a .street, the whole scene; .ply in the layout of 3DGS, .spz or
-             .compressed.ply, one frame; an .html (docs/viewing.md). docs/shipping.md says what each keeps
+             .compressed.ply, one frame; an .html (docs/viewing.md); no ending, a folder of objects.
+             docs/shipping.md says what each keeps
   edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   views      the views.json that holds the cameras (default: the one beside the scene, or in it)
 
@@ -55,6 +57,7 @@ _OWN = {
     ".compressed.ply": (*_FRAME, "sky", "check"),
     ".spz": (*_FRAME, "sky", "check"),
     ".html": ("shapes",),
+    "": (),
     ".usdz": ("car", "mount", "names"),
 }
 """Ending of a file -> the options that not every file has."""
@@ -87,12 +90,12 @@ class ExportRequest:
         if self.nodes is not None and self.instance is not None:
             raise ValueError("nodes and instance exclude each other: leave one out")
         if self.kind not in _OWN:
-            raise ValueError(f"the file must end in {', '.join(_OWN)}, got {self.out.name!r}")
+            raise ValueError(f"the file must end in {', '.join(filter(None, _OWN))}, got {self.out.name!r}")
         others = {name for names in _OWN.values() for name in names} - set(_OWN[self.kind])
         others |= {"edits"} if self.kind in (".usdz", ".street") else set()
         for name in sorted(others):
             if getattr(self, name) is not None:
-                raise ValueError(f"{name} is no option of a {self.kind}: leave it out")
+                raise ValueError(f"{name} is no option of a {self.kind or 'folder'}: leave it out")
         if self.shapes is not None and self.shapes <= 0:
             raise ValueError(f"shapes must be above 0 a second, got {self.shapes:g}")
 
@@ -115,11 +118,13 @@ def _export(request: ExportRequest) -> None:
     stored = open_scene(request.scene, "cpu")
     if request.kind == ".street":
         return _export_street(request, stored)
-    if request.out.suffix == ".html" or request.edits is not None:
+    if request.kind in (".html", "") or request.edits is not None:
         views = recorded_views(request.scene, request.views)
         stored = with_edits(stored, views, request.edits)
         if request.out.suffix == ".html":
             return _export_page(request, stored, views)
+        if request.kind == "":
+            return _export_objects(request, stored, views)
     if request.kind == ".ply":
         return _export_ply(request, stored)
     from sparsestreet.cli.shipping import export_frame
@@ -134,6 +139,13 @@ def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
     save_street(request.out, stored, files_beside(request.scene, request.views))
     count, size = sum(stored.scene.counts().values()), request.out.stat().st_size
     print(f"{request.out}: {count:,} Gaussians, {size / 1e6:.2f} MB, {size / max(count, 1):.1f} bytes a Gaussian")
+
+
+def _export_objects(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
+    from sparsestreet.export.object_files import POSES, write_objects
+
+    names = write_objects(request.out, stored, views.all)
+    print(f"{request.out}: {len(names)} objects and {POSES}: {', '.join(names)}")
 
 
 def _export_ply(request: ExportRequest, stored: "StoredScene") -> None:

@@ -8,6 +8,7 @@ import pytest
 from plyfile import PlyData
 
 from sparsestreet.cli.export import USAGE, ExportRequest, export
+from sparsestreet.cli.render import render
 from sparsestreet.export.ply import scene_gaussians
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
@@ -47,6 +48,30 @@ def test_edits_are_honored(run, tmp_path):
     assert len(means(tmp_path / "a.ply")) == ROAD_ROWS + CAR_ROWS
 
 
+def test_a_street_is_one_file_that_commands_open(run, tmp_path, capsys):
+    write_views(run / "views.json", street_views(), [], frame_rate=10.0)
+    small = tmp_path / "small.street"
+    assert export([str(run), str(small)]) == 0
+    assert "37 Gaussians" in capsys.readouterr().out
+    (run / "views.json").unlink()
+    # It has its views, also where it is packed once more.
+    assert export([str(small), str(tmp_path / "again.street")]) == 0
+    assert render([str(tmp_path / "again.street"), str(tmp_path / "pictures"), "frames=0:2"]) == 0
+    assert len(list((tmp_path / "pictures").iterdir())) == 2
+    assert export([str(small), str(tmp_path / "objects")]) == 0
+    assert "2 objects and poses.json: car, tram" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["street.spz", "street.compressed.ply"])
+def test_a_frame_for_viewers_and_what_it_lost(run, tmp_path, name, capsys):
+    write_views(run / "views.json", street_views(), [], frame_rate=10.0)
+    assert export([str(run), str(tmp_path / name), "time=0.25", "nodes=background", "check=true"]) == 0
+    said = capsys.readouterr().out
+    assert "30 Gaussians at time 0.25" in said
+    assert "dB beside what was written" in said
+    assert "lost: time, as this is the moment 0.25; the sky" in said
+
+
 @pytest.mark.parametrize(
     ("change", "status", "said"),
     [
@@ -57,6 +82,9 @@ def test_edits_are_honored(run, tmp_path):
         ({"out": "street.html"}, 1, "training writes a views.json"),
         ({"out": "street.obj"}, 2, "must end in .street, .ply, .compressed.ply, .spz, .html, .usdz, got 'street.obj'"),
         ({"out": "street.ply", "car": "[4,2,1]"}, 2, "car is no option of a .ply: leave it out"),
+        ({"out": "a.street", "time": 0.5}, 2, "time is no option of a .street: leave it out"),
+        ({"out": "a.ply", "check": "true"}, 2, "check is no option of a .ply: leave it out"),
+        ({"out": "folder", "check": "true"}, 2, "check is no option of a folder: leave it out"),
         ({"nodes": "rigid", "instance": "car"}, 2, "exclude each other"),
         ({"instance": "bus"}, 1, "no instance 'bus'; it has car, tram"),
         ({"nodes": "roads"}, 1, "no node 'roads'; it has background, rigid"),

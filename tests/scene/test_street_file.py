@@ -174,9 +174,7 @@ def test_a_file_that_is_not_there_and_one_of_another_kind(tmp_path: Path):
 def test_a_file_that_was_cut(path: Path, share: float):
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(
-        ValueError, match=r"^[^\n]*a.street is no .street or is damaged: it ends \d+ bytes early"
-    ):
+    with pytest.raises(ValueError, match=r"^[^\n]*a.street is no .street or is damaged: it ends \d+ bytes early"):
         load_scene(path)
 
 
