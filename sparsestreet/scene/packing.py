@@ -59,23 +59,29 @@ def packed_blocks(node: Node, form: Form) -> Iterator[list[bytes]]:
             waiting += [rows[len(rows) // 2 :], rows[: len(rows) // 2]]
 
 
-def columns_of(blocks: Sequence[Block], form: Form) -> dict[str, Tensor]:
-    """Returns the columns of a node's rows, float32 as they are learned."""
-    harmonics = _joined([block.harmonics for block in blocks], len(form.axes))
-    colors = harmonics.reshape(len(harmonics), len(form.axes) // 3, 3)
-    columns = {
-        "means": _joined([block.means for block in blocks], 3),
-        "log_scales": _joined([block.log_scales for block in blocks], 3),
-        "quaternions": _joined([block.quaternions for block in blocks], 4),
-        "opacity_logits": _joined([block.opacity_logits for block in blocks]),
+def columns_of(block: Block, form: Form) -> dict[str, Tensor]:
+    """Returns the columns of a block, float32 as they are learned."""
+    colors = torch.from_numpy(block.harmonics).float().reshape(len(block), len(form.axes) // 3, 3)
+    return {
+        "means": torch.from_numpy(block.means).float(),
+        "log_scales": torch.from_numpy(block.log_scales).float(),
+        "quaternions": torch.from_numpy(block.quaternions).float(),
+        "opacity_logits": torch.from_numpy(block.opacity_logits).float(),
         "sh_dc": colors[:, :1].contiguous(),
         "sh_rest": colors[:, 1:].contiguous(),
+        **{name: torch.from_numpy(np.array(block.others[name])) for name in form.others},
     }
-    for name, column in form.others.items():
-        parts = [torch.from_numpy(np.ascontiguousarray(block.others[name])) for block in blocks]
-        kind = getattr(torch, column.dtype)
-        columns[name] = torch.cat(parts) if parts else torch.zeros(0, *column.shape, dtype=kind)
-    return columns
+
+
+def joined(blocks: list[dict[str, Tensor]], form: Form) -> dict[str, Tensor]:
+    """Returns the columns of all blocks, and empties them; those of a table without rows where there is none."""
+    if not blocks:
+        none = {name: np.zeros((0, *column.shape), column.dtype) for name, column in form.others.items()}
+        empty = Block(
+            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, len(form.axes))), none
+        )
+        return columns_of(empty, form)
+    return {name: torch.cat([block.pop(name) for block in blocks]) for name in list(blocks[0])}
 
 
 def second_moments(nodes: Sequence[Node]) -> dict[int, Float64[np.ndarray, "d d"]]:
@@ -142,8 +148,3 @@ def _step(node: Node, name: str) -> float | None:
     if name == "life_peaks":
         return _LIFE_SHARE * math.exp(float(np.quantile(spans, 0.25)))
     return Steps.log_scale if name == "log_life_spans" else None
-
-
-def _joined(parts: Sequence[Float64[np.ndarray, "..."]], *shape: int) -> Tensor:
-    whole = np.concatenate(parts) if parts else np.zeros((0, *shape))
-    return torch.from_numpy(whole).float()

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.codec.container import FrameReader, FrameWriter
-from sparsestreet.codec.gaussians import Block, rows_in, unpacked_block
+from sparsestreet.codec.gaussians import rows_in, unpacked_block
 from sparsestreet.codec.harmonics import packed_axes, principal_axes, unpacked_axes
 from sparsestreet.codec.plain import TYPES, packed_column, unpacked_column
 from sparsestreet.codec.reading import Cursor
@@ -122,7 +122,7 @@ def _read_file(frames: FrameReader, size: int) -> bytes:
 
 def _read_table(frames: FrameReader, table: Mapping[str, Any], axes: Mapping[int, np.ndarray]) -> dict[str, Tensor]:
     form, rows = packing.form_from(table, axes), _count(table["rows"])
-    blocks: list[Block] = []
+    blocks: list[dict[str, Tensor]] = []
     found = 0
     while found < rows:
         content = frames.read("ROWS")
@@ -130,9 +130,10 @@ def _read_table(frames: FrameReader, table: Mapping[str, Any], axes: Mapping[int
         if not 0 < count <= min(rows - found, packing.BLOCK):
             raise ValueError(f"a block has {count} rows where {rows - found} are left: it is damaged")
         frames.budget.take(count * packing.row_bytes(form))
-        blocks.append(unpacked_block(content, form))
+        # As float32 at once: blocks are in double precision.
+        blocks.append(packing.columns_of(unpacked_block(content, form), form))
         found += count
-    return packing.columns_of(blocks, form)
+    return packing.joined(blocks, form)
 
 
 def _read_tensor(frames: FrameReader, dtype: str, shape: tuple[int, ...], step: float | None) -> Tensor:
