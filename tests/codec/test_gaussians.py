@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sparsestreet.codec.gaussians import LEVELS, Block, Steps, packed_block, unpacked_block
+from sparsestreet.codec.harmonics import along_axes
 from tests.codec.blocks import block, form
 
 STEPS = Steps(0.002)
@@ -52,9 +53,8 @@ def test_errors_are_within_their_bounds(rows: int, named_axes: bool):
     assert len(found) == rows
     np.testing.assert_allclose(found.means, one.means, rtol=0, atol=STEPS.position / 2 + 1e-12)
     np.testing.assert_allclose(opacity(found), opacity(one), rtol=0, atol=1 / 254 + 1e-12)
-    # Each principal axis is off by 0.6 steps at most, so all of them together by that times the root of their number.
-    off = np.linalg.norm(found.harmonics - one.harmonics, axis=1)
-    assert (off <= 0.6 * np.sqrt(12) * STEPS.color * growth(one)[:, 0] * 1.001).all()
+    off = np.abs(along_axes(found.harmonics - one.harmonics, form(one).axes))
+    assert (off <= 0.6 * STEPS.color * growth(one) + 1e-9).all()
     for name, column in one.others.items():
         assert found.others[name].dtype == column.dtype
         assert np.array_equal(found.others[name], column)

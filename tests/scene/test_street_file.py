@@ -219,6 +219,12 @@ def test_a_hostile_header_is_refused_in_one_line_with_bounded_memory(path: Path,
         tracemalloc.stop()
 
 
+def test_a_sky_is_not_made_larger_than_its_texels(path: Path):
+    rewritten(path, lambda header: header["scene"]["effects"]["sky"]["settings"].update(resolution=300))
+    with pytest.raises(ValueError, match=r"texels of shape \(6, 5, 5, 3\), its settings say \(6, 300, 300, 3\)"):
+        load_scene(path)
+
+
 def test_a_header_of_nested_lists(path: Path):
     content = path.read_bytes()
     deep = b"[" * 200_000

@@ -11,6 +11,7 @@ from sparsestreet.scene.effects.lens import Pinhole
 from sparsestreet.scene.effects.shutter import GlobalShutter
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.storage import load_scene
+from sparsestreet.scene.street_file import ATTACHED, save_street
 from sparsestreet.serving.scenes import Scenes, UnknownSceneError, named_runs
 from tests.serving.street import write_run
 
@@ -52,6 +53,15 @@ def test_one_scene_is_open_however_little_memory_there_is_and_read_once_by_many(
     assert opened == ["b"]
     assert scenes.rig("c").cameras[0].name == "0"
     assert scenes.opened == ["b"]
+
+
+def test_a_street_is_served_like_a_folder(folders, tmp_path):
+    attached = {name: (folders[0] / name).read_bytes() for name in ATTACHED if (folders[0] / name).is_file()}
+    save_street(tmp_path / "town.street", load_scene(folders[0]), attached)
+    scenes = Scenes(named_runs([tmp_path / "town.street", folders[1]]), load_scene, memory=1)
+    assert scenes.names == ["town", "b"]
+    assert [one.name for one in scenes.rig("town").cameras] == [one.name for one in scenes.rig("b").cameras]
+    assert scenes.get("town").stored.scene.counts() == scenes.get("b").stored.scene.counts()
 
 
 def test_names_that_are_no_scene(folders):
