@@ -127,9 +127,20 @@ def _export(request: ExportRequest) -> None:
             return _export_objects(request, stored, views)
     if request.kind == ".ply":
         return _export_ply(request, stored)
-    from sparsestreet.cli.shipping import export_frame
+    from sparsestreet.cli.shipping import FrameExport, export_frame
 
-    export_frame(request, stored)
+    wanted = FrameExport(
+        request.scene,
+        request.views,
+        request.out,
+        request.kind,
+        request.time or 0.0,
+        request.nodes,
+        request.instance,
+        sky=request.sky is not False,
+        check=bool(request.check),
+    )
+    export_frame(wanted, stored)
 
 
 def _export_street(request: ExportRequest, stored: "StoredScene") -> None:

@@ -1,6 +1,7 @@
 """``sparsestreet export RUN street.spz``: one frame for viewers, and what it keeps."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
 
 from sparsestreet.cli.scene import recorded_views
 from sparsestreet.export.check import check_file, turned_camera
@@ -10,18 +11,30 @@ from sparsestreet.export.spz import read_spz, write_spz
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians
 
-if TYPE_CHECKING:
-    from sparsestreet.cli.export import ExportRequest
-
 _READERS = {".spz": read_spz, ".compressed.ply": read_compressed_ply}
 
 
-def export_frame(request: "ExportRequest", stored: StoredScene) -> None:
+@dataclass(frozen=True)
+class FrameExport:
+    """What is asked for, as the command says it."""
+
+    scene: Path
+    views: Path | None
+    out: Path
+    kind: str
+    """``.spz`` or ``.compressed.ply``."""
+    time: float
+    nodes: tuple[str, ...] | None
+    instance: str | None
+    sky: bool
+    check: bool
+
+
+def export_frame(request: FrameExport, stored: StoredScene) -> None:
     """Write the file and say what is in it; with ``check``, what it lost. Raises ValueError where nothing is left."""
-    time = request.time or 0.0
+    time = request.time
     instances = None if request.instance is None else [request.instance]
-    sky = request.sky is not False
-    gaussians = frame_gaussians(stored, time, nodes=request.nodes, instances=instances, sky=sky)
+    gaussians = frame_gaussians(stored, time, nodes=request.nodes, instances=instances, sky=request.sky)
     if request.kind == ".spz":
         count = write_spz(request.out, gaussians, antialiased=stored.options.settings.antialias)
     else:
@@ -32,7 +45,7 @@ def export_frame(request: "ExportRequest", stored: StoredScene) -> None:
         _check(request, stored, gaussians)
 
 
-def _check(request: "ExportRequest", stored: StoredScene, gaussians: Gaussians) -> None:
+def _check(request: FrameExport, stored: StoredScene, gaussians: Gaussians) -> None:
     camera = _camera(request)
     found = check_file(request.out, gaussians, camera, _READERS[request.kind], stored.options.settings)
     quality = "no camera is known" if found.psnr is None else f"{found.psnr:.1f} dB beside what was written"
@@ -40,19 +53,19 @@ def _check(request: "ExportRequest", stored: StoredScene, gaussians: Gaussians) 
     print(f"lost: {'; '.join(_lost(request, stored))}")
 
 
-def _camera(request: "ExportRequest") -> Camera | None:
+def _camera(request: FrameExport) -> Camera | None:
     """The camera of the view nearest in time, in the axes of viewers."""
     try:
         views = recorded_views(request.scene, request.views).all
     except FileNotFoundError:
         return None
-    nearest = min(views, key=lambda view: abs(view.time - (request.time or 0.0)))
+    nearest = min(views, key=lambda view: abs(view.time - request.time))
     return turned_camera(nearest.camera, VIEWER_FROM_WORLD)
 
 
-def _lost(request: "ExportRequest", stored: StoredScene) -> list[str]:
-    lost = [f"time, as this is the moment {request.time or 0.0:g}"]
-    if request.sky is False or request.nodes is not None or request.instance is not None:
+def _lost(request: FrameExport, stored: StoredScene) -> list[str]:
+    lost = [f"time, as this is the moment {request.time:g}"]
+    if not request.sky or request.nodes is not None or request.instance is not None:
         lost.append("the sky")
     else:
         lost.append("the sky's infinite distance, as it is a dome")
