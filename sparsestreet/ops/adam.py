@@ -69,11 +69,19 @@ def _in_torch(
     parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, refused: Tensor, step: AdamStep, width: int
 ) -> None:
     tables = [values.reshape(-1, width) for values in (parameter, gradient, first, second)]
-    finite = tables[1].isfinite().all(1)
+    finite = finite_rows(tables[1], refused)
     adam_step_(tables[0], tables[1], tables[2], tables[3], finite, step, backend="torch")
     for whole, table in ((parameter, tables[0]), (first, tables[2]), (second, tables[3])):
         if not whole.is_contiguous():
             whole.copy_(table.view(whole.shape))
-    refused[0] += (~finite).sum()
-    numbers = torch.arange(len(finite), device=finite.device).masked_fill(finite, NONE)
-    refused[1] = torch.minimum(refused[1], numbers.min())
+
+
+def finite_rows(gradient: Tensor, refused: Tensor) -> Tensor:
+    """Which entries of the first dimension are finite, bool [n]; the others are counted as in ``adam_rows_``."""
+    # unflatten gives parameters of one number per row a second dimension as well.
+    finite = gradient.unflatten(0, (-1, 1)).flatten(1).isfinite().all(1)
+    if len(finite):
+        numbers = torch.arange(len(finite), device=finite.device).masked_fill(finite, NONE)
+        refused[0] += (~finite).sum()
+        refused[1] = torch.minimum(refused[1], numbers.min())
+    return finite

@@ -84,6 +84,9 @@ class RunDescription:
     """Noise during training; None if unknown."""
     caps: dict[str, int]
     """Name of each node that reached its ``max_gaussians`` at least once -> that limit."""
+    rested: dict[str, int] = field(default_factory=dict)
+    """Node and column, such as "background.means" -> how often a row of it took no step, since its gradient was not
+    finite."""
     effects: tuple[EffectDecision, ...] = ()
     """The plan of effects, in the order in which they act on an image; empty: the record is older."""
     machine: Machine

@@ -14,6 +14,7 @@ from sparsestreet.ranks import ALONE, LostProcessError, Ranks
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.training.parallel import DisagreementError, check_agreement, exchange
+from sparsestreet.training.row_adam import RowAdam
 from tests.training.parallel.several import PATIENCE, several
 from tests.training.stubs import background, frame_at, rigid, set_rows
 
@@ -73,6 +74,20 @@ def statistics_of(rank: int) -> DensityStatistics:
     return statistics
 
 
+def refused_of(ranks: Ranks) -> dict[str, Tensor]:
+    """What a step refuses where one process has a NaN in a row that others saw too."""
+    rows = nn.Parameter(torch.ones(5, 3))
+    rows.grad = torch.zeros(5, 3)
+    rows.grad[1:4] = ranks.rank + 1.0
+    if ranks.rank == 1:
+        rows.grad[2, 1] = torch.nan
+    optimizer = RowAdam([{"params": [rows], "lr": 0.5}])
+    exchange([rows], ranks)
+    optimizer.step()
+    assert optimizer.refused is not None
+    return {"counts": optimizer.refused.counts, "rows": rows.detach()}
+
+
 def talk(rank: int) -> dict[str, Any]:
     """All that is asked of three processes, in one go; the last dies at the end."""
     dist.init_process_group("gloo", rank=rank, world_size=SIZE, timeout=timedelta(seconds=PATIENCE))
@@ -87,6 +102,7 @@ def talk(rank: int) -> dict[str, Any]:
     said["largest"] = ranks.largest(torch.tensor([rank, -rank]))
     said["gathered"] = ranks.gathered(f"process {rank}")
     said["scores"] = scores(ranks)
+    said["refused"] = refused_of(Ranks(rank, SIZE))
     statistics = statistics_of(rank)
     statistics.total(ranks)
     said["statistics"] = statistics.state_dict()
@@ -137,6 +153,13 @@ def test_sums_have_the_order_of_the_processes(answers):
         assert torch.equal(answer["sum"], in_order)
         assert answer["largest"].tolist() == [2, 0]
         assert answer["gathered"] == ["process 0", "process 1", "process 2"]
+
+
+def test_a_gradient_that_is_not_finite_in_one_process_is_refused_by_all(answers):
+    """Adam's first step is one rate."""
+    for answer in answers:
+        assert answer["refused"]["counts"].tolist() == [[1, 2]]
+        assert answer["refused"]["rows"][:, 0].tolist() == pytest.approx([1.0, 0.5, 1.0, 0.5, 1.0])
 
 
 def test_pruning_scores_views_together(answers):
