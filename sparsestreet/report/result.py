@@ -31,10 +31,11 @@ def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDI
 
 
 def _warnings(run: RunDescription) -> list[str]:
-    if not run.rested:
-        return []
-    times = ", ".join(f"{name} {count:,}" for name, count in run.rested.items())
-    return [f"rows that took no step because their gradient was not finite, counted at each step: {times}"]
+    said = (
+        (run.held_back, "Gaussians that were not added because memory had no room"),
+        (run.rested, "rows that took no step because their gradient was not finite, counted at each step"),
+    )
+    return [f"{what}: {', '.join(f'{name} {n:,}' for name, n in counts.items())}" for counts, what in said if counts]
 
 
 def _quality(summary: RunSummary, split: str, protocol: Protocol) -> str:

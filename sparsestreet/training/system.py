@@ -77,6 +77,8 @@ class StreetSystem(LightningModule):
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
         self.quarantine = Quarantine()
+        self.held_back: dict[str, int] = {}
+        """Node -> Gaussians that were not added because memory had no room, over all refinements."""
         self._losses_seen = LossWatch()
         self._view: View | None = None
         """Of the step that is under way."""
@@ -162,10 +164,12 @@ class StreetSystem(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.settle()
+        checkpoint["held_back"] = dict(self.held_back)
         checkpoint["quarantined"] = self.quarantine.state_dict()
         checkpoint["train_psnr"] = [value.cpu() for value in self.train_psnr]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.held_back = dict(checkpoint.get("held_back", {}))
         self.quarantine.load_state_dict(checkpoint.get("quarantined", {}))
         self.train_psnr.extend(value.to(self.device) for value in checkpoint.get("train_psnr", ()))
 

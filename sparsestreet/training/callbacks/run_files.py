@@ -81,6 +81,7 @@ class RunFiles(Callback, RowListener):
             training_seconds=self.clock.seconds,
             noise=None if before is None else noise_between(before, calibrate(system.device)),
             caps=dict(self.caps),
+            held_back=dict(system.held_back),
             rested=dict(system.quarantine.counts),
         )
         data = data_of(trainer)
