@@ -104,7 +104,6 @@ def _full(path: Path, error: Exception) -> OSError:
     free = shutil.disk_usage(folder).free
     reason = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
     return OSError(
-        errno.ENOSPC,
-        f"{path} cannot be written ({reason}), {free / 1e6:,.1f} MB are free there; what stood there before is whole: "
-        "make room and repeat the command, which goes on from its newest checkpoint",
+        f"{path} cannot be written ({reason}): {free / 1e6:,.1f} MB are free there. What stood there before is whole; make "
+        "room and repeat the command"
     )
