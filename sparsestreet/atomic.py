@@ -47,7 +47,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
             os.replace(temporary, path)
     except Exception as error:
         temporary.unlink(missing_ok=True)
-        if is_full(error):
+        if _is_full(error):
             raise _full(path, error) from error
         raise
     finally:
@@ -81,7 +81,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except Exception as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        if is_full(error):
+        if _is_full(error):
             raise _full(path, error) from error
         raise
     finally:
@@ -92,7 +92,7 @@ def _unwritable(path: Path, error: OSError) -> OSError:
     return OSError(f"{path} cannot be written ({error.strerror}): name another place")
 
 
-def is_full(error: Exception) -> bool:
+def _is_full(error: Exception) -> bool:
     """Whether a file could not be written because the disk, or the share of its user, is full."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno in _FULL
@@ -104,6 +104,6 @@ def _full(path: Path, error: Exception) -> OSError:
     free = shutil.disk_usage(folder).free
     reason = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
     return OSError(
-        f"{path} cannot be written ({reason}): {free / 1e6:,.1f} MB are free there. What stood there before is whole; make "
-        "room and repeat the command"
+        f"{path} cannot be written ({reason}): {free / 1e6:,.1f} MB are free there. What stood there before is whole; "
+        "make room and repeat the command"
     )
