@@ -96,7 +96,7 @@ def test_what_is_no_row_of_a_node_ends_the_run(name):
 
 def test_a_pose_whose_gradient_is_not_finite_ends_the_run_and_stays_as_it_was(tmp_path):
     system = make_system({"rigid": rigid(10)})
-    deltas = system.scene.nodes["rigid"].translation_deltas
+    deltas = system.scene.get_parameter("nodes.rigid.translation_deltas")
     deltas.register_hook(lambda gradient: torch.full_like(gradient, torch.nan))
     with pytest.raises(NotFiniteError, match=r"step 1, .*nodes\.rigid\.translation_deltas row 0"):
         fit(system, [Checkpoints(tmp_path)], 3, frame_at(2))

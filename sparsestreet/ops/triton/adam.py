@@ -14,7 +14,7 @@ from sparsestreet.ops.triton.launch import launch
 # One number per lane: whether a lane loads differs between neighbors, so that wider loads would not be merged.
 LANES = 256
 OPTIONS = {"num_warps": 8}
-TABLE = 1024
+TABLE = 512
 """Numbers of whole rows, padded to a power of two, that a program steps."""
 
 

@@ -14,6 +14,7 @@ from sparsestreet.ranks import ALONE, LostProcessError, Ranks
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.training.parallel import DisagreementError, check_agreement, exchange
+from sparsestreet.training.parallel.agreement import checksum
 from sparsestreet.training.row_adam import RowAdam
 from tests.training.parallel.several import PATIENCE, several
 from tests.training.stubs import background, frame_at, rigid, set_rows
@@ -196,6 +197,16 @@ def test_a_process_that_ends_is_named_in_one_sentence(answers):
         )
         assert "resume=RUN" in lost
     assert "lost" not in answers[2]
+
+
+def test_a_checksum_tells_two_parameters_that_change_places():
+    first, second = torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, 4.0]])
+
+    def module(*weights: Tensor) -> nn.Module:
+        return nn.ParameterList([nn.Parameter(weight) for weight in weights])
+
+    assert bool(checksum(module(first, second)) == checksum(module(first, second)))
+    assert bool(checksum(module(first, second)) != checksum(module(second, first)))
 
 
 def test_alone_nothing_is_shared():
