@@ -46,6 +46,6 @@ def checksum(module: nn.Module) -> Tensor:
     for parameter in module.parameters():
         bits = parameter.detach().float().contiguous().view(torch.int32).flatten().long()
         # Odd weights by place, so that entries that change places are noticed; integers wrap and do not round.
-        places = torch.ones_like(bits)
+        places = 2 * torch.arange(len(bits), device=bits.device) + 1
         total = 31 * total.to(bits.device) + (bits * places).sum()
     return total
