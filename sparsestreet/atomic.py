@@ -1,10 +1,15 @@
 """Files and folders that appear whole or not at all. A reader never sees half of one; a crash leaves the old one."""
 
+import errno
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_SAID = ("os error 28", "os error 27", "os error 122", "iostream error", "unexpected pos", "file write failed")
+"""What safetensors (numbers of the system) and torch say, whose errors are none of the system's."""
 
 
 @contextmanager
@@ -14,7 +19,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     A block that writes nothing changes nothing. When several processes save together, only the first writes; the others
     enter the block too (``Trainer.save_checkpoint`` must be called by all), and change nothing.
 
-    Raises OSError before the block if nothing can be written.
+    Raises OSError before the block if nothing can be written, and where the disk is full, whatever the writer raised.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -40,6 +45,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
             # Some writers (safetensors) leave a file that only its owner may read.
             temporary.chmod(mode)
             os.replace(temporary, path)
+    except Exception as error:
+        temporary.unlink(missing_ok=True)
+        if _is_full(error):
+            raise _full(path, error) from error
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -69,9 +79,31 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         if path.is_dir():
             path.rmdir()
         os.replace(temporary, path)
+    except Exception as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if _is_full(error):
+            raise _full(path, error) from error
+        raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _unwritable(path: Path, error: OSError) -> OSError:
     return OSError(f"{path} cannot be written ({error.strerror}): name another place")
+
+
+def _is_full(error: Exception) -> bool:
+    """Whether a file could not be written because the disk, or the share of its user, is full."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno in _FULL
+    return any(words in str(error) for words in _SAID)
+
+
+def _full(path: Path, error: Exception) -> OSError:
+    folder = next(one for one in (path, *path.absolute().parents) if one.is_dir())
+    free = shutil.disk_usage(folder).free
+    reason = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
+    return OSError(
+        f"{path} cannot be written ({reason}): {free / 1e6:,.1f} MB are free there. What stood there before is whole; "
+        "make room and repeat the command"
+    )

@@ -8,7 +8,8 @@
    ``triton`` for GPUs. All follow the formula in ``spherical_harmonics``.
 3. Steps around the op, in torch and as fused kernels (``fused`` chooses). ``activate`` turns the rows of all nodes into
    Gaussians, and ``poses`` places boxes. ``sky`` adds the sky behind the splats; its geometry is in ``cube_map``.
-   ``ssim`` is D-SSIM (``ssim_window`` its window). ``visible_adam`` steps the rows that were seen.
+   ``ssim`` is D-SSIM (``ssim_window`` its window). ``visible_adam`` steps the rows that were seen, ``adam`` those
+   whose gradient is finite.
 """
 
 from sparsestreet.ops.backend import resolve_backend

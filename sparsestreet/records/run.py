@@ -84,6 +84,11 @@ class RunDescription:
     """Noise during training; None if unknown."""
     caps: dict[str, int]
     """Name of each node that reached its ``max_gaussians`` at least once -> that limit."""
+    held_back: dict[str, int] = field(default_factory=dict)
+    """Name of each node that memory held down -> Gaussians that were not added, over all refinements."""
+    rested: dict[str, int] = field(default_factory=dict)
+    """Node and column, such as "background.means" -> how often a row of it took no step, since its gradient was not
+    finite."""
     effects: tuple[EffectDecision, ...] = ()
     """The plan of effects, in the order in which they act on an image; empty: the record is older."""
     machine: Machine

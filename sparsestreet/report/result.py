@@ -4,6 +4,7 @@ from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
 from sparsestreet.records.quality import HELD_OUT, TRAINING
+from sparsestreet.records.run import RunDescription
 from sparsestreet.records.summary import RunSummary
 
 _VIEWS = {HELD_OUT: "held-out views", TRAINING: "training views"}
@@ -24,8 +25,17 @@ def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDI
     return [
         *(_quality(summary, split, protocol) for split in (HELD_OUT, TRAINING) if split in summary.quality),
         ", ".join([*size, f"{latency.p50:.1f} ms a frame{steady}"]),
+        *_warnings(run),
         f"pictures: {out / 'pictures' / 'sheet.png'}; curves: {out / 'curves'}; numbers: {out / 'records'}",
     ]
+
+
+def _warnings(run: RunDescription) -> list[str]:
+    said = (
+        (run.held_back, "Gaussians that were not added because memory had no room"),
+        (run.rested, "rows that took no step because their gradient was not finite, counted at each step"),
+    )
+    return [f"{what}: {', '.join(f'{name} {n:,}' for name, n in counts.items())}" for counts, what in said if counts]
 
 
 def _quality(summary: RunSummary, split: str, protocol: Protocol) -> str:

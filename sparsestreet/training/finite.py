@@ -1,10 +1,12 @@
 """Numbers that are not numbers: found in the step that shows them, and named."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
+from sparsestreet.data.device import OnItsWay, on_its_way
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import View
 
@@ -16,22 +18,45 @@ class NotFiniteError(ValueError):
     """A loss, a gradient or a parameter is NaN or infinite: training cannot go on from it."""
 
 
-def check_loss(terms: Mapping[str, Tensor], scene: SceneGraph, view: View, step: int) -> None:
-    """Raises NotFiniteError where the sum of a step's terms is not finite, before anything is learned from it.
+class LossWatch:
+    """Looks at the terms of each loss: in the step itself on the CPU, one step later on a device."""
 
-    It names the terms, the view, and the parameters that are not finite. One number is looked at in a step whose loss
-    is finite; on a GPU that would wait for the device, so there only ``check_parameters`` speaks.
-    """
-    if all(term.device.type == "cpu" for term in terms.values()):
-        if bool(torch.stack([term.detach() for term in terms.values()]).sum().isfinite()):
+    def __init__(self) -> None:
+        self._pending: tuple[OnItsWay, tuple[str, ...], SceneGraph, View, int] | None = None
+
+    def look(self, names: Iterable[str], terms: Tensor, scene: SceneGraph, view: View, step: int) -> None:
+        """Before anything is learned from the ``step``-th step. Raises NotFiniteError, on a device for the step before.
+
+        Args:
+            names: of the terms.
+            terms: [terms].
+            scene: is searched for parameters that are not finite, once a term is not.
+            view: that was rendered.
+            step: number of the step.
+        """
+        self.settle()
+        # One number is looked at in a step whose loss is finite.
+        on_host = terms.device.type == "cpu"
+        if not on_host or not bool(terms.detach().sum().isfinite()):
+            self._pending = (on_its_way(terms.detach()), tuple(names), scene, view, step)
+        if on_host:
+            self.settle()
+
+    def settle(self) -> None:
+        """Look at what has not been looked at yet; this may wait. Raises NotFiniteError."""
+        pending, self._pending = self._pending, None
+        if pending is None:
             return
-        wrong = [f"{name} = {float(term.detach()):g}" for name, term in terms.items() if not term.detach().isfinite()]
-        frame = "a view of no frame" if view.frame_index is None else f"frame {view.frame_index}"
-        camera = "" if view.camera_index is None else f", camera {view.camera_index}"
+        terms, names, scene, view, step = pending
+        values = terms.arrived()
+        if bool(values.sum().isfinite()):
+            return
+        wrong = [f"{name} = {value:g}" for name, value in zip(names, values.tolist(), strict=True)
+                 if not math.isfinite(value)]  # fmt: skip
         places = not_finite(scene.named_parameters())
         said = f"; parameters: {', '.join(places)}" if places else "; all parameters are finite"
         raise NotFiniteError(
-            f"step {step + 1}: the loss of {frame}{camera} is not finite ({', '.join(wrong) or 'their sum'}){said}. "
+            f"step {step}: the loss of {seen_from(view)} is not finite ({', '.join(wrong) or 'their sum'}){said}. "
             "The newest checkpoint is from before it: lower learning rates, or leave out that frame"
         )
 
@@ -64,3 +89,9 @@ def not_finite(named: Iterable[tuple[str, Tensor]]) -> list[str]:
             row = int(bad.int().argmax())
             found.append(f"{name} row {row:,} ({int(bad.sum()):,} of {len(bad):,} rows)")
     return found[:_NAMED]
+
+
+def seen_from(view: View) -> str:
+    """The view in words."""
+    frame = "a view of no frame" if view.frame_index is None else f"frame {view.frame_index}"
+    return frame if view.camera_index is None else f"{frame}, camera {view.camera_index}"

@@ -1,10 +1,12 @@
-"""Whether a device can hold a scene as large as it may get, said before the first step."""
+"""Whether a device can hold a scene as large as it may get, said before the first step; and what fits later on."""
 
 import logging
 
 import torch
 
+from sparsestreet.data import free_memory
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.scene.gaussians import Rows
 from sparsestreet.training.forecast import largest
 from sparsestreet.training.system import StreetSystem
 
@@ -17,6 +19,10 @@ STEP_BYTES = 350
 1920x1280 on an H100 (benchmarks/gpu.jsonl, peak less values and gradients)."""
 PIXEL_BYTES = 51
 """For each pixel of an image: from 960x640 to 1920x1280 with 1,000 Gaussians, from the same records."""
+
+
+MARGIN = 0.1
+"""Of what is free, left to others: allocators round, and images differ in what they need."""
 
 
 def foreseen_bytes(rows: int, row_bytes: float, pixels: int) -> float:
@@ -51,6 +57,22 @@ def memory_problem(now: int, grown: int, row_bytes: float, pixels: int, availabl
     if start > available:
         raise ValueError(said)
     return f"the scene may outgrow the device: {said}"
+
+
+def bytes_of_row(rows: Rows) -> int:
+    """What a step needs for one more Gaussian of a node."""
+    columns = rows.columns().values()
+    return COPIES * sum(column[:1].numel() * column.element_size() for column in columns) + STEP_BYTES
+
+
+def bytes_for_growth(device: torch.device) -> float:
+    """What Gaussians that are added now may take: of a GPU what a step has left at its peak so far, of the host what
+    is free; infinite where a host does not say. Nothing waits."""
+    if device.type == "cuda":
+        free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
+        return (1 - MARGIN) * (free - torch.cuda.max_memory_allocated(device))
+    free = free_memory.free_bytes()
+    return float("inf") if free is None else (1 - MARGIN) * free
 
 
 def report_memory(system: StreetSystem, data: StreetData) -> None:

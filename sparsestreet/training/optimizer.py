@@ -8,6 +8,7 @@ import torch
 
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.training.row_adam import RowAdam
 from sparsestreet.training.visible_adam import VisibleAdam
 
 
@@ -51,7 +52,7 @@ class OptimizerSettings:
             groups.setdefault(rate, empty)["params"].append(parameter)
         if self.visible_only:
             return VisibleAdam(groups.values(), betas=betas, eps=self.eps)
-        return torch.optim.Adam(groups.values(), betas=betas, eps=self.eps, fused=True)
+        return RowAdam(groups.values(), betas=betas, eps=self.eps)
 
 
 def set_rates(optimizer: torch.optim.Optimizer, progress: float) -> None:

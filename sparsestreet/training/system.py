@@ -15,16 +15,17 @@ from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
-from sparsestreet.training.finite import check_loss
+from sparsestreet.training.finite import LossWatch
 from sparsestreet.training.lightning import ends_step, image_number, images_per_step, logs_now
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
+from sparsestreet.training.quarantine import Quarantine
 from sparsestreet.training.resolution import ResolutionSchedule
 from sparsestreet.training.said_later import SaidLater
 from sparsestreet.training.schedule import Course
-from sparsestreet.types import Frame
+from sparsestreet.types import Frame, View
 
 
 class StreetSystem(LightningModule):
@@ -76,6 +77,12 @@ class StreetSystem(LightningModule):
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
+        self.quarantine = Quarantine()
+        self.held_back: dict[str, int] = {}
+        """Node -> Gaussians that were not added because memory had no room, over all refinements."""
+        self._losses_seen = LossWatch()
+        self._view: View | None = None
+        """Of the step that is under way."""
         self._course: Course | None = None
         self.train_psnr: deque[Tensor] = deque(maxlen=10)
         self.said = SaidLater()
@@ -123,11 +130,12 @@ class StreetSystem(LightningModule):
             if self.moved_views is not None and self.moved_views.applies(state.step, state.progress):
                 with phase("moved view"):
                     terms |= self.moved_views(self.scene, self.rendering, frame)
-        check_loss(terms, self.scene, frame, self.global_step)
+        values, self._view = torch.stack(tuple(terms.values())), frame
+        self._losses_seen.look(terms, values, self.scene, self._view, self.global_step + 1)
         if logs_now(self.trainer):  # in other steps nothing is computed for the loggers
             with phase("logging"):
                 self._log_training(self.rendering, terms, frame)
-        return torch.stack(tuple(terms.values())).sum()
+        return values.sum()
 
     def backward(self, loss: Tensor) -> None:
         with phase("backward"):
@@ -136,7 +144,11 @@ class StreetSystem(LightningModule):
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Optimizer, optimizer_closure: Any = None) -> None:
         # The closure renders and differentiates: its phases take their own time out of this one.
         with phase("optimizer"):
+            step = self.global_step + 1
             super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
+            refused = getattr(self.trainer.optimizers[0], "refused", None)
+            if refused is not None and self._view is not None:
+                self.quarantine.look(refused, self.scene.named_parameters(), self._view, step)
 
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
@@ -167,10 +179,20 @@ class StreetSystem(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.said.pass_on(self.trainer)
+        self.settle()
+        checkpoint["held_back"] = dict(self.held_back)
+        checkpoint["quarantined"] = self.quarantine.state_dict()
         checkpoint["train_psnr"] = [value.cpu() for value in self.train_psnr]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.held_back = dict(checkpoint.get("held_back", {}))
+        self.quarantine.load_state_dict(checkpoint.get("quarantined", {}))
         self.train_psnr.extend(value.to(self.device) for value in checkpoint.get("train_psnr", ()))
+
+    def settle(self) -> None:
+        """Look at what a device has said of the last step. Raises NotFiniteError."""
+        self._losses_seen.settle()
+        self.quarantine.settle()
 
     def _log_training(self, rendering: SceneRendering, terms: Mapping[str, Tensor], frame: Frame) -> None:
         """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms."""

@@ -29,8 +29,9 @@ def test_a_device_that_is_there(monkeypatch):
 
 
 def test_any_other_is_refused(without_gpu):
-    with pytest.raises(ValueError, match="device must be cpu or cuda, got 'tpu'"):
-        device_of("tpu", "this", "")
+    for name in ("tpu", "mps"):
+        with pytest.raises(ValueError, match=f"device must be cpu or cuda, got '{name}'"):
+            device_of(name, "this", "")
     with pytest.raises(ValueError, match="this needs a CUDA device and torch sees none: buy one"):
         device_of("cuda", "this", "buy one")
 

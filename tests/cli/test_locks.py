@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 
@@ -21,6 +22,12 @@ def test_a_second_writer_is_told_who_the_first_is_and_touches_nothing(tmp_path):
     assert [path.name for path in out.iterdir()] == ["scene"]
     with sole_writer(out):
         pass
+
+
+def test_who_writes_is_not_mixed_with_who_was_killed_there(tmp_path):
+    (tmp_path / LOCK).write_text("process 1234567890 on a-computer-with-a-very-long-name.of.a.lab.of.a.university")
+    with sole_writer(tmp_path):
+        assert (tmp_path / LOCK).read_text() == f"process {os.getpid()} on {socket.gethostname()}"
 
 
 def test_a_failed_writer_leaves_no_lock(tmp_path):

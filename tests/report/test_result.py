@@ -28,3 +28,13 @@ def test_only_what_was_measured_is_said(psnr, training):
     assert len(lines) == 3
     assert lines[0].startswith("training views: PSNR 26.00" if psnr is None else "held-out views: PSNR 25.00")
     assert "people" not in lines[0]
+
+
+def test_what_was_held_back_and_what_rested_is_said_again():
+    summary = make_summary("plain", 0, 24.35, {"background": 10})
+    run = dataclasses.replace(summary.run, held_back={"background": 12_000}, rested={"background.means": 3})
+    held_back, rested = result_lines(dataclasses.replace(summary, run=run), Path("a"))[-3:-1]
+    assert held_back == "Gaussians that were not added because memory had no room: background 12,000"
+    assert rested == (
+        "rows that took no step because their gradient was not finite, counted at each step: background.means 3"
+    )

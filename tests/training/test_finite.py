@@ -6,8 +6,10 @@ import pickle
 import pytest
 import torch
 
+from sparsestreet.data.device import OnItsWay
+from sparsestreet.training import finite
 from sparsestreet.training.callbacks import Checkpoints, step_of
-from sparsestreet.training.finite import NotFiniteError, check_loss, not_finite
+from sparsestreet.training.finite import LossWatch, NotFiniteError, not_finite
 from tests.scene.street import frame_at
 from tests.training.stubs import StubTrainer, background, make_system
 
@@ -18,15 +20,37 @@ def system():
 
 
 def test_a_loss_that_is_not_finite_names_view_term_and_parameter(system):
-    frame, fine = frame_at(2), {"photometric": torch.tensor(1.0), "depth": torch.tensor(2.0)}
-    check_loss(fine, system.scene, frame, 7)
-    broken = fine | {"depth": torch.tensor(float("inf"))}
-    with pytest.raises(NotFiniteError, match=r"step 8: the loss of frame 2, camera 0 .*depth = inf\); all param"):
-        check_loss(broken, system.scene, frame, 7)
+    frame, names, watch = frame_at(2), ("photometric", "depth"), LossWatch()
+    watch.look(names, torch.tensor([1.0, 2.0]), system.scene, frame, 7)
+    broken = torch.tensor([1.0, float("inf")])
+    with pytest.raises(NotFiniteError, match=r"step 8: the loss of frame 2, camera 0 is .*\(depth = inf\); all param"):
+        watch.look(names, broken, system.scene, frame, 8)
     with torch.no_grad():
         system.scene.nodes["background"].rows.sh_dc[3, 0, 1] = torch.nan
     with pytest.raises(NotFiniteError, match=r"parameters: nodes\.background\.rows\.sh_dc row 3 \(1 of 5 rows\)"):
-        check_loss(broken, system.scene, frame, 7)
+        watch.look(names, broken, system.scene, frame, 8)
+
+
+class Late(torch.Tensor):
+    """Numbers that say they lie on a GPU."""
+
+    device = torch.device("cuda")
+
+
+def test_on_a_device_a_loss_is_looked_at_one_step_later(system, monkeypatch):
+    """What arrives is read at the next look, and when somebody settles; nothing is read twice."""
+    monkeypatch.setattr(finite, "on_its_way", lambda values: OnItsWay(values.as_subclass(torch.Tensor), None))
+    values = {kind: torch.tensor([1.0, value]).as_subclass(Late) for kind, value in (("fine", 2.0), ("bad", torch.nan))}
+    watch = LossWatch()
+    watch.look(("a", "b"), values["fine"], system.scene, frame_at(1), 1)
+    watch.look(("a", "b"), values["bad"], system.scene, frame_at(2), 2)
+    with pytest.raises(NotFiniteError, match=r"step 2: the loss of frame 2, camera 0 .*\(b = nan\)"):
+        watch.look(("a", "b"), values["fine"], system.scene, frame_at(3), 3)
+    watch.settle()
+    watch.look(("a", "b"), values["bad"], system.scene, frame_at(4), 4)
+    with pytest.raises(NotFiniteError, match="step 4: the loss of frame 4"):
+        watch.settle()
+    watch.settle()
 
 
 def test_opposite_infinities_and_sums_that_overflow():

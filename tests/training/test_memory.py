@@ -4,8 +4,19 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
-from sparsestreet.training.memory import COPIES, PIXEL_BYTES, foreseen_bytes, memory_problem
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.training import memory
+from sparsestreet.training.memory import (
+    COPIES,
+    PIXEL_BYTES,
+    STEP_BYTES,
+    bytes_for_growth,
+    bytes_of_row,
+    foreseen_bytes,
+    memory_problem,
+)
 
 RECORDS = Path(__file__).parents[2] / "benchmarks" / "gpu.jsonl"
 COLUMNS = 59 * 4.0
@@ -45,3 +56,23 @@ def test_growth_that_may_not_fit_is_a_warning():
 def test_a_start_that_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match=r"^1,000,000 Gaussians .* about 1.3 GB, and the device has 1.0 GB: lower"):
         memory_problem(1_000_000, 2_000_000, COLUMNS, 100, 1e9)
+
+
+def test_bytes_of_a_row_are_those_of_its_columns():
+    assert bytes_of_row(Rows({"means": torch.zeros(7, 3)}, {"label": torch.zeros(7, dtype=torch.int64)})) == (
+        COPIES * (3 * 4 + 8) + STEP_BYTES
+    )
+
+
+@pytest.mark.parametrize(("free", "room"), [(1_000, 900.0), (None, float("inf"))])
+def test_room_on_the_host_is_what_is_free_less_a_margin(free, room, monkeypatch):
+    monkeypatch.setattr(memory.free_memory, "free_bytes", lambda: free)
+    assert bytes_for_growth(torch.device("cpu")) == pytest.approx(room)
+
+
+def test_room_on_a_device_is_what_its_peak_left(monkeypatch):
+    """Of 100 bytes 30 are free and 60 torch's, which needed 50 at once."""
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (30, 100))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 60)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 50)
+    assert bytes_for_growth(torch.device("cuda", 0)) == pytest.approx(0.9 * 40)

@@ -7,6 +7,7 @@ from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
+from sparsestreet.training.row_adam import RowAdam
 from sparsestreet.training.visible_adam import VisibleAdam
 from tests.training.stubs import background, group_of, rigid
 from tests.typed import as_a
@@ -129,7 +130,7 @@ def test_the_longest_name_wins_and_a_missing_one_is_an_error():
     assert rate(optimizer, street, "nodes.background.rows.log_scales") == 3.0
 
 
-@pytest.mark.parametrize(("visible_only", "kind"), [(False, torch.optim.Adam), (True, VisibleAdam)])
+@pytest.mark.parametrize(("visible_only", "kind"), [(False, RowAdam), (True, VisibleAdam)])
 def test_settings_choose_the_optimizer_and_its_epsilon(visible_only, kind):
     """The default is small enough for mask logits, whose only gradient may be lambda_n / K."""
     default = OptimizerSettings(visible_only=visible_only).build(scene(), 1.0)

@@ -322,7 +322,7 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
     expected |= {"config_hash": config_hash(config), "scene": "five", "seed": 6, "split": "every 2th frame from 1"}
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}
-    expected |= {"effects": (sky,)}
+    expected |= {"effects": (sky,), "rested": {}, "held_back": {}}
     assert vars(found) == expected
 
 

@@ -16,6 +16,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.row_adam import RowAdam
 from sparsestreet.training.visible_adam import VisibleAdam, seen_rows
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import camera, cast, random_gaussians
@@ -172,7 +173,7 @@ def test_a_closure_computes_gradients_and_parameters_without_any_rest(generator)
 
 
 @pytest.mark.lengthy
-@pytest.mark.parametrize(("visible_only", "kind"), [("false", torch.optim.Adam), ("true", VisibleAdam)])
+@pytest.mark.parametrize(("visible_only", "kind"), [("false", RowAdam), ("true", VisibleAdam)])
 def test_the_configuration_chooses(visible_only, kind):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         chosen = compose("train", [f"optimizer.visible_only={visible_only}"]).optimizer

@@ -24,7 +24,7 @@ import sparsestreet
 from sparsestreet.data.device import OnItsWay
 from sparsestreet.ops import backend, fused, triton
 from sparsestreet.ops.triton import launch, rasterizer, screen
-from sparsestreet.training import said_later
+from sparsestreet.training import finite, quarantine, said_later
 
 META = torch.device("meta")
 PACKAGE = Path(sparsestreet.__file__).parent
@@ -200,5 +200,6 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
         patch.setattr(screen, "wait_for", counted)
-        patch.setattr(said_later, "on_its_way", queued)
+        for module in (finite, quarantine, said_later):
+            patch.setattr(module, "on_its_way", queued)
         yield found

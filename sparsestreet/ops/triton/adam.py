@@ -1,7 +1,9 @@
-"""Adam for the rows that were seen, one lane per number; for other rows only the mask is read."""
+"""Adam for the rows that were seen, one lane per number; for other rows only the mask is read. And Adam for the rows
+whose gradient is finite, which a program reads whole."""
 
 from functools import partial
 
+import triton
 import triton.language as tl
 from torch import Tensor, uint8
 from torch.autograd.graph import increment_version
@@ -12,6 +14,8 @@ from sparsestreet.ops.triton.launch import launch
 # One number per lane: whether a lane loads differs between neighbors, so that wider loads would not be merged.
 LANES = 256
 OPTIONS = {"num_warps": 8}
+TABLE = 512
+"""Numbers of whole rows, padded to a power of two, that a program steps."""
 
 
 def step_rows_(
@@ -63,3 +67,56 @@ def step_numbers(
     tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
     tl.store(exp_avg + at, m, seen)
     tl.store(exp_avg_sq + at, v, seen)
+
+
+def step_finite_rows_(
+    parameter: Tensor,
+    gradient: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    refused: Tensor,
+    *,
+    width: int,
+    size: float,
+    root: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """``adam.adam_rows_`` on contiguous float32 tensors; ``size`` and ``root`` are those of its AdamStep."""
+    rows, padded = parameter.numel() // width, triton.next_power_of_2(width)
+    launch(
+        step_finite_rows, rows, max(TABLE // padded, 1),
+        parameter, gradient, exp_avg, exp_avg_sq, refused, rows,
+        1 - betas[0], betas[1], 1 - betas[1], root, eps, size,
+        WIDTH=width, PADDED=padded, options=OPTIONS,
+    )  # fmt: skip
+    increment_version((parameter, exp_avg, exp_avg_sq))
+
+
+@partial(jit, do_not_specialize=["rows"])
+def step_finite_rows(
+    parameter, gradient, exp_avg, exp_avg_sq, refused, rows,
+    share, beta, square_share, root, eps, size,
+    WIDTH: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """BLOCK rows of WIDTH numbers; ``refused``: how many were not finite, and the first of them."""
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    column = tl.arange(0, PADDED)
+    at = row[:, None] * WIDTH + column[None, :]
+    given = (row < rows)[:, None] & (column < WIDTH)[None, :]
+    g = tl.load(gradient + at, given, 0.0)
+    # NaN compares as false.
+    wrong = tl.max(tl.where(tl.abs(g) < float("inf"), 0, 1), 1)
+    seen = given & (wrong == 0)[:, None]
+    m, v = tl.load(exp_avg + at, seen, 0.0), tl.load(exp_avg_sq + at, seen, 0.0)
+    g = tl.where(seen, g, 0.0)
+    m += share * (g - m)
+    v = beta * v + square_share * g * g
+    change = size * tl.div_rn(m, tl.div_rn(tl.sqrt_rn(v), root + tl.zeros_like(v)) + eps)
+    tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
+    tl.store(exp_avg + at, m, seen)
+    tl.store(exp_avg_sq + at, v, seen)
+    count = tl.sum(wrong, 0)
+    if count > 0:
+        tl.atomic_add(refused, count.to(tl.int64))
+        tl.atomic_min(refused + 1, tl.min(tl.where(wrong > 0, row, 9223372036854775807), 0))

@@ -58,7 +58,8 @@ class DensityStatistics:
         height: int,
         gradients: Mapping[str, Float[Tensor, " n"]] | None = None,
     ) -> None:
-        """Adds one view after its backward pass; rows with radius 0 were not drawn and do not change.
+        """Adds one view after its backward pass; rows with radius 0 were not drawn and do not change,
+        nor do those whose gradient is not finite.
 
         ``screen_gradient`` is the absolute gradient of the loss per pixel of the projected mean
         (``Rendering.screen_offsets.grad``), ``radii`` are pixels, both for this node's rows. As in 3DGS and DriveStudio
@@ -72,12 +73,14 @@ class DensityStatistics:
             )
         drawn = radii > 0
         norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
+        drawn &= norm < torch.inf  # a row with a gradient that is not finite does not step, and has no say here
         self.gradient_sum += torch.where(drawn, norm, 0.0)
         self.visits += 1 if self.is_empty and self.first_counts_all else drawn
         self.is_empty = False
         self.largest_screen = torch.maximum(self.largest_screen, radii / max(width, height))
         for name, total in self.watched.items():
-            total += torch.where(drawn, (gradients or {})[name].abs(), 0.0)
+            absolute = (gradients or {})[name].abs()
+            total += torch.where(drawn & (absolute < torch.inf), absolute, 0.0)
 
     def mean_gradients(self, column: str | None = None) -> Float[Tensor, " n"]:
         """Returns the mean norm on screen over the visits, or the mean absolute gradient of a watched column.

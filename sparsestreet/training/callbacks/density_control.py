@@ -1,5 +1,7 @@
 """When to densify, cull and reset opacities (the schedule of 3DGS, as DriveStudio runs it per node)."""
 
+import logging
+import math
 from functools import partial
 from typing import Any
 
@@ -17,12 +19,17 @@ from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.training.callbacks.resizing import RowListener, compare_rows, resize_rows
 from sparsestreet.training.lightning import begins_step, data_of, ends_step, ranks_of
+from sparsestreet.training.memory import bytes_for_growth, bytes_of_row
 from sparsestreet.training.schedule import Interval, last_step
 from sparsestreet.training.system import StreetSystem
+
+log = logging.getLogger(__name__)
 
 
 class DensityControl(Callback, RowListener):
     """Refines every node that has a density strategy, and resets its opacities; what happens is the strategy's matter.
+
+    No more rows are added than memory has room for; a run that is held back says so, and goes on.
 
     Args:
         refine_in: when rows that are of no use are culled and, up to ``densify_until``, others split and cloned before.
@@ -180,14 +187,39 @@ class DensityControl(Callback, RowListener):
         when = {"radius": system.radius, "progress": course.progress(step)}
         own = node.settings.densify_until
         if step <= last_step(self.densify_until if own is None else own, course):
-            limit = node.settings.max_gaussians
+            limit, drawn = node.settings.max_gaussians, self.generator.get_state()
             plan = strategy.densify(node.rows, statistics, max_gaussians=limit, generator=self.generator, **when)
+            fits = self._fits(trainer, system, name, len(plan.source) - len(node.rows))
+            if fits is not None:
+                self.generator.set_state(drawn)
+                plan = strategy.densify(node.rows, statistics, max_gaussians=fits, generator=self.generator, **when)
             resize_rows(trainer, system, name, plan, "densify")
         resize_rows(trainer, system, name, strategy.cull(node.rows, statistics, **when), "cull")
         outside = node.outside()
         if outside is not None and bool(outside.any()):
             resize_rows(trainer, system, name, RowPlan.keep(~outside), "outside its box")
         statistics.reset()
+
+    def _fits(self, trainer: Trainer, system: StreetSystem, name: str, added: int) -> int | None:
+        """Rows that a node may have where memory has no room for all that would be added; None where it has."""
+        rows = system.scene.nodes[name].rows
+        if added <= 0:
+            return None
+        free, needed = bytes_for_growth(system.device), bytes_of_row(rows)
+        if self._ranks.size > 1:  # all do what the fullest one can
+            device = system.device
+            free = -float(self._ranks.largest(torch.tensor(-free, dtype=torch.float64, device=device)))
+        if added * needed <= free:
+            return None
+        room = max(math.floor(free / needed), 0)
+        if not system.held_back:
+            log.warning(
+                "step %d: %r would grow by %s Gaussians of %s bytes each, and memory has room for %s: no more are "
+                "added. Further ones are counted, and said at the end; a lower max_gaussians would decide it",
+                trainer.global_step, name, f"{added:,}", f"{needed:,.0f}", f"{room:,}",
+            )  # fmt: skip
+        system.held_back[name] = system.held_back.get(name, 0) + added - room
+        return len(rows) + room
 
     def _take_own(self, ranks: Ranks) -> None:
         """Of the statistics of a checkpoint, those of this process; the first takes all if they are another number."""

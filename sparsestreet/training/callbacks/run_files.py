@@ -70,6 +70,7 @@ class RunFiles(Callback, RowListener):
         """Leave the files as training stands now."""
         if not trainer.is_global_zero:
             return
+        system.settle()
         before = self._calibration
         description = replace(
             self.description,
@@ -80,6 +81,8 @@ class RunFiles(Callback, RowListener):
             training_seconds=self.clock.seconds,
             noise=None if before is None else noise_between(before, calibrate(system.device)),
             caps=dict(self.caps),
+            held_back=dict(system.held_back),
+            rested=dict(system.quarantine.counts),
         )
         data = data_of(trainer)
         log, split = data.driving_log, data.split

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.ops.adam import adam_rows_
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
@@ -32,7 +33,8 @@ DEVICE = device_of("triton")
 # way at once; of poses there is a warp or two.
 REGISTERS = {
     "activate_rows": 64, "activate_rows_backward": 96, "interpolate": 41, "interpolate_backward": 64,
-    "step_numbers": 32, "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
+    "step_numbers": 32, "step_finite_rows": 64,
+    "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
 }  # fmt: skip
 # Where the sine of an angle above 1e5 would be reduced.
 STACK = {"interpolate": 32, "interpolate_backward": 32}
@@ -69,6 +71,9 @@ def compiled(scope) -> list[tuple[Launch, dict]]:
                 AdamStep(1, 0.1),
                 backend="triton",
             )
+            refused = torch.zeros(2, dtype=torch.int64, device=DEVICE)
+            width = values[0].numel()
+            adam_rows_(values, gradient, first, second, refused, AdamStep(1, 0.1), width=width, backend="triton")
     return compile_launches(launches, arch)
 
 
@@ -91,7 +96,8 @@ def launch_images(smallest_too: bool) -> None:
 
 def test_every_kernel_is_compiled(compiled, scope):
     of_two_sizes = [
-        "activate_rows", "activate_rows_backward", "lay_over_sky", "lay_over_sky_backward", "step_numbers"
+        "activate_rows", "activate_rows_backward", "lay_over_sky", "lay_over_sky_backward", "step_numbers",
+        "step_finite_rows",
     ]  # fmt: skip
     of_one = ["interpolate", "interpolate_backward", "similarity", "similarity", "similarity_backward"]
     expected = [*of_one, *of_two_sizes * (1 + scope[1])]
@@ -104,9 +110,10 @@ def test_nothing_spills_and_registers_are_few(compiled):
         assert found["registers"] <= REGISTERS[launch.name], (launch, found)
 
 
-def test_no_tensor_cores_and_atomics_for_the_texels_only(compiled):
-    """Four corners of three channels."""
+def test_no_tensor_cores_and_atomics_for_the_texels_and_refused_rows_only(compiled):
+    """Four corners of three channels; a count and the least number."""
     assert [launch for launch, found in compiled if found["tensor_core"]] == []
     assert {(launch.name, found["atomics"]) for launch, found in compiled if found["atomics"]} == {
-        ("lay_over_sky_backward", 12)
+        ("lay_over_sky_backward", 12),
+        ("step_finite_rows", 2),
     }

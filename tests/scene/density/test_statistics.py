@@ -32,9 +32,18 @@ def test_gradient_of_an_undrawn_row_may_be_anything():
     assert statistics.mean_gradients().tolist() == [0.0, 1.0]
 
 
-def test_nan_of_a_drawn_row_is_refused():
+def test_a_drawn_row_whose_gradient_is_not_finite_has_no_say():
+    statistics = DensityStatistics(3)
+    for value in (torch.nan, torch.inf):
+        statistics.add(torch.tensor([[0.0, 0.0], [value, 0.0], [3.0, 0.0]]), torch.ones(3), 2, 2)
+    assert statistics.mean_gradients().tolist() == [0.0, 0.0, 3.0]
+    assert statistics.visits.tolist() == [2, 0, 2]
+
+
+def test_a_sum_that_overflows_is_refused():
     statistics = DensityStatistics(2)
-    statistics.add(torch.tensor([[0.0, 0.0], [float("nan"), 0.0]]), torch.tensor([1.0, 1.0]), 2, 2)
+    for _ in range(2):
+        statistics.add(torch.tensor([[0.0, 0.0], [3e38, 0.0]]), torch.tensor([1.0, 1.0]), 2, 2)
     with pytest.raises(ValueError, match="row 1 of 2"):
         statistics.mean_gradients()
 
@@ -93,7 +102,11 @@ def test_gradients_of_a_watched_column_are_averaged_over_the_visits():
     statistics = watching()
     assert statistics.mean_gradients("life_peaks").tolist() == [3.0, 0.0, 0.5]
     assert statistics.mean_gradients().tolist() == [0.0, 0.0, 0.0]
+    before = statistics.watched["life_peaks"].clone()
     statistics.add(torch.zeros(3, 2), torch.ones(3), 4, 4, {"life_peaks": torch.full((3,), torch.nan)})
+    assert torch.equal(statistics.watched["life_peaks"], before)
+    for _ in range(2):
+        statistics.add(torch.zeros(3, 2), torch.ones(3), 4, 4, {"life_peaks": torch.full((3,), 3e38)})
     with pytest.raises(ValueError, match="gradients of life_peaks must be finite, but row 0 of 3"):
         statistics.mean_gradients("life_peaks")
 

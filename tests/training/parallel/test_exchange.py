@@ -14,6 +14,8 @@ from sparsestreet.ranks import ALONE, LostProcessError, Ranks
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.training.parallel import DisagreementError, check_agreement, exchange
+from sparsestreet.training.parallel.agreement import checksum
+from sparsestreet.training.row_adam import RowAdam
 from tests.training.parallel.several import PATIENCE, several
 from tests.training.stubs import background, frame_at, rigid, set_rows
 
@@ -73,6 +75,20 @@ def statistics_of(rank: int) -> DensityStatistics:
     return statistics
 
 
+def refused_of(ranks: Ranks) -> dict[str, Tensor]:
+    """What a step refuses where one process has a NaN in a row that others saw too."""
+    rows = nn.Parameter(torch.ones(5, 3))
+    rows.grad = torch.zeros(5, 3)
+    rows.grad[1:4] = ranks.rank + 1.0
+    if ranks.rank == 1:
+        rows.grad[2, 1] = torch.nan
+    optimizer = RowAdam([{"params": [rows], "lr": 0.5}])
+    exchange([rows], ranks)
+    optimizer.step()
+    assert optimizer.refused is not None
+    return {"counts": optimizer.refused.counts, "rows": rows.detach()}
+
+
 def talk(rank: int) -> dict[str, Any]:
     """All that is asked of three processes, in one go; the last dies at the end."""
     dist.init_process_group("gloo", rank=rank, world_size=SIZE, timeout=timedelta(seconds=PATIENCE))
@@ -87,6 +103,7 @@ def talk(rank: int) -> dict[str, Any]:
     said["largest"] = ranks.largest(torch.tensor([rank, -rank]))
     said["gathered"] = ranks.gathered(f"process {rank}")
     said["scores"] = scores(ranks)
+    said["refused"] = refused_of(Ranks(rank, SIZE))
     statistics = statistics_of(rank)
     statistics.total(ranks)
     said["statistics"] = statistics.state_dict()
@@ -139,6 +156,13 @@ def test_sums_have_the_order_of_the_processes(answers):
         assert answer["gathered"] == ["process 0", "process 1", "process 2"]
 
 
+def test_a_gradient_that_is_not_finite_in_one_process_is_refused_by_all(answers):
+    """Adam's first step is one rate."""
+    for answer in answers:
+        assert answer["refused"]["counts"].tolist() == [[1, 2]]
+        assert answer["refused"]["rows"][:, 0].tolist() == pytest.approx([1.0, 0.5, 1.0, 0.5, 1.0])
+
+
 def test_pruning_scores_views_together(answers):
     """Costs are sums of float64 over other groups of views."""
     alone = scores(ALONE)
@@ -173,6 +197,16 @@ def test_a_process_that_ends_is_named_in_one_sentence(answers):
         )
         assert "resume=RUN" in lost
     assert "lost" not in answers[2]
+
+
+def test_a_checksum_tells_two_parameters_that_change_places():
+    first, second = torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, 4.0]])
+
+    def module(*weights: Tensor) -> nn.Module:
+        return nn.ParameterList([nn.Parameter(weight) for weight in weights])
+
+    assert bool(checksum(module(first, second)) == checksum(module(first, second)))
+    assert bool(checksum(module(first, second)) != checksum(module(second, first)))
 
 
 def test_alone_nothing_is_shared():

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 13;
+constexpr int32_t INTERFACE_VERSION = 14;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -131,6 +131,17 @@ struct InstancePoses {
   uint8_t* present;
   double *slopes, *fractions;
   int64_t* keyframes;
+};
+
+// A parameter of `rows` rows of `width` numbers, its gradient and moments, and the numbers of a step.
+struct AdamRows {
+  int64_t rows, width;
+  void* parameter;
+  const void* gradient;
+  void *exp_avg, *exp_avg_sq;
+  double share, beta, square_share, root, eps, size;
+  int64_t threads;
+  int64_t* refused;  // number of rows whose gradient is not finite, and the first of them
 };
 
 enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };

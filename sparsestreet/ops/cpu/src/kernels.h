@@ -36,6 +36,10 @@ struct NodeKernels {
                          void* rotation_deltas, void* translation_deltas);
 };
 
+struct AdamKernels {
+  void (*step)(const AdamRows&);
+};
+
 struct SimilarityKernels {
   void (*forward)(const ImagePair&, void* partials, void* mean);
   void (*backward)(const ImagePair&, void* partials, const void* v_mean, void* v_image);
@@ -47,6 +51,7 @@ struct Kernels {
   PixelKernels pixels[2];
   SkyKernels sky[2];
   NodeKernels nodes[2];
+  AdamKernels adam[2];
   SimilarityKernels similarity[2];
 };
 

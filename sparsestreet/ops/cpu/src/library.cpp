@@ -193,6 +193,10 @@ SPLAT_API void splat_poses_backward(int32_t is_double, int32_t index, int64_t in
                                                 translation_deltas);
 }
 
+SPLAT_API void splat_adam(int32_t is_double, int32_t index, const AdamRows* rows) {
+  chosen(index).adam[is_double].step(*rows);
+}
+
 // Mean similarity, and its partial derivatives unless `partials` is null.
 SPLAT_API int32_t splat_ssim(int32_t is_double, int32_t index, const ImagePair* pair, void* partials, void* mean) {
   return guarded([&]() -> int32_t { return chosen(index).similarity[is_double].forward(*pair, partials, mean), OK; });
