@@ -7,6 +7,7 @@ from typing import Literal
 from omegaconf import OmegaConf
 from rich.console import Console
 
+from sparsestreet.cli.compose import load_config
 from sparsestreet.cli.options import run_command
 from sparsestreet.metrics.protocols import PROTOCOLS, Protocol
 from sparsestreet.report import collect, figure, markdown, sections, tables
@@ -91,5 +92,5 @@ def sweep_name(folder: Path) -> str | None:
     """Which of conf/sweep a folder is of; None for any other sweep. ``NAME_paper`` and ``NAME_others`` add rows to
     the folder of NAME."""
     path = folder / "multirun.yaml"
-    name = OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
+    name = OmegaConf.select(load_config(path), "hydra.runtime.choices.sweep") if path.is_file() else None
     return name and name.removesuffix("_paper").removesuffix("_others")
