@@ -57,7 +57,7 @@ class Forked:
             more_mb: memory that it may reserve beyond what this process holds.
             cores: which it may use.
         """
-        self._log, self._started, self._before = log, time.monotonic(), _resident_mb()
+        self._log, self._started, self._before = log, time.monotonic(), resident_mb()
         log.parent.mkdir(parents=True, exist_ok=True)
         sys.stdout.flush()
         self.pid = os.fork()
@@ -126,5 +126,6 @@ def _reserved_mb() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() >> 20
 
 
-def _resident_mb() -> float:
+def resident_mb() -> float:
+    """Memory that this process holds."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20

@@ -10,6 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
+from sparsestreet.ranks import LostProcessError
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.finite import check_parameters
 from sparsestreet.training.lightning import ends_step, ranks_of, validates_now
@@ -84,6 +85,8 @@ class Checkpoints(Callback):
     def _try_to_save(self, trainer: Trainer, system: LightningModule, name: str) -> bool:
         try:
             self._save(trainer, system, name)
+        except LostProcessError:
+            raise  # no matter of the disk: what is in memory is no state to go on from
         except OSError as error:
             log.error("step %d: no checkpoint could be written (%s); the one before it is whole: %s",
                       trainer.global_step, error, self.folder)  # fmt: skip
