@@ -28,6 +28,7 @@ def test_eight_runs_share_their_caches(tmp_path):
     alone, shared = tmp_path / "alone", tmp_path / "shared"
     ended = command(words(shared, shared / "run"), tmp_path / "log")
     assert ended.status == 0, ended.said
+    expected = content(shared / "run")
     shared.rename(alone)
     cores = sorted(os.sched_getaffinity(0))[-2:]
     runs = [shared / f"run{number}" for number in range(RUNS)]
@@ -39,11 +40,9 @@ def test_eight_runs_share_their_caches(tmp_path):
     assert sorted(path.name for path in shared.iterdir()) == ["points", *(run.name for run in runs), "street"]
     for cached in ("points", "street"):
         assert contents(alone / cached) == contents(shared / cached)
-    expected = content(alone / "run")
     for run in runs:
         got = content(run)
         assert sorted(expected) == sorted(got)
-        # Of a run alone the folder was another one of the same name.
         assert [name for name in expected if expected[name] != got[name]] == []
 
 
