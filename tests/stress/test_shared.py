@@ -10,7 +10,7 @@ from sparsestreet.cli import main
 from sparsestreet.triangulation import cache
 from tests.cli.conftest import street_at
 from tests.cli.test_killed_sweep import content
-from tests.stress.forked import Forked, command
+from tests.stress.forked import Forked
 from tests.stress.runs import SHORT, contents
 from tests.triangulation.test_cache import POINTS, _get
 
@@ -26,11 +26,11 @@ def words(folder: Path, out: Path) -> list[str]:
 def test_eight_runs_share_their_caches(tmp_path):
     """On two cores; each leaves what it would leave alone."""
     alone, shared = tmp_path / "alone", tmp_path / "shared"
-    ended = command(words(shared, shared / "run"), tmp_path / "log")
+    cores = sorted(os.sched_getaffinity(0))[-2:]  # a record says how many there are
+    ended = Forked(partial(main, words(shared, shared / "run")), tmp_path / "log", cores=cores).join()
     assert ended.status == 0, ended.said
     expected = content(shared / "run")
     shared.rename(alone)
-    cores = sorted(os.sched_getaffinity(0))[-2:]
     runs = [shared / f"run{number}" for number in range(RUNS)]
     started = [Forked(partial(main, words(shared, run)), tmp_path / f"log {run.name}", cores=cores) for run in runs]
     for found in [one.join() for one in started]:
