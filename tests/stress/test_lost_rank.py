@@ -35,6 +35,8 @@ def test_a_lost_process_of_a_command(tiny_street, tmp_path):
     whole, lost, log = tmp_path / "whole", tmp_path / "lost", tmp_path / "log"
     process = started([*words, f"out={whole}"], log)
     assert process.wait(300) == 0, log.read_text()
+    for once in ("node 'rigid' takes", "Gaussians, about", "stay in memory once they are decoded", "held-out views:"):
+        assert log.read_text().count(once) == 1, once
 
     process = started([*words, f"out={lost}"], log)
     while "step 120 of" not in log.read_text():
