@@ -36,25 +36,21 @@ def read_npz(path: Path, names: Iterable[str] | None = None) -> dict[str, np.nda
             total = sum(sizes[name].file_size for name in chosen)
             if total > LARGEST + path.stat().st_size:
                 raise ValueError(f"its arrays would take {total:,} bytes")
-            found = {}
-            for name in chosen:
-                with archive.open(sizes[name]) as file:
-                    found[name] = _array(file, sizes[name].file_size)
-            return found
+            return {name: _array(archive, sizes[name]) for name in chosen}
     except (KeyError, MemoryError):
         raise
     except Exception as error:  # each part of a broken archive fails in its own way
         raise ValueError(f"it is no archive of arrays: {type(error).__name__}: {error}"[:300]) from error
 
 
-def _array(file: zipfile.ZipExtFile, size: int) -> np.ndarray:
-    """The array of an entry of so many bytes."""
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
     headers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-    shape, by_columns, kind = headers[npy.read_magic(file)](file)
-    if kind.hasobject:
-        raise ValueError("it holds objects, whose pickle may run code")
-    left, wanted = size - file.tell(), math.prod(shape) * kind.itemsize
-    if left != wanted:
-        raise ValueError(f"an array of shape {shape} of {kind} has {left:,} bytes")
-    values = np.frombuffer(bytearray(file.read()), kind)
+    with archive.open(entry) as file:
+        shape, by_columns, kind = headers[npy.read_magic(file)](file)
+        if kind.hasobject:
+            raise ValueError("it holds objects, whose pickle may run code")
+        left, wanted = entry.file_size - file.tell(), math.prod(shape) * kind.itemsize
+        if left != wanted:
+            raise ValueError(f"an array of shape {shape} of {kind} has {left:,} bytes")
+        values = np.frombuffer(bytearray(file.read()), kind)
     return values.reshape(shape, order="F" if by_columns else "C")

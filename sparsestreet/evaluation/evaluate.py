@@ -1,7 +1,6 @@
 """Renders against recorded images, one at a time: nothing is kept but numbers, and predictions on disk."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -86,7 +85,7 @@ def _of_all(
 ) -> Iterator[FrameQuality]:
     """A round takes a frame of each process, whose pixels travel to the first: only its disk need hold the run."""
 
-    def look(place: int) -> _Look | ValueError | None:
+    def look(place: int) -> tuple[np.ndarray | None, FrameQuality] | ValueError | None:
         if place >= len(frames):
             return None
         frame = frames[place]
@@ -94,8 +93,7 @@ def _of_all(
             pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         except ValueError as error:
             return error
-        kept = pixels if predictions is not None else None
-        return _Look(frame.indices, kept, _quality(pixels, frame, scene.device, lpips))
+        return (None if predictions is None else pixels), _quality(pixels, frame, scene.device, lpips)
 
     for first in range(0, len(frames), ranks.size):
         for found in ranks.gathered(look(first + ranks.rank)):
@@ -103,18 +101,10 @@ def _of_all(
                 raise found
             if found is None:
                 continue
-            if predictions is not None and found.pixels is not None and ranks.rank == 0:
-                predictions.write(*found.indices, found.pixels)
-            yield found.quality
-
-
-@dataclass(frozen=True)
-class _Look:
-    """What a process says of a frame."""
-
-    indices: tuple[int, int]
-    pixels: np.ndarray | None
-    quality: FrameQuality
+            pixels, quality = found
+            if predictions is not None and ranks.rank == 0:
+                predictions.write(quality.frame, quality.camera, pixels)
+            yield quality
 
 
 def evaluate_predictions(
