@@ -32,6 +32,17 @@ def ranks_of(trainer: Trainer) -> Ranks:
     return getattr(trainer.strategy, "ranks", ALONE)
 
 
+def row_number(trainer: Trainer) -> int:
+    """Number of the step whose row Lightning logs next; that of the next step as soon as it has."""
+    return trainer.fit_loop.epoch_loop._batches_that_stepped
+
+
+def row_of_step(trainer: Trainer) -> dict[str, float]:
+    """What Lightning is about to log of the step that is ending."""
+    said = {name: float(value) for name, value in trainer._logger_connector.metrics["log"].items()}
+    return said | {"epoch": trainer.current_epoch, "step": row_number(trainer)}
+
+
 def shares_validation(trainer: Trainer) -> bool:
     """Whether each of several processes validates on its share of the images."""
     return ranks_of(trainer).size > 1 and getattr(trainer.val_dataloaders, "shared", False)

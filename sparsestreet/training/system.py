@@ -17,7 +17,14 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.finite import check_loss
-from sparsestreet.training.lightning import image_number, images_per_step, ranks_of, shares_validation
+from sparsestreet.training.lightning import (
+    image_number,
+    images_per_step,
+    ranks_of,
+    row_number,
+    row_of_step,
+    shares_validation,
+)
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
@@ -79,6 +86,10 @@ class StreetSystem(LightningModule):
         self._course: Course | None = None
         self._looks: list[dict[str, float]] = []
         """What a validation that is shared has measured so far."""
+        self._unlogged: int | None = None
+        """Number of the newest row, unless a validation has logged since."""
+        self._row: dict[str, float] | None = None
+        """What loggers may lack of the step of the checkpoint that training goes on from."""
         self.train_psnr: deque[Tensor] = deque(maxlen=10)
 
     @property
@@ -123,6 +134,7 @@ class StreetSystem(LightningModule):
                     terms |= self.moved_views(self.scene, self.rendering, frame)
         check_loss(terms, self.scene, frame, self.global_step)
         if self._logs():
+            self._unlogged = row_number(self.trainer)
             with phase("logging"):
                 self._log_training(self.rendering, terms, frame)
         return torch.stack(tuple(terms.values())).sum()
@@ -137,7 +149,7 @@ class StreetSystem(LightningModule):
             super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
 
     def on_validation_epoch_start(self) -> None:
-        self._looks = []
+        self._unlogged, self._looks = None, []
 
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
@@ -167,14 +179,24 @@ class StreetSystem(LightningModule):
     def configure_optimizers(self) -> Optimizer:
         return self.optimizer_settings.build(self.scene, self.radius, images_per_step(self.trainer))
 
+    def on_train_start(self) -> None:
+        """Log what the step of the checkpoint measured, if a kill came between the two (``curves.kept_curves``)."""
+        if self._row is not None:
+            for logger in self.trainer.loggers:
+                logger.log_metrics(self._row, int(self._row["step"]))
+        self._row = None
+
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
         set_rates(self.trainer.optimizers[0], self.state().progress)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["train_psnr"] = [value.cpu() for value in self.train_psnr]
+        # Lightning logs a step behind the callbacks that save at its end.
+        checkpoint["row"] = row_of_step(self.trainer) if self._unlogged == row_number(self.trainer) else None
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.train_psnr.extend(value.to(self.device) for value in checkpoint.get("train_psnr", ()))
+        self._row = checkpoint.get("row")
 
     def _logs(self) -> bool:
         """Whether Lightning's loggers will take what this step says; in other steps nothing is computed for them."""

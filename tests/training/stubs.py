@@ -167,7 +167,8 @@ class StubTrainer(Trainer):
     accumulate_grad_batches: int = 1
     strategy: Any = SimpleNamespace(broadcast=lambda value: value)
     loggers: Sequence[Any] = ()
-    fit_loop: Any = SimpleNamespace(_data_fetcher=None)  # nothing is validated
+    # Nothing is validated, and no row is logged.
+    fit_loop: Any = SimpleNamespace(_data_fetcher=None, epoch_loop=SimpleNamespace(_batches_that_stepped=0))
 
     def __init__(
         self,
