@@ -49,12 +49,13 @@ def test_runs_that_are_killed(sparsify, tiny_street, tmp_path):
         for attempt in count():
             forked = Forked(partial(_main, [*words, f"out={run}"]), tmp_path / f"log{number}.{attempt}")
             last = attempt == MOST or killed == KILLS_OF_RUNS // 2
-            found = forked.join() if last else forked.join(kill_after=next(moments) * whole.seconds)
-            assert found.status in (0, -9), found.said
+            found = forked.join() if last else forked.join(kill_after=0.8 * next(moments) * whole.seconds)
             assert "Traceback" not in found.said
             killed += found.status == -9
-            if found.status == 0:
+            # The kill before may have come behind the last file.
+            if found.status == 0 or (found.status == 2 and "holds this very run, finished" in found.said):
                 break
+            assert found.status == -9, found.said
         assert_same(tmp_path / "whole", run)
         if killed == KILLS_OF_RUNS // 2:
             break
