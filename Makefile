@@ -11,7 +11,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help quick test test-all lint style types docs demo bench tables claims figure clean FORCE
+.PHONY: help quick test test-all stress lint style types docs demo bench tables claims figure clean FORCE
 
 help: ## this list
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -51,7 +51,10 @@ test: style ## what a change must pass: lint and all tests but those marked slow
 	$(call beside_types,$(PYTEST) -m "not slow" --durations=20)
 
 test-all: style ## lint and all tests: every kernel for every architecture, every size of tiles
-	$(call beside_types,$(PYTEST))
+	$(call beside_types,$(PYTEST) -m "not stress")
+
+stress: $(VENV)/.ok ## kills, damaged and hostile files, 20,000 steps, shared caches: a quarter of an hour
+	$(PYTEST) -m stress --durations=20 tests/stress
 
 lint: style types ## style, format, imports that go downwards, types
 

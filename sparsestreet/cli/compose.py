@@ -1,6 +1,7 @@
 """Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
 
 import difflib
+import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
 from sparsestreet.cli.limits import limit_problem
+from sparsestreet.safe_yaml import read_yaml
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.
@@ -294,21 +296,35 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
 def load_run_config(run: Path) -> DictConfig:
     """The configuration that a run wrote, with the log where the run had it.
 
-    Raises FileNotFoundError naming what a run folder holds.
+    Raises FileNotFoundError naming what a run folder holds, ValueError for a file that is damaged.
     """
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
-    cfg = cast(DictConfig, OmegaConf.load(path))
+    cfg = load_config(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
     _find_log(cfg, run / ".hydra" / "hydra.yaml")
     return cfg
 
 
+def load_config(path: Path) -> DictConfig:
+    """A configuration that Hydra wrote. Raises ValueError, naming the file, for what is none."""
+    try:
+        cfg = read_yaml(path, lambda text: OmegaConf.load(io.StringIO(text)))
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{path} is damaged ({' '.join(str(error).split())[:200]})") from error
+    if not isinstance(cfg, DictConfig):
+        raise ValueError(f"{path} is damaged: it holds no configuration")
+    return cfg
+
+
 def _find_log(cfg: DictConfig, launch: Path) -> None:
     """Relative folders of the log are meant from where the run was started, as long as that is there."""
-    started = Path(OmegaConf.load(launch).hydra.runtime.cwd) if launch.is_file() else Path()
+    cwd = OmegaConf.select(load_config(launch), "hydra.runtime.cwd") if launch.is_file() else ""
+    if not isinstance(cwd, str):
+        raise ValueError(f"{launch} is damaged: it does not say where the run was started (hydra.runtime.cwd)")
+    started = Path(cwd)
     if started.is_dir():
         for key in ("data.root", "data.log.root", "data.log.parent"):
             folder = OmegaConf.select(cfg, key)

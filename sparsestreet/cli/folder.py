@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -34,6 +35,9 @@ OF_A_RUN = (
     "same_as.json",
 )
 """What a training leaves in its folder, besides its configuration and its log."""
+
+_TEMPORARY = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
+"""Names of ``atomic_file``, with the number of the process."""
 
 _ALIKE = ("seed", "data.root", "data.log.root")
 """Beside the hash: what tells runs of one configuration apart and is part of no configuration's identity."""
@@ -112,8 +116,11 @@ def identity_of_run(config: Configuration) -> tuple[str, ...]:
 def take_folder(cfg: DictConfig, out: Path, goes_on: bool) -> None:
     """Write the configuration of the run that begins or goes on; nothing of an earlier run stays beside a new one.
 
-    Hydra would write it before the run is known to be one.
+    Hydra would write it before the run is known to be one. What a kill left of files that were being written goes:
+    nobody else writes here (``locks.sole_writer``).
     """
+    for half_written in [path for path in out.rglob(".*.tmp*") if _TEMPORARY.fullmatch(path.name) and path.is_file()]:
+        half_written.unlink()
     if not goes_on:
         for name in OF_A_RUN:
             path = out / name

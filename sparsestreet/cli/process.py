@@ -4,6 +4,7 @@ Memory and threads are said before torch is imported, which reads them once.
 """
 
 import ctypes
+import logging
 import os
 import select
 import sys
@@ -71,5 +72,43 @@ def shares_a_run(trainer: Mapping[str, Any]) -> bool:
 
 def follows_another(trainer: Mapping[str, Any]) -> bool:
     """Whether this process is one of those that a run's first one, or the cluster, started beside it."""
-    ranks = ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID")
-    return shares_a_run(trainer) and any(os.environ.get(name, "0") != "0" for name in ranks)
+    return name_beside_first(trainer) is not None
+
+
+def name_beside_first(trainer: Mapping[str, Any]) -> str | None:
+    """What a process is called that another one of its run goes before; None for the first one, and alone.
+
+    >>> name_beside_first({"strategy": "auto"}) is None
+    True
+    """
+    given = {name: os.environ.get(name, "0") for name in ("RANK", "SLURM_PROCID", "NODE_RANK", "LOCAL_RANK")}
+    if not shares_a_run(trainer) or set(given.values()) == {"0"}:
+        return None
+    of_all = next((given[name] for name in ("RANK", "SLURM_PROCID") if given[name] != "0"), None)
+    if of_all is not None:  # torchrun and SLURM count over all nodes, Lightning on each
+        return f"process {of_all}"
+    node = "" if given["NODE_RANK"] == "0" else f" of node {given['NODE_RANK']}"
+    return f"process {given['LOCAL_RANK']}{node}"
+
+
+def speak_as(name: str) -> None:
+    """Let this process, which others of its run go before, say nothing but warnings and errors, and who it is.
+
+    The first says what all of them do.
+    """
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(_Named(name))
+    for library in ("lightning.fabric", "lightning.pytorch"):
+        logging.getLogger(library).setLevel(logging.WARNING)
+    logging.captureWarnings(True)
+
+
+class _Named(logging.Filter):
+    """Of a handler: lets warnings pass, with the name of the process in front."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno < logging.WARNING:
+            return False
+        if not getattr(record, "named", False):  # of another handler
+            record.msg, record.named = f"{self.name}: {record.msg}", True
+        return True

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from omegaconf import OmegaConf
+import yaml
 from rich.console import Console
 
 from sparsestreet.cli.options import run_command
@@ -13,6 +13,7 @@ from sparsestreet.report import collect, figure, markdown, sections, tables
 from sparsestreet.report.arms import arms
 from sparsestreet.report.figures_readme import time_figure
 from sparsestreet.report.sweep import sweep_records, write_report
+from sparsestreet.safe_yaml import read_yaml
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
@@ -91,5 +92,7 @@ def sweep_name(folder: Path) -> str | None:
     """Which of conf/sweep a folder is of; None for any other sweep. ``NAME_paper`` and ``NAME_others`` add rows to
     the folder of NAME."""
     path = folder / "multirun.yaml"
-    name = OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices.sweep") if path.is_file() else None
+    name = read_yaml(path, yaml.safe_load) if path.is_file() else None
+    for key in ("hydra", "runtime", "choices", "sweep"):
+        name = name.get(key) if isinstance(name, dict) else None
     return name and name.removesuffix("_paper").removesuffix("_others")

@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml
 
 from sparsestreet.cli.compose import load_run_config, resolved
 from sparsestreet.records.configuration import IDENTITY_KEYS, flat_config, without
+from sparsestreet.safe_yaml import read_yaml
 
 
 def resumed_overrides(arguments: list[str]) -> list[str]:
@@ -27,7 +28,9 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
             f"resume={given}: it was ended before its first checkpoint (checkpoint_every=...): start it again with "
             f"its own options and out={run}"
         )
-    overrides = OmegaConf.load(run / ".hydra" / "overrides.yaml")
+    overrides = read_yaml(run / ".hydra" / "overrides.yaml", yaml.safe_load)
+    if not isinstance(overrides, list):
+        raise ValueError(f"{run}/.hydra/overrides.yaml is damaged: it holds no list of options")
     kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out=", "overwrite="))]
     folder = [] if any(text.startswith("out=") for text in arguments) else [f"out={run}"]
     return [*kept, *arguments, *folder]
@@ -51,7 +54,7 @@ def check_resumed(config: dict[str, Any], run: Path) -> None:
     now = flat_config(config)
     old, new = (without(flat, (*IDENTITY_KEYS, "trainer.*")) for flat in (before, now))
     changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
-    if before["seed"] != now["seed"]:
+    if before.get("seed") != now["seed"]:
         changed.insert(0, "seed")
     if changed:
         said = ", ".join(f"{key} ({old.get(key, before.get(key))} before)" for key in changed[:3])

@@ -77,7 +77,7 @@ def silence_known_noise() -> None:
     warnings.filterwarnings("ignore", message="Total length of .list. across ranks is zero.*")
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")
-    # Each of several processes validates on all of the images.
+    # Of several processes all log the means over the images of all (``StreetSystem.on_validation_epoch_end``).
     warnings.filterwarnings("ignore", message=".*sync_dist=True.*")
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)

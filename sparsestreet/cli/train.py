@@ -18,7 +18,7 @@ from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.locks import sole_writer
-from sparsestreet.cli.process import follows_another
+from sparsestreet.cli.process import follows_another, name_beside_first, speak_as
 from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
@@ -93,6 +93,8 @@ def app(cfg: DictConfig) -> float | None:
     # installed script): they need the command's name, which Hydra does not know, and the overrides of this job alone.
     sys.argv = [sys.argv[0], "train", *HydraConfig.get().overrides.task]
     out = Path(HydraConfig.get().runtime.output_dir)
+    if name := name_beside_first(cfg.trainer):
+        speak_as(name)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         hydra = HydraConfig.get()
         with job_beside_others(Path(hydra.sweep.dir)) if beside_each_other(hydra) else nullcontext():
@@ -106,7 +108,8 @@ def app(cfg: DictConfig) -> float | None:
         # Where somebody looks for a fault, Hydra's own report with the whole trace is better.
         if "HYDRA_FULL_ERROR" in os.environ:
             raise
-        print(f"sparsestreet train: {sentence(error)}", file=sys.stderr)
+        name = name_beside_first(cfg.trainer)
+        print(f"sparsestreet train{f', {name}' if name else ''}: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
     finally:
         leave_folder(out, f"{HydraConfig.get().job.name}.log")

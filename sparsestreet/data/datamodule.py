@@ -116,9 +116,20 @@ class OrderedFrames:
 
     Threads read while an iteration lasts."""
 
-    def __init__(self, frames: Frames, limit: int | None = None, device: torch.device = HOST) -> None:
-        """``limit``: so many of the frames, spread evenly over all of them, the first and the last included."""
-        self.frames = frames if limit is None else frames.at(spread(len(frames), limit))
+    def __init__(
+        self, frames: Frames, limit: int | None = None, device: torch.device = HOST, ranks: Ranks = ALONE
+    ) -> None:
+        """
+        Args:
+            frames: all of them.
+            limit: so many of the frames, spread evenly over all of them, the first and the last included.
+            device: where frames are wanted.
+            ranks: the processes that share the frames, as ``ranks.share`` does. Where there are fewer frames than
+                processes, each one has all: an iteration of none would be left out.
+        """
+        places = list(range(len(frames)) if limit is None else spread(len(frames), limit))
+        self.shared = 1 < ranks.size <= len(places)
+        self.frames = frames.at(ranks.share(places) if self.shared else places)
         self._device = device
 
     def __len__(self) -> int:
@@ -204,9 +215,13 @@ class StreetData(LightningDataModule):
         return self._training
 
     def val_dataloader(self) -> OrderedFrames | list:
-        """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out."""
+        """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out. Of
+        several processes each has its share."""
         held_out = self.split.held_out
-        return OrderedFrames(held_out, self.val_frames, self._device) if len(held_out) else []
+        if not len(held_out):
+            return []
+        ranks = ALONE if self.trainer is None else getattr(self.trainer.strategy, "ranks", ALONE)
+        return OrderedFrames(held_out, self.val_frames, self._device, ranks)
 
     def teardown(self, stage: str) -> None:
         self._close()

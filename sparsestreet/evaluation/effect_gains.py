@@ -6,6 +6,7 @@ import torch
 
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.evaluation.evaluate import evaluate_frames
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.costs import EffectGain
 from sparsestreet.records.quality import FrameQuality, summarize
 from sparsestreet.scene.graph import SceneGraph
@@ -17,14 +18,21 @@ MOST_IMAGES = 60
 
 @torch.no_grad()
 def measure_effect_gains(
-    scene: SceneGraph, frames: Frames, quality: Sequence[FrameQuality], options: RenderOptions
+    scene: SceneGraph,
+    frames: Frames,
+    quality: Sequence[FrameQuality],
+    options: RenderOptions,
+    ranks: Ranks = ALONE,
 ) -> dict[str, EffectGain]:
-    """Name of each effect of the scene -> its gain on ``frames``, of which ``quality`` is that of the whole scene."""
+    """Name of each effect of the scene -> its gain on ``frames``, of which ``quality`` is that of the whole scene.
+
+    ``ranks``: as in ``evaluate_frames``.
+    """
     chosen = spread(len(frames), MOST_IMAGES)
     whole = _means([quality[index] for index in chosen])
     gains = {}
     for name in (name for name, effect in scene.effects.items() if effect.is_on):
-        without = _means(list(evaluate_frames(scene.without(name), frames.at(chosen), options)))
+        without = _means(list(evaluate_frames(scene.without(name), frames.at(chosen), options, ranks=ranks)))
         full, vehicle, human = (_less(*pair) for pair in zip(whole, without, strict=True))
         if full is not None:
             gains[name] = EffectGain(full, vehicle, human, len(chosen))

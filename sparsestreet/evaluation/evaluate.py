@@ -8,12 +8,14 @@ from jaxtyping import Bool, Float, UInt16
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
+from sparsestreet.data.lazy import Frames
 from sparsestreet.data.lidar import near_returns
 from sparsestreet.evaluation.predictions import Predictions, quantized, restored
 from sparsestreet.metrics import image as metrics
 from sparsestreet.metrics import ssim
 from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
 from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.quality import FrameQuality, RegionQuality
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -42,8 +44,12 @@ def evaluate_frames(
     options: RenderOptions,
     predictions: Predictions | None = None,
     lpips: Mapping[str, Lpips] | None = None,
+    ranks: Ranks = ALONE,
 ) -> Iterator[FrameQuality]:
     """The quality of each frame's render, in order; holds one frame at a time, and moves it to the scene's device.
+
+    Of several processes each renders its share, and all get the quality of all frames: the same bits as of one process,
+    because every image is measured alone.
 
     Args:
         scene: what is rendered.
@@ -52,15 +58,53 @@ def evaluate_frames(
         predictions: where renders are stored; what is compared is then read back from there. None: they
             are rounded alike, and not stored.
         lpips: the perceptual distances to measure, by the quantity that each is; on the scene's device.
+        ranks: the processes that evaluate together; the first one alone writes.
 
-    Raises ValueError for a render that is not finite, OSError where a prediction cannot be written.
+    Raises ValueError for a render that is not finite (in all processes), OSError where a prediction cannot be written,
+    LostProcessError.
     """
+    if ranks.size > 1:
+        views = frames if isinstance(frames, Frames) else Frames.of(tuple(frames))
+        yield from _of_all(scene, views, options, predictions, lpips, ranks)
+        return
     for frame in frames:
         pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         if predictions is not None:
             predictions.write(*frame.indices, pixels)
             pixels = predictions.read(*frame.indices)
         yield _quality(pixels, frame, scene.device, lpips)
+
+
+def _of_all(
+    scene: SceneGraph,
+    frames: Frames,
+    options: RenderOptions,
+    predictions: Predictions | None,
+    lpips: Mapping[str, Lpips] | None,
+    ranks: Ranks,
+) -> Iterator[FrameQuality]:
+    """A round takes a frame of each process, whose pixels travel to the first: only its disk need hold the run."""
+
+    def look(place: int) -> tuple[np.ndarray | None, FrameQuality] | ValueError | None:
+        if place >= len(frames):
+            return None
+        frame = frames[place]
+        try:
+            pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
+        except ValueError as error:
+            return error
+        return (None if predictions is None else pixels), _quality(pixels, frame, scene.device, lpips)
+
+    for first in range(0, len(frames), ranks.size):
+        for found in ranks.gathered(look(first + ranks.rank)):
+            if isinstance(found, ValueError):
+                raise found
+            if found is None:
+                continue
+            pixels, quality = found
+            if predictions is not None and ranks.rank == 0:
+                predictions.write(quality.frame, quality.camera, pixels)
+            yield quality
 
 
 def evaluate_predictions(

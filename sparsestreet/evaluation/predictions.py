@@ -55,7 +55,10 @@ class Predictions:
         path = self.path(frame, camera)
         if not path.is_file():
             raise PredictionError(f"{path} is not there: evaluate the run, which stores its predictions")
-        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        try:
+            pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:  # an empty file, or a header of more pixels than OpenCV reads
+            pixels = None
         if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
             found = "cannot be decoded" if pixels is None else f"is {pixels.dtype} of shape {pixels.shape}"
             raise PredictionError(f"{path} {found}, a prediction is a 16-bit RGB PNG: evaluate the run again")

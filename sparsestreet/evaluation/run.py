@@ -21,7 +21,8 @@ from sparsestreet.ops import Guards, guards
 from sparsestreet.phases import stage
 from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_picture, write_picture, write_png
 from sparsestreet.pictures.sheets import Legend, picture_sheet
-from sparsestreet.records.costs import update_costs
+from sparsestreet.ranks import ALONE, Ranks
+from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.latency import LATENCY, Latency, clock_rows
 from sparsestreet.records.novel import NOVEL
 from sparsestreet.records.presets import PRESETS
@@ -48,6 +49,7 @@ def evaluate_scene(
     device: torch.device | str,
     pictures: int = 4,
     timing: Timing | None = None,
+    ranks: Ranks = ALONE,
 ) -> RunSummary:
     """Measure quality, speed and size of a scene; write ``out/records``, ``out/predictions`` and ``out/pictures``.
 
@@ -68,38 +70,25 @@ def evaluate_scene(
         device: where it is rendered and timed.
         pictures: how many views become pictures.
         timing: how often frames are timed; None: ``Timing()``.
+        ranks: the processes that measure quality together. This is the first; the others call ``help_to_evaluate``.
 
-    Raises ValueError without any view, or for renders that are not finite.
+    Raises ValueError without any view, or for renders that are not finite, LostProcessError.
     """
-    splits = {split: Frames.of(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
+    splits = _splits(held_out, training)
     if not splits:
         raise ValueError(f"there is no view to evaluate {run.label} on: give held-out views, training views or both")
     scene = scene.to(torch.device(device)).eval()
     main, frames = next(iter(splits.items()))
-    lpips, absent = open_lpips(scene.device)
     for split in (HELD_OUT, TRAINING):
         Predictions.of(out, split).clear()
     for file in (NOVEL, PRESETS):
         file.remove(out)  # of an earlier evaluation, perhaps of an earlier scene
-    quality = {
-        split: list(
-            evaluate_frames(
-                scene,
-                frames,
-                options,
-                Predictions.of(out, split) if split == HELD_OUT else None,
-                lpips if split == main else {},
-            )
-        )
-        for split, frames in splits.items()
-    }
+    quality, gains, absent = _looks(scene, splits, options, out, ranks)
     timing = timing or Timing()
     with stage("latency"):
         latency = measure_latency(scene, frames.views, options, warmup=timing.warmup, repeats=timing.repeats)
     with stage("costs"):
         costs = measure_scene_costs(scene, frames.views, options, repeats=timing.rounds)
-    with stage("gains"):
-        gains = measure_effect_gains(scene, frames, quality[main], options)
     summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent)
     with stage("pictures"):
         chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
@@ -112,6 +101,52 @@ def evaluate_scene(
     update_costs(out, **vars(costs), gains=gains)
     SUMMARY.write(out, summary)
     return summary
+
+
+@torch.no_grad()
+def help_to_evaluate(
+    scene: SceneGraph,
+    held_out: Frames | tuple[Frame, ...],
+    training: Frames | tuple[Frame, ...],
+    *,
+    options: RenderOptions,
+    out: Path,
+    device: torch.device | str,
+    ranks: Ranks,
+) -> None:
+    """A process's share of what the first one measures in ``evaluate_scene``; writes nothing. Ends before frames are
+    timed, so that nobody else computes then. Raises as ``evaluate_scene``."""
+    splits = _splits(held_out, training)
+    if splits:
+        _looks(scene.to(torch.device(device)).eval(), splits, options, out, ranks)
+
+
+def _splits(held_out: Frames | tuple[Frame, ...], training: Frames | tuple[Frame, ...]) -> dict[str, Frames]:
+    return {split: Frames.of(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
+
+
+def _looks(
+    scene: SceneGraph, splits: Mapping[str, Frames], options: RenderOptions, out: Path, ranks: Ranks
+) -> tuple[dict[str, list[FrameQuality]], dict[str, EffectGain], Mapping[str, str]]:
+    """Quality by split, gains of effects, and which distances could not be measured and why."""
+    main, frames = next(iter(splits.items()))
+    lpips, absent = open_lpips(scene.device)
+    quality = {
+        split: list(
+            evaluate_frames(
+                scene,
+                views,
+                options,
+                Predictions.of(out, split) if split == HELD_OUT else None,
+                lpips if split == main else {},
+                ranks,
+            )
+        )
+        for split, views in splits.items()
+    }
+    with stage("gains"):
+        gains = measure_effect_gains(scene, frames, quality[main], options, ranks)
+    return quality, gains, absent
 
 
 def _guard_counts(scene: SceneGraph, views: Sequence[View], options: RenderOptions) -> GuardCounts:

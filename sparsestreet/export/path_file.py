@@ -89,7 +89,7 @@ def read_path(path: Path, like: View, seconds: float, fps: float) -> PathFile:
         if kind == "keyframes":
             poses = _splined(poses, fps)
         return PathFile(tuple((pose.view(time_of),) for pose in poses), None)
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON: {error}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -94,7 +94,7 @@ class CsvFile(RunFile, Generic[Row]):
         path = self.path(run)
         if not path.is_file():
             raise RecordError(f"{path}: does not exist; {self.remedy} first")
-        lines = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8"))))
+        lines = csv_lines(path, self.remedy)
         if not lines or tuple(lines[0]) != self.columns:
             raise RecordError(
                 f"{path}: the header is {lines[:1]}, expected {','.join(self.columns)}; {self.remedy} again"
@@ -124,6 +124,15 @@ class CsvFile(RunFile, Generic[Row]):
             return self.row(cells)
         except ValueError as error:
             raise RecordError(f"{where}: {error}; {self.remedy} again") from error
+
+
+def csv_lines(path: Path, remedy: str) -> list[list[str]]:
+    """Cells of each line. Raises RecordError, naming the file and how to make it, for what is no text."""
+    try:
+        # As bytes, because a cell may hold ends of lines.
+        return list(csv.reader(io.StringIO(path.read_bytes().decode("utf-8"), newline="")))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RecordError(f"{path}: cannot be read ({error}); {remedy} again") from error
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

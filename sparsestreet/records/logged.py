@@ -1,11 +1,10 @@
 """``curves/metrics.csv``: what training logged, as Lightning's CSV logger writes it."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.records.file import RunFile, csv_text
+from sparsestreet.records.file import RunFile, csv_lines, csv_text
 from sparsestreet.records.strict_json import write_atomically
 
 Logged = dict[str, str]
@@ -17,11 +16,15 @@ class LoggedFile(RunFile):
     """Rows whose columns are whatever training logs."""
 
     def rows(self, run: Path) -> list[Logged]:
-        """Returns all rows; none for a run without the file."""
+        """Returns all rows; none for a run without the file. What a kill left of a line is none.
+
+        Raises RecordError for what is no text.
+        """
         if not self.exists(run):
             return []
-        with self.path(run).open(newline="") as file:
-            return list(csv.DictReader(file))
+        head, *lines = csv_lines(self.path(run), "remove it, or train the run") or [[]]
+        rows = [dict(zip(head, line, strict=True)) for line in lines if len(line) == len(head)]
+        return [row for row in rows if row.get("step", "").isdecimal()]
 
     def write(self, run: Path, rows: Sequence[Logged]) -> None:
         """Writes the whole file or nothing, with every column that any row has, in order of appearance."""

@@ -78,6 +78,8 @@ def parsed(text: str, where: str) -> Json:
         return json.loads(text, parse_constant=_refuse_constant)
     except ValueError as error:
         raise RecordError(f"{where}: is not strict JSON ({error}); write the record again") from error
+    except RecursionError as error:
+        raise RecordError(f"{where}: is brackets in brackets without end; write the record again") from error
 
 
 def significant(value: float, where: str) -> float:

@@ -18,10 +18,11 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.doubts import doubts
 from sparsestreet.evaluation.extra import ExtraMetrics
-from sparsestreet.evaluation.run import evaluate_scene
+from sparsestreet.evaluation.run import evaluate_scene, help_to_evaluate
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.effects import draw_effects
 from sparsestreet.pictures.history import draw_history
+from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.result import result_lines
@@ -43,7 +44,7 @@ from sparsestreet.training.callbacks import (
 from sparsestreet.training.costs import record_costs
 from sparsestreet.training.curves import kept_curves
 from sparsestreet.training.identity import RunIdentity
-from sparsestreet.training.lightning import check_images, end_after, images_per_step, is_dev_run, steps_for
+from sparsestreet.training.lightning import check_images, end_after, images_per_step, is_dev_run, ranks_of, steps_for
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.system import StreetSystem
 
@@ -78,8 +79,8 @@ def train(
 ) -> RunSummary | None:
     """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
 
-    Of several processes (``training/parallel``) each one trains; the first alone writes, evaluates and returns a
-    summary.
+    Of several processes (``training/parallel``) each one trains and measures its share of the images; the first alone
+    writes, times frames and returns a summary.
 
     Args:
         recipe: the parts of the training. Its callbacks keep state: take a new recipe for another run.
@@ -138,12 +139,21 @@ def train(
             sys.exit(stop.exit_status or 1)
         if is_dev_run(trainer):
             log.info("fast_dev_run: stopped after %d steps without evaluation", trainer.global_step)
-        if is_dev_run(trainer) or not trainer.is_global_zero:
             return None
-
-        device = trainer.strategy.root_device
+        device, ranks = trainer.strategy.root_device, ranks_of(trainer)
+        if not trainer.is_global_zero:
+            help_to_evaluate(
+                system.scene,
+                data.split.held_out,
+                data.split.train,
+                options=system.options,
+                out=out,
+                device=device,
+                ranks=ranks,
+            )
+            return None
         summary = evaluate(
-            system.scene, system.options, data, out, device=device, command=identity.command, extra=extra
+            system.scene, system.options, data, out, device=device, command=identity.command, extra=extra, ranks=ranks
         )
         record_costs(out, stages, device)  # the last file: a run with costs is a whole one
     for line in result_lines(summary, out):
@@ -218,8 +228,11 @@ def evaluate(
     command: str,
     extra: ExtraMetrics,
     say: Callable[[str], None] = log.info,
+    ranks: Ranks = ALONE,
 ) -> RunSummary:
     """Measure a scene on the views of its log, as ``out/run.json`` identifies it; write records and pictures there.
+
+    ``ranks``: as in ``evaluate_scene``.
 
     Raises ValueError for renders that are not finite.
     """
@@ -234,6 +247,7 @@ def evaluate(
             command=command,
             device=device,
             timing=extra.timing,
+            ranks=ranks,
         )
     extra.measure(scene, data, options, out=out, command=command, say=say)
     with stage("pictures"):

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -16,7 +17,14 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.finite import LossWatch
-from sparsestreet.training.lightning import ends_step, image_number, images_per_step, logs_now
+from sparsestreet.training.lightning import (
+    ends_step,
+    image_number,
+    images_per_step,
+    logs_now,
+    ranks_of,
+    shares_validation,
+)
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
@@ -84,6 +92,8 @@ class StreetSystem(LightningModule):
         self._view: View | None = None
         """Of the step that is under way."""
         self._course: Course | None = None
+        self._looks: list[dict[str, float]] = []
+        """What a validation that is shared has measured so far."""
         self.train_psnr: deque[Tensor] = deque(maxlen=10)
         self.said = SaidLater()
         """What training steps logged: PSNR, the terms, the number of Gaussians."""
@@ -150,16 +160,33 @@ class StreetSystem(LightningModule):
             if refused is not None and self._view is not None:
                 self.quarantine.look(refused, self.scene.named_parameters(), self._view, step)
 
+    def on_validation_epoch_start(self) -> None:
+        self._looks = []
+
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
             image = render(self.scene, frame, self.state(), self.options).rgb.clamp(0, 1)
             truth = frame.image.to(image.dtype) / 255
-            self.log("val/psnr", psnr(image, truth), batch_size=1)
+            look = {"val/psnr": psnr(image, truth)}
             for region in ("human", "vehicle"):
                 mask = getattr(frame, region)
                 value = None if mask is None else masked_psnr(image, truth, mask)
                 if value is not None:
-                    self.log(f"val/psnr_{region}", value, batch_size=1)
+                    look[f"val/psnr_{region}"] = value
+        if shares_validation(self.trainer):
+            self._looks.append(look)
+        else:
+            self.log_dict(look, batch_size=1)
+
+    def on_validation_epoch_end(self) -> None:
+        """Of several processes all log the means over the images of all, summed in the order of one process."""
+        if not shares_validation(self.trainer):
+            return
+        in_turn = zip_longest(*ranks_of(self.trainer).gathered(self._looks), fillvalue={})
+        looks = [look for turn in in_turn for look in turn]
+        for name in dict.fromkeys(name for look in looks for name in look):
+            values = [torch.tensor(look[name]) for look in looks if name in look]
+            self.log(name, sum(values[1:], values[0]) / len(values), batch_size=1)
 
     def configure_optimizers(self) -> Optimizer:
         return self.optimizer_settings.build(self.scene, self.radius, images_per_step(self.trainer))

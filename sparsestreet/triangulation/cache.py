@@ -12,6 +12,7 @@ import numpy as np
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.data.lazy import Frames
+from sparsestreet.safe_npz import read_npz
 from sparsestreet.triangulation.points import TriangulatedPoints
 from sparsestreet.triangulation.settings import ImagePointSettings
 from sparsestreet.triangulation.street import StreetPoints, street_points
@@ -33,9 +34,9 @@ def cached_street_points(frames: Frames, moving: Sequence[Track], settings: Imag
     if settings.cache is None:
         return street_points(frames, moving, settings)
     path = Path(settings.cache) / f"{_key(frames, moving, settings)}.npz"
-    if path.is_file():
+    if path.is_file() and (kept := _read(path)) is not None:
         log.info("points from images: taken from %s", path)
-        return _read(path)
+        return kept
     with atomic_file(path) as unfinished:
         points = street_points(frames, moving, settings)
         _write(unfinished, points)
@@ -71,10 +72,13 @@ def _write(path: Path, points: StreetPoints) -> None:
     np.savez(path, names=np.array(list(points.in_boxes), dtype=np.str_), **tables)
 
 
-def _read(path: Path) -> StreetPoints:
-    with np.load(path, allow_pickle=False) as tables:
-        parts = [
-            TriangulatedPoints(*(tables[f"{column}_{number}"] for column in _COLUMNS))
-            for number in range(len(tables["names"]) + 1)
-        ]
+def _read(path: Path) -> StreetPoints | None:
+    """None, and a warning, for a file that is damaged."""
+    try:
+        tables = read_npz(path)
+        count = len(tables["names"]) + 1
+        parts = [TriangulatedPoints(*(tables[f"{column}_{number}"] for column in _COLUMNS)) for number in range(count)]
         return StreetPoints(parts[0], dict(zip(tables["names"].tolist(), parts[1:], strict=True)))
+    except (ValueError, KeyError, TypeError) as error:
+        log.warning("points from images: %s is damaged (%s), so they are made anew", path, error)
+        return None

@@ -237,6 +237,24 @@ def test_a_run_that_goes_on_keeps_its_files(tmp_path):
     assert RUN.read(out).steps == 23
 
 
+@pytest.mark.usefixtures("within_hydra")
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_what_a_kill_left_half_written_goes(goes_on, tmp_path):
+    out = a_run(tmp_path / "run", steps=23)
+    (out / "pictures").mkdir()
+    half = [
+        out / "pictures/.effects.7995.tmp.png",
+        out / ".scene.31.tmp.safetensors",
+        out / "checkpoints/.last.9.tmp.ckpt",
+    ]
+    others = [out / ".notes.tmp", out / "a.7.tmp.png"]
+    for path in (*half, *others):
+        path.touch()
+    take_folder(composed(["overwrite=true", "seed=1"]), out, goes_on=goes_on)
+    assert not [path for path in half if path.exists()]
+    assert all(path.exists() for path in others)
+
+
 def test_a_start_that_failed_leaves_nothing_and_a_run_everything(tmp_path):
     failed, run = tmp_path / "failed", a_run(tmp_path / "run")
     (failed / ".hydra").mkdir(parents=True)

@@ -18,8 +18,8 @@ from tests.cli.conftest import TIMED_ONCE
 
 KILLS = 5
 JOBS = 12
-TIMES = {"training_seconds", "seconds", "noise", "latency", "evaluated", "out"}
-"""Keys and columns of records that hold times, or when a run was made."""
+TIMES = {"training_seconds", "seconds", "noise", "latency", "evaluated", "out", "source"}
+"""Keys and columns of records that hold times, or when a run was made, and from which state of a checkout."""
 REPEATED = "train/moved"
 """Columns of losses that most steps lack: Lightning writes the value of the last step that had one, and forgets it when
 a run goes on."""

@@ -11,11 +11,14 @@ from hydra.utils import instantiate
 from lightning import Trainer
 
 from sparsestreet.cli.assemble import data_of, recipe_of, with_views
+from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.evaluation.speed import Timing
 from sparsestreet.training.callbacks import RowLedger
 from sparsestreet.training.parallel import DataParallel
-from sparsestreet.training.run import CPU_TRAINER, build, fit
+from sparsestreet.training.run import CPU_TRAINER, build, fit, train
 from tests.cli.configurations import composed
 from tests.cli.conftest import TINY_NODES
+from tests.cli.test_killed_sweep import content
 from tests.training.parallel.several import several, trainers
 from tests.typed import as_a
 
@@ -67,3 +70,31 @@ def test_methods_train_the_same_bits_in_several_processes(method, size, tiny_str
         for name, value in one["parameters"].items():
             assert torch.equal(value, each["parameters"][name]), name
     print(method, size, {c.node: c.after for c in one["changes"]}, one["losses"][0] * size, one["losses"][-1] * size)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [2, 3])
+def test_several_processes_leave_the_records_of_one(size, tiny_street, tmp_path):
+    """Validations, quality of all images, predictions, pictures: what one process that accumulates writes."""
+
+    def run(out: Path, make_trainer: Callable[..., Trainer], val_check_interval: int) -> None:
+        cfg = composed(*tiny_street, *TINY_NODES["streetgs"], "schedule.max_steps=120", f"folder={out}")
+        data = data_of(cfg)
+        cfg = with_views(cfg, data)
+        train(
+            recipe_of(cfg),
+            data,
+            out,
+            max_steps=cfg.trainer.max_steps,
+            make_trainer=partial(make_trainer, val_check_interval=val_check_interval, limit_val_batches=1.0),
+            extra=ExtraMetrics(timing=Timing(1, 2, 1)),
+        )
+
+    run(tmp_path / "one/run", partial(CPU_TRAINER, accumulate_grad_batches=size), 10 * size)
+    several(size, lambda rank: run(tmp_path / "several/run", trainers(size), 10), tmp_path)
+    one, found = content(tmp_path / "one"), content(tmp_path / "several")
+    assert {"run/predictions/held_out/005_0.png", "run/curves/held_out.csv"} <= one.keys()
+    assert sorted(one) == sorted(found)
+    # Losses of a step are those of the first process's image, and divided by the images of a step.
+    one, found = ({name: value for name, value in each.items() if "metrics.csv" not in name} for each in (one, found))
+    assert [name for name in one if one[name] != found[name]] == []

@@ -1,10 +1,20 @@
 """A metrics.csv that a logger begins anew, kept together."""
 
+import shutil
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
+from lightning import Callback, Trainer
+from lightning.pytorch.loggers import CSVLogger
 
+from sparsestreet.records.logged import LOGGED, Logged
+from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
 from sparsestreet.training.curves import kept_curves
+from sparsestreet.training.run import CPU_TRAINER, fit
+from tests.conftest import unchecked
+from tests.training.parallel.street import data, system
 
 
 def write(path: Path, text: str) -> None:
@@ -58,3 +68,38 @@ def test_without_a_file_there_is_nothing_to_keep(tmp_path):
     with kept_curves(tmp_path, resumed_at=15):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+class Kept(Callback):
+    """Copies of a run's folder, as kills leave it: before a step, and between its checkpoint and its row."""
+
+    def __init__(self, run: Path, step: int) -> None:
+        self.run, self.step = run, step
+
+    def on_train_batch_end(self, trainer: Trainer, *arguments: Any) -> None:
+        if trainer.global_step == self.step:
+            shutil.copytree(self.run, self.run.parent / "between")
+
+    def on_train_batch_start(self, trainer: Trainer, *arguments: Any) -> None:
+        if trainer.global_step == self.step:
+            shutil.copytree(self.run, self.run.parent / "behind")
+
+
+def trained(run: Path, *watch: Callback, start: Path | None = None) -> list[Logged]:
+    callbacks = [Checkpoints(run / "checkpoints", every=6), *watch]
+    logger = CSVLogger(run, name="", version="curves")
+    make = partial(CPU_TRAINER, limit_val_batches=0, log_every_n_steps=3)
+    fit(system(), data(), callbacks, make, run, max_steps=12, logger=logger, start=start)
+    return LOGGED.rows(run)
+
+
+@pytest.mark.filterwarnings("ignore:Experiment logs directory")
+def test_the_row_of_a_step_is_written_before_its_checkpoint(tmp_path):
+    """Lightning logs a step when those who save at its end are done; a kill may come between the two."""
+    with unchecked():
+        whole = trained(tmp_path / "whole", Kept(tmp_path / "whole", 6))
+        assert [row["step"] for row in whole] == ["2", "5", "8", "11"]
+        assert [row["step"] for row in LOGGED.rows(tmp_path / "between")] == ["2", "5"]
+        for killed in ("between", "behind"):
+            run = tmp_path / killed
+            assert trained(run, start=newest_checkpoint(run)) == whole

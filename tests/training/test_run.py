@@ -22,6 +22,7 @@ from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
+from sparsestreet.ranks import ALONE
 from sparsestreet.records.configuration import config_hash
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.effects import EffectDecision
@@ -160,6 +161,7 @@ class NotTheFirst(SingleDeviceStrategy):
 
 
 def test_of_several_processes_the_first_alone_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "help_to_evaluate", lambda *args, **how: None)
     monkeypatch.setattr(rank_zero_only, "rank", 1)
     other = partial(TRAINER, strategy=NotTheFirst(device="cpu"), accelerator="auto")
     assert train(recipe(tmp_path), data(), tmp_path, max_steps=4, make_trainer=other) is None
@@ -168,6 +170,7 @@ def test_of_several_processes_the_first_alone_writes(tmp_path, monkeypatch):
 
 def test_another_process_leaves_what_the_first_one_wrote(whole, monkeypatch):
     before = {path: path.stat().st_mtime_ns for path in files(whole)}
+    monkeypatch.setattr(run, "help_to_evaluate", lambda *args, **how: None)
     monkeypatch.setattr(rank_zero_only, "rank", 1)
     other = partial(TRAINER, strategy=NotTheFirst(device="cpu"), accelerator="auto")
     assert train(recipe(whole), data(), whole, max_steps=STEPS + 2, make_trainer=other, resume=whole) is None
@@ -247,7 +250,7 @@ def test_an_evaluation_is_handed_all_that_it_is_given(tmp_path, monkeypatch):
     with StageRecorder() as stages:
         assert run.evaluate(scene, options, frames, **told, extra=extra, say=said) is summary
     held_out, training = frames.split.held_out, frames.split.train
-    measured = {"run": summary.run, "options": options, "timing": extra.timing} | told
+    measured = {"run": summary.run, "options": options, "timing": extra.timing, "ranks": ALONE} | told
     assert called == [
         ((scene, held_out, training), measured),
         (extra, (scene, frames, options), {"out": tmp_path, "command": "typed", "say": said}),
@@ -279,7 +282,7 @@ def test_a_training_hands_on_what_it_is_given(tmp_path, monkeypatch):
     (one, of, callbacks, make, out), how = called["fit"]
     assert (one, of, make, out) == (system, frames, TRAINER, tmp_path / "o")
     assert how == {"max_steps": 9, "logger": False, "start": checkpoint}
-    evaluated = {"device": device, "command": "typed", "extra": extra}
+    evaluated = {"device": device, "command": "typed", "extra": extra, "ranks": ALONE}
     assert called["evaluate"] == ((system.scene, system.options, frames, tmp_path / "o"), evaluated)
     assert called["record_costs"] == ((tmp_path / "o", stages, device), {})
     # In this order: a clock first, then those of the recipe, a signal last.
@@ -300,6 +303,7 @@ def test_curves_go_into_the_folder_unless_a_logger_is_given(tmp_path, monkeypatc
     given: dict[str, Any] = {}
     monkeypatch.setattr(run, "build", lambda *parts: make_system({"background": background(1)}))
     trainer = Finished()
+    monkeypatch.setattr(run, "help_to_evaluate", lambda *args, **how: None)
     trainer.is_global_zero = False
     monkeypatch.setattr(run, "fit", lambda *args, **how: given.update(how) or trainer)
     assert train(recipe(tmp_path), data(), tmp_path / "o") is None

@@ -61,7 +61,7 @@ def _read_json(path: Path) -> dict[str, Any]:
         raise fault(path, "the file is missing", "write it, or remove the folder to read the log without boxes")
     try:
         content = json.loads(path.read_text())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise fault(path, f"the file is no JSON ({error})", "write it again from the annotations") from error
     if not isinstance(content, dict):
         raise fault(path, f"the file holds a {type(content).__name__}, not an object", "key it by instance or frame")

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float64
 
 from sparsestreet.geometry.skeleton import NUM_JOINTS, PARENTS
+from sparsestreet.safe_npz import read_npz
 from sparsestreet.safe_pickle import read_pickled
 from sparsestreet.scene.body.template import Body, BodyTemplate
 
@@ -39,10 +40,7 @@ class SmplFile(Body):
 def _read(path: Path) -> Mapping[str, Any]:
     if path.suffix != ".npz":
         return read_pickled(path)
-    with np.load(path, allow_pickle=False) as stored:
-        return {
-            name: stored[name] for name in ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table")
-        }
+    return read_npz(path, ("v_template", "f", "weights", "shapedirs", "J_regressor", "kintree_table"))
 
 
 def _template(stored: Mapping[str, Any]) -> BodyTemplate:

@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from sparsestreet.safe_yaml import read_yaml
 from sparsestreet.scene.edits.edits import REMOVED, Added, Edits
 from sparsestreet.scene.edits.nodes import Change
 from sparsestreet.scene.edits.paths import AsRecorded, Driven, Held, Moved, Path
@@ -52,11 +53,9 @@ def read_values(path: FilePath | str) -> dict[str, Any]:
     path = FilePath(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file of edits at {path}: write one (docs/editing.md has an example)")
+    said = read_yaml(path, yaml.safe_load) or {}
     try:
-        said = yaml.safe_load(path.read_text()) or {}
         _mapping(said, "the file")
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return dict(said)

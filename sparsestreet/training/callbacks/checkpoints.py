@@ -2,6 +2,7 @@
 
 import logging
 import pickle
+import zipfile
 from pathlib import Path
 
 import torch
@@ -9,6 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
+from sparsestreet.ranks import LostProcessError
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.finite import check_parameters
 from sparsestreet.training.lightning import ends_step, ranks_of, validates_now
@@ -16,6 +18,9 @@ from sparsestreet.training.lightning import ends_step, ranks_of, validates_now
 log = logging.getLogger(__name__)
 
 LAST, INTERRUPTED = "last.ckpt", "interrupted.ckpt"
+
+_BROKEN = (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, EOFError, KeyError, TypeError, ValueError)
+"""What reading a broken checkpoint fails with; NotImplementedError, of an unknown way to pack, is a RuntimeError."""
 
 
 class Checkpoints(Callback):
@@ -80,6 +85,8 @@ class Checkpoints(Callback):
     def _try_to_save(self, trainer: Trainer, system: LightningModule, name: str) -> bool:
         try:
             self._save(trainer, system, name)
+        except LostProcessError:
+            raise  # no matter of the disk: what is in memory is no state to go on from
         except OSError as error:
             log.error("step %d: no checkpoint could be written (%s); the one before it is whole: %s",
                       trainer.global_step, error, self.folder)  # fmt: skip
@@ -95,15 +102,26 @@ class Checkpoints(Callback):
 
 
 def step_of(checkpoint: Path) -> int:
-    """After how many steps it was written. Raises ValueError for a file that is no checkpoint of plain values."""
+    """After how many steps it was written. Raises ValueError for a file that is no checkpoint of plain values, or in
+    which a bit is not what was written: torch reads tensors without a look at their checksums."""
     try:
+        _check_sums(checkpoint)
         return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError) as error:
+    except _BROKEN as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(
             f"{checkpoint} is no checkpoint of a training, is damaged, or holds what may run code, which is never "
             f"opened ({type(error).__name__}: {reason}): go on from another one, or begin again with overwrite=true"
         ) from error
+
+
+def _check_sums(checkpoint: Path) -> None:
+    """Raises ValueError, or what an archive that is broken fails with."""
+    with zipfile.ZipFile(checkpoint) as archive:
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+            raise ValueError("it is compressed, as no checkpoint is")
+        if broken := archive.testzip():
+            raise ValueError(f"the checksum of {broken} is wrong")
 
 
 def newest_checkpoint(run: Path) -> Path:

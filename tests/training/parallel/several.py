@@ -37,7 +37,9 @@ def several(size: int, work: Callable[[int], Any], folder: Path) -> list[Any]:
 
 def trainers(size: int, **settings: Any) -> Callable[..., Trainer]:
     """What makes the trainer of one of several processes."""
-    return partial(CPU_TRAINER, strategy=DataParallel(patience=PATIENCE), devices=size, limit_val_batches=0, **settings)
+    return partial(
+        CPU_TRAINER, strategy=DataParallel(patience=PATIENCE), devices=size, **{"limit_val_batches": 0} | settings
+    )
 
 
 def _run(rank: int, size: int, port: int, work: Callable[[int], Any], folder: Path) -> None:
