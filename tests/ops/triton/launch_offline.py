@@ -27,17 +27,21 @@ _ALLOCATIONS = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_
 
 
 class Dispatches(TorchDispatchMode):
-    """Names of torch's operations from the wait on, those that start something on a device: no views (something that
-    is returned shares memory with an argument that is not written) and no bare allocations."""
+    """Names of torch's operations: all of them, and from the wait on those that start something on a device: no views
+    (something that is returned shares memory with an argument that is not written) and no bare allocations."""
 
     def __init__(self) -> None:
         super().__init__()
+        self.all: list[str] = []
         self.names: list[str] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         returned = [result.alias_info for result in func._schema.returns]
         view = any(alias is not None and not alias.is_write for alias in returned)
         name = func._schema.name.removeprefix("aten::")
+        # The check of a background reads its sum, but not on a device.
+        if name != "_local_scalar_dense":
+            self.all.append(name)
         if not view and name not in _ALLOCATIONS:
             self.names.append(name)
         return func(*args, **(kwargs or {}))
@@ -60,6 +64,7 @@ class Case:
 
     def run(self, backward: bool = True, counted: bool = False) -> list[str]:
         """Torch's operations after the wait, forward."""
+        self.dispatches.all.clear()
         with self.dispatches if counted else nullcontext():
             drawn = splat(self.gaussians, self.view, background=self.background, backend="triton")
         if backward:
@@ -95,6 +100,16 @@ def launch_time(case: Case, repeats: int) -> float:
     return statistics.median(spent[:-1]) * 1e6
 
 
+def host_time(case: Case, repeats: int) -> list[float]:
+    """Microseconds of the host's thread in a forward pass: the least, the quartiles."""
+    times = []
+    for _ in range(repeats):
+        start = time.thread_time()
+        case.run(backward=False)
+        times.append(1e6 * (time.thread_time() - start))
+    return [min(times), *statistics.quantiles(times, n=4)]
+
+
 def measure(device: FakeDevice, given: dict) -> dict:
     """All that is asked of a case."""
     before = len(device.binaries)
@@ -103,9 +118,10 @@ def measure(device: FakeDevice, given: dict) -> dict:
     answer: dict[str, Any] = {"compiled": found_in(device.binaries[before:], device.arch)}
     device.launches.clear()
     answer["dispatches"] = case.run(backward=False, counted=True)
-    answer["forward"] = [binary.name for binary in device.launches]
+    answer["calls"], answer["forward"] = case.dispatches.all, [binary.name for binary in device.launches]
     if given["repeats"]:
         answer["microseconds"] = launch_time(case, given["repeats"])
+        answer["forward_microseconds"] = host_time(case, given["repeats"])
     return answer
 
 

@@ -19,6 +19,8 @@ FORWARD = [
     "thin_parts", "blend_tiles", "merge_parts",
 ]  # fmt: skip
 BACKWARD = ["blend_tiles_backward", "blend_tiles_backward", "sum_slots", "project_rows_backward"]
+CALLS, LAUNCHES = 67, 10
+"""Most calls of torch in a forward pass with a background, allocations and views too, and most launches."""
 CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
 DAILY = CASE | {"width": 1920, "height": 1280}
 SLOW = [
@@ -59,6 +61,8 @@ def test_every_kernel_compiles_as_it_is_launched():
     check(DAILY, found)
     assert found["forward"] == FORWARD
     assert [kernel["name"] for kernel in found["compiled"]] == [*FORWARD, *BACKWARD]
+    assert len(found["calls"]) <= CALLS, Counter(found["calls"])
+    assert len(found["forward"]) <= LAUNCHES
     # What torch starts on the device after the wait, but for views and bare allocations: 5 of it put the background
     # behind the layers (ops/splat.py).
     assert Counter(found["dispatches"]) == Counter(
