@@ -109,6 +109,11 @@ def _is_known(version: str) -> bool:
     return known
 
 
+def stream_of(device: torch.device) -> int:
+    """The stream on which kernels and copies of a device start; 0 on the host."""
+    return 0 if device.type == "cpu" else driver.active.get_current_stream(device.index)
+
+
 def is_interpreted(kernel: KernelInterface) -> bool:
     """Whether Triton's interpreter runs the kernel, on CPU tensors (TRITON_INTERPRET=1 when it was imported)."""
     return isinstance(kernel, InterpretedFunction)

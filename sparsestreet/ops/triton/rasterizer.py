@@ -38,14 +38,14 @@ def rasterize(
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*fields, screen_offsets))
-    return Raster(*_Blend.apply(*fields, screen_offsets, g.displacements, KernelView(camera, settings), differentiated))
+    return Raster(*_Blend.apply(*fields, screen_offsets, g.displacements, KernelView.of(camera, settings), differentiated))
 
 
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
     _check(gaussians)
-    view = KernelView(camera, settings)
+    view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists = screen.lists
     counters = screen.records.new_empty(len(lists.slots), count.COUNTER_COUNT)
@@ -70,7 +70,7 @@ def leave_one_out(
 ) -> LeaveOneOut:
     """How much the view changes when each row alone is removed, over a background (None: black)."""
     _check(gaussians)
-    view = KernelView(camera, settings)
+    view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists, layers = screen.lists, blend_view(screen, view, lasts=True)
     changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)

@@ -19,7 +19,7 @@ FORWARD = [
     "thin_parts", "blend_tiles", "merge_parts",
 ]  # fmt: skip
 BACKWARD = ["blend_tiles_backward", "blend_tiles_backward", "sum_slots", "project_rows_backward"]
-CALLS, LAUNCHES = 67, 10
+CALLS, LAUNCHES = 55, 10
 """Most calls of torch in a forward pass with a background, allocations and views too, and most launches."""
 CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
 DAILY = CASE | {"width": 1920, "height": 1280}
