@@ -1,5 +1,7 @@
 """Long tiles in parts: the same image and gradients as in one piece, for any length of the parts."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import example, given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import blend_backward, pixels, rasterizer
-from sparsestreet.ops.triton.parts import part_length, split_length, split_tiles
+from sparsestreet.ops.triton.parts import part_length, split_length
 from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -22,6 +24,7 @@ from tests.ops.scenes import (
     relative_error,
     render,
 )
+from tests.ops.triton.tile_lists import lists_of
 
 DEVICE = device_of("triton")
 STOPS = {
@@ -158,19 +161,30 @@ def test_parts_longer_than_a_look():
     assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6
 
 
-@settings(deadline=None, max_examples=100)
-@given(st.lists(st.integers(0, 40), min_size=1, max_size=9), st.integers(1, 7), st.integers(1, 12), st.integers(2, 4))
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.integers(0, 40), min_size=1, max_size=9),
+    st.integers(1, 7),
+    st.integers(1, 12),
+    st.integers(2, 4),
+    st.integers(0, 40),
+)
 # More parts, and more tiles, than a program has lanes.
-@example([300], 1, 400, 3)
-@example([5] + [0] * 299, 2, 12, 2)
-def test_parts_cover_long_tiles_once(counts, length, limit, fewest):
-    ends = torch.tensor(counts).cumsum(0).int()
-    begins, pairs = ends - torch.tensor(counts, dtype=torch.int32), sum(counts)
+@example([300], 1, 400, 3, 0)
+@example([5] + [0] * 299, 2, 12, 2, 9)
+# Tiles of a class in three programs.
+@example([7, 3, 0] * 200, 2, 12, 2, 0)
+def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
+    pairs = sum(counts)
     with tuned(Tuning(most_parts=limit, shortest_part=length, fewest_parts=fewest)):
-        share, least, lengths = part_length(pairs), split_length(pairs), ends - begins
-        # Those that are split come first; the others in any order.
-        order = torch.sort(lengths >= least, descending=True, stable=True).indices.int()
-        found = split_tiles(begins.to(DEVICE), ends.to(DEVICE), order.to(DEVICE), lengths.to(DEVICE), pairs)
+        share, least = part_length(pairs), split_length(pairs)
+        begins, ends, order, found = lists_of(counts, pairs + more)
+    assert ends.tolist() == torch.tensor(counts).cumsum(0).tolist()
+
+    def key(tile: int) -> tuple[float, int]:
+        return -math.floor(math.log2(counts[tile] / least)) if counts[tile] else math.inf, tile
+
+    assert order.tolist() == sorted(range(len(counts)), key=key)
     long = [tile for tile, count in enumerate(counts) if count >= least]
     if found is None:
         assert not long
