@@ -198,7 +198,10 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
     rows, first_pairs, (columns, lines) = torch.empty_like(counts), torch.empty_like(counts), view.tiles
     kind = torch.int16 if columns * lines <= _SHORT_KEYS else torch.int32
     # Those of no pair are sorted to the end.
-    keys, unsorted_rows = counts.new_full((room.pairs,), torch.iinfo(kind).max, dtype=kind), counts.new_empty(room.pairs)
+    keys, unsorted_rows = (
+        counts.new_full((room.pairs,), torch.iinfo(kind).max, dtype=kind),
+        counts.new_empty(room.pairs),
+    )
     launch(
         list_pairs, room.rows, 32 // _LANES,
         records, order, visible.rows, counts, ends, rows, first_pairs, keys, unsorted_rows, room.rows,

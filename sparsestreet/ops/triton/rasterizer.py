@@ -38,7 +38,9 @@ def rasterize(
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*fields, screen_offsets))
-    return Raster(*_Blend.apply(*fields, screen_offsets, g.displacements, KernelView.of(camera, settings), differentiated))
+    return Raster(
+        *_Blend.apply(*fields, screen_offsets, g.displacements, KernelView.of(camera, settings), differentiated)
+    )
 
 
 @torch.no_grad()

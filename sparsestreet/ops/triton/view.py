@@ -131,9 +131,7 @@ def _numbers(camera: Camera, s: SplatSettings) -> list[float]:
     """In the order of the places above."""
     pose, K = camera.camera_from_world.double().tolist(), camera.intrinsics.double().tolist()
     position = exact_position(camera)
-    slopes = [
-        _slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))
-    ]
+    slopes = [_slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))]
     distortion = [0.0] * 5 if camera.distortion is None else camera.distortion.double().tolist()
     motion, sign = [0.0] * 6, 0
     if camera.shutter is not None:

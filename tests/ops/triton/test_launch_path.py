@@ -4,6 +4,7 @@ from collections import Counter
 from types import SimpleNamespace
 
 import pytest
+import torch
 from triton import knobs
 from triton.compiler import CompiledKernel
 from triton.runtime.jit import KernelInterface
@@ -155,7 +156,9 @@ def test_an_unknown_triton_is_named():
 
 def test_other_arguments_are_refused():
     with pytest.raises(TypeError, match="must be tensors, ints or floats, got None"):
-        launch._kinds((None,), [None])
+        launch._kind(None)
+    with pytest.raises(TypeError, match="got True"):
+        launch._kind(True)
 
 
 @pytest.mark.parametrize(("current", "entered"), [(1, []), (0, [1])])
@@ -180,8 +183,8 @@ def test_a_kernel_runs_on_the_device_of_its_tensors(monkeypatch, current, entere
 
     monkeypatch.setattr(launch.torch.cuda, "device", Entered)
     monkeypatch.setattr(launch.torch.cuda, "current_device", lambda: current)
-    tensor = SimpleNamespace(get_device=lambda: 1)
-    monkeypatch.setattr(launch, "_kinds", lambda arguments, given: [])
+    tensor = torch.zeros(2)
+    monkeypatch.setattr(torch.Tensor, "get_device", lambda tensor: 1)
     launch.launch(Kernel(), 33, 16, tensor, 5, options={"num_warps": 1}, DEPTH=True)
     assert devices == entered
     assert started == [((3, 1, 1), (tensor, 5), {"DEPTH": True, "BLOCK": 16, "num_warps": 1})]
