@@ -10,13 +10,12 @@ from sparsestreet.ops import reference
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.compiling import disable_compile
 from sparsestreet.ops.cpu import rasterizer as cpu
-from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.raster import LEAST_ALPHA, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_pixel_weights, check_structure
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
-_LEAST_ALPHA = 1e-6
 
 
 @disable_compile
@@ -68,6 +67,8 @@ def splat(
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.autocast(gaussians.means.device.type, enabled=False):
         offsets = _screen_offsets(gaussians, screen_gradients)
+        if chosen == "triton":
+            return _module(chosen).render(gaussians, offsets, background, camera, settings)
         raster = _module(chosen).rasterize(gaussians, offsets, camera, settings)
         return _compose(raster, offsets, background)
 
@@ -156,5 +157,5 @@ def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rend
     rgb = raster.rgb
     if background is not None:
         rgb = rgb + raster.transmittance[..., None] * background
-    depth = raster.depth_sum / alpha.clamp(min=_LEAST_ALPHA)
+    depth = raster.depth_sum / alpha.clamp(min=LEAST_ALPHA)
     return Rendering(rgb, alpha, depth, raster.radii, offsets)

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend, blend_backward, count, rows_backward, slots
 from sparsestreet.ops.triton import leave_one_out as remove
+from sparsestreet.ops.triton.compose import Composed, compose, decompose
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
 from sparsestreet.ops.triton.pixels import (
@@ -27,20 +27,24 @@ from sparsestreet.ops.triton.pixels import (
 from sparsestreet.ops.triton.quadrants import MOST_ROWS
 from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import KernelView
-from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 
-def rasterize(
-    gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
-) -> Raster:
-    """Projects, sorts by tile and blends, in float32. Bitwise the same in every run on one device."""
+def render(
+    gaussians: Gaussians,
+    screen_offsets: Float[Tensor, "n 2"],
+    background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None,
+    camera: Camera,
+    settings: SplatSettings,
+) -> Rendering:
+    """Projects, sorts by tile, blends and composes, in float32. Bitwise the same in every run on one device."""
     g = gaussians
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*fields, screen_offsets))
-    return Raster(
-        *_Blend.apply(*fields, screen_offsets, g.displacements, KernelView.of(camera, settings), differentiated)
-    )
+    view = KernelView.of(camera, settings)
+    images = _Blend.apply(*fields, screen_offsets, background, g.displacements, view, differentiated)
+    return Rendering(*images, screen_offsets)
 
 
 @torch.no_grad()
@@ -93,31 +97,37 @@ def leave_one_out(
 
 
 class _Blend(torch.autograd.Function):
-    """Maps five fields and the screen offsets to the layers of a Raster."""
+    """Maps five fields, the screen offsets and the background to the images of a Rendering, and the radii."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, differentiated):
+    def forward(
+        ctx, means, quaternions, scales, opacities, sh, screen_offsets, background, displacements, view, differentiated
+    ):  # fmt: skip
         ctx.set_materialize_grads(False)
         gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
         screen = project(gaussians, view)
         layers = blend_view(screen, view, lasts=differentiated)
+        rgb, depth, passed, background = layers.rgb, layers.depth_sum, layers.ends.transmittance, contiguous(background)
+        alpha = compose(rgb, passed, depth, background)
         ctx.mark_non_differentiable(screen.radii)
-        ctx.save_for_backward(*fields_of(gaussians), layers.ends.transmittance)
+        ctx.save_for_backward(*fields_of(gaussians), passed, depth, background)
         ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
         ctx.lasts, ctx.parts = layers.ends.lasts, layers.ends.parts
-        return layers.rgb, layers.ends.transmittance, layers.depth_sum, screen.radii
+        return rgb, alpha, depth, screen.radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, transmittance = ctx.saved_tensors
+    def backward(ctx, v_rgb, v_alpha, v_depth, _v_radii):
+        *fields, transmittance, depth, background = ctx.saved_tensors
         screen, view, lists = ctx.screen, ctx.view, ctx.screen.lists
-        cotangents = Cotangents(
-            transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous(),
-            torch.zeros_like(transmittance) if v_transmittance is None else v_transmittance.contiguous(),
-            contiguous(v_depth_sum),
+        v_rgb = transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous()
+        composed = Composed(transmittance, depth, background)
+        v_passed, v_depth_sum, v_background = decompose(
+            composed, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[6]
         )
-        ends = Ends(transmittance, ctx.lasts, ctx.parts)
+        if not any(ctx.needs_input_grad[:6]):
+            return *[None] * 6, v_background, None, None, None
+        cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
         plain = view.settings.plain_gradients
         gradients = differentiate_view(screen, view, ends, cotangents, absolute=ctx.needs_input_grad[5] and not plain)
         sums = transmittance.new_empty(len(fields[0]), blend_backward.SLOT_LENGTH)
@@ -131,7 +141,7 @@ class _Blend(torch.autograd.Function):
             TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, CLAMPED=view.settings.clamp_colors,
             DETACHED=view.settings.detach_directions, PLAIN=plain, **effects(view, ctx.displacements),
         )  # fmt: skip
-        return *outputs, v_screen, None, None, None
+        return *outputs, v_screen, v_background, None, None, None
 
 
 def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype) -> None:

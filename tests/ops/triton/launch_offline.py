@@ -15,13 +15,13 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestreet.ops import splat
-from sparsestreet.ops.triton import lists, order, pixels, rasterizer, screen
+from sparsestreet.ops.triton import compose, lists, order, pixels, rasterizer, screen
 from sparsestreet.ops.triton.launch import launch
 from tests.ops.scenes import camera, cast, random_gaussians
 from tests.ops.triton.compile_offline import forbidden_in, instructions_of, resources_of
 from tests.ops.triton.fake_driver import Binary, FakeDevice, install
 
-MODULES: tuple[ModuleType, ...] = (screen, lists, order, pixels, rasterizer)
+MODULES: tuple[ModuleType, ...] = (screen, lists, order, pixels, rasterizer, compose)
 ROWS, VISIBLE = 40, 30
 _ALLOCATIONS = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 
