@@ -27,7 +27,8 @@ from sparsestreet.ops.triton.view import KernelView
 
 PAIR_LIMIT = 1 << 28
 """Most (splat, tile) pairs of one rendering. A pair takes 34 bytes while sorting (torch 2.11, H100; 40 above 32,768
-tiles). 12 of them are kept for the backward pass, which takes 48 more: 9 and 16 GB at the limit."""
+tiles). 12 of them are kept for the backward pass, which takes 48 more: 9 and 16 GB at the limit. Room that a view does
+not fill takes the first two as well (capacity.py)."""
 _SHORT_KEYS = 1 << 15
 _LANES = 2
 """Lanes per splat in the listing of pairs, because most splats reach one or two rows of tiles."""
@@ -63,6 +64,8 @@ class Lists:
     """Tiles by the power of two of their number of pairs, longest first, because long ones must not start last."""
     parts: Parts | None
     """Room for the parts of long tiles, empty if there are none; None if no tile can be long."""
+    sizes: Sizes
+    """How much of the room is used."""
 
     @property
     def rows_of_pairs(self) -> Int[Tensor, " p"]:
@@ -191,7 +194,9 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
 
     The device has nothing else to do, so every host call between two of our kernels is a gap.
     """
-    keys, counts = visible.keys[: room.rows], visible.counts[: room.rows]
+    keys, counts = visible.keys, visible.counts
+    if len(keys) > room.rows:
+        keys, counts = keys[: room.rows], counts[: room.rows]
     order = torch.sort(keys, stable=True).indices
     counts = counts.index_select(0, order)
     ends = counts.cumsum(0, dtype=torch.int32)
@@ -210,7 +215,7 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
     )  # fmt: skip
     keys, slots = torch.sort(keys, stable=True)
     pair_rows, *tiles = list_by_tile(keys, slots, unsorted_rows, visible.sizes, columns * lines)
-    return Lists(rows, first_pairs, counts, pair_rows, slots, *tiles)
+    return Lists(rows, first_pairs, counts, pair_rows, slots, *tiles, visible.sizes)
 
 
 def check_pairs(pairs: int, tile_counts: Tensor) -> None:

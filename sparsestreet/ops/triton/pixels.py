@@ -84,7 +84,7 @@ def differentiate_view(
 ) -> Float[Tensor, "p 12"]:
     """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
-    slots = passed.new_empty(len(lists.slots), blend_backward.SLOT_LENGTH)
+    slots = passed.new_empty(lists.sizes.pairs, blend_backward.SLOT_LENGTH)
 
     def differentiate_each(begins: Tensor, stops: Tensor, tiles: Tensor, *part: Tensor, split: bool) -> None:
         launch(

@@ -1,7 +1,7 @@
 """The Triton backend as an autograd function over torch tensors.
 
-A forward pass waits for the device once, for the numbers of visible rows, pairs and bad values. A backward pass never
-waits.
+A forward pass waits for the device once, for the numbers of visible rows, pairs and bad values, when all is queued. A
+backward pass never waits.
 """
 
 import torch
@@ -25,7 +25,7 @@ from sparsestreet.ops.triton.pixels import (
     pixel_arguments,
 )
 from sparsestreet.ops.triton.quadrants import MOST_ROWS
-from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
+from sparsestreet.ops.triton.screen import contiguous, draw, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
@@ -105,8 +105,7 @@ class _Blend(torch.autograd.Function):
     ):  # fmt: skip
         ctx.set_materialize_grads(False)
         gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
-        screen = project(gaussians, view)
-        layers = blend_view(screen, view, lasts=differentiated)
+        screen, layers = draw(gaussians, view, lambda screen: blend_view(screen, view, lasts=differentiated))
         rgb, depth, passed, background = layers.rgb, layers.depth_sum, layers.ends.transmittance, contiguous(background)
         alpha = compose(rgb, passed, depth, background)
         ctx.mark_non_differentiable(screen.radii)
@@ -146,8 +145,8 @@ class _Blend(torch.autograd.Function):
 
 def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype) -> None:
     launch(
-        slots.sum_slots, len(lists.rows), slots.ROWS,
-        values, lists.rows, lists.first_pairs, lists.tile_counts, sums, len(lists.rows),
+        slots.sum_slots, lists.sizes.rows, slots.ROWS,
+        values, lists.rows, lists.first_pairs, lists.tile_counts, sums, lists.sizes.rows,
         COUNT=values.shape[1], PADDED=padded, SUM=kind, options=slots.OPTIONS,
     )  # fmt: skip
 

@@ -22,12 +22,18 @@ class Room:
     rows: int
     pairs: int
 
+    def holds(self, pairs: int, rows: int) -> bool:
+        return pairs <= self.pairs and rows <= self.rows
 
-@dataclass(frozen=True)
+
+@dataclass
 class Sizes:
-    """Numbers of one view."""
+    """Numbers of one view; on the host -1 until it has waited for them."""
 
     on_device: Int[Tensor, "5"]
+    pairs: int = -1
+    rows: int = -1
+    """Visible ones."""
 
 
 @jit

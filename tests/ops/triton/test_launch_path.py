@@ -20,7 +20,7 @@ FORWARD = [
     "thin_parts", "blend_tiles", "merge_parts", "compose_pixels",
 ]  # fmt: skip
 BACKWARD = ["decompose_pixels", "blend_tiles_backward", "blend_tiles_backward", "sum_slots", "project_rows_backward"]
-CALLS, LAUNCHES = 48, 10
+CALLS, LAUNCHES = 45, 10
 """Most calls of torch in a forward pass with a background, allocations and views too, and most launches."""
 CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
 DAILY = CASE | {"width": 1920, "height": 1280}
@@ -64,17 +64,16 @@ def test_every_kernel_compiles_as_it_is_launched():
     assert [kernel["name"] for kernel in found["compiled"]] == [*FORWARD, *BACKWARD]
     assert len(found["calls"]) <= CALLS, Counter(found["calls"])
     assert len(found["forward"]) <= LAUNCHES
-    # What torch starts on the device after the wait, but for views and bare allocations.
-    assert Counter(found["dispatches"]) == Counter(
-        ["sort"] * 2 + ["cumsum", "index_select", "new_full"]
-    )  # fmt: skip
+    # What torch starts on the device, but for views and bare allocations.
+    assert Counter(found["dispatches"]) == Counter(["sort"] * 2 + ["cumsum"] * 2 + ["index_select", "new_full"])
+    assert found["after_wait"] == []
 
 
 @pytest.mark.slow
 def test_every_kernel_compiles_for_other_sizes():
     for case, found in zip(SLOW, run_compiler("launch_offline", SLOW), strict=True):
         check(case, found)
-        assert len(found["dispatches"]) <= 5
+        assert len(found["dispatches"]) <= 6
 
 
 KINDS = [
