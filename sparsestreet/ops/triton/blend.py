@@ -11,28 +11,30 @@ import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.programs import place_of, work_of
 from sparsestreet.ops.triton.quadrants import (
     WARP,
     across,
     centers,
+    held_splat,
+    hold_splats,
     load_splat,
     of_lines,
-    quadrant_pixels,
+    part_places,
+    quadrant_places,
     row_of,
     touches,
 )
+from sparsestreet.ops.triton.thin import LOOK, open_light, thin_pairs
 from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
-# Number of pairs between two checks whether the whole tile is finished.
-LOOK_LENGTH = 32
-LOOK = constant(LOOK_LENGTH)
 
 
-def registers(exclusive: bool) -> int:
+def registers(exclusive: bool, staged: bool) -> int:
     """Fewest registers of a lane without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
-    return 88 if exclusive else 80
+    return 96 if staged else 88 if exclusive else 80
 
 
 @jit
@@ -52,25 +54,6 @@ def part_pixels(part):
     """Indices of a part's pixels in the layers of all parts [256], line by line as in the image."""
     p = tl.arange(0, PIXELS)
     return part * PIXELS + p % TILE * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
-
-
-@jit
-def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr):
-    """Indices at which a quadrant's pixels are written, in the image or in the layers of parts, and a mask; [64]."""
-    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
-    at, inside = y * width + x, (x < width) & (y < height)
-    if PARTS:
-        # Pixels outside the image are written too, because they are read.
-        at, inside = tl.program_id(0) * PIXELS + y % TILE * TILE + x % TILE, inside | True
-    return at, inside
-
-
-@jit
-def pairs_of(tile, begins, ends, PARTS: tl.constexpr):
-    """First pair, and the one after the last, of this program's tile or part of one."""
-    if PARTS:
-        tile = tl.program_id(0)
-    return tl.load(begins + tile), tl.load(ends + tile)
 
 
 @jit
@@ -105,18 +88,13 @@ def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE:
 
 
 @jit
-def open_quadrant(
-    tile, products, firsts, first_pair, width, height, tiles_x, QUADRANT: tl.constexpr, PARTS: tl.constexpr
-):
+def open_quadrant(tile, part, first, products, first_pair, width, height, tiles_x, QUADRANT: tl.constexpr):
     """A quadrant before its first splat: light, color, depth, and the index after the last pair each pixel was open to.
 
-    Light is 0 for pixels outside the image; color and depth are 0."""
-    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
-    passed = tl.where((x < width) & (y < height), 1.0, 0.0)
-    if PARTS:
-        part = tl.program_id(0)
-        for before in range(tl.load(firsts + part), part):
-            passed *= tl.load(products + before * PIXELS + y % TILE * TILE + x % TILE)
+    Light is what the parts of the tile from ``first`` on let through, 0 for pixels outside the image."""
+    passed = open_light(tile, width, height, tiles_x, QUADRANT)
+    for before in range(first, part):
+        passed *= tl.load(products + part_places(before, QUADRANT))
     nothing = tl.zeros_like(passed)
     return passed, nothing, nothing, nothing, nothing, nothing.to(tl.int32) + first_pair
 
@@ -150,12 +128,10 @@ def any_open(upper_left, upper_right, lower_left, lower_right, transmittance_min
 
 
 @jit
-def store_quadrant(
-    quadrant, tile, rgb, transmittance, depth_sum, lasts, width, height, tiles_x,
-    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr,
-):  # fmt: skip
+def store_quadrant(quadrant, at, inside, layers, DEPTH: tl.constexpr, LASTS: tl.constexpr):
+    """Writes a quadrant's layers: color, light, depth, and where each pixel ended."""
     passed, red, green, blue, depth, last = quadrant
-    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, PARTS)
+    rgb, transmittance, depth_sum, lasts = layers
     tl.store(rgb + 3 * at, red, inside)
     tl.store(rgb + 3 * at + 1, green, inside)
     tl.store(rgb + 3 * at + 2, blue, inside)
@@ -166,33 +142,76 @@ def store_quadrant(
         tl.store(lasts + at, last, inside)
 
 
-# Specialized to the sizes of some images, the kernel would need one register too many.
-@partial(jit, do_not_specialize=["width", "height", "tiles_x"])
-def blend_tiles(
-    records, pair_rows, begins, ends, order, firsts, products, rgb, transmittance, depth_sum, lasts,
-    width, height, tiles_x, alpha_max, transmittance_min,
-    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Writes every pixel of one tile. With PARTS it writes those of one part, if needed, into the layers (parts.py).
+@jit
+def store_in_image(
+    wanted, quadrants, layers, order, place, width, height, tiles_x, DEPTH: tl.constexpr, LASTS: tl.constexpr
+):
+    if wanted:
+        # Volatile, so that the compiler computes indices anew instead of keeping them in registers through the loop.
+        tile = tl.load(order + place, volatile=True)
+        for i in tl.static_range(4):
+            at, inside = quadrant_places(tile, width, height, tiles_x, i)
+            store_quadrant(quadrants[i], at, inside, layers, DEPTH, LASTS)
 
-    ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins.
+
+@jit
+def store_in_part(
+    wanted, quadrants, layers, part, products, DEPTH: tl.constexpr, LASTS: tl.constexpr, PRODUCTS: tl.constexpr
+):
+    """PRODUCTS: also what a first part lets through. That is 0 for a pixel that the exclusive stop has closed."""
+    if wanted:
+        for i in tl.static_range(4):
+            at = part_places(part, i)
+            store_quadrant(quadrants[i], at, at >= 0, layers, DEPTH, LASTS)
+            if PRODUCTS:
+                tl.store(products + at, tl.maximum(quadrants[i][0], 0.0))
+
+
+# Specialized to the sizes of some images, the kernel would need one register too many.
+@partial(jit, do_not_specialize=["width", "height", "tiles_x", "part_count"])
+def blend_tiles(
+    records, pair_rows, begins, ends, order, ahead, part_tiles, part_begins, part_ends, firsts, nexts, products,
+    rgb, transmittance, depth_sum, lasts, part_rgb, part_transmittance, part_depth, part_lasts,
+    width, height, tiles_x, part_count, alpha_max, transmittance_min,
+    EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
+    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, STAGED: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes every pixel of one tile; with PARTS those of one part, if needed, into the layers of parts (parts.py).
+
+    ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins. TOGETHER:
+    whole tiles and parts. Of parts the first ones of tiles are then blended, and of the others it is computed what they
+    let through. REST: parts but the first ones. STAGED: each lane fetches the record of one of the next pairs.
     """
     tl.static_assert(BLOCK == 1)
-    tile = tl.load(order + tl.program_id(0))
-    k, end = pairs_of(tile, begins, ends, PARTS)
-    written = (k < end) | (not PARTS)
-    limit = transmittance_min
-    q0 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 0, PARTS)
-    q1 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 1, PARTS)
-    q2 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 2, PARTS)
-    q3 = open_quadrant(tile, products, firsts, k, width, height, tiles_x, 3, PARTS)
+    tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
+    tile, part, k, end, is_part = work_of(*tables, PARTS, TOGETHER)
+    limit, first = transmittance_min, part
+    if PARTS or TOGETHER:
+        first = tl.load(firsts + part)
+    if TOGETHER:
+        later = is_part & (first < part)
+        if later & (part + 1 < tl.load(nexts + part)):
+            thin_pairs(
+                records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, limit
+            )  # fmt: skip
+        first, end = part, tl.where(later, k, end)
+    if REST:
+        end = tl.where(first < part, end, k)
+    q0 = open_quadrant(tile, part, first, products, k, width, height, tiles_x, 0)
+    q1 = open_quadrant(tile, part, first, products, k, width, height, tiles_x, 1)
+    q2 = open_quadrant(tile, part, first, products, k, width, height, tiles_x, 2)
+    q3 = open_quadrant(tile, part, first, products, k, width, height, tiles_x, 3)
     x, y = centers(tile, tiles_x)
-    unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
-    pair = tl.load(pair_rows + k, k < end, 0)
+    written = k < end
+    unfinished = written & any_open(q0, q1, q2, q3, limit)
+    pair = tl.load(pair_rows + k, written, 0)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
+        if STAGED:
+            held = hold_splats(records, pair_rows, k, end)
         for i in range(k, stop):
-            splat, touched = load_splat(records, row_of(pair)), pair
+            touched = pair
+            splat = held_splat(held, i - k) if STAGED else load_splat(records, row_of(pair))
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(y, splat[0], splat[1][0], 0)
@@ -203,11 +222,13 @@ def blend_tiles(
             q3 = blend_quadrant(touches(touched, 3), q3, x, line, 1, *more)
         k = stop
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
-    if written:
-        # Volatile, so that the compiler computes indices anew instead of keeping them in registers through the loop.
-        tile = tl.load(order + tl.program_id(0), volatile=True)
-        to, size = (rgb, transmittance, depth_sum, lasts), (width, height, tiles_x)
-        store_quadrant(q0, tile, *to, *size, 0, DEPTH, LASTS, PARTS)
-        store_quadrant(q1, tile, *to, *size, 1, DEPTH, LASTS, PARTS)
-        store_quadrant(q2, tile, *to, *size, 2, DEPTH, LASTS, PARTS)
-        store_quadrant(q3, tile, *to, *size, 3, DEPTH, LASTS, PARTS)
+    quadrants = (q0, q1, q2, q3)
+    place, part, is_part = place_of(ahead, part_count, TOGETHER)
+    if PARTS or TOGETHER:
+        layers = (part_rgb, part_transmittance, part_depth, part_lasts)
+        store_in_part(written & is_part, quadrants, layers, part, products, DEPTH, LASTS, TOGETHER)
+    if not PARTS:
+        layers, is_whole = (rgb, transmittance, depth_sum, lasts), place >= 0
+        if TOGETHER:
+            is_whole = not is_part
+        store_in_image(is_whole, quadrants, layers, order, place, width, height, tiles_x, DEPTH, LASTS)

@@ -13,8 +13,8 @@ from functools import partial
 
 import triton.language as tl
 
-from sparsestreet.ops.triton.blend import pairs_of, quadrant_places
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.programs import work_of
 from sparsestreet.ops.triton.quadrants import (
     WARP,
     across,
@@ -23,6 +23,8 @@ from sparsestreet.ops.triton.quadrants import (
     load_splat,
     of_lane,
     of_lines,
+    part_places,
+    quadrant_places,
     row_of,
     touches,
 )
@@ -91,11 +93,11 @@ def alpha_behind(exponent, cutoff, k, last, alpha_max):
 
 
 @jit
-def light_behind(part_rgb, part_depth, nexts, v, at, DEPTH: tl.constexpr):
-    """Light of the tile's parts behind this one times the cotangents; ``at``: indices in this part's layer."""
-    part = tl.program_id(0)
+def light_behind(part_rgb, part_depth, part, following, v, at, DEPTH: tl.constexpr):
+    """Light of the tile's parts behind this one, before ``following``, times the cotangents; ``at``: indices in this
+    part's layer."""
     light = tl.zeros_like(v[0])
-    for after in range(part + 1, tl.load(nexts + part)):
+    for after in range(part + 1, following):
         to = at + (after - part) * TILE * TILE
         light += tl.load(part_rgb + 3 * to) * v[0] + tl.load(part_rgb + 3 * to + 1) * v[1]
         light += tl.load(part_rgb + 3 * to + 2) * v[2]
@@ -107,25 +109,28 @@ def light_behind(part_rgb, part_depth, nexts, v, at, DEPTH: tl.constexpr):
 @jit
 def last_quadrant(
     tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin,
-    nexts, part_rgb, part_depth, part_transmittance, part_lasts, width, height, tiles_x,
-    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr,
+    part, following, is_part, part_rgb, part_depth, part_transmittance, part_lasts, width, height, tiles_x,
+    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr,
 ):  # fmt: skip
     """A quadrant after its last splat: the light left, and the light behind times the cotangents.
 
     Then what stays the same: the cotangents of color and depth, and the index after the last pair of each pixel."""
-    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, False)
+    at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT)
     red = tl.load(v_rgb + 3 * at, inside, 0.0)
     green = tl.load(v_rgb + 3 * at + 1, inside, 0.0)
     blue = tl.load(v_rgb + 3 * at + 2, inside, 0.0)
     v = (red, green, blue, tl.load(v_depth_sum + at, inside, 0.0) if DEPTH else red)
     passed = tl.load(transmittance + at, inside, 0.0)
     behind = passed * tl.load(v_transmittance + at, inside, 0.0)
+    if PARTS or TOGETHER:
+        to = part_places(part, QUADRANT)
+        behind += light_behind(part_rgb, part_depth, part, following, v, to, DEPTH)
     if PARTS:
-        at, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT, True)
-        behind += light_behind(part_rgb, part_depth, nexts, v, at, DEPTH)
-        passed, last = tl.load(part_transmittance + at), tl.load(part_lasts + at)
+        passed, last = tl.load(part_transmittance + to), tl.load(part_lasts + to)
     else:
         last = tl.load(lasts + at, inside, begin)
+    if TOGETHER:
+        passed, last = tl.load(part_transmittance + to, is_part, passed), tl.load(part_lasts + to, is_part, last)
     return (passed, behind), v, last
 
 
@@ -168,33 +173,39 @@ def differentiate_quadrant(
     return (passed, behind), (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11)
 
 
-@partial(jit, do_not_specialize=["width", "height", "tiles_x"])
+@partial(jit, do_not_specialize=["width", "height", "tiles_x", "part_count"])
 def blend_tiles_backward(
-    records, pair_rows, pair_slots, begins, ends, order, transmittance, lasts,
-    nexts, part_rgb, part_depth, part_transmittance, part_lasts,
-    v_rgb, v_transmittance, v_depth_sum, slots, width, height, tiles_x, alpha_max,
-    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, BLOCK: tl.constexpr,
+    records, pair_rows, pair_slots, begins, ends, order, ahead, part_tiles, part_begins, part_ends, nexts,
+    transmittance, lasts, part_rgb, part_depth, part_transmittance, part_lasts,
+    v_rgb, v_transmittance, v_depth_sum, slots, walked, width, height, tiles_x, part_count, alpha_max,
+    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr, MARKED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile, with PARTS of one part of a tile.
+    """Writes the slots of all pairs of one tile, or (PARTS; TOGETHER: both) of one part of a tile.
 
-    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given.
+    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given; MARKED: sets ``walked`` of each slot that it
+    writes, and leaves the slots behind the last pair that a pixel was open to.
     """
     tl.static_assert(BLOCK == 1)
-    tile = tl.load(order + tl.program_id(0))
-    begin, end = pairs_of(tile, begins, ends, PARTS)
+    tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
+    tile, part, begin, end, is_part = work_of(*tables, PARTS, TOGETHER)
+    following = part
+    if PARTS or TOGETHER:
+        following = tl.load(nexts + part, is_part, 0)
     given = (tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin)
-    part = (nexts, part_rgb, part_depth, part_transmittance, part_lasts)
+    of_part = (part, following, is_part, part_rgb, part_depth, part_transmittance, part_lasts)
     size = (width, height, tiles_x)
-    q0, v0, last0 = last_quadrant(*given, *part, *size, 0, DEPTH, PARTS)
-    q1, v1, last1 = last_quadrant(*given, *part, *size, 1, DEPTH, PARTS)
-    q2, v2, last2 = last_quadrant(*given, *part, *size, 2, DEPTH, PARTS)
-    q3, v3, last3 = last_quadrant(*given, *part, *size, 3, DEPTH, PARTS)
+    q0, v0, last0 = last_quadrant(*given, *of_part, *size, 0, DEPTH, PARTS, TOGETHER)
+    q1, v1, last1 = last_quadrant(*given, *of_part, *size, 1, DEPTH, PARTS, TOGETHER)
+    q2, v2, last2 = last_quadrant(*given, *of_part, *size, 2, DEPTH, PARTS, TOGETHER)
+    q3, v3, last3 = last_quadrant(*given, *of_part, *size, 3, DEPTH, PARTS, TOGETHER)
     x, y = centers(tile, tiles_x)
     latest = tl.max(tl.maximum(tl.maximum(last0, last1), tl.maximum(last2, last3)))
     # A split tile leaves no pair to this program: its ``lasts`` are those of all parts together. A part that is not
     # needed has written nothing.
     latest = tl.maximum(tl.minimum(latest, end), begin)
-    zero_slots(slots, pair_slots, latest, end, SLOT)
+    if not MARKED:
+        zero_slots(slots, pair_slots, latest, end, SLOT)
     pair = tl.load(pair_rows + latest - 1, latest > begin, 0)
     k = latest - 1
     while k >= begin:
@@ -210,5 +221,8 @@ def blend_tiles_backward(
         line = of_lines(y, splat[0], splat[1][0], 1)
         q2, s = differentiate_quadrant(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more)
         q3, s = differentiate_quadrant(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more)
-        store_sums(slots + tl.load(pair_slots + k) * SLOT, s)
+        slot = tl.load(pair_slots + k)
+        store_sums(slots + slot * SLOT, s)
+        if MARKED:
+            tl.store(walked + slot, 1)
         k -= 1

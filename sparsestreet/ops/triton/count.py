@@ -6,10 +6,11 @@ It is a separate pass, so that training does not pay for it. Like backward it wr
 import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, blend_one, pixels_of, whitened
+from sparsestreet.ops.triton.blend import blend_one, pixels_of, whitened
 from sparsestreet.ops.triton.blend_backward import zero_slots
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.quadrants import row_of
+from sparsestreet.ops.triton.thin import LOOK
 
 COUNTER_COUNT = 3
 COUNTERS = constant(COUNTER_COUNT)

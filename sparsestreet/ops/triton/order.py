@@ -23,7 +23,10 @@ _BLOCK = 256
 _CLASS_COUNT = 32
 CLASSES = constant(_CLASS_COUNT)
 LONGEST_CLASS = constant(11)
-"""A tile of 2^12 times the length from which tiles are split would have more pairs than all together."""
+AHEAD_CLASS = constant(13)
+"""A tile of 2^12 times the length from which tiles are split would have more pairs than all together.
+
+Up to AHEAD_CLASS tiles have a quarter of that length and more, about that of a part."""
 CHUNK = constant(32)
 
 
@@ -47,7 +50,8 @@ def list_by_tile(
     )  # fmt: skip
     parts = None
     if part_count:
-        parts = Parts(*(unsorted_rows.new_empty(part_count) for _ in range(5)), whole_ends)
+        vectors = (unsorted_rows.new_empty(part_count) for _ in range(5))
+        parts = Parts(*vectors, whole_ends, unsorted_rows.new_empty(1))
     launch(
         order_tiles, max(tiles, part_count), _BLOCK,
         begins, ends, classes, part_counts, table, order, *_part_arguments(parts, begins), tiles, blocks, part_count,
@@ -57,8 +61,8 @@ def list_by_tile(
 
 def _part_arguments(parts: Parts | None, unread: Tensor) -> tuple[Tensor, ...]:
     if parts is None:
-        return (unread,) * 5
-    return parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts
+        return (unread,) * 6
+    return parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.ahead
 
 
 @jit
@@ -112,7 +116,8 @@ def bound_tiles(
 
 @jit
 def before_block(table, block, blocks):
-    """Of each class: how many of the table's things lie before this block's, in earlier classes too; and all."""
+    """Of each class: how many of the table's things lie before this block's, in earlier classes too; and how many there
+    are."""
     each, chunk = tl.arange(0, CLASSES)[:, None], tl.arange(0, CHUNK)[None, :]
     earlier, every = tl.zeros((CLASSES,), tl.int32), tl.zeros((CLASSES,), tl.int32)
     for first in range(0, blocks, CHUNK):
@@ -120,7 +125,7 @@ def before_block(table, block, blocks):
         counts = tl.load(table + each * blocks + other, other < blocks, 0)
         every += tl.sum(counts, 1)
         earlier += tl.sum(tl.where(other < block, counts, 0), 1)
-    return earlier + tl.cumsum(every, 0) - every, tl.sum(every)
+    return earlier + tl.cumsum(every, 0) - every, every
 
 
 @jit
@@ -132,15 +137,15 @@ def of_class(values, kind):
 
 @partial(jit, do_not_specialize=["tiles", "blocks", "part_count"])
 def order_tiles(
-    begins, ends, classes, part_counts, table, order, part_tiles, part_begins, part_ends, firsts, nexts,
+    begins, ends, classes, part_counts, table, order, part_tiles, part_begins, part_ends, firsts, nexts, ahead,
     tiles, blocks, part_count, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Tiles by class, and the parts of each; parts behind the last one are made empty."""
+    """Tiles by class, how many of them start before the parts, and the parts; those behind the last are empty."""
     block = tl.program_id(0)
     tile = block * BLOCK + tl.arange(0, BLOCK)
     given = tile < tiles
-    first_of_class, _ = before_block(table, block, blocks)
-    first_parts, all_parts = before_block(table + CLASSES * blocks, block, blocks)
+    first_of_class, tiles_of_class = before_block(table, block, blocks)
+    first_parts, parts_of_class = before_block(table + CLASSES * blocks, block, blocks)
     kind, count = tl.load(classes + tile, given, 0), tl.load(part_counts + tile, given, 0)
     place, part = of_class(first_of_class, kind), of_class(first_parts, kind)
     for first in range(block * BLOCK, tl.minimum((block + 1) * BLOCK, tiles), CHUNK):
@@ -151,6 +156,8 @@ def order_tiles(
         place += tl.sum(same.to(tl.int32), 1)
         part += tl.sum(tl.where(same, tl.load(part_counts + other, other < tiles, 0)[None, :], 0), 1)
     tl.store(order + place, tile, given)
+    if (part_count > 0) & (block == 0):
+        tl.store(ahead, tl.sum(tl.where(tl.arange(0, CLASSES) <= AHEAD_CLASS, tiles_of_class, 0)))
 
     begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
     for i in range(tl.max(count)):
@@ -161,7 +168,7 @@ def order_tiles(
         tl.store(firsts + part + i, part, mine)
         tl.store(nexts + part + i, part + count, mine)
     # Lanes stand for parts, of which there may be more than tiles.
-    unused = (tile >= all_parts) & (tile < part_count)
+    unused = (tile >= tl.sum(parts_of_class)) & (tile < part_count)
     tl.store(part_tiles + tile, 0, unused)
     tl.store(part_begins + tile, 0, unused)
     tl.store(part_ends + tile, 0, unused)

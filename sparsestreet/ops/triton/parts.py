@@ -1,14 +1,12 @@
 """Long tiles in parts, so that a few deep tiles do not keep the device waiting for one warp each.
 
-A part starts with the light that the parts before it let through. ``thin_parts`` computes the light that each part
-alone
-lets through, for all parts at once. Then every part is blended from its true start, with the stop rule of the whole
-tile, and ``merge_parts`` adds up the parts. The image differs from that of an unsplit tile only by rounding. In
-backward
-the light behind a part is the sum of the parts behind it.
+A part starts with the light that the parts before it let through. First it is computed for all parts at once what each
+lets through alone: a first part is blended for that, behind a last one nothing lies. Then the other parts are blended
+from their true start, with the stop rule of the whole tile, and ``merge_parts`` adds up the parts. The image differs
+from that of an unsplit tile only by rounding. In backward the light behind a part is the sum of the parts behind it.
 
-A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The parts'
-transmittance is computed twice, which pays only if other warps would wait.
+A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The
+transmittance of parts in the middle is computed twice, which pays only if other warps would wait.
 """
 
 from dataclasses import dataclass
@@ -17,10 +15,9 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.blend import LOOK, PIXEL_COUNT, PIXELS, part_pixels, pixels_of, whitened
+from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS, part_pixels, pixels_of
 from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.quadrants import row_of
+from sparsestreet.ops.triton.thin import thin_pairs
 from sparsestreet.ops.triton.tuning import tuning
 
 
@@ -37,6 +34,8 @@ class Parts:
     """The part after the last one of the same tile."""
     whole_ends: Int[Tensor, " t"]
     """End of each tile's pairs; their beginning where the tile is split."""
+    ahead: Int[Tensor, " 1"]
+    """Number of tiles that are at least about as long as a part, and start before the parts."""
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -47,7 +46,7 @@ class PartLayers:
     """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
 
     products: Float[Tensor, "s 256"]
-    """Light that the part alone lets through."""
+    """Light that the part alone lets through; unwritten for the last part of a tile."""
     rgb: Float[Tensor, "s 256 3"]
     transmittance: Float[Tensor, "s 256"]
     depth_sum: Float[Tensor, "s 256"]
@@ -105,28 +104,17 @@ def part_begin(begin, end, count, i):
 
 @jit
 def thin_parts(
-    records, pair_rows, tiles, begins, ends, products, width, height, tiles_x, alpha_max, transmittance_min,
+    records, pair_rows, tiles, begins, ends, nexts, products, width, height, tiles_x, alpha_max, transmittance_min,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over each needed part, or some value below the limit once it is below."""
+    """Writes what each part lets through alone, but for the last parts of tiles, behind which nothing is blended."""
     tl.static_assert(BLOCK == 1)
     part = tl.program_id(0)
-    x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
-    px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
-    passed = tl.where(inside, 1.0, 0.0)
-    k, end = tl.load(begins + part), tl.load(ends + part)
-    needed = k < end
-    unfinished = needed
-    while unfinished:
-        stop = tl.minimum(k + LOOK, end)
-        for i in range(k, stop):
-            s = record.record_of(records, row_of(tl.load(pair_rows + i)))
-            _, _, _, _, exponent = whitened(s, px, py)
-            alpha = tl.minimum(tl.exp2(exponent), alpha_max)
-            passed -= tl.where(exponent >= tl.load(s + record.CUTOFF), alpha, 0.0) * passed
-        k = stop
-        unfinished = (k < end) & (tl.max(passed) > transmittance_min)
-    tl.store(products + part_pixels(part), passed, needed)
+    if part + 1 < tl.load(nexts + part):
+        thin_pairs(
+            records, pair_rows, tl.load(begins + part), tl.load(ends + part), tl.load(tiles + part), part, products,
+            width, height, tiles_x, alpha_max, transmittance_min,
+        )  # fmt: skip
 
 
 @jit
@@ -154,7 +142,7 @@ def merge_parts(
         rest = tl.where(reached, tl.load(part_transmittance + at), rest)
         if LASTS:
             last = tl.where(reached, tl.load(part_lasts + at), last)
-        passed *= tl.load(products + at)
+        passed *= tl.load(products + at, i + 1 < end, 0.0)
     at = y * width + x
     written = inside & (end > part)
     tl.store(rgb + 3 * at, red, written)

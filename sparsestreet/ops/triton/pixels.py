@@ -1,17 +1,23 @@
-"""Runs the pixel kernels of a view: one over whole tiles and, if there may be long ones, some over parts."""
+"""Runs the pixel kernels of a view: over whole tiles and, if there may be long ones, over parts (parts.py)."""
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sparsestreet.ops.triton import blend, blend_backward
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.parts import PartLayers, merge_parts, thin_parts
+from sparsestreet.ops.triton.lists import Lists
+from sparsestreet.ops.triton.parts import PartLayers, Parts, merge_parts, thin_parts
 from sparsestreet.ops.triton.screen import Screen, given_or
+from sparsestreet.ops.triton.tuning import tuning
 from sparsestreet.ops.triton.view import KernelView
 
 ONE_WARP = {"num_warps": 1}
+WHOLE_TILES = {"PARTS": False, "TOGETHER": False}
+PARTS = {"PARTS": True, "TOGETHER": False}
+TOGETHER = {"PARTS": False, "TOGETHER": True}
 
 
 @dataclass(frozen=True)
@@ -47,30 +53,40 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
     lists, shape, limit = screen.lists, (view.camera.height, view.camera.width), view.transmittance_min
     rgb = screen.records.new_empty(*shape, 3)
     transmittance, depth_sum = screen.records.new_empty(shape), screen.records.new_empty(shape)
-    last = lists.begins.new_empty(shape) if lasts else None
-    layers = (rgb, transmittance, depth_sum, given_or(last, lists.begins))
+    last, parts = lists.begins.new_empty(shape) if lasts else None, lists.parts
+    layers = part_layers = (rgb, transmittance, depth_sum, given_or(last, lists.begins))
+    neighbors, part = (lists.order, lists.order, transmittance), None
+    if parts is not None:
+        part = PartLayers.empty(parts, rgb)
+        part_layers = (part.rgb, part.transmittance, part.depth_sum, part.lasts)
+        neighbors = (parts.firsts, parts.nexts, part.products)
 
-    def blend_each(*arguments: Tensor, split: bool) -> None:
+    staged = len(lists.order) <= tuning().staged_tiles
+
+    def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
         launch(
-            blend.blend_tiles, len(arguments[0]), 1,
-            screen.records, lists.pair_rows, *arguments, *pixel_arguments(view), limit,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, PARTS=split,
-            options=ONE_WARP | {"maxnreg": blend.registers(view.exclusive)},
+            blend.blend_tiles, count, 1,
+            screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers,
+            *sizes(view, parts), view.settings.alpha_max, limit,
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, **work,
+            options=ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged)},
         )  # fmt: skip
 
-    parts = lists.parts
-    whole_ends = lists.ends if parts is None else parts.whole_ends
-    blend_each(lists.begins, whole_ends, lists.order, lists.order, transmittance, *layers, split=False)
-    if parts is None:
+    tiles = len(lists.order)
+    if parts is None or part is None:
+        blend_each(tiles, WHOLE_TILES)
         return Layers(rgb, depth_sum, Ends(transmittance, last, None))
-    part = PartLayers.empty(parts, rgb)
-    part_layers = (part.rgb, part.transmittance, part.depth_sum, part.lasts)
-    launch(
-        thin_parts, len(parts), 1,
-        screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, part.products,
-        *pixel_arguments(view), limit, options=ONE_WARP,
-    )  # fmt: skip
-    blend_each(parts.begins, parts.ends, parts.tiles, parts.firsts, part.products, *part_layers, split=True)
+    if tuning().two_launches:
+        blend_each(tiles + len(parts), TOGETHER)
+        blend_each(len(parts), PARTS, rest=True)
+    else:
+        blend_each(tiles, WHOLE_TILES)
+        launch(
+            thin_parts, len(parts), 1,
+            screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, parts.nexts, part.products,
+            *pixel_arguments(view), limit, options=ONE_WARP,
+        )  # fmt: skip
+        blend_each(len(parts), PARTS)
     launch(
         merge_parts, len(parts), 1,
         parts.tiles, parts.firsts, parts.nexts, part.products, *part_layers, *layers,
@@ -81,30 +97,50 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
 
 def differentiate_view(
     screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
-) -> Float[Tensor, "p 12"]:
-    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
+) -> tuple[Float[Tensor, "p 12"], UInt8[Tensor, " p"] | None]:
+    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means.
+
+    Also which slots are written, as bytes; None: all."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
     slots = passed.new_empty(lists.sizes.pairs, blend_backward.SLOT_LENGTH)
+    walked = slots.new_zeros(len(slots), dtype=torch.uint8) if tuning().marked_slots else None
+    parts, part = lists.parts, ends.parts
+    nexts, part_layers = lists.order, (passed, passed, passed, lists.order)
+    if parts is not None and part is not None:
+        nexts, part_layers = parts.nexts, (part.rgb, part.depth_sum, part.transmittance, part.lasts)
 
-    def differentiate_each(begins: Tensor, stops: Tensor, tiles: Tensor, *part: Tensor, split: bool) -> None:
+    def differentiate_each(count: int, work: dict[str, bool]) -> None:
         launch(
-            blend_backward.blend_tiles_backward, len(begins), 1,
-            screen.records, lists.pair_rows, lists.slots, begins, stops, tiles, passed, ends.lasts, *part,
-            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, *pixel_arguments(view),
-            DEPTH=depth, ABSOLUTE=absolute, PARTS=split,
+            blend_backward.blend_tiles_backward, count, 1,
+            screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
+            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, given_or(walked, lists.order),
+            *sizes(view, parts), view.settings.alpha_max,
+            DEPTH=depth, ABSOLUTE=absolute, MARKED=walked is not None, **work,
             options=ONE_WARP | {"maxnreg": blend_backward.registers(depth)},
         )  # fmt: skip
 
-    parts, part = lists.parts, ends.parts
-    unread = (lists.order, passed, passed, passed, lists.order)
-    whole_ends = lists.ends if parts is None else parts.whole_ends
-    differentiate_each(lists.begins, whole_ends, lists.order, *unread, split=False)
-    if parts is not None:
-        differentiate_each(
-            parts.begins, parts.ends, parts.tiles,
-            parts.nexts, part.rgb, part.depth_sum, part.transmittance, part.lasts, split=True,
-        )  # fmt: skip
-    return slots
+    tiles = len(lists.order)
+    if parts is None:
+        differentiate_each(tiles, WHOLE_TILES)
+    elif tuning().two_launches:
+        differentiate_each(tiles + len(parts), TOGETHER)
+    else:
+        differentiate_each(tiles, WHOLE_TILES)
+        differentiate_each(len(parts), PARTS)
+    return slots, walked
+
+
+def work_tables(lists: Lists) -> tuple[Tensor, ...]:
+    """What a program works on (programs.py): tiles, then parts; where there are none, tables that are not read."""
+    parts = lists.parts
+    if parts is None:
+        return lists.begins, lists.ends, *(lists.order,) * 5
+    return lists.begins, parts.whole_ends, lists.order, parts.ahead, parts.tiles, parts.begins, parts.ends
+
+
+def sizes(view: KernelView, parts: Parts | None) -> tuple[int, int, int, int]:
+    """Width, height, columns of tiles, and the room for parts."""
+    return *pixel_arguments(view)[:3], 0 if parts is None else len(parts)
 
 
 def pixel_arguments(view: KernelView) -> tuple[int, int, int, float]:

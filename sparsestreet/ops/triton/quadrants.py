@@ -75,6 +75,20 @@ def quadrant_pixels(tile, tiles_x, QUADRANT: tl.constexpr):
 
 
 @jit
+def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the image, and which of them lie in it; [64]."""
+    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
+    return y * width + x, (x < width) & (y < height)
+
+
+@jit
+def part_places(part, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the layers of parts [64], of all, because those outside the image are read."""
+    x, y = quadrant_pixels(0, 1, QUADRANT)
+    return part * TILE * TILE + y * TILE + x
+
+
+@jit
 def centers(tile, tiles_x):
     """Centers of the upper left quadrant's pixels. For other quadrants kernels move the splat by SIDE."""
     x, y = quadrant_pixels(tile, tiles_x, 0)
@@ -94,18 +108,57 @@ def of_lane(values):
 
 
 @jit
-def load_splat(records, row):
-    """Mean and factor of the row's splat; log2 of its opacity and the cutoff; color and depth."""
+def load_shape(records, row):
+    """Mean and factor of the row's splat; log2 of its opacity and the cutoff."""
     s = record.record_of(records, row)
     geometry = (
         tl.load(s + record.X), tl.load(s + record.Y),
         tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
     )  # fmt: skip
-    ends = tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF)
+    return geometry, (tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF))
+
+
+@jit
+def load_splat(records, row):
+    """The shape of the row's splat (``load_shape``), its color and depth."""
+    geometry, ends = load_shape(records, row)
+    s = record.record_of(records, row)
     return geometry, ends, (
         tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
         tl.load(s + record.DEPTH),
     )  # fmt: skip
+
+
+@jit
+def hold_splats(records, pair_rows, k, end):
+    """Of WARP pairs from ``k`` on one splat in each lane: the eleven numbers of ``load_splat`` and whatever behind
+    ``end``."""
+    pair = k + tl.arange(0, WARP)
+    given = pair < end
+    s = record.record_of(records, row_of(tl.load(pair_rows + pair, given, 0)))
+    return (
+        tl.load(s + record.X, given, 0.0), tl.load(s + record.Y, given, 0.0),
+        tl.load(s + record.L11, given, 0.0), tl.load(s + record.L21, given, 0.0), tl.load(s + record.L22, given, 0.0),
+        tl.load(s + record.LOG2_OPACITY, given, 0.0), tl.load(s + record.CUTOFF, given, 0.0),
+        tl.load(s + record.COLOR, given, 0.0), tl.load(s + record.COLOR + 1, given, 0.0),
+        tl.load(s + record.COLOR + 2, given, 0.0), tl.load(s + record.DEPTH, given, 0.0),
+    )  # fmt: skip
+
+
+@jit
+def handed(values, lane):
+    """The value of one lane, to all pixels of a quadrant [64]."""
+    value = tl.gather(values, tl.zeros((WARP,), tl.int32) + lane, 0)
+    return tl.reshape(tl.broadcast_to(value[None, :], (PIXELS // WARP, WARP)), (PIXELS,))
+
+
+@jit
+def held_splat(held, lane):
+    """As ``load_splat``, of the splat that a lane holds."""
+    x, y, l11, l21, l22, log2_opacity, cutoff, red, green, blue, depth = held
+    geometry = (handed(x, lane), handed(y, lane), handed(l11, lane), handed(l21, lane), handed(l22, lane))
+    color = (handed(red, lane), handed(green, lane), handed(blue, lane), handed(depth, lane))
+    return geometry, (handed(log2_opacity, lane), handed(cutoff, lane)), color
 
 
 @jit

@@ -128,9 +128,10 @@ class _Blend(torch.autograd.Function):
             return *[None] * 6, v_background, None, None, None
         cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
         plain = view.settings.plain_gradients
-        gradients = differentiate_view(screen, view, ends, cotangents, absolute=ctx.needs_input_grad[5] and not plain)
+        absolute = ctx.needs_input_grad[5] and not plain
+        gradients, walked = differentiate_view(screen, view, ends, cotangents, absolute)
         sums = transmittance.new_empty(len(fields[0]), blend_backward.SLOT_LENGTH)
-        _sum_slots(gradients, lists, sums, 16, tl.float32)
+        _sum_slots(gradients, lists, sums, 16, tl.float32, walked)
         outputs = [torch.empty_like(field) for field in fields]
         v_screen = transmittance.new_empty(len(fields[0]), 2)
         launch(
@@ -143,11 +144,13 @@ class _Blend(torch.autograd.Function):
         return *outputs, v_screen, v_background, None, None, None
 
 
-def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype) -> None:
+def _sum_slots(
+    values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype, walked: Tensor | None = None
+) -> None:
     launch(
         slots.sum_slots, lists.sizes.rows, slots.ROWS,
-        values, lists.rows, lists.first_pairs, lists.tile_counts, sums, lists.sizes.rows,
-        COUNT=values.shape[1], PADDED=padded, SUM=kind, options=slots.OPTIONS,
+        values, given_or(walked, lists.rows), lists.rows, lists.first_pairs, lists.tile_counts, sums, lists.sizes.rows,
+        COUNT=values.shape[1], PADDED=padded, SUM=kind, MARKED=walked is not None, options=slots.OPTIONS,
     )  # fmt: skip
 
 

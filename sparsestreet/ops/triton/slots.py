@@ -15,10 +15,12 @@ STEP = constant(4)
 
 @partial(jit, do_not_specialize=["visible"])
 def sum_slots(
-    slots, rows, first_pairs, tile_counts, sums, visible,
-    COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
+    slots, walked, rows, first_pairs, tile_counts, sums, visible,
+    COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, MARKED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two."""
+    """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two.
+
+    MARKED: of the slots that are marked in ``walked``; the others are not written."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = rank < visible
     first, count = tl.load(first_pairs + rank, given, 0).to(tl.int64), tl.load(tile_counts + rank, given, 0)
@@ -26,9 +28,14 @@ def sum_slots(
     slot = slots + first[:, None] * COUNT + field[None, :]
     total = tl.zeros((BLOCK, PADDED), SUM)
     for k in range(0, tl.max(count, 0), STEP):
-        values = ()
+        wanted, values = (), ()
         for i in tl.static_range(STEP):
-            mask = (k + i < count)[:, None] & (field < COUNT)[None, :]
+            mask = k + i < count
+            if MARKED:
+                mask = tl.load(walked + first + k + i, mask, 0) != 0
+            wanted += (mask,)
+        for i in tl.static_range(STEP):
+            mask = wanted[i][:, None] & (field < COUNT)[None, :]
             values += (tl.load(slot + (k + i) * COUNT, mask, 0.0),)
         for i in tl.static_range(STEP):
             total += values[i].to(SUM)

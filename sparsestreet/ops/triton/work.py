@@ -5,10 +5,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.triton.blend import LOOK_LENGTH
 from sparsestreet.ops.triton.pixels import blend_view
 from sparsestreet.ops.triton.quadrants import QUADRANT_PIXELS
 from sparsestreet.ops.triton.screen import project
+from sparsestreet.ops.triton.thin import LOOK_LENGTH
 from sparsestreet.ops.triton.view import TILE_SIZE, KernelView
 from sparsestreet.types import Camera, Gaussians
 

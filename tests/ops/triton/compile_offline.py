@@ -59,12 +59,13 @@ def _compile(kernel: JITFunction, launch: dict, arch: int) -> CompiledKernel:
 
 
 def _found(compiled: CompiledKernel, instructions: list[tuple[int, str]]) -> dict:
-    forbidden = forbidden_in(instructions)
+    forbidden, loops = forbidden_in(instructions), _loops(instructions)
     return {
         **resources_of(compiled.asm["cubin"]),
         **forbidden,
         "tensor_core": forbidden["tensor_core"] + compiled.asm["ptx"].count("tf32"),
-        "sample": _per_sample(instructions),
+        "sample": _per_sample(loops),
+        "loops": loops,
         "loads": sum(text.startswith("LDG") for _, text in instructions),
         "stores": sum(text.startswith("STG") for _, text in instructions),
         "tiles": _tiles(compiled.asm["ttgir"]),
@@ -140,17 +141,32 @@ def _tiles(ttgir: str) -> list[dict]:
     return tiles
 
 
-def _per_sample(instructions: list[tuple[int, str]]) -> float | None:
-    """Instructions of the shortest loop around powers of two, per power: each (splat, pixel) sample takes one."""
+def _loops(instructions: list[tuple[int, str]]) -> list[dict[str, int]]:
+    """The innermost loops around powers of two, of which each (splat, pixel) sample takes one, the longest last.
+
+    Counted are all their instructions, the powers, loads from memory, exchanges between lanes, and what reads or
+    writes spilled registers."""
+    jumps = [(at, re.match(r"BRA\S*\s+.*?(0x[0-9a-f]+)", text)) for at, text in instructions]
+    ranges = sorted({(int(jump[1], 16), at) for at, jump in jumps if jump and int(jump[1], 16) < at})
     loops = []
-    for address, text in instructions:
-        jump = re.match(r"BRA\S*\s+.*?(0x[0-9a-f]+)", text)
-        if jump and int(jump[1], 16) < address:
-            body = [other for at, other in instructions if int(jump[1], 16) <= at <= address]
-            powers = sum(other.startswith("MUFU.EX2") for other in body)
-            if powers:
-                loops.append((len(body), len(body) / powers))
-    return min(loops)[1] if loops else None
+    for first, last in ranges:
+        body = [text for at, text in instructions if first <= at <= last]
+        kinds = {"powers": "MUFU.EX2", "loads": "LDG", "exchanges": "SHFL", "spilled": ("LDL", "STL")}
+        counts = {name: sum(text.startswith(kind) for text in body) for name, kind in kinds.items()}
+        if counts["powers"]:
+            loops.append((first, last, {"instructions": len(body)} | counts))
+    # The shortest of those that overlap.
+    inner = [
+        counts
+        for first, last, counts in loops
+        if not any(a <= last and first <= b and b - a < last - first for a, b, _ in loops)
+    ]
+    return sorted(inner, key=lambda counts: counts["instructions"])
+
+
+def _per_sample(loops: list[dict[str, int]]) -> float | None:
+    """Instructions of the longest loop per power of two."""
+    return loops[-1]["instructions"] / loops[-1]["powers"] if loops else None
 
 
 if __name__ == "__main__":

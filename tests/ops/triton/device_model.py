@@ -30,6 +30,8 @@ class Split:
 
     whole: list[int]
     parts: list[list[int]]
+    ahead: int
+    """Number of whole tiles that start before the parts where both start together."""
 
     @property
     def chains(self) -> list[float]:
@@ -68,6 +70,17 @@ def four_launches(split: Split, fit: tuple[float, float]) -> float:
     thin = [THIN * pairs for parts in split.parts for pairs in parts[:-1]]
     blended = [pairs for parts in split.parts for pairs in parts]
     return makespan(split.whole, fit) + makespan(thin, fit, resident=8) + makespan(blended, fit)
+
+
+def together(split: Split, parts: Sequence[float]) -> list[float]:
+    """Whole tiles and parts in the order in which they start."""
+    return [*split.whole[: split.ahead], *parts, *split.whole[split.ahead :]]
+
+
+def two_launches(split: Split, fit: tuple[float, float]) -> float:
+    """Forward: whole tiles, first parts, and the transmittance of middle ones; then all parts but the first."""
+    first = [parts[0] if i == 0 else THIN * parts[i] for parts in split.parts for i in range(len(parts) - 1)]
+    return makespan(together(split, first), fit) + makespan([n for parts in split.parts for n in parts[1:]], fit)
 
 
 def lengths_of(quantiles: dict[float, int], tiles: int) -> NDArray[np.int64]:

@@ -14,8 +14,8 @@ import pytest
 import torch
 import triton.language as tl
 
-from sparsestreet.ops.triton import launch as package
 from sparsestreet.ops.triton import compose, lists, order, pixels, rasterizer, screen
+from sparsestreet.ops.triton import launch as package
 
 _POINTERS = {
     torch.float32: "*fp32",

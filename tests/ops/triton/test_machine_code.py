@@ -1,8 +1,8 @@
-"""Every kernel compiles for sm_80 and sm_90 without a GPU, and the pixel loops stay within their budgets.
+"""Every kernel compiles for sm_80, sm_90 and sm_120 without a GPU, and the pixel loops stay within their budgets.
 
 What has a budget or is launched beside training is compiled for sm_90 by ``make test``, with the switches of training;
 the rest of training's kernels as they are launched (test_launch_path.py). ``make test-all`` compiles every switch for
-both.
+all three.
 
 Budgets are what was measured with Triton 3.7.1; 3.6.0 makes pixel kernels of the same registers and instructions. The
 instructions of a (splat, pixel) sample are those of a splat that touches all four quadrants of its tile: the
@@ -11,6 +11,7 @@ forward and 487 backward whatever it touched.
 """
 
 import dataclasses
+import itertools
 import json
 from functools import cache
 
@@ -65,8 +66,11 @@ _BACKWARD = ("unscented", "unscented_backward", "roll", "roll_backward", "veloci
 EFFECTS = {"project_rows": _FORWARD, "project_rows_backward": _BACKWARD}
 
 
-def launches_of(monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[StopRule, ...]) -> list[Launch]:
-    """What these cases launch, and all that is counted, with these rules of where a pixel stops."""
+def launches_of(
+    monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[StopRule, ...], choices: list[Tuning]
+) -> list[Launch]:
+    """What these cases launch, and all that is counted, with these rules of where a pixel stops and these choices for
+    split tiles."""
     launches = record_launches(monkeypatch)
     for terms, name, moves, settings, output in cases:
         scene = cast(random_gaussians(3, STILL, terms=terms), torch.float32, requires_grad=True, device=DEVICE)
@@ -81,8 +85,8 @@ def launches_of(monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tupl
         rasterizer.leave_one_out(scene, background, weights, STILL, SplatSettings())
     for stop in stops:
         contribution(scene, STILL, settings=SplatSettings(stop=stop), backend="triton")
-    with tuned(Tuning(shortest_part=1, fewest_parts=2)):
-        for stop in stops:
+    for choice, stop in itertools.product(choices, stops):
+        with tuned(choice):
             splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()
     unique = {json.dumps(dataclasses.asdict(launch), sort_keys=True): launch for launch in launches}
     return list(unique.values())
@@ -94,10 +98,18 @@ def bare(launch: Launch, registers: int, **constants: bool) -> Launch:
     return dataclasses.replace(launch, constants=constants, options=launch.options | {"maxnreg": registers})
 
 
+SPLIT = Tuning(shortest_part=1, fewest_parts=2)
+TUNINGS = [
+    SPLIT,
+    dataclasses.replace(SPLIT, two_launches=False),
+    dataclasses.replace(SPLIT, marked_slots=True, staged_tiles=1),
+]
+ALL = (TRAINED + OTHERS, ("inclusive", "exclusive"), TUNINGS)
 SCOPES = {
-    "trained, sm_90": (90, TRAINED, ("inclusive",)),
-    "all, sm_80": (80, TRAINED + OTHERS, ("inclusive", "exclusive")),
-    "all, sm_90": (90, TRAINED + OTHERS, ("inclusive", "exclusive")),
+    "trained, sm_90": (90, TRAINED, ("inclusive",), [SPLIT]),
+    "all, sm_80": (80, *ALL),
+    "all, sm_90": (90, *ALL),
+    "all, sm_120": (120, *ALL),
 }
 
 
@@ -116,9 +128,9 @@ def everything(request) -> list[tuple[Launch, dict]]:
 
 @cache
 def compiled_in(scope: str) -> list[tuple[Launch, dict]]:
-    arch, cases, stops = SCOPES[scope]
+    arch, cases, stops, choices = SCOPES[scope]
     with pytest.MonkeyPatch.context() as monkeypatch:
-        launches = launches_of(monkeypatch, cases, stops)
+        launches = launches_of(monkeypatch, cases, stops, choices)
     if cases is TRAINED:
         return compile_launches([launch for launch in launches if _is_daily(launch)], arch)
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
@@ -141,7 +153,7 @@ def test_every_kernel_is_compiled(compiled, request):
     names = {launch.name for launch, _ in compiled}
     if "trained" in request.node.name:
         assert names == {*BUDGETS, *ROW_BUDGETS, "count_tiles_pixels", "remove_from_tiles"}
-        names |= {*FORWARD_PASS, *BACKWARD_PASS}
+        names |= {*FORWARD_PASS, *BACKWARD_PASS, "thin_parts"}
     assert names == {
         "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
         "count_tiles_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward", "remove_from_tiles",
@@ -149,8 +161,17 @@ def test_every_kernel_is_compiled(compiled, request):
     }  # fmt: skip
 
 
-def test_nothing_spills(compiled):
-    assert [launch for launch, found in compiled if found["spilled"]] == []
+def test_nothing_spills(compiled, request):
+    """But for staged records, outside of the loop, and for sm_120, where registers were not tuned."""
+    newest = "sm_120" in request.node.name
+    spilled = [launch for launch, found in compiled if found["spilled"] and not (newest or _is_staged(launch))]
+    assert spilled == []
+    for launch, found in compiled:
+        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and _is_staged(launch)), launch
+
+
+def _is_staged(launch: Launch) -> bool:
+    return bool(launch.constants.get("STAGED"))
 
 
 def test_no_tensor_cores_and_no_atomics(compiled):
@@ -164,20 +185,30 @@ FORWARD = {
     "LASTS": (80, 22.0),
     "DEPTH": (80, 22.0),
     "DEPTH LASTS": (80, 23.5),
+    "DEPTH LASTS TOGETHER": (80, 24.0),
+    "DEPTH LASTS PARTS REST": (80, 23.5),
     "DEPTH LASTS PARTS": (80, 23.5),
+    "DEPTH LASTS STAGED TOGETHER": (96, 24.0),
+    "DEPTH LASTS PARTS REST STAGED": (96, 23.5),
     "DEPTH EXCLUSIVE LASTS": (88, 26.0),
+    "DEPTH EXCLUSIVE LASTS TOGETHER": (88, 26.0),
+    "DEPTH EXCLUSIVE LASTS PARTS REST": (88, 26.0),
     "DEPTH EXCLUSIVE LASTS PARTS": (88, 26.0),
+    "DEPTH EXCLUSIVE LASTS STAGED TOGETHER": (96, 26.0),
+    "DEPTH EXCLUSIVE LASTS PARTS REST STAGED": (96, 26.0),
 }
 BACKWARD = {
     "": (96, 53.0),
     "DEPTH": (104, 56.0),
     "ABSOLUTE": (96, 58.5),
     "ABSOLUTE DEPTH": (104, 61.0),
+    "ABSOLUTE DEPTH TOGETHER": (104, 61.0),
     "ABSOLUTE DEPTH PARTS": (104, 61.0),
+    "ABSOLUTE DEPTH MARKED TOGETHER": (104, 62.0),
 }
 OF_TRAINING = {
-    "blend_tiles": ("DEPTH", "DEPTH LASTS", "DEPTH LASTS PARTS"),
-    "blend_tiles_backward": ("ABSOLUTE", "ABSOLUTE DEPTH", "ABSOLUTE DEPTH PARTS"),
+    "blend_tiles": ("DEPTH", "DEPTH LASTS", "DEPTH LASTS TOGETHER", "DEPTH LASTS PARTS REST"),
+    "blend_tiles_backward": ("ABSOLUTE", "ABSOLUTE DEPTH", "ABSOLUTE DEPTH TOGETHER"),
 }
 BUDGETS = {"blend_tiles": FORWARD, "blend_tiles_backward": BACKWARD}
 
@@ -186,13 +217,19 @@ def test_budget_of_the_pixel_loops(compiled):
     loops = [(launch, _switches(launch.constants), found) for launch, found in compiled if launch.name in BUDGETS]
     every_switch = any("EXCLUSIVE" in switches for _, switches, _ in loops)
     wanted = [(name, switches) for name, budgets in BUDGETS.items() for switches in budgets]
-    assert sorted((launch.name, switches) for launch, switches, _ in loops) == sorted(
+    assert {(launch.name, switches) for launch, switches, _ in loops} == {
         (name, switches) for name, switches in wanted if every_switch or switches in OF_TRAINING[name]
-    )
+    }
     for launch, switches, found in loops:
         registers, instructions = BUDGETS[launch.name][switches]
         assert found["registers"] <= registers, (launch.name, switches)
         assert found["sample"] <= instructions, (launch.name, switches)
+        # Staged, only the next pair's row and quadrants are loaded, and eleven numbers change lanes.
+        loop = found["loops"][-1]
+        if _is_staged(launch):
+            assert (loop["loads"], loop["exchanges"]) == (1, 11)
+        # What a part lets through is a second, shorter loop.
+        assert len(found["loops"]) == (2 if launch.name == "blend_tiles" and launch.constants["TOGETHER"] else 1)
 
 
 def _switches(constants: dict) -> str:

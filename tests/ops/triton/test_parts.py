@@ -1,5 +1,6 @@
 """Long tiles in parts: the same image and gradients as in one piece, for any length of the parts."""
 
+import dataclasses
 import math
 
 import pytest
@@ -10,10 +11,10 @@ from hypothesis import strategies as st
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import blend_backward, pixels, rasterizer
 from sparsestreet.ops.triton.parts import part_length, split_length
-from sparsestreet.ops.triton.tuning import Tuning, tuned
+from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
+from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
-    FIELDS,
     camera,
     cast,
     device_of,
@@ -60,7 +61,7 @@ def short_parts():
 
 @pytest.mark.parametrize("name", first_interpreted(*STOPS))
 def test_against_the_reference(name, short_parts):
-    scene, seen = stack(13), []
+    scene, seen = stack(10), []
     truth = render(scene, VIEW, "reference", torch.float64, STOPS[name])
     original = rasterizer.blend_view
 
@@ -99,7 +100,8 @@ def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatc
     monkeypatch.setattr(pixels, "launch", launch)
     gaussians = cast(stack(13), torch.float32, requires_grad=True, device=DEVICE)
     # Wider than VIEW: one tile is not split.
-    splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
+    with tuned(dataclasses.replace(tuning(), two_launches=False)):
+        splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
     assert written[True].any()
     assert written[False].any()
     assert torch.equal(written[False], ~written[True])
@@ -118,21 +120,33 @@ def test_any_length_draws_the_same(length):
         assert relative_error(split.gradients[field], gradient) <= 1e-5, field
 
 
-def test_two_runs_are_bitwise_equal_and_read_nothing_unwritten(short_parts, monkeypatch):
-    scene = stack(13, 0.9)
-    plain = render(scene, VIEW, "triton", torch.float32)
-    empty = torch.Tensor.new_empty
+def test_each_launch_does_what_no_other_does(short_parts, poisoned, monkeypatch):
+    """Whole tiles, first parts and what later ones let through; then these, but nothing behind the last of a tile."""
+    started, blended, multiplied = pixels.launch, [], []
 
-    def poisoned(*args, **kwargs):
-        tensor = empty(*args, **kwargs)
-        return tensor.fill_(float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
+    def launch(kernel, items, block, *arguments, **options):
+        started(kernel, items, block, *arguments, **options)
+        (rgb,) = (a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256, 3))
+        products = next(a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256,))
+        for written, layer in ((blended, rgb.flatten(1)), (multiplied, products)):
+            finite = layer.isfinite()
+            assert torch.equal(finite.all(1), finite.any(1))
+            written.append(finite.all(1))
+        rgb.fill_(torch.nan if len(blended) == 1 else 0.0)
 
-    monkeypatch.setattr(torch.Tensor, "new_empty", poisoned)
-    again = render(scene, VIEW, "triton", torch.float32)
-    for name, image in plain.images.items():
-        assert torch.equal(again.images[name], image), name
-    for field in FIELDS:
-        assert torch.equal(again.gradients[field], plain.gradients[field]), field
+    view = KernelView(VIEW, SplatSettings())
+    screen = rasterizer.project(cast(stack(13), torch.float32, device=DEVICE), view)
+    monkeypatch.setattr(pixels, "launch", launch)
+    layers, split = pixels.blend_view(screen, view, lasts=False), screen.lists.parts
+    assert split is not None
+    assert layers.rgb.isfinite().all()
+    part = torch.arange(len(split), device=DEVICE)
+    first, last, used = split.firsts == part, split.nexts == part + 1, split.nexts > part
+    assert int(used.sum()) > int((first & used).sum()) + int((last & used).sum()) > 0
+    assert torch.equal(blended[0], used & first)
+    assert torch.equal(blended[1], used & ~first)
+    assert torch.equal(multiplied[0], used & ~last)
+    assert torch.equal(multiplied[1], used & ~last)
 
 
 def test_counting_and_removal_walk_whole_tiles(short_parts):
@@ -148,14 +162,15 @@ def test_counting_and_removal_walk_whole_tiles(short_parts):
     torch.testing.assert_close(split.max_abs_change, whole.max_abs_change, rtol=1e-5, atol=1e-7)
 
 
-def test_parts_longer_than_a_look():
+@pytest.mark.parametrize("staged", first_interpreted(1, 0))
+def test_parts_longer_than_a_look(staged):
     # Both parts hold 35 splats and are looked at after 32, when half the light still passes.
     layers = [
         one_gaussian(means=[[0.0, 0.0, 2 + 0.1 * k]], scales=[[90.0] * 3], opacities=[0.02], sh=[[[0.01 * k] * 3]])
         for k in range(70)
     ]
     scene, view = Gaussians.concatenate(layers), front_camera(3, 2, 20.0)
-    with tuned(Tuning(shortest_part=33, fewest_parts=2)):
+    with tuned(Tuning(shortest_part=33, fewest_parts=2, staged_tiles=staged)):
         drawn = splat(cast(scene, torch.float32, device=DEVICE), view, backend="triton")
     truth = splat(scene, view, backend="reference")
     assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6
@@ -190,6 +205,9 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
         assert not long
         return
     assert len(found) <= limit
+    starts = [4 * counts[tile] >= least for tile in order] + [False]
+    assert int(found.ahead) in [place for place in range(len(counts) + 1) if not starts[place]]
+    assert all(starts[: int(found.ahead)][-1:])
     listed: dict[int, list[int]] = {}
     for part, (tile, begin, end) in enumerate(zip(found.tiles, found.begins, found.ends, strict=True)):
         if found.nexts[part] > part:
@@ -208,9 +226,9 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
 
 
 def test_a_tuning_that_splits_nothing_into_nothing_is_refused():
-    for wrong in ({"most_parts": 0}, {"shortest_part": 0}, {"fewest_parts": 1}):
+    for wrong in ((0, 1, 2), (1, 0, 2), (1, 1, 1)):
         with pytest.raises(ValueError, match="at least 2 parts, got Tuning"):
-            Tuning(**wrong)
+            Tuning(*wrong)
 
 
 def test_a_tuning_holds_in_its_block_alone():

@@ -6,7 +6,17 @@ from numpy.typing import NDArray
 
 from sparsestreet.ops.triton.parts import split_length
 from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
-from tests.ops.triton.device_model import BACKWARD, FORWARD, WARPS, Split, four_launches, lengths_of, makespan
+from tests.ops.triton.device_model import (
+    BACKWARD,
+    FORWARD,
+    WARPS,
+    Split,
+    four_launches,
+    lengths_of,
+    makespan,
+    together,
+    two_launches,
+)
 from tests.ops.triton.tile_lists import lists_of
 
 # Pairs of a tile, counted on views of two trained streets: ten front views of one, scaled to the mean of a street of
@@ -24,14 +34,14 @@ def split(lengths: NDArray[np.int64]) -> Split:
     """As the lists of a view with these tiles split them."""
     begins, ends, order, found = lists_of(lengths.tolist())
     if found is None:
-        return Split(lengths[order.cpu()].tolist(), [])
+        return Split(lengths[order.cpu()].tolist(), [], 0)
     parts: dict[int, list[int]] = {}
     for first, begin, end in zip(found.firsts.tolist(), found.begins.tolist(), found.ends.tolist(), strict=True):
         if begin < end:
             parts.setdefault(first, []).append(end - begin)
     whole = (found.whole_ends - begins)[order].tolist()
     assert sum(whole) + sum(map(sum, parts.values())) == int(lengths.sum()) == int(ends[-1])
-    return Split(whole, list(parts.values()))
+    return Split(whole, list(parts.values()), int(found.ahead))
 
 
 @pytest.mark.parametrize(("name", "mean", "longest"), [("ten views", 875, 5.7), ("one view", 804, 9.9)])
@@ -96,3 +106,20 @@ def test_a_street_takes_half_the_time_with_its_tiles_split(name):
     for fit in BACKWARD:
         parts = [pairs for parts in found.parts for pairs in parts]
         assert makespan(found.whole, fit) + makespan(parts, fit) < 0.6 * makespan(whole.whole, fit)
+
+
+@pytest.mark.parametrize("name", STREETS)
+def test_parts_and_whole_tiles_start_together(name):
+    """What is as long as a part or longer starts before the parts, the rest after them: both orders take longer."""
+    lengths = lengths_of(*STREETS[name])
+    found = split(lengths)
+    # Of a split tile nothing is left.
+    ahead = [pairs for pairs in found.whole[: found.ahead] if pairs]
+    assert min(ahead) >= split_length(int(lengths.sum())) / 4 > max(found.whole[found.ahead :])
+    for fit in FORWARD:
+        assert two_launches(found, fit) < 0.95 * four_launches(found, fit)
+    for fit in BACKWARD:
+        parts = [pairs for parts in found.parts for pairs in parts]
+        one = makespan(together(found, parts), fit)
+        assert one < 0.85 * (makespan(found.whole, fit) + makespan(parts, fit))
+        assert one < 1.03 * min(makespan([*found.whole, *parts], fit), makespan([*parts, *found.whole], fit))
