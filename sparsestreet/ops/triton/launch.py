@@ -23,8 +23,8 @@ from triton.runtime.jit import KernelInterface
 _KNOWN = ("3.6.", "3.7.")
 """Versions of Triton for which a direct call is known to work.
 
-Kinds of arguments are no coarser than their specialization. Their compiled kernels take the grid, what hooks get, and then all
-arguments: tensors by address, and constants too."""
+Kinds of arguments are no coarser than their specialization. Their compiled kernels take the grid, what hooks get, and
+then all arguments: tensors by address, and constants too."""
 _INT32 = 1 << 31
 _DTYPE = attrgetter("dtype")
 _PLANS: dict[tuple, "_Plan"] = {}

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import records as record
+from sparsestreet.ops.triton.arena import vectors
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.order import list_by_tile
@@ -52,7 +53,8 @@ class Lists:
 
     rows: Int[Tensor, " v"]
     """Visible rows, nearest first."""
-    first_pairs: Int[Tensor, " v"]
+    row_ends: Int[Tensor, " v"]
+    """The number after that of each row's last pair."""
     tile_counts: Int[Tensor, " v"]
     pair_rows: Int[Tensor, " p"]
     """Row of each pair, tile by tile, nearest first, with the quadrants of the tile that it touches (quadrants.py)."""
@@ -147,18 +149,17 @@ def ranked(order, unsorted_rows, counts, ends, rank, room):
 
 @partial(jit, do_not_specialize=["room"])
 def list_pairs(
-    records, order, unsorted_rows, counts, ends, rows, first_pairs, keys, pair_rows, room, width, height, tiles_x,
+    records, order, unsorted_rows, counts, ends, rows, keys, pair_rows, room, width, height, tiles_x,
     BOUNDED: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the rows in the ``order`` of their depths and the first pair of each. Then the tile of each pair, and its
-    row with the quadrants it touches (quadrants.py).
+    """Writes the rows in the ``order`` of their depths. Then the tile of each pair, and its row with the quadrants it
+    touches (quadrants.py).
 
     Pair i of a row lies in the i-th tile of its splat, counted along rows of tiles. Giants get a warp each, so that no
     other splat waits for them."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    row, _, at = ranked(order, unsorted_rows, counts, ends, rank, room)
+    row, _, _ = ranked(order, unsorted_rows, counts, ends, rank, room)
     tl.store(rows + rank, row, rank < room)
-    tl.store(first_pairs + rank, at, rank < room)
     lane = tl.arange(0, LANES)[None, :]
     each_row, count, first = ranked(order, unsorted_rows, counts, ends, rank[:, None] + 0 * lane, room)
     list_splats(
@@ -178,7 +179,7 @@ def list_pairs(
 
 def list_rows(records: Tensor, tile_counts: Tensor, sums: Tensor, room: Room, view: KernelView) -> Visible:
     """Visible rows, if they and their pairs fit the room, and how many of both there are."""
-    keys, rows, counts = (tile_counts.new_empty(room.rows) for _ in range(3))
+    keys, rows, counts = vectors(tile_counts, *(room.rows,) * 3)
     sizes = Sizes(sums.new_empty(LENGTH))
     launch(
         list_visible, max(len(tile_counts), room.rows, 1), block_of(view),
@@ -197,10 +198,11 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
     keys, counts = visible.keys, visible.counts
     if len(keys) > room.rows:
         keys, counts = keys[: room.rows], counts[: room.rows]
-    order = torch.sort(keys, stable=True).indices
+    # The sorted keys are not needed: their memory takes the sorted rows.
+    rows, order = torch.sort(keys, stable=True)
     counts = counts.index_select(0, order)
     ends = counts.cumsum(0, dtype=torch.int32)
-    rows, first_pairs, (columns, lines) = torch.empty_like(counts), torch.empty_like(counts), view.tiles
+    columns, lines = view.tiles
     kind = torch.int16 if columns * lines <= _SHORT_KEYS else torch.int32
     # Those of no pair are sorted to the end.
     keys, unsorted_rows = (
@@ -209,13 +211,13 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
     )
     launch(
         list_pairs, room.rows, 32 // _LANES,
-        records, order, visible.rows, counts, ends, rows, first_pairs, keys, unsorted_rows, room.rows,
+        records, order, visible.rows, counts, ends, rows, keys, unsorted_rows, room.rows,
         float(view.camera.width), float(view.camera.height), columns,
         BOUNDED=view.bounded, LANES=_LANES, options={"enable_fp_fusion": False, "num_warps": 1},
     )  # fmt: skip
     keys, slots = torch.sort(keys, stable=True)
     pair_rows, *tiles = list_by_tile(keys, slots, unsorted_rows, visible.sizes, columns * lines)
-    return Lists(rows, first_pairs, counts, pair_rows, slots, *tiles, visible.sizes)
+    return Lists(rows, ends, counts, pair_rows, slots, *tiles, visible.sizes)
 
 
 def check_pairs(pairs: int, tile_counts: Tensor) -> None:

@@ -12,6 +12,8 @@ import triton.language as tl
 from jaxtyping import Int
 from torch import Tensor
 
+from sparsestreet.ops.triton.arena import vectors
+from sparsestreet.ops.triton.blend import PIXEL_COUNT
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.parts import Parts, most_parts_of, part_begin, parts_of, shortest_split
@@ -38,31 +40,22 @@ def list_by_tile(
     ``keys``: the sorted tiles of the pairs, ``slots``: which each was before the sort.
 
     It does not wait for the device: there is room for the most parts that this room of pairs could need."""
-    room = len(keys)
-    pair_rows, part_count = unsorted_rows.new_empty(room), most_parts_of(room)
-    begins, ends, whole_ends, order, classes, part_counts = (unsorted_rows.new_empty(tiles) for _ in range(6))
-    blocks, rule = -(-tiles // _BLOCK), (tuning().shortest_part, tuning().most_parts, tuning().fewest_parts)
-    table = unsorted_rows.new_empty(2 * _CLASS_COUNT * blocks)
+    room, part_count, blocks = len(keys), most_parts_of(len(keys)), -(-tiles // _BLOCK)
+    rule = (tuning().shortest_part, tuning().most_parts, tuning().fewest_parts)
+    pair_rows, begins, ends, whole_ends, order, classes, part_counts, table, ahead, lasts, *part_vectors = vectors(
+        keys, room, *(tiles,) * 6, 2 * _CLASS_COUNT * blocks, 1, part_count * PIXEL_COUNT, *(part_count,) * 5
+    )
     launch(
         bound_tiles, max(room, tiles), _BLOCK,
         keys, slots, unsorted_rows, pair_rows, begins, ends, whole_ends, classes, part_counts, table, sizes.on_device,
         tiles, blocks, room.bit_length(), *rule,
     )  # fmt: skip
-    parts = None
-    if part_count:
-        vectors = (unsorted_rows.new_empty(part_count) for _ in range(5))
-        parts = Parts(*vectors, whole_ends, unsorted_rows.new_empty(1))
     launch(
         order_tiles, max(tiles, part_count), _BLOCK,
-        begins, ends, classes, part_counts, table, order, *_part_arguments(parts, begins), tiles, blocks, part_count,
+        begins, ends, classes, part_counts, table, order, *part_vectors, ahead, tiles, blocks, part_count,
     )  # fmt: skip
+    parts = Parts(*part_vectors, whole_ends, ahead, lasts) if part_count else None
     return pair_rows, begins, ends, order, parts
-
-
-def _part_arguments(parts: Parts | None, unread: Tensor) -> tuple[Tensor, ...]:
-    if parts is None:
-        return (unread,) * 6
-    return parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.ahead
 
 
 @jit

@@ -15,6 +15,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestreet.ops.triton.arena import vectors
 from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS, part_pixels, pixels_of
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.thin import thin_pairs
@@ -36,6 +37,8 @@ class Parts:
     """End of each tile's pairs; their beginning where the tile is split."""
     ahead: Int[Tensor, " 1"]
     """Number of tiles that are at least about as long as a part, and start before the parts."""
+    lasts: Int[Tensor, " s*256"]
+    """Room for those of the layers."""
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -45,21 +48,20 @@ class Parts:
 class PartLayers:
     """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
 
-    products: Float[Tensor, "s 256"]
+    products: Float[Tensor, " s*256"]
     """Light that the part alone lets through; unwritten for the last part of a tile."""
-    rgb: Float[Tensor, "s 256 3"]
-    transmittance: Float[Tensor, "s 256"]
-    depth_sum: Float[Tensor, "s 256"]
-    lasts: Int[Tensor, "s 256"]
+    rgb: Float[Tensor, " s*256*3"]
+    transmittance: Float[Tensor, " s*256"]
+    depth_sum: Float[Tensor, " s*256"]
+    lasts: Int[Tensor, " s*256"]
     """Index after the last pair of the part that each pixel was open to."""
 
     @staticmethod
     def empty(parts: Parts, like: Tensor) -> "PartLayers":
         """Unwritten layers on the device of ``like``."""
-        count = len(parts)
-        pixels = [like.new_empty(count, PIXEL_COUNT) for _ in range(3)]
-        rgb, lasts = like.new_empty(count, PIXEL_COUNT, 3), parts.tiles.new_empty(count, PIXEL_COUNT)
-        return PartLayers(pixels[0], rgb, pixels[1], pixels[2], lasts)
+        count = len(parts) * PIXEL_COUNT
+        products, rgb, transmittance, depth_sum = vectors(like, count, 3 * count, count, count, dtype=like.dtype)
+        return PartLayers(products, rgb, transmittance, depth_sum, parts.lasts)
 
 
 def part_length(pairs: int) -> int:

@@ -149,7 +149,7 @@ def _sum_slots(
 ) -> None:
     launch(
         slots.sum_slots, lists.sizes.rows, slots.ROWS,
-        values, given_or(walked, lists.rows), lists.rows, lists.first_pairs, lists.tile_counts, sums, lists.sizes.rows,
+        values, given_or(walked, lists.rows), lists.rows, lists.row_ends, lists.tile_counts, sums, lists.sizes.rows,
         COUNT=values.shape[1], PADDED=padded, SUM=kind, MARKED=walked is not None, options=slots.OPTIONS,
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ FORWARD = [
     "blend_tiles", "merge_parts", "compose_pixels",
 ]  # fmt: skip
 BACKWARD = ["decompose_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward"]
-CALLS, LAUNCHES = 45, 9
+CALLS, LAUNCHES = 25, 9
 """Most calls of torch in a forward pass with a background, allocations and views too, and most launches."""
 CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
 DAILY = CASE | {"width": 1920, "height": 1280}
