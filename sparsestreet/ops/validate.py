@@ -33,16 +33,15 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
     It reads neither values of Gaussians nor anything on a GPU, so it is cheap and never waits.
     """
     means, rows = gaussians.means, gaussians.means.shape[0]
+    dtype, device = means.dtype, means.device
     for name, tail in _SHAPES.items():
         field = getattr(gaussians, name)
-        expected = (rows, *tail)
-        fits = field.dim() == len(expected) and all(
-            want is None or got == want for got, want in zip(field.shape, expected, strict=True)
-        )
-        if not fits:
-            text = f"[{', '.join('k' if want is None else str(want) for want in expected)}]"
+        # Harmonics have any number of terms.
+        expected = (rows, field.shape[1], *tail[1:]) if tail[:1] == (None,) and field.dim() > 1 else (rows, *tail)
+        if field.shape != expected:
+            text = f"[{', '.join('k' if want is None else str(want) for want in (rows, *tail))}]"
             raise ValueError(f"{name} must have shape {text} like the {rows} rows of means, got {list(field.shape)}")
-        if field.dtype != means.dtype or field.device != means.device:
+        if field.dtype != dtype or field.device != device:
             raise ValueError(
                 f"all fields must share one dtype and device: means is {means.dtype} on {means.device}, {name} is "
                 f"{field.dtype} on {field.device}; convert them with .to(means)"

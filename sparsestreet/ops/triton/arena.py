@@ -15,7 +15,11 @@ def vectors(like: Tensor, *lengths: int, dtype: torch.dtype = torch.int32) -> tu
     >>> [len(vector) for vector in vectors(torch.zeros(1), 3, 8)]
     [3, 8]
     """
-    pieces = []
+    pieces, places = [], []
     for length in lengths:
-        pieces += (length, -length % _ALIGNED)
-    return like.new_empty(sum(pieces), dtype=dtype).split_with_sizes(pieces)[::2]
+        places.append(len(pieces))
+        pieces.append(length)
+        if length % _ALIGNED:
+            pieces.append(_ALIGNED - length % _ALIGNED)
+    found = like.new_empty(sum(pieces), dtype=dtype).split_with_sizes(pieces)
+    return found if len(found) == len(places) else tuple(found[place] for place in places)

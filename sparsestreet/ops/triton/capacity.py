@@ -18,18 +18,23 @@ _seen: dict[tuple, Room] = {}
 _repeated = 0
 
 
-def predicted(rows: int, view: KernelView, device: torch.device, limit: int) -> Room | None:
-    """Room for a scene of ``rows``; None: nothing is known of views like this one. At most ``limit`` pairs."""
-    most = _seen.get(_like(rows, view, device))
+def like(rows: int, view: KernelView, device: torch.device) -> tuple:
+    """What views must share to tell each other's size: scenes within a factor of two, among others."""
+    return device, view.tiles, rows.bit_length(), view.settings
+
+
+def predicted(place: tuple, rows: int, limit: int) -> Room | None:
+    """Room for a scene of ``rows``; None: nothing is known of views ``like`` this one. At most ``limit`` pairs."""
+    most = _seen.get(place)
     if most is None:
         return None
     return Room(min(_with_margin(most.rows), _up(rows)), min(_with_margin(most.pairs), limit))
 
 
-def remember(rows: int, view: KernelView, device: torch.device, taken: Room) -> None:
-    """What a view took."""
-    before = _seen.get(_like(rows, view, device), Room(0, 0))
-    _seen[_like(rows, view, device)] = Room(_faded(before.rows, taken.rows), _faded(before.pairs, taken.pairs))
+def remember(place: tuple, rows: int, pairs: int) -> None:
+    """What a view took: visible rows and pairs."""
+    before = _seen.get(place)
+    _seen[place] = Room(rows, pairs) if before is None else Room(_faded(before.rows, rows), _faded(before.pairs, pairs))
 
 
 def repeated_forwards() -> int:
@@ -45,11 +50,6 @@ def count_repeated() -> None:
 def forget() -> None:
     """Forget all views, as at the start of the process."""
     _seen.clear()
-
-
-def _like(rows: int, view: KernelView, device: torch.device) -> tuple:
-    """What views must share to tell each other's size: scenes within a factor of two, among others."""
-    return device, view.tiles, rows.bit_length(), view.settings
 
 
 def _faded(before: int, taken: int) -> int:

@@ -58,6 +58,7 @@ class _Plan:
 
     def __init__(self, kernel: KernelInterface, arguments: tuple, constants: dict[str, Any], options: dict[str, Any]):
         self._kernel, self._constants, self._options = kernel, constants, options
+        self._filling = tuple(constants.values())
         self._interpreted = is_interpreted(kernel)
         self._tensors = sum(isinstance(value, Tensor) for value in arguments)
         self._compiled: dict[tuple, CompiledKernel] = {}
@@ -79,7 +80,7 @@ class _Plan:
         with torch.cuda.device(device) if elsewhere else _NOTHING:
             if compiled is not None:
                 # Constants only fill their places in the signature; the machine code has them already.
-                _start(compiled, device, grid, (*addresses, *numbers, *self._constants.values()))
+                _start(compiled, device, grid, (*addresses, *numbers, *self._filling))
                 return
             compiled = self._kernel[grid](*arguments, **self._constants, **self._options)
         # A hook of Triton may have prevented the compilation.

@@ -37,8 +37,8 @@ class Parts:
     """End of each tile's pairs; their beginning where the tile is split."""
     ahead: Int[Tensor, " 1"]
     """Number of tiles that are at least about as long as a part, and start before the parts."""
-    lasts: Int[Tensor, " s*256"]
-    """Room for those of the layers."""
+    lasts: Int[Tensor, " p"]
+    """Room for those of ``PartLayers``."""
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -46,14 +46,15 @@ class Parts:
 
 @dataclass(frozen=True)
 class PartLayers:
-    """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
+    """What each part adds to its tile's pixels (as in ``Raster``), and the light after it: p = 256 s pixels, one part
+    after the other, c = 3 p."""
 
-    products: Float[Tensor, " s*256"]
+    products: Float[Tensor, " p"]
     """Light that the part alone lets through; unwritten for the last part of a tile."""
-    rgb: Float[Tensor, " s*256*3"]
-    transmittance: Float[Tensor, " s*256"]
-    depth_sum: Float[Tensor, " s*256"]
-    lasts: Int[Tensor, " s*256"]
+    rgb: Float[Tensor, " c"]
+    transmittance: Float[Tensor, " p"]
+    depth_sum: Float[Tensor, " p"]
+    lasts: Int[Tensor, " p"]
     """Index after the last pair of the part that each pixel was open to."""
 
     @staticmethod
@@ -81,7 +82,8 @@ def split_length(pairs: int) -> int:
 def most_parts_of(room: int) -> int:
     """Most parts that up to ``room`` pairs of a view can need; 0 if no tile can be long enough for some."""
     most = min(tuning().most_parts, room // tuning().shortest_part)
-    return most if most >= tuning().fewest_parts else 0
+    # In fours, as memory is laid out (arena.py).
+    return -(-most // 4) * 4 if most >= tuning().fewest_parts else 0
 
 
 @jit

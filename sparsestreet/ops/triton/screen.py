@@ -55,8 +55,9 @@ def draw(gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers
     The room for the lists is a guess. If it is too small all that follows the projection is done again. Where views are
     known too little for a guess, it waits in between.
     """
-    projection, place = project_all(gaussians, view), (len(gaussians), view, gaussians.means.device)
-    room = capacity.predicted(*place, PAIR_LIMIT)
+    projection, rows = project_all(gaussians, view), len(gaussians)
+    place = capacity.like(rows, view, projection.records.device)
+    room = capacity.predicted(place, rows, PAIR_LIMIT)
     if room is not None:
         visible = list_visible_rows(projection, room, view)
         arriving = Arriving(visible.sizes.on_device)
@@ -64,12 +65,12 @@ def draw(gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers
         layers = work(screen)
         read(visible.sizes, arriving, gaussians, projection)
         if room.holds(visible.sizes.pairs, visible.sizes.rows):
-            capacity.remember(*place, Room(visible.sizes.rows, visible.sizes.pairs))
+            capacity.remember(place, visible.sizes.rows, visible.sizes.pairs)
             return screen, layers
         capacity.count_repeated()
         del screen, layers
     screen = list_exactly(gaussians, projection, view)
-    capacity.remember(*place, Room(screen.lists.sizes.rows, screen.lists.sizes.pairs))
+    capacity.remember(place, screen.lists.sizes.rows, screen.lists.sizes.pairs)
     return screen, work(screen)
 
 

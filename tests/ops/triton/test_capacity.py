@@ -26,7 +26,7 @@ from tests.ops.triton.recording import record_launches
 
 DEVICE = device_of("triton")
 VIEW = camera(19, 17)
-PLACE = (1000, KernelView(VIEW, SplatSettings()), DEVICE)
+PLACE = capacity.like(1000, KernelView(VIEW, SplatSettings()), DEVICE)
 
 
 def scene() -> Gaussians:
@@ -158,31 +158,33 @@ def test_pairs_beyond_32_bits_after_a_guess(monkeypatch):
 
 
 def test_room_for_a_quarter_more_than_the_largest_view():
-    assert capacity.predicted(*PLACE, 10**9) is None
-    capacity.remember(*PLACE, Room(600, 40_000))
-    capacity.remember(*PLACE, Room(500, 80_000))
+    assert capacity.predicted(PLACE, 1000, 10**9) is None
+    capacity.remember(PLACE, 600, 40_000)
+    capacity.remember(PLACE, 500, 80_000)
     # 750 and 100,000 in steps of an eighth of the power of two below.
-    assert capacity.predicted(*PLACE, 10**9) == Room(768, 106_496)
+    assert capacity.predicted(PLACE, 1000, 10**9) == Room(768, 106_496)
     # No more rows than there are, and no more pairs than may be held.
-    capacity.remember(*PLACE, Room(1000, 80_000))
-    assert capacity.predicted(*PLACE, 90_000) == Room(1024, 90_000)
+    capacity.remember(PLACE, 1000, 80_000)
+    assert capacity.predicted(PLACE, 1000, 90_000) == Room(1024, 90_000)
 
 
 def test_a_large_view_is_forgotten():
-    capacity.remember(*PLACE, Room(800, 80_000))
+    capacity.remember(PLACE, 800, 80_000)
     for _ in range(28):
-        capacity.remember(*PLACE, Room(80, 8_000))
-    room = capacity.predicted(*PLACE, 10**9)
+        capacity.remember(PLACE, 80, 8_000)
+    room = capacity.predicted(PLACE, 1000, 10**9)
     assert room is not None
     assert room.holds(80_000, 800)
     for _ in range(600):
-        capacity.remember(*PLACE, Room(80, 8_000))
-    assert capacity.predicted(*PLACE, 10**9) == Room(112, 10_240)
+        capacity.remember(PLACE, 80, 8_000)
+    assert capacity.predicted(PLACE, 1000, 10**9) == Room(112, 10_240)
 
 
 @pytest.mark.parametrize(
-    "other", [(2048, *PLACE[1:]), (1000, KernelView(camera(36, 33), SplatSettings()), DEVICE)], ids=["rows", "image"]
+    "other",
+    [(2048, KernelView(VIEW, SplatSettings()), DEVICE), (1000, KernelView(camera(36, 33), SplatSettings()), DEVICE)],
+    ids=["rows", "image"],
 )
 def test_other_views_tell_nothing(other):
-    capacity.remember(*PLACE, Room(5, 9))
-    assert capacity.predicted(*other, 10**9) is None
+    capacity.remember(PLACE, 5, 9)
+    assert capacity.predicted(capacity.like(*other), 1000, 10**9) is None

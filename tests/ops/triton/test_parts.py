@@ -126,9 +126,9 @@ def test_each_launch_does_what_no_other_does(short_parts, poisoned, monkeypatch)
 
     def launch(kernel, items, block, *arguments, **options):
         started(kernel, items, block, *arguments, **options)
-        (rgb,) = (a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256, 3))
-        products = next(a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (256,))
-        for written, layer in ((blended, rgb.flatten(1)), (multiplied, products)):
+        given = dict(zip(kernel.arg_names, arguments, strict=False))
+        rgb, products = given["part_rgb"], given["products"]
+        for written, layer in ((blended, rgb.view(-1, 768)), (multiplied, products.view(-1, 256))):
             finite = layer.isfinite()
             assert torch.equal(finite.all(1), finite.any(1))
             written.append(finite.all(1))
@@ -204,7 +204,7 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
     if found is None:
         assert not long
         return
-    assert len(found) <= limit
+    assert len(found) < limit + 4  # in fours
     starts = [4 * counts[tile] >= least for tile in order] + [False]
     assert int(found.ahead) in [place for place in range(len(counts) + 1) if not starts[place]]
     assert all(starts[: int(found.ahead)][-1:])
