@@ -121,8 +121,8 @@ def measure(device: FakeDevice, given: dict) -> dict:
     answer: dict[str, Any] = {"compiled": found_in(device.binaries[before:], device.arch)}
     device.launches.clear()
     answer["dispatches"] = case.run(backward=False, counted=True)
-    answer["after_wait"] = case.dispatches.after_wait
-    answer["calls"], answer["forward"] = case.dispatches.all, [binary.name for binary in device.launches]
+    answer["after_wait"] = list(case.dispatches.after_wait)
+    answer["calls"], answer["forward"] = list(case.dispatches.all), [binary.name for binary in device.launches]
     if given["repeats"]:
         answer["microseconds"] = launch_time(case, given["repeats"])
         answer["forward_microseconds"] = host_time(case, given["repeats"])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import PairLimitError, SplatSettings, splat
-from sparsestreet.ops.triton import capacity, lists, screen
+from sparsestreet.ops.triton import capacity, lists, order, pixels, screen
 from sparsestreet.ops.triton.sizes import Room
 from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.ops.triton.view import KernelView
@@ -116,6 +116,30 @@ def test_the_wait_comes_after_the_last_launch(monkeypatch):
     assert seen[-1] == names[:-1]
 
 
+def test_views_of_one_room_differ_in_addresses_alone(taken, monkeypatch):
+    """What the host passes for the kernels after the projection, so that one graph could hold them."""
+    passed: list[list] = [[]]
+
+    def launch(kernel, items, block, *arguments, options=None, **constants):
+        numbers = [value for value in arguments if not isinstance(value, torch.Tensor)]
+        passed[-1].append((kernel.fn.__name__, items, block, numbers, options, constants))
+        launches(kernel, items, block, *arguments, options=options, **constants)
+
+    launches = screen.launch
+    for module in (screen, lists, order, pixels):
+        monkeypatch.setattr(module, "launch", launch)
+    monkeypatch.setattr(capacity, "predicted", lambda *_: Room(taken.rows + 5, taken.pairs + 40))
+    other = dataclasses.replace(VIEW, camera_from_world=VIEW.camera_from_world.clone())
+    other.camera_from_world[0, 3] += 0.2
+    images = []
+    for view in (VIEW, other):
+        images.append(splat(cast(scene(), torch.float32, device=DEVICE), view, backend="triton").rgb)
+        passed.append([])
+    assert not torch.equal(*images)
+    assert len(passed[0]) == 6
+    assert passed[0] == passed[1]
+
+
 @pytest.mark.lengthy
 def test_two_renderings_before_one_backward_pass():
     """Each has memory of its own: the gradients of the sum are the sum of the gradients."""
@@ -126,7 +150,7 @@ def test_two_renderings_before_one_backward_pass():
     ]
     splat(leaves, VIEW, backend="triton")  # from now on rooms are guessed
     together = [splat(leaves, view, backend="triton") for view in (VIEW, other)]
-    sum(drawn.rgb.sum() + drawn.depth.sum() for drawn in together).backward()
+    torch.stack([drawn.rgb.sum() + drawn.depth.sum() for drawn in together]).sum().backward()
     for view in (other, VIEW):
         rendering = splat(alone, view, backend="triton")
         (rendering.rgb.sum() + rendering.depth.sum()).backward()

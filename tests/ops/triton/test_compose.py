@@ -43,18 +43,19 @@ def test_against_torch(behind, asked):
         used, [passed, depth_sum, *background], [v for v in given if v is not None], allow_unused=True
     )
 
-    own = [value.detach().clone() for value in layers[:3]]
-    alpha = compose(*own, None if behind_it is None else behind_it.detach())
-    for ours, theirs in zip((own[0], alpha, own[2]), images, strict=True):
+    colors, light, depth = (value.detach().clone() for value in layers[:3])
+    alpha = compose(colors, light, depth, None if behind_it is None else behind_it.detach())
+    for ours, theirs in zip((colors, alpha, depth), images, strict=True):
         assert torch.equal(ours, theirs)
-    composed = Composed(own[1], own[2], None if behind_it is None else behind_it.detach())
+    composed = Composed(light, depth, None if behind_it is None else behind_it.detach())
     v_rgb = torch.zeros_like(rgb) if given[0] is None else given[0]
     found = decompose(composed, v_rgb, given[1], given[2], background_too=bool(background))
     for ours, theirs in zip(found, (*expected, None), strict=False):
-        if theirs is not None:
+        if theirs is None:
+            assert ours is None or not ours.any()
+        else:
+            assert ours is not None
             assert torch.equal(ours, theirs)
-        elif ours is not None:
-            assert not ours.any()
 
 
 def test_a_background_alone_is_differentiated():
