@@ -11,7 +11,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help quick test test-all lint style types demo bench tables claims figure clean FORCE
+.PHONY: help quick test test-all lint style types docs demo bench tables claims figure clean FORCE
 
 help: ## this list
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,6 +63,9 @@ style: $(VENV)/.ok ## lint without types: seconds
 types: $(VENV)/.ok
 	$(BIN)/pyright
 
+docs: $(VENV)/.ok ## these pages as a site, without a network: outputs/site/index.html; a broken link is an error
+	$(BIN)/python -m sphinx -q -E -a -W --keep-going -n -d .cache/doctrees docs outputs/site
+
 demo: $(VENV)/.ok ## a synthetic street, trained plain and pruned: one table, pictures in outputs/demo
 	$(BIN)/sparsestreet demo
 
@@ -87,4 +90,4 @@ figure: $(VENV)/.ok ## quality against training and frame time on the default st
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/readme figure=docs/figures/time.png; exit $$status
 
 clean: ## removes what the targets made
-	rm -rf $(VENV) build outputs/demo outputs/streets
+	rm -rf $(VENV) build outputs/demo outputs/site outputs/streets

@@ -40,7 +40,7 @@ case "${1:-}" in
 esac
 
 mkdir -p "$OUT" "$SITE"
-rm -f "$OUT"/{table.txt,{setup,gsplat,parity,kernels,train,bench}.log,gpu.jsonl,train.json}
+rm -f "$OUT"/{table.txt,{setup,check,gsplat,parity,kernels,train,bench}.log,gpu.jsonl,train.json}
 export PYTHONPATH="$ROOT:$ROOT/scripts:$SITE${PYTHONPATH:+:$PYTHONPATH}"
 export PYTHONUNBUFFERED=1
 unset TRITON_INTERPRET # the tests set it where there is no device
@@ -94,6 +94,11 @@ say_needs() {
   [ -n "$MACHINE" ] || { cat "$OUT/setup.log" >&2; exit 2; }
   [ -n "$CAPABILITY" ] || DRY=1
   echo "$MACHINE"
+}
+
+# What would fail in every part, named with its remedy; its kernels are in the cache then.
+run_check() {
+  [ "$DRY" = 1 ] || run_part check 60 "$OUT/check.log" "$PYTHON" -m sparsestreet check
 }
 
 build_library() {
@@ -152,7 +157,7 @@ run_tests() { # part, limit in seconds, arguments of pytest...
 }
 
 run_parity() {
-  local files=(tests/ops/triton/test_{parity,edges,lists,parts}.py)
+  local files=(tests/ops/triton/test_{parity,edges,lists,parts,tuning}.py)
   [ "$DRY" = 0 ] || files=(tests/ops/triton/test_work.py)
   run_tests parity 120 "${files[@]}"
 }
@@ -160,7 +165,7 @@ run_parity() {
 # All other tests that launch kernels on the device; those that only compile need none.
 run_kernels() {
   local files=(tests/ops -k triton --ignore-glob='*machine_code*')
-  files+=(--ignore=tests/ops/triton/test_{parity,edges,lists,parts}.py)
+  files+=(--ignore=tests/ops/triton/test_{parity,edges,lists,parts,tuning}.py)
   [ "$DRY" = 0 ] || files=(tests/ops/triton/test_refused.py)
   run_tests kernels 75 "${files[@]}"
 }
@@ -193,6 +198,7 @@ print_table() {
 
 say_needs
 start_gsplat
+run_check
 build_library
 run_parity
 # A benchmark beside the compiler would be disturbed: these have the time until then, or what is left at the end.

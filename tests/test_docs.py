@@ -1,10 +1,15 @@
 """What the pages say of the code: files that they name, the floors, the options of conf."""
 
+import fnmatch
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from sparsestreet import __version__
 
@@ -34,6 +39,39 @@ def test_every_link_leads_to_a_file(page):
 def test_every_page_of_results_is_linked():
     linked = set(re.findall(r"\(results/(\w+\.md)\)", (ROOT / "docs" / "results.md").read_text()))
     assert linked == {page.name for page in (ROOT / "docs" / "results").glob("*.md")}
+
+
+def test_every_page_stands_in_the_navigation_of_the_site_once():
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", (ROOT / "docs" / "index.md").read_text(), flags=re.S)
+    named = re.findall(r"^(?!:)(?:.* <)?([\w/*\[\]]+)>?$", "".join(trees), flags=re.M)
+    pages = {page.relative_to(ROOT / "docs").with_suffix("").as_posix() for page in (ROOT / "docs").rglob("*.md")}
+    assert sorted(page for name in named for page in fnmatch.filter(pages, name)) == sorted(pages - {"index"})
+    assert [name for name in named if not fnmatch.filter(pages, name)] == []
+
+
+@pytest.mark.slow
+def test_the_site_is_built_and_a_broken_link_is_an_error(tmp_path):
+    pytest.importorskip("furo", reason="pip install 'sparsestreet[docs]'")
+    build = [sys.executable, "-m", "sphinx", "-q", "-E", "-W", "-n", "-d", str(tmp_path / "trees")]
+    subprocess.run([*build, str(ROOT / "docs"), str(tmp_path / "site")], check=True)
+    page = (tmp_path / "site" / "index.html").read_text()
+    assert "datasets/own_log.html" in page
+    assert re.findall(r"<(?:script|img|link|iframe)[^>]*=\"(?:https?:)?//", page) == []  # nothing is loaded
+    shutil.copytree(ROOT / "docs", tmp_path / "docs")
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    shutil.copy(ROOT / "README.md", tmp_path)
+    with (tmp_path / "docs" / "gpu.md").open("a") as file:
+        file.write("\n[lost](scaling.md#there-is-no-such-heading)\n")
+    broken = subprocess.run([*build, str(tmp_path / "docs"), str(tmp_path / "site")], capture_output=True, text=True)
+    assert broken.returncode != 0
+    assert "there-is-no-such-heading" in broken.stderr
+
+
+def test_the_citation_names_the_version():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == __version__
+    assert f"version = {{{__version__}}}" in (ROOT / "docs" / "cite.md").read_text()
+    assert citation["references"][0]["doi"] in (ROOT / "docs" / "cite.md").read_text()
 
 
 def test_the_last_release_of_the_changelog_is_the_version():

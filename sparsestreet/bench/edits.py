@@ -7,6 +7,7 @@ the object, by projection, and its energy as a share of the object's.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from sparsestreet.scene.edits import REMOVED, Added, Change, Edits, Moved, edite
 from sparsestreet.scene.edits.edits import objects_of
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
+
+Show = Callable[[View], Float64[np.ndarray, "h w 3"]]
+"""The image of a view, RGB in [0, 1]."""
 
 RIGHT = 3.0
 """Meters."""
@@ -78,21 +82,26 @@ def run_edits(
     """Measures three edits of each object that is seen; returns the number of records."""
     world, count = build_world(settings), 0
     truth = street_truth(settings, street_from_world)
-    for name, actor, place in _pairs(stored, world, settings, street_from_world):
+    for name, actor, place in actors_of(stored, world, settings, street_from_world):
         for kind in KINDS:
             edits, actors = _edit(kind, name, actor, list(world.actors), place)
             other = street_truth(settings, street_from_world, replace(world, actors=tuple(actors)))
             scene = replace(stored, scene=edited(stored.scene, edits))
-            record = _compared(kind, name, actor, stored, scene, views, truth, other)
+            shown = (partial(shown_by, stored), partial(shown_by, scene))
+            record = compared(kind, name, actor, shown, views, (truth, other))
             if record is not None:
                 file.write("edit", record)
-                ghost = "" if record.ghost is None else f", ghost {100 * record.ghost:.2f} %"
-                say(
-                    f"{kind:8} {name:16} {record.class_name:10} {record.psnr:5.1f} dB in {record.pixels:,} pixels of "
-                    f"{record.views} views (unedited {record.psnr_before:.1f}){ghost}"
-                )
+                say(in_words(record))
                 count += 1
     return count
+
+
+def in_words(record: EditRecord) -> str:
+    ghost = "" if record.ghost is None else f", ghost {100 * record.ghost:.2f} %"
+    return (
+        f"{record.edit:8} {record.object:16} {record.class_name:10} {record.psnr:5.1f} dB in {record.pixels:,} pixels "
+        f"of {record.views} views (unedited {record.psnr_before:.1f}){ghost}"
+    )
 
 
 def _edit(kind: str, name: str, actor: Actor, actors: list[Actor], place: int) -> tuple[Edits, list[Actor]]:
@@ -104,19 +113,16 @@ def _edit(kind: str, name: str, actor: Actor, actors: list[Actor], place: int) -
     return Edits(added={"copy": Added(name, Change(Moved(right=RIGHT)))}), [*actors, beside]
 
 
-def _compared(
-    kind: str,
-    name: str,
-    actor: Actor,
-    stored: StoredScene,
-    scene: StoredScene,
-    views: Sequence[View],
-    truth: Truth,
-    other: Truth,
+def compared(
+    kind: str, name: str, actor: Actor, shown: tuple[Show, Show], views: Sequence[View], truths: tuple[Truth, Truth]
 ) -> EditRecord | None:
+    """What is shown without and with an edit, beside the street traced without and with it.
+
+    None where the edit changes too little in every view.
+    """
     found = []
     for view in views:
-        before, after = truth(view), other(view)
+        before, after = (truth(view) for truth in truths)
         if before is None or after is None:
             continue
         pair = [frame.image.double().numpy() / 255 for frame in (before, after)]
@@ -128,10 +134,10 @@ def _compared(
         return None
     errors, old_errors, alike, own = 0.0, 0.0, 0.0, 0.0
     for _, view, (before, after), changed in found:
-        error = (_image(scene, view) - after)[changed]
+        error = (shown[1](view) - after)[changed]
         thing = (before - after)[changed]
         errors += float((error**2).sum())
-        old_errors += float(((_image(stored, view) - before)[changed] ** 2).sum())
+        old_errors += float(((shown[0](view) - before)[changed] ** 2).sum())
         alike += float((error * thing).sum())
         own += float((thing**2).sum())
     pixels = sum(one[0] for one in found)
@@ -141,7 +147,8 @@ def _compared(
     )
 
 
-def _image(stored: StoredScene, view: View) -> Float64[np.ndarray, "h w 3"]:
+def shown_by(stored: StoredScene, view: View) -> Float64[np.ndarray, "h w 3"]:
+    """The image of a scene, RGB in [0, 1]."""
     return stored.render(view).rgb.clamp(0, 1).double().cpu().numpy()
 
 
@@ -149,7 +156,7 @@ def _db(squared: float, pixels: int) -> float:
     return float(-10 * np.log10(squared / (3 * pixels)))
 
 
-def _pairs(
+def actors_of(
     stored: StoredScene, world: World, settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]
 ) -> Iterator[tuple[str, Actor, int]]:
     """Yields the objects of the scene with the actors that they are: those whose paths are the nearest."""

@@ -1,7 +1,7 @@
 """``sparsestreet bench gpu``: stage times and peak memory at sizes of real scenes, with gsplat in the same run."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import ModuleType
@@ -11,11 +11,13 @@ from torch import Tensor
 
 from sparsestreet.bench import gsplat_peer
 from sparsestreet.bench.accuracy import Errors, answer, errors
-from sparsestreet.bench.device_profile import kernel_milliseconds, peak_megabytes
+from sparsestreet.bench.device_profile import peak_megabytes, profiled
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.bench.gpu_record import GpuRecord, line
 from sparsestreet.bench.gpu_step import Render, our_render, step_time, their_render
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.scenes import BenchScene, Size
+from sparsestreet.bench.tile_loads import loads_of
 from sparsestreet.bench.timing import (
     Cotangent,
     Draw,
@@ -31,9 +33,12 @@ from sparsestreet.bench.timing import (
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu.library import find_library
 from sparsestreet.ops.splat import splat
+from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.phases import clock_of
 from sparsestreet.types import Camera, Gaussians
 
+DEFAULT = {"": Tuning()}
+"""The kernels as they are chosen without a word."""
 ROWS = (1_500_000, 500_000, 5_000_000, 100_000, 1_000)
 """Numbers of rows. The last is almost no work for a device, so it measures the host."""
 IMAGES = ((1920, 1280), (960, 640))
@@ -43,41 +48,6 @@ TRUTH_ROWS = 1_500_000
 
 The host takes seconds where the device takes milliseconds."""
 BUDGET = TimingBudget(repeats=30, seconds=8.0, least=20)
-
-
-@dataclass(frozen=True)
-class GpuRecord:
-    """One renderer at one size. Times are milliseconds, memory is MB (10^6 bytes)."""
-
-    renderer: str
-    device: str
-    scene: str
-    rows: int
-    width: int
-    height: int
-    pairs: int | None = None
-    """(splat, tile) pairs, and (splat, pixel) samples of the forward pass; None for gsplat."""
-    samples: int | None = None
-    failed: str | None = None
-    """Why a measurement is missing; earlier measurements stay."""
-    inference: TimeSpread | None = None
-    """Forward without gradients."""
-    forward: TimeSpread | None = None
-    backward: TimeSpread | None = None
-    step: TimeSpread | None = None
-    """A whole step of training (gpu_step.py)."""
-    stages: dict[str, TimeSpread] | None = None
-    """Device time by stage of the kernels of one forward and backward; None without a CUDA device."""
-    memory_before: float | None = None
-    memory_peak: float | None = None
-    """Peak during one forward and backward, including what was there before: the Gaussians."""
-    parity: Errors | None = None
-    """For gsplat: against us. For us: against the C++ backend in float64, if it is built. None above TRUTH_ROWS."""
-    agrees: bool | None = None
-
-    @property
-    def ok(self) -> bool:
-        return self.failed is None and self.agrees is not False
 
 
 @dataclass(frozen=True)
@@ -110,12 +80,14 @@ def run_gpu(
     budget: TimingBudget,
     file: RecordFile,
     say: Callable[[str], None] = print,
-    street: BenchScene | None = None,
+    streets: Sequence[BenchScene] = (),
+    tunings: Mapping[str, Tuning] = DEFAULT,
 ) -> bool:
-    """Measures every size, and a trained street after the first; returns False if a renderer failed or gsplat
+    """Measures every size, and trained streets after the first; returns False if a renderer failed or gsplat
     disagrees.
 
-    A failure does not stop the other measurements. gsplat runs in both of its modes at the first size, then in the
+    ``tunings``, by their names in the table, are compared at every size. A failure does not stop the other
+    measurements. gsplat runs in both of its modes at the first size, then in the
     faster one. Each record is on disk as soon as it is measured.
     """
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
@@ -126,8 +98,8 @@ def run_gpu(
         return False
     records: list[GpuRecord] = []
     peer, modes = (None, ()) if isinstance(found, str) else (found, gsplat_peer.MODES)
-    for workload in _workloads(sizes, street, device):
-        for record in _measure_all(workload, name, backend, peer, modes, budget):
+    for workload in _workloads(sizes, streets, device):
+        for record in _measure_all(workload, name, backend, tunings, peer, modes, budget):
             file.write("gpu", record)
             say(line(record))
             records.append(record)
@@ -138,10 +110,10 @@ def run_gpu(
     return good == len(records)
 
 
-def _workloads(sizes: Sequence[Size], street: BenchScene | None, device: torch.device) -> Iterator[Workload]:
+def _workloads(sizes: Sequence[Size], streets: Sequence[BenchScene], device: torch.device) -> Iterator[Workload]:
     for size in sizes[:1]:
         yield Workload.random(size, device)
-    if street is not None:
+    for street in streets:
         yield Workload.of(street, device)
     for size in sizes[1:]:
         yield Workload.random(size, device)
@@ -151,24 +123,27 @@ def _measure_all(
     workload: Workload,
     name: str,
     backend: str,
+    tunings: Mapping[str, Tuning],
     peer: ModuleType | None,
     modes: Sequence[str],
     budget: TimingBudget,
 ) -> Iterator[GpuRecord]:
     rows, camera = workload.rows, workload.camera
     blank = GpuRecord("", name, workload.scene, len(rows), camera.width, camera.height)
-    record = replace(blank, renderer=f"sparsestreet {backend}")
-    record = _counted(measure(record, _ours(workload, backend), workload, budget), workload, backend)
-    record = stepped(record, our_render(camera, backend), workload, budget)
     is_compared = len(rows) <= TRUTH_ROWS
-    if is_compared and find_library() is not None:
-        record = compared(record, partial(_against_truth, workload, backend))
-    yield record
+    for words, choices in tunings.items():
+        record = replace(blank, renderer=" ".join(["sparsestreet", backend, *words.split()]), tuning=vars(choices))
+        with tuned(choices):
+            record = _counted(measure(record, _ours(workload, backend), workload, budget), workload, backend)
+            record = stepped(record, our_render(camera, backend), workload, budget)
+            if is_compared and find_library() is not None:
+                record = compared(record, partial(_against_truth, workload, backend))
+        yield record
     if peer is None:
         return
     for mode in modes:
         record = replace(blank, renderer=f"gsplat {gsplat_peer.version(peer)} {mode}")
-        record = measure(record, _theirs(workload, peer, mode), workload, budget)
+        record = _listed(measure(record, _theirs(workload, peer, mode), workload, budget), workload, peer)
         record = stepped(record, their_render(peer, camera, workload.device, mode), workload, budget)
         if is_compared:
             record = compared(record, partial(gsplat_peer.parity, peer, workload.rows, workload.camera, backend))
@@ -185,8 +160,19 @@ def _milliseconds(measured: tuple[str, GpuRecord]) -> float:
 def _counted(record: GpuRecord, workload: Workload, backend: str) -> GpuRecord:
     if record.failed is not None:
         return record
-    pairs, samples = work_of(workload.rows, workload.camera, gsplat_peer.SETTINGS, backend)
-    return replace(record, pairs=pairs, samples=samples)
+    given = (workload.rows, workload.camera, gsplat_peer.SETTINGS, backend)
+    pairs, samples = work_of(*given)
+    return replace(record, pairs=pairs, samples=samples, tiles=loads_of(*given))
+
+
+def _listed(record: GpuRecord, workload: Workload, peer: ModuleType) -> GpuRecord:
+    if record.failed is not None:
+        return record
+    try:
+        pairs, tiles = gsplat_peer.loads_of(peer, workload.rows, workload.camera)
+    except Exception as error:  # a peer may raise anything
+        return replace(record, failed=_reason(error))
+    return replace(record, pairs=pairs, tiles=tiles)
 
 
 def _ours(workload: Workload, backend: str) -> Draw:
@@ -216,7 +202,7 @@ def measure(record: GpuRecord, draw: Draw, workload: Workload, budget: TimingBud
         record = replace(record, forward=forward, backward=backward, inference=_inference(draw, workload, budget))
         if workload.device.type == "cuda":
             before, peak = peak_megabytes(step)
-            record = replace(record, memory_before=before, memory_peak=peak, stages=kernel_milliseconds(step))
+            record = replace(record, memory_before=before, memory_peak=peak, **vars(profiled(step)))
     except Exception as error:  # a peer may raise anything
         return replace(record, failed=_reason(error))
     return record
@@ -272,28 +258,3 @@ def _inference(draw: Draw, workload: Workload, budget: TimingBudget) -> TimeSpre
 def _reason(error: Exception) -> str:
     text = str(error).strip().splitlines()
     return f"{type(error).__name__}: {text[0] if text else 'no message'}"
-
-
-def line(record: GpuRecord) -> str:
-    """One row of the table: medians and inter-quartile ranges."""
-    start = f"{record.renderer:<24}{record.scene:<16}{record.rows:>9} {record.width}x{record.height:<6}"
-    if record.forward is None or record.backward is None:
-        return f"{start} FAILED: {record.failed}"
-    inference = _short(record.inference) if record.inference else "-"
-    text = f"{start} forward {_short(record.forward)}  backward {_short(record.backward)}  no grad {inference} ms"
-    if record.step is not None:
-        text += f"  step {_short(record.step)}"
-    if record.pairs is not None and record.samples is not None:
-        text += f"  {1e-6 * record.pairs:.2f} M pairs, {1e-6 * record.samples:.0f} M samples"
-    if record.memory_peak is not None:
-        text += f"  peak {record.memory_peak:7.0f} MB"
-    if record.stages:
-        text += "  [" + ", ".join(f"{name} {_short(value)}" for name, value in record.stages.items()) + "]"
-    if record.parity is not None:
-        psnr = record.parity.image.psnr
-        text += f"  {'agrees' if record.agrees else 'DISAGREES'}: {'equal' if psnr is None else f'{psnr:.1f} dB'}"
-    return text + (f"  FAILED: {record.failed}" if record.failed else "")
-
-
-def _short(value: TimeSpread) -> str:
-    return f"{value.median:.3f}" + ("" if value.iqr is None else f" (iqr {value.iqr:.3f})")

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.bench.accuracy import Errors, answer, collect, errors
+from sparsestreet.bench.tile_loads import TileLoads, loads
 from sparsestreet.bench.timing import Cotangent, drop_gradients
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.types import Camera, Gaussians
@@ -50,6 +51,18 @@ def draw(
     """Color (premultiplied), alpha and the number of (splat, tile) pairs; ``packed`` trades time for memory."""
     colors, alphas, meta = _rasterization(module, gaussians, camera, packed)
     return colors[0], alphas[0, ..., 0], int(meta["flatten_ids"].shape[0])
+
+
+@torch.no_grad()
+def loads_of(module: ModuleType, gaussians: Gaussians, camera: Camera) -> tuple[int, TileLoads | None]:
+    """The number of (splat, tile) pairs that it lists, and how they lie on its tiles; None if it does not say."""
+    _, _, meta = _rasterization(module, gaussians, camera, packed=False)
+    pairs, offsets = int(meta["flatten_ids"].shape[0]), meta.get("isect_offsets")
+    if offsets is None:
+        return pairs, None
+    begins = offsets.flatten()
+    lengths = torch.diff(begins, append=begins.new_tensor([pairs]))
+    return pairs, loads(lengths, lengths[:0], split=0)
 
 
 def draw_for_training(

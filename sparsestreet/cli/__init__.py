@@ -31,6 +31,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet effects data=auto data.root=DIR        which effects of cameras and light a log calls for, and why
   sparsestreet presets streetgs                       our presets beside DriveStudio's settings, key by key
   sparsestreet bench                                  what the splat op costs in time, memory and accuracy
+  sparsestreet check                                  whether a GPU can train here, and what is missing
 
 Every command takes --help. Options of train are Hydra overrides; `sparsestreet train --cfg job` prints them all.
 """
@@ -38,7 +39,7 @@ Every command takes --help. Options of train are Hydra overrides; `sparsestreet 
 COMMANDS = (
     "demo", "train", "jobs", "evaluate", "report", "render", "export", "objects", "view", "serve", "data", "effects",
     "presets",
-    "bench",
+    "bench", "check",
 )  # fmt: skip
 
 

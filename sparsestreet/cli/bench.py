@@ -14,6 +14,9 @@ from sparsestreet.cli.compose import override_problem
 from sparsestreet.records.provenance import this_machine, this_source
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from sparsestreet.data.synthetic.settings import StreetSettings
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.types import View
 
@@ -37,8 +40,12 @@ examples:
   sparsestreet bench effects                    effects planted in streets of ten seeds: what plans see; --quick: one
   sparsestreet bench costs --street RUN         what each effect adds to a frame of a trained street, beside the plan's
   sparsestreet bench edits --street RUN         objects removed, moved, copied, beside a street traced that way
+  sparsestreet bench edits --street RUN --other RUN     and objects of another street inserted, beside its trace
+  sparsestreet bench serve --street RUN         the render server: latency, memory, wrong requests, objects it places
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
+  sparsestreet bench gpu --street RUN --refine 3   and a trained street, each splat as 3 x 3, the image 3 times as wide
+  sparsestreet bench gpu --tuning most_parts=1 --tuning two_launches=false   and other choices of the kernels
 
 Records go to OUT/MODE.jsonl, one JSON object a line; figures beside them as SVG and PNG.
 """
@@ -55,6 +62,7 @@ def bench(arguments: list[str]) -> int:
         "effects": _effects,
         "costs": _costs,
         "edits": _edits,
+        "serve": _serve,
         "scaling": _scaling,
         "gpu": _gpu,
     }
@@ -62,6 +70,10 @@ def bench(arguments: list[str]) -> int:
     options = parser.parse_intermixed_args(arguments)
     if options.overrides and options.mode != "step":
         parser.error(f"{options.mode} takes no options of train, got {' '.join(options.overrides)}")
+    if options.refine is not None and (options.mode != "gpu" or options.street is None or options.refine < 1):
+        parser.error("--refine N, at least 1, makes the street of gpu --street RUN finer")
+    if options.tuning and options.mode != "gpu":
+        parser.error("--tuning compares choices of the kernels of gpu")
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     options.command = shlex.join(["sparsestreet", "bench", *arguments])
@@ -79,8 +91,18 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
     parser.add_argument(
-        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits: the trained street of this run's folder"
+        "--street", type=Path, metavar="RUN", help="knobs, gpu, edits, serve: the trained street of this run's folder"
     )
+    parser.add_argument(
+        "--other", type=Path, metavar="RUN", help="edits: a run on another synthetic street, whose objects are inserted"
+    )
+    parser.add_argument(
+        "--refine", type=int, metavar="N", help="gpu: N x N smaller splats for each of the street's, N times the image"
+    )
+    parser.add_argument(
+        "--tuning", action="append", default=[], metavar="NAME=VALUE,...",
+        help="gpu: other choices of the kernels beside today's (ops/triton/tuning.py); once for each",
+    )  # fmt: skip
     parser.add_argument("--threads", type=int, help="threads of the CPU (default: as torch finds them)")
     parser.add_argument("--out", type=Path, default=Path("outputs/bench"), help="folder for records and figures")
     return parser
@@ -168,26 +190,42 @@ def _costs(options: argparse.Namespace) -> bool:
 
 
 def _edits(options: argparse.Namespace) -> bool:
-    from hydra.utils import instantiate
-
-    from sparsestreet.bench import edits
-    from sparsestreet.cli.compose import check_moved, load_run_config
-    from sparsestreet.data.lazy import spread
-    from sparsestreet.data.synthetic import StreetReader
+    from sparsestreet.bench import edits, edits_insert
     from sparsestreet.scene.storage import load_scene
-    from sparsestreet.scene.views import FILE_NAME, read_views
 
     if options.street is None:
         raise SystemExit("sparsestreet bench edits: --street RUN names a run on a synthetic street")
-    config = load_run_config(options.street)
+    if (traced := _traced(options.street, options.quick)) is None:
+        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
+    views, settings, street_from_world = traced
+    stored, file = load_scene(options.street), _file(options)
+    count = edits.run_edits(stored, views, settings, street_from_world, file)
+    if options.other is not None:
+        if (foreign := _traced(options.other, options.quick)) is None:
+            raise SystemExit(f"sparsestreet bench edits: {options.other} was not trained on a synthetic street")
+        street = edits_insert.TracedStreet(stored, settings, street_from_world)
+        other = edits_insert.TracedStreet(load_scene(options.other), *foreign[1:])
+        count += edits_insert.run_inserts(street, other, views, file)
+    return count > 0
+
+
+def _traced(run: Path, quick: bool) -> "tuple[list[View], StreetSettings, Tensor] | None":
+    """Held-out views of a run, and how its street can be traced with other actors; None for a recorded drive."""
+    from hydra.utils import instantiate
+
+    from sparsestreet.cli.compose import check_moved, load_run_config
+    from sparsestreet.data.lazy import spread
+    from sparsestreet.data.synthetic import StreetReader
+    from sparsestreet.scene.views import FILE_NAME, read_views
+
+    config = load_run_config(run)
     check_moved(config)
     reader = instantiate(config.data.log)
     if not isinstance(reader, StreetReader):
-        raise SystemExit(f"sparsestreet bench edits: {options.street} was not trained on a synthetic street")
-    views = read_views(options.street / FILE_NAME).held_out
-    chosen = [views[place] for place in spread(len(views), 4 if options.quick else 24)]
-    street_from_world = reader.read().dataset_from_world
-    return edits.run_edits(load_scene(options.street), chosen, reader.settings, street_from_world, _file(options)) > 0
+        return None
+    views = read_views(run / FILE_NAME).held_out
+    chosen = [views[place] for place in spread(len(views), 4 if quick else 24)]
+    return chosen, reader.settings, reader.read().dataset_from_world
 
 
 def _masks(options: argparse.Namespace) -> bool:
@@ -197,6 +235,24 @@ def _masks(options: argparse.Namespace) -> bool:
     sizes, budget = ((100,), TimingBudget(repeats=2, least=1)) if options.quick else (masks.ROWS, TimingBudget(100))
     masks.run_masks(sizes, masks.FRAMES, budget, _file(options))
     return True
+
+
+def _serve(options: argparse.Namespace) -> bool:
+    if options.street is None:
+        raise SystemExit("sparsestreet bench serve: --street RUN names the folder of a trained run")
+    try:
+        from sparsestreet.bench import serve, serve_client, serve_placed
+    except ModuleNotFoundError as error:
+        raise SystemExit(f"sparsestreet bench serve needs {error.name}: pip install 'sparsestreet[serve]'") from error
+    file = _file(options)
+    good = serve.run_serve(options.street, serve.QUICK if options.quick else serve.FULL, file)
+    traced = _traced(options.street, options.quick)
+    if traced is None:
+        print("the street is no synthetic one: objects that a request places are compared with nothing")
+        return good
+    with serve_client.server(options.street, workers=1) as (client, _):
+        serve_placed.run_placed(client, *traced, file)
+    return good
 
 
 def _scaling(options: argparse.Namespace) -> bool:
@@ -214,15 +270,34 @@ def _scaling(options: argparse.Namespace) -> bool:
 def _gpu(options: argparse.Namespace) -> bool:
     from sparsestreet.bench import gpu
     from sparsestreet.bench.timing import TimingBudget
+    from sparsestreet.bench.tunings import tuning_of
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu" and not options.quick:
         raise SystemExit("sparsestreet bench gpu: no CUDA device is available; --quick runs it on the CPU, tiny")
-    sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
-    street = None if options.street is None else trained_street(options.street)
+    try:
+        tunings = gpu.DEFAULT | {words: tuning_of(words) for words in options.tuning}
+    except ValueError as error:
+        raise SystemExit(f"sparsestreet bench gpu: {error}") from error
+    streets = [] if options.street is None else front_streets(options.street, options.refine or 1)
     if options.quick:
-        return gpu.run_gpu([Size(64, 48, 500)], device, TimingBudget(repeats=2, least=1), _file(options))
-    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), street=street)
+        once = TimingBudget(repeats=2, least=1)
+        return gpu.run_gpu([Size(64, 48, 500)], device, once, _file(options), streets=streets, tunings=tunings)
+    sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
+    return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), streets=streets, tunings=tunings)
+
+
+def front_streets(run: Path, refine: int) -> list[BenchScene]:
+    """A trained run as its camera of the least number sees it in its first and in its middle frame, refined.
+
+    Raises FileNotFoundError if the folder holds no scene or no views.
+    """
+    from sparsestreet.bench.refine import refined
+
+    stored, views = _scene_and_views(run)
+    front = [view for view in views if view.camera_index == min(view.indices[1] for view in views)]
+    chosen = {place: front[place] for place in (0, len(front) // 2)}
+    return [refined(_street(run, stored, view), refine) for view in chosen.values()]
 
 
 def trained_street(run: Path) -> BenchScene:
@@ -230,7 +305,10 @@ def trained_street(run: Path) -> BenchScene:
 
     Raises FileNotFoundError if the folder holds no scene or no views.
     """
-    stored, view = _stored(run)
+    return _street(run, *_stored(run))
+
+
+def _street(run: Path, stored: "StoredScene", view: "View") -> BenchScene:
     with torch.no_grad():
         placed = stored.scene.gaussians_at(view)
     source = f"trained: {run.name} on {stored.name}, frame {view.frame_index}"
@@ -238,11 +316,15 @@ def trained_street(run: Path) -> BenchScene:
 
 
 def _stored(run: Path) -> "tuple[StoredScene, View]":
+    stored, views = _scene_and_views(run)
+    return stored, views[len(views) // 2]
+
+
+def _scene_and_views(run: Path) -> "tuple[StoredScene, tuple[View, ...]]":
     from sparsestreet.scene.storage import load_scene
     from sparsestreet.scene.views import FILE_NAME, read_views
 
-    stored, views = load_scene(run), read_views(run / FILE_NAME).all
-    return stored, views[len(views) // 2]
+    return load_scene(run), read_views(run / FILE_NAME).all
 
 
 def _file(options: argparse.Namespace) -> RecordFile:

@@ -113,6 +113,8 @@ def override_problem(overrides: list[str]) -> str | None:
         # Every key has its place in conf/, so an added one is a slip that Hydra would let pass.
         if text.startswith("+") and not text.startswith(ADDABLE):
             return _unknown_key(text.lstrip("+").partition("=")[0])
+        if text.startswith("folder="):
+            return f"{text}: folder follows from out, and a value of its own would lead nowhere: give out=DIR"
     try:
         # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
         single = [text for text in keyed if not _is_sweep(text)]

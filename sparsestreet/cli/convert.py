@@ -40,6 +40,8 @@ def convert(arguments: Sequence[str]) -> int:
         words = _sorted(arguments)
         to = words.to.resolve()
         return _convert(words, to)
+    except BrokenPipeError:
+        raise  # somebody reads no more of our output
     except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
         print(f"sparsestreet data convert: {error}", file=sys.stderr)
         return 2 if isinstance(error, UsageError) else 1

@@ -33,6 +33,8 @@ def data(arguments: list[str]) -> int:
         return convert(rest)
     try:
         return _check(rest) if verb == "check" else _make(rest)
+    except BrokenPipeError:
+        raise  # somebody reads no more of our output
     except (ValueError, OSError) as error:
         print(f"sparsestreet data {verb}: {error}", file=sys.stderr)
         return 2

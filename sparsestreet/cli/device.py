@@ -36,7 +36,7 @@ def device_problem(trainer: DictConfig) -> str | None:
     devices = trainer.get("devices", 1)
     if trainer.get("accelerator") in GPU:
         try:
-            device_of("cuda", "trainer=gpu", "train with trainer=cpu, or check the driver")
+            device_of("cuda", "trainer=gpu", "sparsestreet check says why; trainer=cpu trains without")
         except ValueError as error:
             return str(error)
     if shares_a_run(trainer):

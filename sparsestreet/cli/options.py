@@ -10,6 +10,8 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from sparsestreet.cli.process import nobody_reads
+
 Options = TypeVar("Options")
 
 FEW = 20
@@ -45,8 +47,8 @@ def run_command(
         print(f"sparsestreet {name}: {error}", file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:
-        if isinstance(error, BrokenPipeError):
-            sys.stdout.flush()  # breaks again where it is our output that nobody reads any more: ``main`` ends quietly
+        if isinstance(error, BrokenPipeError) and nobody_reads():
+            raise  # ``main`` ends quietly; a program of ours that broke, such as ffmpeg, is told
         print(f"sparsestreet {name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

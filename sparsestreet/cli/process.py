@@ -5,6 +5,7 @@ Memory and threads are said before torch is imported, which reads them once.
 
 import ctypes
 import os
+import select
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -20,6 +21,22 @@ def prepare_process() -> None:
     """Keep freed memory, and sleep instead of spinning; what the environment says of either stays as it is."""
     keep_freed_memory()
     wait_politely()
+
+
+def nobody_reads() -> bool:
+    """Whether the reader of our output has enough (``| head``): the pipe is broken, by its state and not by an error.
+
+    Where there is no such question to ask (Windows, output that is no file), nobody is said to read.
+    """
+    if not hasattr(select, "poll"):
+        return True
+    try:
+        pipe = sys.stdout.fileno()
+    except (OSError, ValueError):
+        return True
+    poll = select.poll()
+    poll.register(pipe, 0)  # errors are told in any case
+    return bool(poll.poll(0))
 
 
 def keep_freed_memory() -> None:

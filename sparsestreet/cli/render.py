@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from sparsestreet.cli.options import run_command
 
 if TYPE_CHECKING:
+    from sparsestreet.export.lidar import LidarReturns
     from sparsestreet.export.path import CameraPath
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
@@ -26,6 +27,7 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN flight.mp4 path=keys.json               along poses of your own (docs/rendering.md)
   sparsestreet render outputs/RUN truck.mp4 cameras=0 up=1.2 fov=100 width=960 height=400    another camera
   sparsestreet render outputs/RUN labels layers=[rgb,depth,instances]     a folder of PNGs for each layer
+  sparsestreet render outputs/RUN lidar.mp4 layers=[rgb,lidar] cameras=0  the log's lidar on the picture
 
   scene     a run's folder, or a scene.safetensors; the first word without a key
   out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
@@ -47,15 +49,16 @@ the cameras:
   height    pixels; rows come or go above and below (default: in proportion)
 
 the pictures:
-  layers    [rgb,depth,alpha,nodes,instances]: in a .mp4 one below the other, in colors; in a folder one folder each,
-            exact: depth in millimeters, ids of nodes and objects with tables (default: rgb)
+  layers    [rgb,depth,alpha,nodes,instances,lidar]: in a .mp4 one below the other, in colors; in a folder one folder
+            each, exact: depth in millimeters, ids of nodes and objects with tables (default: rgb). lidar needs the log:
+            its returns, drawn on the picture
   fps       frames a second of the video; poses between the recorded ones are interpolated (default: as the log)
   log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
 """
 
 PATHS = ("recorded", "shifted", "lane_change")
-LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
+LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "lidar")
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,7 @@ def render(arguments: list[str]) -> int:
 def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.edits import with_edits
+    from sparsestreet.cli.returns import returns_of
     from sparsestreet.cli.scene import folder_of, open_scene
     from sparsestreet.export.video import check_destination
     from sparsestreet.scene.views import DEFAULT_FRAME_RATE, FILE_NAME, read_views
@@ -128,8 +132,9 @@ def _render(request: RenderRequest) -> None:
     if log_fps is None:
         log_fps = DEFAULT_FRAME_RATE
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
+    returns = returns_of(folder_of(request.scene), views) if "lidar" in request.layers else None
     path, fps, what = _path(request, views, log_fps)
-    count = _write(request, stored, _seen_by(request, path), fps)
+    count = _write(request, stored, _seen_by(request, path), fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"
     print(f"{request.out}: {count} frames of {what} at {fps:g} a second{_speed(request, log_fps)}, {made}")
 
@@ -173,7 +178,9 @@ def _seen_by(request: RenderRequest, path: "CameraPath") -> "CameraPath":
     return path if request.fov is None else rig.pinholes(path, request.fov)
 
 
-def _write(request: RenderRequest, stored: "StoredScene", path: "CameraPath", fps: float) -> int:
+def _write(
+    request: RenderRequest, stored: "StoredScene", path: "CameraPath", fps: float, returns: "LidarReturns | None"
+) -> int:
     from sparsestreet.cli.progress import shown
     from sparsestreet.export import layers
     from sparsestreet.export.video import path_pictures, write_pictures
@@ -181,11 +188,10 @@ def _write(request: RenderRequest, stored: "StoredScene", path: "CameraPath", fp
     if request.layers == ("rgb",):
         pictures = path_pictures(stored, path)
     elif request.out.suffix:
-        pictures = layers.layer_pictures(stored, path, request.layers)
+        pictures = layers.layer_pictures(stored, path, request.layers, returns)
     else:
-        return layers.write_layers(
-            request.out, stored, path, request.layers, shown(range(len(path)), len(path), "frames")
-        )
+        frames = shown(range(len(path)), len(path), "frames")
+        return layers.write_layers(request.out, stored, path, request.layers, frames, returns)
     return write_pictures(request.out, shown(pictures, len(path), "frames"), fps=fps, quality=request.quality)
 
 

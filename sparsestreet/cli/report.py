@@ -82,8 +82,8 @@ def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> Non
     written = write_report(folder, sweep_name(folder), protocol)
     if picture is not None:
         time_figure(arms(sweep_records(folder)), protocol, picture)
-    for note in written.notes:
-        print(note)
+    for sentence in (*written.notes, *written.verdict):
+        print(sentence)
     print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
 
 

@@ -42,8 +42,9 @@ def train(arguments: list[str]) -> int:
                 arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments)))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
-                arguments = _shown(as_sweep(arguments))
+                arguments = as_sweep(arguments)
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
+                arguments = _shown(arguments)
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:

@@ -2,6 +2,7 @@
 
 import colorsys
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_folder
+from sparsestreet.export.lidar import FARTHEST, LidarReturns, enlarged
 from sparsestreet.export.path import CameraPath
 from sparsestreet.export.video import Picture, side_by_side
 from sparsestreet.ops import splat
@@ -24,14 +26,15 @@ from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
 
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
+"""Those that are of the scene; ``lidar`` is of the log."""
 
 Values = Shaped[np.ndarray, "_h _w *_c"]
-"""rgb uint8 [h, w, 3]; depth uint16, millimeters; alpha uint8; ids of nodes uint8 and of instances uint16."""
+"""rgb uint8 [h, w, 3]; depth and lidar uint16, millimeters; alpha uint8; ids of nodes uint8, of instances uint16."""
 
-FARTHEST = 65_535
-"""Millimeters of a depth that is no smaller; 0 where more light passes than is kept."""
 _SOLID = 0.5
 """Of alpha, from which a pixel has a depth."""
+_DOTS = 320
+"""Dots of the lidar that fit side by side into a picture, at most."""
 _NEAR, _FAR = 1.0, 100.0
 """Meters of the lightest and of the darkest color in a picture of depth."""
 _FIRST_HARMONIC = 0.28209479177387814
@@ -60,11 +63,14 @@ def instance_table(stored: StoredScene) -> list[Instance]:
 
 
 @torch.no_grad()
-def layer_values(stored: StoredScene, view: View, layers: Sequence[str]) -> dict[str, Values]:
+def layer_values(
+    stored: StoredScene, view: View, layers: Sequence[str], returns: LidarReturns | None = None
+) -> dict[str, Values]:
     """Returns the layers of a view, by name; see ``Values``.
 
     A pixel shows the node, or the object, that has the largest part of its color. Id 0 is what is none of them: the
-    sky, and for objects all that is no object.
+    sky, and for objects all that is no object. The layer ``lidar`` is made of the log's ``returns``, not of the scene:
+    the nearest one in each pixel, of the sweep that is nearest in time, and 0 where there is none.
     """
     rendering = stored.render(view)
     found: dict[str, Values] = {}
@@ -77,6 +83,10 @@ def layer_values(stored: StoredScene, view: View, layers: Sequence[str]) -> dict
             millimeters = (1000 * rendering.depth).round().clamp(1, FARTHEST)
             shown = torch.where(rendering.alpha >= _SOLID, millimeters, 0.0)
             found[layer] = shown.cpu().numpy().astype(np.uint16)
+        elif layer == "lidar":
+            if returns is None:
+                raise ValueError("the layer lidar is made of a log's returns: give them")
+            found[layer] = returns.millimeters(stored.scene.seen(view).camera, view.time)
         elif layer == "nodes":
             found[layer] = _shown_ids(stored, view, rendering, _node_ids(rendering)).astype(np.uint8)
         else:
@@ -84,15 +94,20 @@ def layer_values(stored: StoredScene, view: View, layers: Sequence[str]) -> dict
     return found
 
 
-def layer_picture(layer: str, values: Values, nodes: Sequence[str]) -> Picture:
-    """Returns a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own."""
+def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Picture | None = None) -> Picture:
+    """Returns a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own.
+
+    Returns of the lidar are dots on the picture ``under`` them, darkened to half, or on black without one.
+    """
     if layer == "rgb":
         return values
     if layer == "alpha":
         return np.repeat(values[..., None], 3, axis=-1)
     if layer == "depth":
-        closeness = 1 - np.log(np.maximum(values, 1) / 1000 / _NEAR) / np.log(_FAR / _NEAR)
-        return np.where(values[..., None] > 0, color_map(closeness), 0).astype(np.uint8)
+        return np.where(values[..., None] > 0, _by_distance(values), 0).astype(np.uint8)
+    if layer == "lidar":
+        dots = enlarged(values, math.ceil(values.shape[1] / _DOTS))
+        return np.where(dots[..., None] > 0, _by_distance(dots), 0 if under is None else under // 2).astype(np.uint8)
     if layer == "nodes":
         colors = [(0, 0, 0), *node_legend(nodes).values()]
     else:
@@ -102,17 +117,30 @@ def layer_picture(layer: str, values: Values, nodes: Sequence[str]) -> Picture:
     return np.array(colors, np.uint8)[values]
 
 
-def layer_pictures(stored: StoredScene, path: CameraPath, layers: Sequence[str]) -> Iterator[Picture]:
+def _by_distance(millimeters: Values) -> Picture:
+    return color_map(1 - np.log(np.maximum(millimeters, 1) / 1000 / _NEAR) / np.log(_FAR / _NEAR))
+
+
+def layer_pictures(
+    stored: StoredScene, path: CameraPath, layers: Sequence[str], returns: LidarReturns | None = None
+) -> Iterator[Picture]:
     """Yields one picture an instant: a row of cameras for each layer, one below the other."""
-    nodes = list(stored.scene.nodes)
+    nodes, wanted = list(stored.scene.nodes), dict.fromkeys((*layers, "rgb") if "lidar" in layers else layers)
     for rig in path:
-        views = [layer_values(stored, view, layers) for view in rig]
-        rows = [side_by_side([layer_picture(layer, one[layer], nodes) for one in views]) for layer in layers]
+        views = [layer_values(stored, view, tuple(wanted), returns) for view in rig]
+        rows = [
+            side_by_side([layer_picture(layer, one[layer], nodes, one.get("rgb")) for one in views]) for layer in layers
+        ]
         yield np.concatenate(rows)
 
 
 def write_layers(
-    out: Path, stored: StoredScene, path: CameraPath, layers: Sequence[str], shown: Iterator[int] | range
+    out: Path,
+    stored: StoredScene,
+    path: CameraPath,
+    layers: Sequence[str],
+    shown: Iterator[int] | range,
+    returns: LidarReturns | None = None,
 ) -> int:
     """Writes a folder of PNGs for each layer, the exact values, and tables of ids; whole or not at all.
 
@@ -125,7 +153,7 @@ def write_layers(
             rig = path[index]
             for place, view in enumerate(rig):
                 camera = "" if len(rig) == 1 else f"camera_{place if view.camera_index is None else view.camera_index}"
-                for layer, values in layer_values(stored, view, layers).items():
+                for layer, values in layer_values(stored, view, layers, returns).items():
                     folder = temporary / layer / camera
                     folder.mkdir(parents=True, exist_ok=True)
                     Image.fromarray(values).save(folder / f"{index:05d}.png")

@@ -133,7 +133,7 @@ def ray_directions(camera: Camera, device: torch.device | str = "cpu") -> Float[
         in_camera = _pinhole_rays(*image)
     else:
         in_camera = _lens_rays(tuple(camera.distortion.tolist()), *image)
-    in_world = in_camera @ camera.camera_from_world[:3, :3].to(device)
+    in_world = in_camera @ camera.camera_from_world[:3, :3].to(device, non_blocking=True)
     return in_world / in_world.norm(dim=-1, keepdim=True)
 
 
@@ -178,5 +178,5 @@ def distance_to_view(camera: Camera, points: Float[Tensor, "n 3"], margin: float
     low = [-row - margin * size * ahead for size, row in limits]
     high = [row - (1 + margin) * size * ahead for size, row in limits]
     normals = torch.nn.functional.normalize(torch.stack((*low, *high, -ahead)), dim=1)
-    planes = (normals @ camera.camera_from_world[:3]).to(points)
+    planes = (normals @ camera.camera_from_world[:3]).to(points, non_blocking=True)
     return (points @ planes[:, :3].T + planes[:, 3]).amax(1)

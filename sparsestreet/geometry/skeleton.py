@@ -86,7 +86,7 @@ def posed_bones(joints: Float[Tensor, "b 24 3"], rotations: Float[Tensor, "b 24 
     turns = torch.where(rotations[..., :1] < 0, -rotations, rotations)
     nothing = torch.zeros_like(turns[:, :1])
     nothing[..., 0] = 1
-    turns, steps = torch.cat((turns, nothing), 1), torch.tensor(_ANCESTORS, device=joints.device)
+    turns, steps = torch.cat((turns, nothing), 1), torch.tensor(_ANCESTORS).to(joints.device, non_blocking=True)
     for above in steps:
         turns = quat.multiply(turns[:, above], turns)
     matrices = quat.to_matrix(turns)

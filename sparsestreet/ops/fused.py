@@ -28,10 +28,13 @@ def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHO
         return backend
     if "cpu" in choices and _fit_library(tensors) and find_library() is not None:
         return "cpu"
-    on_gpu = {tensor.device.type for tensor in tensors} == {"cuda"}
-    if "triton" in choices and on_gpu and _fit_triton(tensors) and has_triton():
+    if "triton" in choices and _on_gpu(tensors) and _fit_triton(tensors) and has_triton():
         return "triton"
     return "torch"
+
+
+def _on_gpu(tensors: tuple[Tensor, ...]) -> bool:
+    return {tensor.device.type for tensor in tensors} == {"cuda"}
 
 
 def _fit_library(tensors: tuple[Tensor, ...]) -> bool:

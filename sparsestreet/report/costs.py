@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from sparsestreet.records.costs import COSTS, PRUNE, CostRecord
 from sparsestreet.report.arms import Arm
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.grid import ABSENT, Cell, Grid
+from sparsestreet.report.grid import Cell, Grid, number_cell
 
 _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] = (
     ("", "Gaussians", "{:,.0f}", lambda record: float(record.summary.gaussians_total)),
@@ -29,8 +29,7 @@ def what_arms_cost(arms: Sequence[Arm]) -> Grid:
     rows = []
     for arm in arms:
         runs = tuple(record.folder.name for record in arm.records)
-        means = [(form, _mean(arm, value)) for _, _, form, value in shown]
-        cells = [Cell(ABSENT if mean is None else form.format(mean), runs=runs) for form, mean in means]
+        cells = [number_cell(_mean(arm, value), form, runs) for _, _, form, value in shown]
         rows.append((Cell(arm.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
     header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _, _ in shown))
     notes = [

@@ -4,6 +4,7 @@ import io
 import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -62,17 +63,43 @@ def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figur
     return figure, axes
 
 
-def write_svg(figure: Figure, path: Path) -> None:
-    """Writes the figure as SVG in the page's own text color; the same numbers give the same bytes."""
+Says = dict[str, list[str]]
+"""Name of a group of marks in a figure -> what each of them says when somebody points at it."""
+
+
+def write_svg(figure: Figure, path: Path, says: Says | None = None) -> None:
+    """Writes the figure as SVG in the page's own text color; the same numbers give the same bytes.
+
+    Artists whose ``gid`` is a key of ``says`` have marks that say something: a ``<title>`` each, in their order.
+    """
     buffer = io.StringIO()
     with matplotlib.rc_context({**_STYLE, "svg.hashsalt": path.stem}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Title": path.stem})
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(_INK, "currentColor")
+    for name, texts in (says or {}).items():
+        text = _titled(text, name, texts)
     # Several figures of one page would share these names of groups. References use definitions, named by content.
     text = re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", text)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
+
+
+def _titled(svg: str, name: str, texts: Sequence[str]) -> str:
+    """Returns the figure with a title in each mark of a group. Raises ValueError where it has fewer marks."""
+    head, group, tail = svg.partition(f'<g id="{name}">')
+    tail, behind, rest_of_figure = tail.partition('<g id="')
+    rest = iter(texts)
+
+    def titled(mark: re.Match[str]) -> str:
+        return f"{mark[1]}><title>{escape(next(rest))}</title></{mark[2]}>"
+
+    # A single hollow mark is drawn as it is, all others from a definition.
+    kind = "use" if "<use " in tail else "path"
+    tail, found = re.subn(rf"(<({kind}) [^>]*?)/>", titled, tail, count=len(texts))
+    if not group or found < len(texts):
+        raise ValueError(f"the figure has {found} marks in {name!r}, and {len(texts)} texts")
+    return f"{head}<g>{tail}{behind}{rest_of_figure}"
 
 
 def colors(arms: Sequence[Arm]) -> dict[str, str]:
@@ -127,14 +154,15 @@ def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value]
     if not regions or all(arm.mean(cost[2]) is None for arm in arms):
         return False
     figure, axes = panels(len(regions))
+    says: Says = {}
     for index, (one, (name, value)) in enumerate(zip(axes, regions.items(), strict=True)):
-        _pareto_panel(one, arms, cost[2], value)
+        says |= _pareto_panel(one, arms, cost, value, name)
         one.set_title(name, fontsize=10)
         one.set_xlabel(cost[1])
         if index == 0:
             one.set_ylabel("held-out PSNR, dB")
     figure.legend(handles=_legend(arms), loc="outside lower center", ncols=4, **LEGEND)
-    write_svg(figure, path)
+    write_svg(figure, path, says)
     return True
 
 
@@ -142,21 +170,26 @@ def _held_out(metric: str) -> Value:
     return lambda run: run.mean(metric, HELD_OUT)
 
 
-def _pareto_panel(axes: Axes, arms: Sequence[Arm], cost: Value, quality: Value) -> None:
+def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], quality: Value, region: str) -> Says:
     color = colors(arms)
+    cost, unit = of[2], of[1]
     means: dict[str, tuple[float, float]] = {}
-    for arm in arms:
+    says: Says = {}
+    for number, arm in enumerate(arms):
         paint = GREY if arm.control else color[arm.plain_label]
         points = _points(arm, cost, quality)
         if not points:
             continue
         axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker(arm),
-                     linewidths=0.8)  # fmt: skip
+                     linewidths=0.8, gid=(runs := f"{region} {number} runs"))  # fmt: skip
         means[arm.name] = _mean_point(points)
+        says[runs] = [f"{arm.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
+                      for ((scene, _), seed), point in points.items()]  # fmt: skip
+        says[f"{region} {number} mean"] = [f"{arm.title}, mean: {_in_words(means[arm.name], unit)}"]
         # A marker of lines has no inside to leave empty: it is drawn thin.
         hollow = {"facecolors": "none", "edgecolors": paint} if marker(arm) not in "x+" else {"color": paint}
         shape = {**hollow, "linewidths": 0.8} if arm.lacks else {"color": paint, "linewidths": 1.6}
-        axes.scatter(*means[arm.name], s=48, marker=marker(arm), zorder=3, **shape)
+        axes.scatter(*means[arm.name], s=48, marker=marker(arm), zorder=3, gid=f"{region} {number} mean", **shape)
     for arm in arms:
         ends = None if arm.control else paired_means(arm, plain_of(arm, arms), cost, quality)
         if ends is not None:
@@ -170,6 +203,12 @@ def _pareto_panel(axes: Axes, arms: Sequence[Arm], cost: Value, quality: Value) 
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high > 10 * low else MaxNLocator(4))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
+    return says
+
+
+def _in_words(point: tuple[float, float], unit: str) -> str:
+    cost = f"{point[0]:,.0f}" if point[0] >= 1000 else f"{point[0]:.4g}"
+    return f"{point[1]:.3f} dB, {cost} {unit}"
 
 
 def paired_means(

@@ -14,7 +14,7 @@ from sparsestreet.records.costs import COSTS
 from sparsestreet.records.ledger import LEDGER
 from sparsestreet.report.arms import Arm
 from sparsestreet.report.curves import curves_of_runs
-from sparsestreet.report.figures import COLORS, GREY, LEGEND, of_sparsify, panels, short, write_svg
+from sparsestreet.report.figures import COLORS, GREY, LEGEND, Says, of_sparsify, panels, short, write_svg
 
 
 def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
@@ -25,13 +25,17 @@ def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
         return False
     methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
     figure, axes = panels(len(methods))
+    says: Says = {}
     for one, method in zip(axes, methods, strict=True):
         for arm in _of(drawn, method):
             for curve in found[arm.name]:
-                one.plot(curve.seconds, curve.psnr, **_line(arm), marker=".", markersize=3)
+                name = f"curve {len(says)}"
+                one.plot(curve.seconds, curve.psnr, **_line(arm), marker=".", markersize=3, gid=name)
+                looks = zip(curve.seconds, curve.psnr, strict=True)
+                says[name] = [f"{arm.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
         _finish(one, method, "training seconds")
     axes[0].set_ylabel("held-out PSNR, dB")
-    write_svg(figure, path)
+    write_svg(figure, path, says)
     return True
 
 

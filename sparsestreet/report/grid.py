@@ -19,6 +19,17 @@ class Cell:
     """Whether the paper published the number; otherwise it is ours."""
     runs: tuple[str, ...] = ()
     """Names of the runs that the number comes from."""
+    exact: str = ""
+    """The number before it was rounded, for whoever points at it on the page."""
+
+
+def number_cell(value: float | None, form: str, runs: tuple[str, ...]) -> Cell:
+    """Returns a rounded number with its exact value.
+
+    >>> number_cell(0.123456, "{:.2f}", ("run0",))
+    Cell(text='0.12', bold=False, published=False, runs=('run0',), exact='0.123456')
+    """
+    return Cell(runs=runs) if value is None else Cell(form.format(value), runs=runs, exact=f"{value:.8g}")
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,8 @@ def _row(
     for key in table.columns:
         ours = _ours(arm, key, protocol) if arm else None
         theirs = published.get(key)
-        cells += [Cell(_text(ours, key), runs=runs), Cell(_text(theirs, key), published=True)]
+        exact = "" if ours is None else f"{ours:.8g}"
+        cells += [Cell(_text(ours, key), runs=runs, exact=exact), Cell(_text(theirs, key), published=True)]
     return tuple(cells)
 
 

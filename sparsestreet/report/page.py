@@ -2,14 +2,18 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
 from sparsestreet.records.failures import FailedRun
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.grid import Cell, Grid
+from sparsestreet.report.grid import ABSENT, Cell, Grid
 
+_THEIRS = ", paper"
+"""The end of a heading whose column has published numbers."""
+_MANY = 14
+"""Columns from which on a table is printed smaller."""
 _HERE = Path(__file__).parent
 _NOTHING_FROM_OUTSIDE = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
@@ -28,6 +32,8 @@ class Page:
     """The JSON of ``comparison.comparison_data``."""
     records: Sequence[RunRecord]
     failures: Sequence[tuple[Path, FailedRun]]
+    verdict: Sequence[str] = ()
+    """Sentences that say what follows from the numbers; none where the runs are too few."""
 
 
 def html(page: Page) -> str:
@@ -37,6 +43,7 @@ def html(page: Page) -> str:
         f"<h1>{escape(page.title)}</h1>",
         f"<p class='soft'>{len(page.records)} runs with a record, {len(page.failures)} failed. "
         "Every number links to the runs that it is of, with their records, configurations and commits.</p>",
+        _verdict(page.verdict),
         _navigation(page),
         _notes(page.notes),
         *(_grid(grid, sets) for grid in page.grids),
@@ -76,6 +83,12 @@ def _notes(notes: Sequence[str]) -> str:
     return "<ul class='notes'>" + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
 
 
+def _verdict(sentences: Sequence[str]) -> str:
+    if not sentences:
+        return ""
+    return "<section id='verdict'>" + "".join(f"<p>{escape(one)}</p>" for one in sentences) + "</section>"
+
+
 def _sets(grids: Sequence[Grid]) -> dict[tuple[str, ...], str]:
     """Returns names of the runs that a number comes from -> the place on the page that lists them."""
     several = dict.fromkeys(cell.runs for grid in grids for row in grid.rows for cell in row if len(cell.runs) > 1)
@@ -83,17 +96,30 @@ def _sets(grids: Sequence[Grid]) -> dict[tuple[str, ...], str]:
 
 
 def _grid(grid: Grid, sets: Mapping[tuple[str, ...], str]) -> str:
+    grid = _without_empty(grid)
     above = "".join(f"<th class='above' colspan='{span}'>{escape(text)}</th>" for text, span in grid.spans)
     above = f"<tr>{above}</tr>" if any(text for text, _ in grid.spans) else ""
     heads = "".join(
-        f"<th{' class=theirs' if heading.endswith(', paper') else ''}>{escape(heading)}</th>"
+        f"<th{' class=theirs' if heading.endswith(_THEIRS) else ''}>{escape(heading)}</th>"
         for _, heading in grid.header
     )
     rows = "\n".join("<tr>" + "".join(_cell(cell, sets) for cell in row) + "</tr>" for row in grid.rows)
+    wide = "wide many" if len(grid.header) > _MANY else "wide"
     return (
-        f"<section id='{grid.name}'><h2>{escape(grid.title)}</h2>\n<div class='wide' tabindex='0'><table><thead>{above}"
-        f"<tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>\n{_notes(grid.notes)}</section>"
+        f"<section id='{grid.name}'><h2>{escape(grid.title)}</h2>\n<div class='{wide}' tabindex='0'><table><thead>"
+        f"{above}<tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>\n{_notes(grid.notes)}</section>"
     )
+
+
+def _without_empty(grid: Grid) -> Grid:
+    """Returns the table without columns for published numbers of which there are none."""
+    kept = [
+        index
+        for index, (_, heading) in enumerate(grid.header)
+        if not heading.endswith(_THEIRS) or any(row[index].text != ABSENT for row in grid.rows)
+    ]
+    rows = tuple(tuple(row[index] for index in kept) for row in grid.rows)
+    return replace(grid, header=tuple(grid.header[index] for index in kept), rows=rows)
 
 
 def _cell(cell: Cell, sets: Mapping[tuple[str, ...], str]) -> str:
@@ -101,7 +127,8 @@ def _cell(cell: Cell, sets: Mapping[tuple[str, ...], str]) -> str:
     if cell.runs and cell.text != "-":
         target = sets.get(cell.runs, f"run-{cell.runs[0]}")
         text = f"<a href='#{escape(target)}'>{text}</a>"
-    return f"<td{' class=theirs' if cell.published else ''}>{text}</td>"
+    title = f" title='{escape(cell.exact)}'" if cell.exact else ""
+    return f"<td{' class=theirs' if cell.published else ''}{title}>{text}</td>"
 
 
 def _figure(index: int, caption: str, svg: str) -> str:

@@ -8,7 +8,7 @@ from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report.arms import Arm, Unit, mean_over_scenes
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.grid import ABSENT, Cell, Grid
+from sparsestreet.report.grid import Cell, Grid, number_cell
 from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
 
 Number = Callable[[RenderedAs], float | None]
@@ -97,5 +97,4 @@ def _values(found: Rendered, number: Number) -> dict[Unit, float]:
 
 
 def _mean(values: dict[Unit, float], form: str, runs: tuple[str, ...]) -> Cell:
-    mean = mean_over_scenes(values)
-    return Cell(ABSENT if mean is None else form.format(mean), runs=runs)
+    return number_cell(mean_over_scenes(values), form, runs)

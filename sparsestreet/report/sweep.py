@@ -22,6 +22,7 @@ from sparsestreet.report.layouts import paper_table
 from sparsestreet.report.page import Page, html
 from sparsestreet.report.presets import rendered_otherwise
 from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality
+from sparsestreet.report.verdict import verdict
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class SweepReport:
     folder: Path
     grids: tuple[Grid, ...]
     notes: tuple[str, ...]
+    verdict: tuple[str, ...]
 
 
 def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIVESTUDIO) -> SweepReport:
@@ -48,6 +50,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     records = sweep_records(sweep)
     found = arms(records)
     grids = _grids(found, failures, protocol, name)
+    said = verdict(found, protocol)
     folder = sweep / "report"
     figures, absent = _figures(found, protocol, folder / "figures")
     notes = [*incomplete(found), *why_apart(found), *_caps(found), *_unfinished(records), *_taken(records), *absent]
@@ -62,9 +65,10 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
         pictures=comparison_data(found),
         records=records,
         failures=failures,
+        verdict=said,
     )
     write_atomically(folder / "index.html", html(page))
-    return SweepReport(folder, tuple(grids), tuple(notes))
+    return SweepReport(folder, tuple(grids), tuple(notes), said)
 
 
 def sweep_records(sweep: Path) -> list[RunRecord]:

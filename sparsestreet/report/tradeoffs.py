@@ -7,7 +7,7 @@ from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Unit, Value, by_scene, mean_over_scenes, plain_of
-from sparsestreet.report.grid import ABSENT, Cell, Grid
+from sparsestreet.report.grid import Cell, Grid, number_cell
 from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
 from sparsestreet.report.notes import CAPPED
 
@@ -98,18 +98,19 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
     return Grid("differences", "Differences to the plain method", header, tuple(rows), (*notes, *_caps(arms)))
 
 
-def _capped(plain: Arm) -> bool:
+def is_capped(plain: Arm) -> bool:
+    """Whether a limit ended the growth of a run of the arm."""
     return any(record.summary.run.caps for record in plain.records)
 
 
 def _named(plain: Arm) -> str:
     """Returns the name of a plain arm, marked where its count is a limit's."""
-    return f"{plain.name} {CAPPED}" if _capped(plain) else plain.name
+    return f"{plain.name} {CAPPED}" if is_capped(plain) else plain.name
 
 
 def _caps(arms: Sequence[Arm]) -> tuple[str, ...]:
     """Says what a share of a marked arm's Gaussians is a share of."""
-    held = [arm.name for arm in arms if arm.sparsify == "none" and _capped(arm)]
+    held = [arm.name for arm in arms if arm.sparsify == "none" and is_capped(arm)]
     said = "held down by max_gaussians, so that a share of its Gaussians is a share of that limit"
     return (f"{CAPPED} {', '.join(held)}: {said}",) if held else ()
 
@@ -125,7 +126,13 @@ def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs
     text = form.format(interval.mean)
     if interval.low is not None:
         text += f" [{form.format(interval.low)}, {form.format(interval.high)}]"
-    return Cell(text if interval.n == n else f"{text} (n={interval.n})", interval.proven, runs=runs)
+    text = text if interval.n == n else f"{text} (n={interval.n})"
+    return Cell(text, interval.proven, runs=runs, exact=_exactly(interval))
+
+
+def _exactly(interval: ConfidenceInterval) -> str:
+    spread = "" if interval.low is None else f", interval {interval.low:.6g} to {interval.high:.6g}"
+    return f"{interval.mean:.6g}{spread}, n = {interval.n}"
 
 
 @dataclass(frozen=True)
@@ -202,20 +209,20 @@ def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
         return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
     runs = tuple(record.folder.name for record in best.arm.records)
 
-    def mean(value: Value, form: str) -> str:
+    def mean(value: Value, form: str) -> Cell:
         ours, theirs = best.arm.units(value), best.plain.units(value)
         found = mean_over_scenes({unit: ours[unit] for unit in ours.keys() & theirs.keys()})
-        return ABSENT if found is None else form.format(found)
+        return number_cell(found, form, runs)
 
     numbers = (
-        f"{-best.loss:+.2f}",
-        f"{100 * best.share:.0f}",
+        number_cell(-best.loss, "{:+.2f}", runs),
+        number_cell(100 * best.share, "{:.0f}", runs),
         mean(lambda run: float(run.gaussians_total), "{:,.0f}"),
         mean(lambda run: run.bytes_total / 1e6, "{:.2f}"),
         mean(lambda run: run.latency.p50, "{:.2f}"),
         mean(_minutes, "{:.2f}"),
     )
-    return (Cell(best.arm.title, runs=runs), *(Cell(number, runs=runs) for number in numbers))
+    return (Cell(best.arm.title, runs=runs), *numbers)
 
 
 def _minutes(run: RunSummary) -> float | None:

@@ -1,5 +1,7 @@
 """What Lightning's trainer holds and does not declare."""
 
+from typing import Any
+
 from lightning import Callback, Trainer
 
 from sparsestreet.data.datamodule import StreetData
@@ -20,6 +22,21 @@ def validates_now(trainer: Trainer) -> bool:
     """Whether validation follows the step that is ending; Lightning makes up for none when a run goes on."""
     fetcher = trainer.fit_loop._data_fetcher
     return fetcher is not None and trainer.fit_loop.epoch_loop._should_check_val_fx(fetcher)
+
+
+def logs_now(trainer: Trainer) -> bool:
+    """Whether Lightning's loggers will take what this step says."""
+    return trainer._logger_connector.should_update_logs
+
+
+def logged_number(trainer: Trainer) -> int:
+    """Under which its loggers file what a step says: where a run goes on, its count of batches is not the step."""
+    return trainer.fit_loop.epoch_loop._batches_that_stepped
+
+
+def log_numbers(trainer: Trainer, numbers: dict[str, Any], step: int) -> None:
+    """Give its loggers numbers of a step that is over."""
+    trainer._logger_connector.log_metrics(numbers, step=step)
 
 
 def is_dev_run(trainer: Trainer) -> bool:

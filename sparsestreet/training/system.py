@@ -16,12 +16,13 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.finite import check_loss
-from sparsestreet.training.lightning import image_number, images_per_step
+from sparsestreet.training.lightning import ends_step, image_number, images_per_step, logs_now
 from sparsestreet.training.losses import Loss
 from sparsestreet.training.losses.hood import without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.resolution import ResolutionSchedule
+from sparsestreet.training.said_later import SaidLater
 from sparsestreet.training.schedule import Course
 from sparsestreet.types import Frame
 
@@ -77,6 +78,8 @@ class StreetSystem(LightningModule):
         """Density control says for each step whether it needs them."""
         self._course: Course | None = None
         self.train_psnr: deque[Tensor] = deque(maxlen=10)
+        self.said = SaidLater()
+        """What training steps logged: PSNR, the terms, the number of Gaussians."""
 
     @property
     def course(self) -> Course:
@@ -107,6 +110,8 @@ class StreetSystem(LightningModule):
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
             self.rendering = render(self.scene, frame, state, self.options)
+            # The splat op has waited for the device, so all that earlier steps said is on the host.
+            self.said.pass_on(self.trainer)
             applicable = {name: loss for name, loss in self.losses.items() if loss.applies(frame)}
             terms = {}
             seen, recorded = without_hood(self.rendering, frame)
@@ -119,7 +124,7 @@ class StreetSystem(LightningModule):
                 with phase("moved view"):
                     terms |= self.moved_views(self.scene, self.rendering, frame)
         check_loss(terms, self.scene, frame, self.global_step)
-        if self._logs():
+        if logs_now(self.trainer):  # in other steps nothing is computed for the loggers
             with phase("logging"):
                 self._log_training(self.rendering, terms, frame)
         return torch.stack(tuple(terms.values())).sum()
@@ -150,24 +155,27 @@ class StreetSystem(LightningModule):
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
         set_rates(self.trainer.optimizers[0], self.state().progress)
 
+    def on_train_batch_end(self, outputs: object, batch: Frame, batch_idx: int) -> None:
+        if self.said.is_there and ends_step(self.trainer, batch_idx):
+            self.said.pass_on(self.trainer)
+
+    def on_validation_start(self) -> None:
+        self.said.pass_on(self.trainer)
+
+    def on_train_end(self) -> None:
+        self.said.pass_on(self.trainer)
+
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.said.pass_on(self.trainer)
         checkpoint["train_psnr"] = [value.cpu() for value in self.train_psnr]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.train_psnr.extend(value.to(self.device) for value in checkpoint.get("train_psnr", ()))
 
-    def _logs(self) -> bool:
-        """Whether Lightning's loggers will take what this step says; in other steps nothing is computed for them."""
-        # Lightning's own word: in a resumed run its count of batches is not the step.
-        return self.trainer._logger_connector.should_update_logs
-
     def _log_training(self, rendering: SceneRendering, terms: Mapping[str, Tensor], frame: Frame) -> None:
-        """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms.
-
-        All as tensors: a number would wait for the device before the backward pass is launched.
-        """
+        """PSNR, over the last steps that logged, and the number of Gaussians for the progress bar; the terms."""
         image = rendering.rgb.detach().clamp(0, 1)
         self.train_psnr.append(psnr_on_device(image, frame.image.to(image.dtype) / 255))
-        self.log("psnr", torch.stack(tuple(self.train_psnr)).mean(), batch_size=1)
-        self.log("gaussians", float(sum(self.scene.counts().values())), batch_size=1)
-        self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()}, batch_size=1)
+        values = {"psnr": torch.stack(tuple(self.train_psnr)).mean()}
+        values |= {f"train/{name}": term for name, term in terms.items()}
+        self.said.say(self.trainer, values, {"gaussians": float(sum(self.scene.counts().values()))})

@@ -8,9 +8,13 @@ import torch
 
 from sparsestreet.bench import edits
 from sparsestreet.bench.edits import Beside
+from sparsestreet.bench.edits_insert import TracedStreet, _is_free, _way, run_inserts
+from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.data.synthetic.models.car import STYLES, Car
 from sparsestreet.data.synthetic.motion import Path
-from sparsestreet.data.synthetic.world import Actor
+from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.world import Actor, build_world
+from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.types import Frame
 from tests.export.street import stored_street, street_views
 
@@ -37,10 +41,12 @@ def test_a_ghost_is_the_energy_of_what_is_left_of_an_object(left, ghost, psnr, m
     monkeypatch.setattr(edits, "LEAST", 24 * 16)
     before, after, views = traced(140), traced(40), street_views()[:3]
     shown = traced(round(40 + 100 * left))
-    monkeypatch.setattr(edits, "_image", lambda stored, view: shown(view).image.double().numpy() / 255)
-    stored = stored_street()
+
+    def show(view):
+        return shown(view).image.double().numpy() / 255
+
     with np.errstate(divide="ignore"):
-        record = edits._compared("removed", "car", CAR, stored, stored, views, before, after)
+        record = edits.compared("removed", "car", CAR, (show, show), views, (before, after))
     assert record is not None
     assert (record.views, record.pixels) == (3, 3 * 24 * 16)
     assert record.ghost == pytest.approx(ghost, abs=1e-12)
@@ -52,8 +58,12 @@ def test_a_ghost_is_the_energy_of_what_is_left_of_an_object(left, ghost, psnr, m
 
 def test_views_that_an_edit_hardly_changes_do_not_count(monkeypatch):
     monkeypatch.setattr(edits, "LEAST", 24 * 16 + 1)
-    stored, views = stored_street(), street_views()[:2]
-    assert edits._compared("removed", "car", CAR, stored, stored, views, traced(140), traced(40)) is None
+    views = street_views()[:2]
+
+    def show(view):
+        raise AssertionError("nothing is rendered")
+
+    assert edits.compared("removed", "car", CAR, (show, show), views, (traced(140), traced(40))) is None
 
 
 def test_an_actor_beside_its_way_keeps_heading_and_steps():
@@ -63,3 +73,40 @@ def test_an_actor_beside_its_way_keeps_heading_and_steps():
         np.testing.assert_allclose(moved[:3, :3], own[:3, :3])
         np.testing.assert_allclose(moved[:3, 3] - own[:3, 3], [0.0, -3.0, 0.0], atol=1e-12)
         assert beside.path.traveled(time) == CAR.path.traveled(time)
+
+
+def test_an_object_of_another_street_goes_its_actors_way():
+    """Both worlds are turned and shifted; the trained frame is half a meter above the middle of the actor's box."""
+    settings = StreetSettings(num_frames=11)
+
+    def street(yaw: float, x: float) -> TracedStreet:
+        street_from_world = torch.eye(4, dtype=torch.float64)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        street_from_world[:2, :2], street_from_world[0, 3] = torch.from_numpy(turn), x
+        return TracedStreet(stored_street(), settings, street_from_world)
+
+    here, other = street(0.5, 3.0), street(-0.7, 20.0)
+    actor = replace(CAR, ground=1.0 - 0.5 - CAR.model.size[2] / 2)  # the trained car is 1 m above the ground
+    way = _way(here, other, "car", actor)
+    for time in (0.0, 0.3, 1.0):
+        expected = np.linalg.inv(here.street_from_world.numpy()) @ actor.pose(time * settings.recorded[1])
+        expected[2, 3] += 0.5
+        np.testing.assert_allclose(way.frame(time, lambda _: np.eye(4)), expected, atol=1e-6)
+
+
+def test_who_stands_in_another_actor_is_not_compared():
+    settings = StreetSettings()
+    street = TracedStreet(stored_street(), settings, torch.eye(4, dtype=torch.float64))
+    world = build_world(settings)
+    near, far = (replace(world, actors=(replace(CAR, path=Beside(CAR.path, right)),)) for right in (2.0, 6.0))
+    assert not _is_free(street, near, CAR, 0.5)
+    assert _is_free(street, far, CAR, 0.5)
+
+
+def test_streets_of_two_lengths_are_refused(tmp_path):
+    short, long = (
+        TracedStreet(stored_street(), StreetSettings(num_frames=count), torch.eye(4, dtype=torch.float64))
+        for count in (10, 20)
+    )
+    with pytest.raises(ValueError, match="both logs must last as long"):
+        run_inserts(short, long, [], RecordFile(tmp_path / "a", Provenance("", 1, this_machine(), this_source())))

@@ -2,21 +2,26 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import DeviceType
 
-from sparsestreet.bench import device_profile, gpu, gpu_step, gsplat_peer
+from sparsestreet.bench import device_profile, gpu, gpu_record, gpu_step, gsplat_peer
 from sparsestreet.bench.accuracy import Errors, GradientError, ImageError
-from sparsestreet.bench.device_profile import stage_of
+from sparsestreet.bench.device_profile import DeviceProfile, numbered, short_name, stage_of
 from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
-from sparsestreet.bench.gpu import GpuRecord
+from sparsestreet.bench.gpu_record import GpuRecord
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import BenchScene, Size
+from sparsestreet.bench.tile_loads import TileLoads
 from sparsestreet.bench.timing import TimeSpread, TimingBudget, leaves
 from sparsestreet.ops import splat
+from sparsestreet.ops.triton.tuning import Tuning, tuning
 from sparsestreet.phases import WallClock
 from sparsestreet.types import Camera, Gaussians
 from tests.bench.test_records import PROVENANCE
@@ -46,7 +51,10 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
             absgrad = property(lambda self: rendering.screen_offsets.grad[None])
 
         radii = rendering.radii[None, :, None].expand(-1, -1, 2)
+        # Six tiles of 16x16, of which the third and the last are empty.
+        offsets = torch.tensor([[[0, 2, 3], [3, 4, 7]]], dtype=torch.int32)
         meta = {"flatten_ids": torch.zeros(7, dtype=torch.int32), "means2d": Means(), "radii": radii}
+        meta |= {"isect_offsets": offsets}
         return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
 
     module = ModuleType("gsplat")
@@ -118,7 +126,11 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
         assert record["inference"]["repeats"] == 1
         assert record["stages"] is None  # no device, no kernels
     assert [record["agrees"] for record in records] == [True] * 3
-    assert [record["pairs"] is None for record in records] == [False, True, True]
+    assert [record["pairs"] for record in records[1:]] == [7, 7]
+    assert [record["samples"] is None for record in records] == [False, True, True]
+    # 2, 1, 0, 1, 3 and 0 pairs.
+    said_of_theirs = {"mean": 1.16667, "median": 1.0, "longest": 3, "split": 0, "parts": 0, "longest_part": 0}
+    assert [record["tiles"] for record in records] == [None, said_of_theirs, said_of_theirs]
     assert records[0]["samples"] > records[0]["pairs"] >= 60
     assert any("agrees: equal" in line for line in said)
 
@@ -222,48 +234,107 @@ def test_kernels_belong_to_stages(kernel, stage):
     assert stage_of(kernel) == stage
 
 
-def test_device_time_of_the_stages_and_its_spread(monkeypatch):
-    def kernel(name: str, microseconds: float, device: DeviceType) -> SimpleNamespace:
-        return SimpleNamespace(key=name, self_device_time_total=microseconds, device_type=device)
+def event(name: str, start: float, microseconds: float, device: DeviceType = DeviceType.CUDA) -> FunctionEvent:
+    return FunctionEvent(0, name, 0, start, start + microseconds, device_type=device)
 
+
+@pytest.fixture
+def profiles(monkeypatch):
+    """A profiler: the events of each run, and how many there were."""
     runs: list[int] = []
 
-    class Profiler:
-        """One run each: the first a second, then 2, 4, 3 and 9 ms, of which 1 ms is another kernel's."""
+    def install(events_of: Callable[[int], list[FunctionEvent]]) -> list[int]:
+        class Profiler:
+            def __init__(self, activities: list) -> None: ...
 
-        def __init__(self, activities: list) -> None: ...
+            def __enter__(self) -> "Profiler":
+                return self
 
-        def __enter__(self) -> "Profiler":
-            return self
+            def __exit__(self, *error: object) -> None: ...
 
-        def __exit__(self, *error: object) -> None: ...
+            def events(self) -> list[FunctionEvent]:
+                return events_of(len(runs) - 1)
 
-        def key_averages(self) -> list[SimpleNamespace]:
-            milliseconds = [1000.0, 2.0, 4.0, 3.0, 9.0][len(runs) - 1]
-            return [
-                kernel("blend_tiles", 1000.0 * (milliseconds - 1), DeviceType.CUDA),
-                kernel("raster_more", 1000.0, DeviceType.CUDA),
-                *([kernel("project_rows", 500.0, DeviceType.CUDA)] if len(runs) > 2 else []),
-                kernel("blend_tiles", 9000.0, DeviceType.CPU),  # the launch: not a time of the device
-            ]
+        monkeypatch.setattr(device_profile, "profile", Profiler)
+        monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+        return runs
 
-    monkeypatch.setattr(device_profile, "profile", Profiler)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
-    stages = device_profile.kernel_milliseconds(lambda: runs.append(1), repeats=4)
+    return install
+
+
+def test_device_time_of_the_stages_and_its_spread(profiles):
+    def events(run: int) -> list[FunctionEvent]:
+        """The first run takes a second, then 2, 4, 3 and 9 ms, of which 1 ms is another kernel's."""
+        milliseconds = [1000.0, 2.0, 4.0, 3.0, 9.0][run]
+        return [
+            event("blend_tiles", 0, 1000.0 * (milliseconds - 1)),
+            event("raster_more", 1, 1000.0),
+            *([event("project_rows", 2, 500.0)] if run > 1 else []),
+            event("blend_tiles", 3, 9000.0, DeviceType.CPU),  # the launch: not a time of the device
+        ]
+
+    runs = profiles(events)
+    found = device_profile.profiled(lambda: runs.append(1), repeats=4)
     assert len(runs) == 5  # the first does not count: kernels are compiled
-    assert list(stages) == ["blend", "project"]
+    assert list(found.stages) == ["blend", "project"]
     # Quartiles of 2, 3, 4, 9, linear between samples: 2.75 and 5.25.
-    assert (stages["blend"].median, stages["blend"].minimum, stages["blend"].iqr) == pytest.approx((3.5, 2.0, 2.5))
+    blend = found.stages["blend"]
+    assert (blend.median, blend.minimum, blend.iqr) == pytest.approx((3.5, 2.0, 2.5))
     # A run without the kernel counts as zero: 0, 0.5, 0.5, 0.5.
-    assert (stages["project"].median, stages["project"].minimum) == pytest.approx((0.5, 0.0))
-    assert stages["project"].repeats == 4
+    project = found.stages["project"]
+    assert (project.median, project.minimum, project.repeats) == (pytest.approx(0.5), 0.0, 4)
+    assert list(found.kernels) == ["blend_tiles", "raster_more", "project_rows"]
+    assert found.kernels["blend_tiles"].median == pytest.approx(2.5)  # of 1, 3, 2, 8
+
+
+def test_times_by_the_names_of_kernels_launches_and_waits(profiles):
+    sort = "void cub::DeviceRadixSortOnesweepKernel<P, int>(int)"
+    host = DeviceType.CPU
+    given = [
+        event("blend_tiles", 40.0, 300.0),  # the second launch, of parts
+        event("blend_tiles", 10.0, 100.0),
+        event("thin_parts", 30.0, 200.0),
+        event(sort, 3.0, 7.0),
+        event(sort, 4.0, 8.0),
+        event("Memcpy DtoH (Device -> Pageable)", 5.0, 2.0),
+        *(event(name, 0.0, 50.0, host) for name in ("cudaStreamSynchronize", "cudaLaunchKernel", "aten::item")),
+        event("cudaDeviceSynchronize", 99.0, 50.0, host),  # of the measurement
+    ]
+    profiles(lambda run: given)
+    found = device_profile.profiled(lambda: None, repeats=2)
+    assert {name: round(1e3 * times.median, 6) for name, times in found.kernels.items()} == {
+        "cub::DeviceRadixSortOnesweepKernel": 15.0,
+        "Memcpy DtoH": 2.0,
+        "blend_tiles": 100.0,
+        "thin_parts": 200.0,
+        "blend_tiles 2": 300.0,
+    }
+    assert {name: round(1e3 * times.median, 6) for name, times in found.stages.items()} == {
+        "sort": 15.0, "other": 2.0, "blend": 600.0,
+    }  # fmt: skip
+    assert (found.launches, found.waits) == (6, 1)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "name"),
+    [
+        ("blend_tiles", "blend_tiles"),
+        ("void at::native::(anonymous namespace)::search_kernel<long, int>(long*, int)", "native::search_kernel"),
+        ("void gsplat::raster_fwd_kernel<3u, float>(f<g<int> >(*)(int))", "gsplat::raster_fwd_kernel"),
+        ("Memset (Device)", "Memset"),
+        ("()", "()"),
+    ],
+)  # fmt: skip
+def test_names_of_kernels_are_short(kernel, name):
+    assert short_name(kernel) == name
+    assert numbered([event(kernel, 0, 1)] * 2)[1] == (f"{name} 2" if kernel == "blend_tiles" else name)
 
 
 def test_a_line_has_medians_and_spreads():
     value, single = TimeSpread(1.25, 1.0, 0.125, 20), TimeSpread(3.0, 3.0, None, 1)
     record = GpuRecord("sparsestreet triton", "a device", "random frustum", 7, 8, 9, forward=value, backward=single)
     record = dataclasses.replace(record, inference=value, stages={"sort": value, "other": single})
-    text = gpu.line(record)
+    text = gpu_record.line(record)
     assert "forward 1.250 (iqr 0.125)  backward 3.000  no grad 1.250 (iqr 0.125) ms" in text
     assert "[sort 1.250 (iqr 0.125), other 3.000]" in text
 
@@ -304,26 +375,55 @@ def test_a_step_trains_all_fields_and_counts_the_view(rows):
 def test_every_number_of_a_record_is_in_its_line():
     values = [TimeSpread(float(place), 0.5, None, 3) for place in range(1, 5)]
     record = GpuRecord("sparsestreet triton", "a device", "a street", 1234, 640, 480)
-    assert gpu.line(dataclasses.replace(record, failed="RuntimeError: no")).split() == [
+    assert gpu_record.line(dataclasses.replace(record, failed="RuntimeError: no")).split() == [
         *("sparsestreet", "triton", "a", "street", "1234", "640x480", "FAILED:", "RuntimeError:", "no"),
     ]
     inference, forward, backward, step = values
     record = dataclasses.replace(record, inference=inference, forward=forward, backward=backward)
     start = "sparsestreet triton     a street             1234 640x480    forward 2.000  backward 3.000"
-    assert gpu.line(record) == f"{start}  no grad 1.000 ms"
-    assert gpu.line(dataclasses.replace(record, inference=None)) == f"{start}  no grad - ms"
-    assert gpu.line(dataclasses.replace(record, backward=None, failed="why")).endswith("FAILED: why")
+    assert gpu_record.line(record) == f"{start}  no grad 1.000 ms"
+    assert gpu_record.line(dataclasses.replace(record, inference=None)) == f"{start}  no grad - ms"
+    assert gpu_record.line(dataclasses.replace(record, backward=None, failed="why")).endswith("FAILED: why")
     image = ImageError(0.1, 0.2, 61.25)
     whole = dataclasses.replace(
         record, step=step, pairs=2_500_000, samples=70_000_000, memory_before=10.0, memory_peak=345.0,
         parity=Errors(image, {}), agrees=True, failed="late",
     )  # fmt: skip
-    assert gpu.line(whole) == (
+    assert gpu_record.line(whole) == (
         f"{start}  no grad 1.000 ms  step 4.000  2.50 M pairs, 70 M samples  peak     345 MB  agrees: 61.2 dB"
         "  FAILED: late"
     )
-    for one in ("pairs", "samples"):
-        assert " M pairs" not in gpu.line(dataclasses.replace(whole, **{one: None}))
+    busy = dataclasses.replace(whole, launches=31, waits=1, tiles=TileLoads(804.4, 421.5, 7925, 700, 2500, 1300))
+    said = "  tiles 804 pairs, longest 7925, 700 split in 2500 parts"
+    assert gpu_record.line(busy) == gpu_record.line(whole).replace(
+        "  peak     345 MB", f"{said}  peak     345 MB  31 launches, 1 waits"
+    )
+    without = dataclasses.replace(whole, samples=None)
+    assert gpu_record.line(without) == gpu_record.line(whole).replace(", 70 M samples", "")
+    assert " M " not in gpu_record.line(dataclasses.replace(without, pairs=None))
+
+
+def test_every_choice_of_the_kernels_is_measured_as_it_says(tmp_path, monkeypatch):
+    """Forward, backward, step and counts see it; gsplat is measured once."""
+    monkeypatch.setattr(gsplat_peer, "find_gsplat", lambda device: fake_gsplat())
+    held = []
+    counted = gpu.work_of
+
+    def counts(*given: Any) -> tuple[int | None, int | None]:
+        held.append(tuning())
+        return counted(*given)
+
+    monkeypatch.setattr(gpu, "work_of", counts)
+    file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
+    other = Tuning(most_parts=1)
+    tunings = {"": Tuning(), "most_parts=1": other}
+    assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append, tunings=tunings)
+    ours, changed, *theirs = read_records(file.path)
+    assert (ours["renderer"], changed["renderer"]) == ("sparsestreet cpu", "sparsestreet cpu most_parts=1")
+    assert (ours["tuning"], changed["tuning"]) == (vars(Tuning()), vars(other))
+    assert [record["tuning"] for record in theirs] == [None, None]
+    assert held == [Tuning(), other]
+    assert tuning() == Tuning()
 
 
 def test_a_record_is_of_its_workload(tmp_path, monkeypatch):
@@ -332,7 +432,7 @@ def test_a_record_is_of_its_workload(tmp_path, monkeypatch):
     camera = frustum_camera(40, 56)
     street = BenchScene("a street", "of a run", frustum_gaussians(30, camera, sigma_pixels=2.0, terms=4), camera)
     file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
-    assert gpu.run_gpu([Size(48, 32, 60), Size(32, 48, 20)], CPU, ONCE, file, said.append, street)
+    assert gpu.run_gpu([Size(48, 32, 60), Size(32, 48, 20)], CPU, ONCE, file, said.append, [street])
     records = read_records(file.path)
     assert [(one["kind"], one["scene"], one["rows"], one["width"], one["height"]) for one in records] == [
         ("gpu", "random frustum", 60, 48, 32),
@@ -365,11 +465,14 @@ def test_memory_and_stages_are_of_a_whole_step(rows, monkeypatch):
         assert rows.means.grad is None
         return answer
 
-    stages = {"blend": TimeSpread(1.0, 1.0, None, 1)}
+    time = TimeSpread(1.0, 1.0, None, 1)
+    profile = DeviceProfile({"blend": time}, {"blend_tiles": time}, 7, 1)
     monkeypatch.setattr(gpu, "peak_megabytes", lambda step: run_once(step, (10.0, 30.0)))
-    monkeypatch.setattr(gpu, "kernel_milliseconds", lambda step: run_once(step, stages))
+    monkeypatch.setattr(gpu, "profiled", lambda step: run_once(step, profile))
     record = gpu.measure(GpuRecord("r", "d", "s", 60, 48, 32), draw, workload, ONCE)
-    assert (record.memory_before, record.memory_peak, record.stages) == (10.0, 30.0, stages)
+    assert (record.memory_before, record.memory_peak) == (10.0, 30.0)
+    assert (record.stages, record.kernels) == ({"blend": time}, {"blend_tiles": time})
+    assert (record.launches, record.waits) == (7, 1)
     assert (record.forward.repeats, record.backward.repeats, record.inference.repeats) == (1, 1, 1)
     assert drawn.count(False) == 2  # without gradients: a warm-up and one that counts
     assert record.ok

@@ -105,6 +105,10 @@ def call(name):
 
 if "gpu_says.py machine" in given:
     print("a device", "9.0", "/a/library.so", sep="\\n")
+elif given == "-m sparsestreet check":
+    call("check")
+    print("device    MISSING: a driver" if MODE == "failing" else "a GPU trains here")
+    sys.exit(MODE == "failing")
 elif "gsplat.cuda._backend" in given:
     while MODE == "slow" and not trained.exists():
         time.sleep(0.02)
@@ -153,9 +157,9 @@ def run_on_a_pretended_device(folder: Path, mode: str) -> tuple[subprocess.Compl
 @pytest.mark.parametrize(
     ("gsplat", "order", "beside"),
     [
-        ("compiled", ["parity", "bench", "train", "kernels"], "beside gsplat"),
-        ("slow", ["parity", "train", "bench", "kernels"], "beside gsplat"),
-        ("failing", ["parity", "bench", "train", "kernels"], "alone"),
+        ("compiled", ["check", "parity", "bench", "train", "kernels"], "beside gsplat"),
+        ("slow", ["check", "parity", "train", "bench", "kernels"], "beside gsplat"),
+        ("failing", ["check", "parity", "bench", "train", "kernels"], "alone"),
     ],
 )
 def test_the_order_of_the_parts_and_their_table(tmp_path, gsplat, order, beside):
@@ -163,21 +167,22 @@ def test_the_order_of_the_parts_and_their_table(tmp_path, gsplat, order, beside)
     assert [call.split(":")[0] for call in calls if not call.startswith("timeout")] == order
     table = (tmp_path / "out" / "table.txt").read_text(encoding="utf-8").splitlines()
     states = {line[:8].strip(): line[9:17].strip() for line in table if line[25:26] == "s"}
-    failed = ["parity"] + ["gsplat"] * (gsplat == "failing")
+    failed = ["parity"] + ["gsplat", "check"] * (gsplat == "failing")
     expected = dict.fromkeys((*order, "gsplat"), "ok") | {"build": "skipped"} | dict.fromkeys(failed, "failed")
     assert states == expected, said.stdout + said.stderr
     assert said.returncode == 1
     assert any("FAILED tests/ops/test_it.py::test_this - it is so" in line for line in table)
     assert any("tests/ops/test_that.py (no hypothesis)" in line for line in table)
     assert any(line.strip() == "trained" for line in table)
-    assert any("error: of nvcc" in line for line in table) == (gsplat == "failing")
+    for said_of_it in ("error: of nvcc", "device    MISSING: a driver"):
+        assert any(said_of_it in line for line in table) == (gsplat == "failing")
     assert table[-1] == f"sparsestreet triton {beside}"
 
 
 def test_parts_end_as_by_ctrl_c_and_tests_keep_going_at_warnings(tmp_path):
     _, calls = run_on_a_pretended_device(tmp_path, "compiled")
     parts = [call for call in calls if call.startswith("timeout") and "gsplat.cuda" not in call]
-    assert len(parts) == 4
+    assert len(parts) == 5
     assert all(call.startswith("timeout: --signal=INT --kill-after=10 ") for call in parts)
     for call in calls:
         if call.startswith(("parity", "kernels")):

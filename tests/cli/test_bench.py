@@ -13,6 +13,7 @@ from sparsestreet.cli import bench as cli_bench
 from sparsestreet.cli import step as cli_step
 from sparsestreet.cli.bench import bench, trained_street
 from sparsestreet.ops import splat
+from sparsestreet.ops.triton.tuning import Tuning
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import read_views, write_views
@@ -91,7 +92,7 @@ def test_gpu_without_a_device_is_an_error_and_quick_is_not(tmp_path, capsys, mon
         bench(["gpu", "--out", str(tmp_path)])
     assert bench(["gpu", "--quick", "--out", str(tmp_path)]) == 0
     assert "no GPU timings" in capsys.readouterr().out
-    monkeypatch.setattr(gpu, "run_gpu", lambda *arguments: False)
+    monkeypatch.setattr(gpu, "run_gpu", lambda *arguments, **named: False)
     assert bench(["gpu", "--quick", "--out", str(tmp_path)]) == 1
 
 
@@ -176,7 +177,7 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
     file, *folder = args[len(expected) :]
     assert file.path == tmp_path / "o" / f"{mode}.jsonl"
     assert folder == ([tmp_path / "o"] if mode in ("scaling", "step") else [])
-    assert named == ({"street": None} if words == ["gpu"] else {})
+    assert named == ({"streets": [], "tunings": gpu.DEFAULT} if words[0] == "gpu" else {})
     if mode == "knobs":
         assert handed["drawn"] == ([], tmp_path / "o")
         assert handed.get("street") == (Path("RUN") if "--street" in words else None)
@@ -187,8 +188,73 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
 
 def test_a_street_is_beside_the_sizes_of_a_gpu(handed, monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert bench(["gpu", "--street", "RUN", "--out", str(tmp_path)]) == 0
-    assert (handed["run_gpu"][1], handed["street"]) == ({"street": "the street"}, Path("RUN"))
+    monkeypatch.setattr(cli_bench, "front_streets", lambda run, refine: [(run, refine)])
+    for words, refine in (([], 1), (["--quick", "--refine", "3"], 3)):
+        assert bench(["gpu", "--street", "RUN", *words, "--out", str(tmp_path)]) == 0
+        assert handed["run_gpu"][1]["streets"] == [(Path("RUN"), refine)]
+
+
+def test_other_choices_of_the_kernels_are_beside_todays(handed, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    words = ["--tuning", "most_parts=1,two_launches=false", "--tuning", "shortest_part=64"]
+    assert bench(["gpu", *words, "--out", str(tmp_path)]) == 0
+    today, whole, short = handed["run_gpu"][1]["tunings"].items()
+    assert today == ("", Tuning())
+    assert whole == (words[1], Tuning(most_parts=1, two_launches=False))
+    assert short == (words[3], Tuning(shortest_part=64))
+    with pytest.raises(SystemExit, match="bench gpu: no choice 'most_part' of the kernels: name one of most_parts, "):
+        bench(["gpu", "--tuning", "most_part=1"])
+    for wrong, said in (("most_parts=many", "most_parts is a number, got 'many'"), ("most_parts=0", "at least 1 part"),
+                        ("two_launches=1", "two_launches is true or false, got '1'")):  # fmt: skip
+        with pytest.raises(SystemExit, match=said):
+            bench(["gpu", "--tuning", wrong])
+    with pytest.raises(SystemExit) as ended:
+        bench(["knobs", "--tuning", "most_parts=1"])
+    assert ended.value.code == 2
+
+
+@pytest.mark.parametrize("words", [["gpu"], ["knobs", "--street", "RUN"], ["gpu", "--street", "RUN", "--refine", "0"]])
+def test_only_the_street_of_a_gpu_is_refined(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        bench([*words, *(() if "--refine" in words else ("--refine", "3"))])
+    assert ended.value.code == 2
+    assert "--refine N, at least 1" in capsys.readouterr().err
+
+
+def made_street(folder: Path) -> Path:
+    """A run of 37 splats, four cameras, five frames, of which the front camera's third is held out."""
+    save_scene(folder / "scene.safetensors", stored_street())
+    views = street_views()
+    write_views(folder / "views.json", [*views[:8], *views[9:]], [views[8]])
+    return folder
+
+
+def test_the_front_camera_sees_the_first_frame_and_the_middle_one(tmp_path):
+    run = made_street(tmp_path / "run")
+    streets, stored = cli_bench.front_streets(run, 3), load_scene(run)
+    views = [view for view in read_views(run / "views.json").all if view.camera_index == 0]
+    for street, view in zip(streets, (views[0], views[2]), strict=True):
+        assert street.source == f"trained: run on hand-made, frame {view.frame_index}, refined 3x3"
+        assert len(street.gaussians) == 9 * len(stored.scene.gaussians_at(view).gaussians)
+        assert (street.camera.width, street.camera.height) == (3 * view.camera.width, 3 * view.camera.height)
+        assert torch.equal(street.camera.camera_from_world, view.camera.camera_from_world)
+    assert [street.source.split(", ")[1] for street in streets] == ["frame 0", "frame 2"]
+
+
+@pytest.mark.lengthy
+def test_a_dry_run_of_a_refined_street(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    run = made_street(tmp_path / "run")
+    words = ["gpu", "--quick", "--street", str(run), "--refine", "3", "--out", str(tmp_path)]
+    assert bench(words) == 0
+    records = [json.loads(line) for line in (tmp_path / "gpu.jsonl").read_text().splitlines()]
+    assert [record["scene"].split(", ")[-1] for record in records] == ["random frustum", "refined 3x3", "refined 3x3"]
+    # The tram has left at frame 3, not at 0 and 2.
+    assert [(record["rows"], record["width"], record["height"]) for record in records[1:]] == [(333, 144, 96)] * 2
+    for record in records:
+        assert record["failed"] is None
+        assert record["pairs"] > 0
+        assert [record[name] for name in ("kernels", "launches", "waits", "tiles")] == [None] * 4  # of a device
 
 
 def test_a_drive_is_made_up_beside_the_records(handed, tmp_path):

@@ -117,6 +117,10 @@ def test_numbers_out_of_their_limits_are_found_before_torch_is_imported(override
     assert config_problem(composed([override])) == problem  # of a job of a sweep
 
 
+def test_a_folder_that_would_lead_nowhere_is_refused():
+    assert "give out=DIR" in there(override_problem(["folder=outputs/mine"]))
+
+
 def test_the_first_checks_import_no_torch():
     code = (
         "import sys; from sparsestreet.cli.train import train; status = train(['schedule.max_steps=0'])\n"
@@ -193,7 +197,9 @@ def test_a_gpu_that_is_not_there(monkeypatch):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert "trainer=gpu needs a CUDA device" in there(config_problem(composed(["trainer=gpu"])))
+    assert "trainer=gpu needs a CUDA device and torch sees none: sparsestreet check says why" in there(
+        config_problem(composed(["trainer=gpu"]))
+    )
 
 
 def folder_of_the_log(run: Path, started: Path, *overrides: str) -> Path:

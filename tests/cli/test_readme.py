@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.cli import COMMANDS
-from sparsestreet.cli.compose import override_problem
 from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.conftest import unchecked
 
@@ -39,16 +37,3 @@ def test_the_lines_of_python_train_a_street(tiny_street, tmp_path, monkeypatch, 
     assert 5 < float(psnr) < 40
     assert gaussians.startswith("{'background': 5000, 'rigid': ")
     assert (tmp_path / "outputs" / "mine" / "scene.safetensors").is_file()
-
-
-@pytest.mark.lengthy
-def test_every_command_line_is_one_that_is_understood():
-    lines = re.findall(r"^\.venv/bin/sparsestreet (.*?)(?:\s+#.*)?$", README, flags=re.M)
-    assert len(lines) > 10
-    for line in lines:
-        command, *words = line.split()
-        assert command in COMMANDS
-        # The command puts the reader that it finds in the place of auto.
-        words = ["data=drivestudio" if word == "data=auto" else word for word in words]
-        if command == "train" and "resume=RUN" not in words:
-            assert override_problem(words) is None, line

@@ -1,14 +1,18 @@
 """``sparsestreet render`` on a hand-made scene; the run of a real training is rendered in test_train."""
 
 import json
+import re
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra.utils import instantiate
 from PIL import Image
 
 from sparsestreet.cli import scene
+from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.render import USAGE, RenderRequest, render
 from sparsestreet.export import rig, video
 from sparsestreet.export.layers import LAYERS, layer_values
@@ -17,6 +21,7 @@ from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
+from tests.typed import there
 
 
 @pytest.fixture
@@ -120,7 +125,8 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
         ({"path": "circle"}, 2, "or a .json, got 'circle'"),
         ({"path": "a.json", "frames": "0:2"}, 2, "frames= chooses of the log's"),
         ({"path": "a.json"}, 1, "there is no path at a.json"),
-        ({"layers": "rgb,lidar"}, 2, "layers are rgb, depth, alpha, nodes, instances, each once"),
+        ({"layers": "rgb,radar"}, 2, "layers are rgb, depth, alpha, nodes, instances, lidar, each once"),
+        ({"layers": "rgb,lidar"}, 1, "the layer lidar needs the log that the scene was trained on"),
         ({"layers": "rgb,rgb"}, 2, "each once, got rgb, rgb"),
         ({"fov": 180}, 2, "fov lies between 0 and 180 degrees"),
         ({"height": 0}, 2, "height must be above 0"),
@@ -142,6 +148,27 @@ def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, sa
     assert said in error
     assert len(error.strip().splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+@pytest.mark.lengthy
+def test_the_lidar_of_the_log_that_trained_the_run(finished, tmp_path, capsys):
+    """Returns of the recorded depth images, which the reader made of the same sweeps in its own way."""
+    words = [str(finished), str(tmp_path / "out"), "layers=[lidar]", "frames=2:3", "cameras=0"]
+    assert render(words) == 0, capsys.readouterr().err
+    (found,) = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "out" / "lidar").iterdir())]
+    log = instantiate(load_run_config(finished).data.log, _convert_="all").read()
+    (frame,) = [frame for frame in log.frames if frame.indices == (2, 0)]
+    assert np.count_nonzero(found) > 50
+    np.testing.assert_allclose(found / 1000, there(frame.depth).clamp(max=65.535).numpy(), atol=0.00051)
+
+
+def test_the_lidar_of_another_log_is_refused(finished, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    description = run / "run.json"
+    description.write_text(re.sub(r'"data_hash": "\w{8}', '"data_hash": "00000000', description.read_text()))
+    assert render([str(run), str(tmp_path / "out"), "layers=[lidar]"]) == 1
+    assert "the log is not the one that" in capsys.readouterr().err
 
 
 def test_a_place_that_cannot_be_written_is_found_before_the_first_frame(run, tmp_path, monkeypatch, capsys):

@@ -17,7 +17,7 @@ from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect, figures, figures_time
 from sparsestreet.report.arms import arms
-from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, marker, panels, pareto, short
+from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, marker, panels, pareto, short, write_svg
 from sparsestreet.report.figures_time import (
     _counts,
     _frame_costs,
@@ -144,7 +144,7 @@ def test_every_run_has_a_line(tmp_path, monkeypatch):
         HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(10.0, 9, 20.0, None, None)])
         runs.append(record(make_summary("plain"), str(tmp_path / name)))
     drawn = []
-    monkeypatch.setattr(figures_time, "write_svg", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(figures_time, "write_svg", lambda figure, path, says=None: drawn.append(figure))
     assert held_out_over_time(arms(runs), tmp_path / "some.svg")
     assert len(drawn[0].axes[0].get_lines()) == 2
 
@@ -168,7 +168,7 @@ def canvas(monkeypatch):
     """The figures that would have been written, by the name of their file."""
     drawn = {}
     for module in (figures, figures_time):
-        monkeypatch.setattr(module, "write_svg", lambda figure, path: drawn.update({path.name: figure}))
+        monkeypatch.setattr(module, "write_svg", lambda figure, path, says=None: drawn.update({path.name: figure}))
     return drawn
 
 
@@ -345,3 +345,22 @@ def test_panels_are_as_large_as_they_are_asked_to_be(canvas, tmp_path):
         update_costs(tmp_path / name, nodes={"road": NodeCost(10, 0.1, 4.0, 3.0)})
     frame_waterfall(arms([record(make_summary(name), str(tmp_path / name)) for name in "ab"]), tmp_path / "w.svg")
     assert canvas["w.svg"].get_size_inches().tolist() == pytest.approx([7.4, 1.1 + 0.34 * 2])
+
+
+def test_marks_say_what_they_are(found, tmp_path):
+    """Three streets: a run each, and a mean, in the order in which they are drawn; names of groups are not left."""
+    assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "a.svg")
+    text = (tmp_path / "a.svg").read_text()
+    said = re.findall(r"<use [^>]*><title>([^<]+)</title></use>", text)
+    assert said[:3] == [
+        f"streetgs, street {seed}, seed {seed}: {25 + seed}.000 dB, 10,000 Gaussians" for seed in range(3)
+    ]
+    assert said.count("streetgs, mean: 26.000 dB, 10,000 Gaussians") == 1
+    assert len(said) == 4 * 3 * 2  # three runs and a mean of three arms, in two panels
+    assert ' runs"' not in text
+    figure, (axes,) = panels(1)
+    axes.scatter([1.0], [2.0], gid="one")
+    with pytest.raises(ValueError, match="1 marks in 'one', and 2 texts"):
+        write_svg(figure, tmp_path / "b.svg", {"one": ["a <b>", "c"]})
+    write_svg(figure, tmp_path / "b.svg", {"one": ["a <b>"]})
+    assert "<title>a &lt;b&gt;</title>" in (tmp_path / "b.svg").read_text()

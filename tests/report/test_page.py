@@ -55,6 +55,48 @@ def test_a_failed_folder_with_an_old_record_is_no_run(tmp_path):
     assert "streetgs+removal_seed0" not in text
 
 
+def test_it_says_what_follows_from_it(page):
+    """-0.2, -0.3, -0.4 dB of three streets, a quarter of the Gaussians."""
+    (verdict,) = re.findall(r"<section id='verdict'>(.*?)</section>", page.read_text())
+    assert "streetgs: the smallest within 0.3 dB is streetgs+removal, with 25 % of the Gaussians, -0.30 dB" in verdict
+
+
+@pytest.mark.slow
+def test_tables_are_sorted_and_marks_speak(page):
+    from tests.browser import browser
+
+    def column(index: int) -> list[str]:
+        cells = f"[...document.querySelectorAll('#costs tbody tr')].map((row) => row.cells[{index}].textContent)"
+        return shown.run(f"JSON.stringify({cells})")
+
+    with browser() as shown:
+        shown.open(f"file://{page}", 1280, 900)
+        shown.wait("document.readyState === 'complete'")
+        was = column(0)
+        click = "document.querySelectorAll('#costs thead tr:last-child [role=button]')[2].click()"
+        shown.run(click)
+        assert column(2) == '["10,000","2,510","2,510"]'
+        assert shown.run("document.querySelector('#costs [aria-sort=descending]').textContent") == "Gaussians"
+        shown.run(click)
+        assert column(2) == '["2,510","2,510","10,000"]'
+        shown.run(click)
+        assert column(0) == was
+        shown.run("document.querySelector('figure').scrollIntoView()")
+        mark = "document.querySelector('figure use > title').parentNode.getBoundingClientRect()"
+        at = shown.run(f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])({mark})")
+        shown.call("Input.dispatchMouseEvent", type="mouseMoved", x=at[0] + 5, y=at[1] + 5)
+        shown.wait("!document.getElementById('says').hidden")
+        assert shown.run("document.getElementById('says').textContent").startswith(
+            "streetgs, street 0, seed 0: 25.000 dB"
+        )
+        # On paper nothing is cut off at the right, and what only the screen can do is gone.
+        shown.call("Emulation.setEmulatedMedia", media="print")
+        shown.call("Emulation.setDeviceMetricsOverride", width=1047, height=740, deviceScaleFactor=1, mobile=False)
+        assert shown.run("document.documentElement.scrollWidth") <= 1047
+        assert shown.run("getComputedStyle(document.querySelector('.compare .choice')).display") == "none"
+        assert [one for one in shown.requests if not one.startswith(("file:", "data:"))] == []
+
+
 @pytest.mark.lengthy
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open the page with: apt-get install chromium")
 def test_it_works_in_a_browser(page, tmp_path):

@@ -125,6 +125,26 @@ def test_a_number_leads_to_its_runs():
     assert "What numbers are of" not in whole(grids=[replace(grid, rows=grid.rows[1:])])
 
 
+def test_an_exact_number_stands_behind_the_rounded_one():
+    text = whole(grids=[Grid("a", "A", (("", "x"), ("", "y")), ((Cell("1.2", exact="1.2345 <"), Cell("2")),), ())])
+    assert "<tr><td title='1.2345 &lt;'>1.2</td><td>2</td></tr>" in text
+
+
+def test_columns_without_any_published_number_are_left_out():
+    header = (("", "arm"), ("of", "x"), ("of", "x, paper"), ("of", "y"), ("of", "y, paper"))
+    rows = ((Cell("a"), Cell("1"), Cell(), Cell(), Cell("7", published=True)), (Cell("b"), *[Cell()] * 4))
+    text = whole(grids=[Grid("a", "A", header, rows, ())])
+    assert re.findall(r"<th[^>]*>([^<]+)</th>", text) == ["of", "arm", "x", "y", "y, paper"]
+    assert "<th class='above' colspan='3'>of</th>" in text
+    assert "<tr><td>a</td><td>1</td><td>-</td><td class=theirs>7</td></tr>" in text
+
+
+def test_the_verdict_comes_first_and_only_if_there_is_one():
+    text = whole(verdict=("<this> arm.", "And so on."))
+    assert "<section id='verdict'><p>&lt;this&gt; arm.</p><p>And so on.</p></section>\n<nav>" in text
+    assert "id='verdict'" not in whole()
+
+
 def test_the_navigation_names_what_is_there():
     def links(text):
         return re.findall(r"<a href='#([^']+)'>([^<]+)</a>", re.findall(r"<nav>(.*?)</nav>", text)[0])

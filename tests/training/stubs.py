@@ -155,6 +155,7 @@ class StubTrainer(Trainer):
 
     # In place of Lightning's properties.
     global_step: int = 0
+    current_epoch: int = 0
     max_steps: int = 0
     log_every_n_steps: int = 1
     optimizers: Sequence[torch.optim.Optimizer] = ()
@@ -167,7 +168,6 @@ class StubTrainer(Trainer):
     accumulate_grad_batches: int = 1
     strategy: Any = SimpleNamespace(broadcast=lambda value: value)
     loggers: Sequence[Any] = ()
-    fit_loop: Any = SimpleNamespace(_data_fetcher=None)  # nothing is validated
 
     def __init__(
         self,
@@ -190,9 +190,15 @@ class StubTrainer(Trainer):
             callback.setup(self, system, "fit")
 
     @property
+    def fit_loop(self) -> SimpleNamespace:
+        """Nothing is validated, and every batch was a step."""
+        return SimpleNamespace(_data_fetcher=None, epoch_loop=SimpleNamespace(_batches_that_stepped=self.global_step))
+
+    @property
     def _logger_connector(self) -> SimpleNamespace:
         every = self.log_every_n_steps
-        return SimpleNamespace(should_update_logs=every > 0 and (self.global_step + 1) % every == 0)
+        logs = every > 0 and (self.global_step + 1) % every == 0
+        return SimpleNamespace(should_update_logs=logs, log_metrics=self._log_metrics)
 
     def start(self) -> None:
         for callback in self.callbacks:
@@ -229,10 +235,16 @@ class StubTrainer(Trainer):
         self.global_step += 1
         for callback in self.callbacks:
             callback.on_train_batch_end(self, self.system, None, frame, 0)
+        if frame is not None:
+            self.system.on_train_batch_end(None, frame, 0)
 
     def _log(self, name: str, value: Any, *places: Any, **how: Any) -> None:
         self.log_calls.append((name, float(value), how))
         self.callback_metrics[name] = torch.as_tensor(float(value))
+
+    def _log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
+        """What the loggers of Lightning's trainer get."""
+        self.log_calls += [(name, value, {"step": step}) for name, value in metrics.items()]
 
     def _log_dict(self, dictionary: Any, *places: Any, **how: Any) -> None:
         for name, value in dictionary.items():

@@ -1,93 +1,226 @@
-"""A step must not wait for its device between the wait of the splat op and its end.
+"""A training step waits for its device once a rendering, for the number of pairs; where it waits again is listed here.
 
-Tensors on the device "meta" have no numbers: whatever would wait for one of them (``item``, a condition, picking by a
-mask) is an error there.
+The steps are whole: the scene, the op's host side, losses, regularizers, logging, backward, statistics, optimizer.
 """
 
-from collections.abc import Callable
-from contextlib import nullcontext
+import csv
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.accelerators.cpu import CPUAccelerator
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor
 
-from sparsestreet.scene.density import DensityStatistics
-from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.masks import StaticMaskSettings
-from sparsestreet.scene.rendering import SceneRendering
-from sparsestreet.scene.state import SceneState
+from sparsestreet.data.device import to_device
+from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.density.vibrating import VibratingDensity
+from sparsestreet.scene.effects import (
+    Affine,
+    AffineSettings,
+    CameraPoses,
+    CameraPosesSettings,
+    Effect,
+    Exposure,
+    ExposureSettings,
+    Sky,
+    SkySettings,
+)
+from sparsestreet.scene.effects.recorded_poses import RecordedPoses
+from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import StaticMaskSettings, TemporalMaskSettings
+from sparsestreet.scene.nodes import Node
 from sparsestreet.training import losses
-from sparsestreet.training.losses import Loss, dynamic_region
-from sparsestreet.types import Frame, Rendering
-from tests.training.stubs import StubTrainer, background, frame_at, make_system, no_gaussians, rigid
+from sparsestreet.training.callbacks import DensityControl
+from sparsestreet.training.losses import MaskSparsity, Photometric
+from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
+from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.schedule import Interval
+from sparsestreet.training.system import StreetSystem
+from sparsestreet.types import Frame, Shutter
+from tests.scene.nodes.test_deformable import objects
+from tests.scene.nodes.test_field import street as field
+from tests.scene.nodes.test_vibrating import vibrating
+from tests.scene.people import smpl, walker
+from tests.scene.street import POSE_RATES, RATES
+from tests.training.moved_views.test_term import street, wall
+from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system, rigid
+from tests.training.waiting import META, SPLAT, Waits, pretended, waits
 
-META = torch.device("meta")
 SIZE = (16, 32)
-LOSSES = [getattr(losses, name) for name in losses.__all__ if name != "Loss"]
+RATE = LearningRate(0.01)
+ALL_LOSSES = {name: getattr(losses, name)() for name in losses.__all__ if name != "Loss"}
+
+__all__ = ["pretended"]  # a fixture
 
 
-@pytest.fixture(autouse=True)
-def no_autocast(monkeypatch):
-    """Which does not know the device."""
-    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
+def masked(weight: float = 1.0) -> dict[str, Node]:
+    mask = {"mask": StaticMaskSettings(weight), "min_gaussians": 8}
+    return {"background": background(20, **mask), "rigid": rigid(10, **mask)}
 
 
-def splats(rows: int) -> Rendering:
-    rgb, radii = torch.empty(*SIZE, 3, device=META, requires_grad=True), torch.empty(rows, device=META)
-    return Rendering(rgb, rgb.sum(-1), rgb.sum(-1), radii, torch.empty(rows, 2, device=META))
+def nodes(sharp_shape: float = 0.0) -> dict[str, Node]:
+    shared = {"density": GradientDensity(), "sharp_shape": sharp_shape}
+    return {"background": background(20, **shared), "rigid": rigid(10, **shared)}
 
 
-def scene() -> SceneGraph:
-    weights = {"sharp_shape": 1.0, "mask": StaticMaskSettings(1.0)}
-    return SceneGraph({"background": background(6, **weights), "rigid": rigid(4, temporal_smooth=1.0, **weights)})
+def poses() -> CameraPoses:
+    recorded = RecordedPoses([(0, 0), (1, 0)], [0.0, 0.25], torch.eye(4).repeat(2, 1, 1))
+    settings = CameraPosesSettings(learning_rates={"translations": RATE, "rotations": RATE}, weight=1.0)
+    return CameraPoses(settings, recorded, torch.zeros(2, 6), torch.ones(2))
 
 
-def given() -> tuple[SceneRendering, Frame, SceneGraph]:
-    """A rendering and its frame on a device, and the scene there; cameras stay on the host."""
-    frame = frame_at(depth=torch.ones(SIZE), sky=torch.zeros(SIZE, dtype=torch.bool))
-    known = {name: getattr(frame, name).to(META) for name in ("image", "depth", "sky")}
-    placed = scene().to(META)
-    spans = {"background": slice(0, 6), "rigid": slice(6, 10)}
-    state = SceneState(0.9, 3, training=True)
-    parts = {name: node.raw_at(frame, state) for name, node in placed.nodes.items()}
-    drawn = splats(10)
-    rendering = SceneRendering(drawn.rgb, drawn.alpha, drawn.depth, drawn, spans, parts, no_gaussians(), state)
-    return rendering, replace(frame, **known), placed
+def seen_through(**effects: Effect) -> StreetSystem:
+    return make_system(nodes(), effects=effects)
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_no_loss_waits(loss: Callable[[], Loss], monkeypatch):
-    monkeypatch.setattr(dynamic_region, "splat", lambda gaussians, *_, **__: splats(len(gaussians)))
-    term = loss()(*given())
-    assert term.device == META
-    assert term.requires_grad
-    term.backward()
+CASES: Mapping[str, tuple[Callable[[], StreetSystem], list[str]]] = {
+    "plain": (lambda: make_system(nodes()), [SPLAT]),
+    "regularizers": (lambda: make_system(nodes(sharp_shape=1.0)), [SPLAT]),
+    "masks with K_min": (
+        lambda: make_system(masked(), {"photometric": Photometric(), "sparsity": MaskSparsity()}),
+        [SPLAT],
+    ),
+    "rows that were seen": (lambda: make_system(nodes(), optimizer=OptimizerSettings(visible_only=True)), [SPLAT]),
+    "sky": (lambda: seen_through(sky=Sky(SkySettings(resolution=4))), [SPLAT]),
+    "affine": (lambda: seen_through(affine=Affine(AffineSettings(weight=1.0, decay=1.0))), [SPLAT]),
+    "exposure": (
+        lambda: seen_through(exposure=Exposure(ExposureSettings(level=1.0, smooth=1.0), {0: [0.0, 0.25, 0.5]})),
+        [SPLAT],
+    ),
+    "deformable": (lambda: make_system({"objects": objects()}), [SPLAT]),
+    "vibrating": (lambda: make_system({"street": vibrating(density=VibratingDensity())}), [SPLAT]),
+    "people": (lambda: make_system({"people": smpl(walker())}), [SPLAT]),
+    "field": (lambda: make_system({"field": field(reach=None, deform_from=0.0)}), [SPLAT]),
+    # The network is most of the step, and rows that are not near would cost more than a look at their number.
+    "field with reach": (
+        lambda: make_system({"field": field(deform_from=0.0)}),
+        ["scene/nodes/field.py:_near: nonzero", SPLAT],
+    ),
+    # The camera is read on the host, and follows from what the optimizer wrote last.
+    "camera poses": (
+        lambda: seen_through(poses=poses()),
+        ["scene/effects/camera_poses.py:corrections: copy to the host", SPLAT],
+    ),
+    # Objects are rendered once more, alone.
+    "all losses": (lambda: make_system(masked(), ALL_LOSSES), [SPLAT, SPLAT]),
+    "moved views": (
+        lambda: make_system(nodes(), moved_views=MovedViewTerm(MovedViews(every=1), street(wall(4.0)), seed=7)),
+        [SPLAT, SPLAT],
+    ),
+}
 
 
-def test_no_regularizer_waits():
-    rendering, frame, placed = given()
-    terms = placed.regularizers(frame, rendering.parts, rendering.drawn, rendering.state)
-    assert set(terms) == {"background/sharp_shape", "rigid/sharp_shape", "rigid/temporal_smooth"}
-    assert all(term.device == META for term in terms.values())
+def frame_with(**changes: Any) -> Frame:
+    return frame_at(1, depth=torch.ones(SIZE), sky=torch.zeros(SIZE, dtype=torch.bool), **changes)
 
 
-def test_logging_does_not_wait(monkeypatch):
-    rendering, frame, _ = given()
-    system = StubTrainer(make_system({"background": background(3)})).system
-    logged: dict[str, Any] = {}
-    monkeypatch.setattr(system, "log", lambda name, value, **how: logged.update({name: value}))
-    monkeypatch.setattr(system, "log_dict", lambda values, **how: logged.update(values))
-    for _ in range(3):
-        system._log_training(rendering, {"depth": rendering.depth.mean()}, frame)
-    tensors = {name: value.device for name, value in logged.items() if isinstance(value, Tensor)}
-    assert tensors == {"psnr": META, "train/depth": META}
-    assert logged["gaussians"] == 3
+def places_of_a_step(system: StreetSystem, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Where the second step waits: the first makes tables that stay."""
+    every = Interval(0.0, 1.0, 100)
+    trainer = StubTrainer(system.to(META), [DensityControl(every, 1.0, Interval(0.0, 1.0, 1000))], max_steps=12)
+    trainer.global_step = 9
+    with waits(monkeypatch) as found:
+        frame = to_device(frame, META)
+        trainer.start()
+        trainer.train(1, frame)
+        found.places.clear()
+        trainer.train(1, frame)
+    assert [how["step"] for name, _, how in trainer.log_calls if name == "psnr"] == [9]
+    assert system.screen_gradients == any(node.settings.density for node in system.scene.nodes.values())
+    return found.places
 
 
-def test_density_statistics_do_not_wait():
-    statistics = DensityStatistics(10, META, watched=["size"])
-    seen = splats(10)
-    statistics.add(seen.screen_offsets, seen.radii, *SIZE, {"size": torch.empty(10, device=META)})
-    assert statistics.visits.device == META
+@pytest.mark.parametrize("case", CASES)
+def test_a_step_waits_once_a_rendering(case: str, pretended: None, monkeypatch: pytest.MonkeyPatch):
+    make, expected = CASES[case]
+    assert places_of_a_step(make(), frame_with(), monkeypatch) == expected
+
+
+@pytest.mark.parametrize("case", ["lens", "shutter", "hood"])
+def test_cameras_and_masks_of_the_car_wait_for_nothing(case: str, pretended: None, monkeypatch: pytest.MonkeyPatch):
+    frame = frame_with()
+    if case == "hood":
+        frame = replace(frame, ego=torch.ones(SIZE, dtype=torch.bool))
+    elif case == "lens":
+        frame = replace(frame, camera=replace(frame.camera, distortion=torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0])))
+    else:
+        shutter = Shutter(torch.ones(3), torch.zeros(3), seconds=0.1, span=0.1)
+        frame = replace(frame, camera=replace(frame.camera, shutter=shutter))
+    system = make_system(nodes(), effects={"sky": Sky(SkySettings(resolution=4))})
+    assert places_of_a_step(system, frame, monkeypatch) == [SPLAT]
+
+
+def test_a_mask_over_time_does_not_wait(pretended: None, monkeypatch: pytest.MonkeyPatch):
+    learned = {"mask_features": RATE, "mask": RATE, "joint_deltas": RATE, **RATES, **POSE_RATES}
+    mask = {"mask": TemporalMaskSettings(1.0), "masked": True, "learning_rates": learned}
+    system = make_system({"people": smpl(walker(), **mask)}, {"sparsity": MaskSparsity()})
+    assert places_of_a_step(system, frame_with(), monkeypatch) == [SPLAT]
+
+
+@pytest.mark.filterwarnings("ignore")  # of an epoch of one frame, and workers
+def test_lightning_and_its_loggers_add_no_wait(pretended: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Its own loop on the pretended device, which validates nothing; two of seven steps log."""
+    monkeypatch.setattr(CPUAccelerator, "setup_device", lambda self, device: None)
+    monkeypatch.setattr("lightning.pytorch.loops.fit_loop.has_len_all_ranks", lambda *_, **__: True)
+    strategy = SingleDeviceStrategy(device=META, accelerator=CPUAccelerator())
+    settings: dict[str, Any] = {"logger": CSVLogger(tmp_path, "", ""), "log_every_n_steps": 3, "accelerator": "auto"}
+    with waits(monkeypatch) as found:
+        ends = Ends(found)
+        fit(make_system(nodes()), [ends], 7, to_device(frame_with(), META), strategy=strategy, **settings)
+    assert ends.places == [[SPLAT]] * 7
+    rows = list(csv.DictReader((tmp_path / "metrics.csv").open()))
+    assert [(row["step"], row["gaussians"]) for row in rows] == [("2", "30.0"), ("5", "30.0")]
+
+
+class Ends(Callback):
+    """Where each step has waited, from the end of the one before."""
+
+    def __init__(self, waits: Waits) -> None:
+        self.waits, self.places = waits, []
+
+    def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
+        self.waits.places.clear()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: StreetSystem, *step: Any) -> None:
+        self.places.append(self.waits.places.copy())
+        self.waits.places.clear()
+
+
+@pytest.mark.parametrize(
+    ("waiting", "done"),
+    [
+        ("_local_scalar_dense", lambda values: values[0].item()),
+        ("_local_scalar_dense", lambda values: bool(values.sum() > 0)),
+        ("nonzero", lambda values: (values > 0).nonzero()),
+        ("nonzero", lambda values: torch.where(values > 0)),
+        ("index by a mask", lambda values: values[values > 0]),
+        ("index by a mask", lambda values: values.index_put_((values > 0,), values)),
+        ("index of the host", lambda values: values[torch.tensor([0, 1])]),
+        ("index of the host", lambda values: values[[0, 1]]),
+        ("copy to the host", lambda values: values.cpu()),
+        ("copy to the host", lambda values: torch.zeros(3).copy_(values)),
+        ("copy to the device", lambda values: torch.ones(3).to(values)),
+        ("copy to the device", lambda values: values.copy_(torch.ones(3))),
+        ("copy to the device", lambda values: torch.tensor([1.0], device=META)),
+        ("copy to the device", lambda values: values.new_tensor([1.0])),
+        ("_unique2", lambda values: values.unique()),
+        ("equal", lambda values: torch.equal(values, values)),
+        (None, lambda values: values.masked_fill_(values > 0, 0.0)),
+        (None, lambda values: torch.ones(3).to(values, non_blocking=True)),
+        (None, lambda values: values.copy_(torch.ones(3), non_blocking=True)),
+        (None, lambda values: torch.where(values > 0, values, 1.0) + torch.tensor(2.0)),
+        (None, lambda values: torch.zeros(3, device=META).index_add(0, values.long(), values).cumsum(0).sort()),
+        (None, lambda values: torch.ones(3).nonzero()),
+    ],
+)
+def test_what_would_wait_is_noted(waiting: str | None, done: Callable[[Tensor], Any], monkeypatch: pytest.MonkeyPatch):
+    values = torch.empty(3, device=META)
+    with waits(monkeypatch) as found:
+        done(values)
+    assert [place.split(": ")[-1] for place in found.places] == ([] if waiting is None else [waiting])

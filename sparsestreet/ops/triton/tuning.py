@@ -1,7 +1,7 @@
 """What only a device can decide: where long tiles are split, and which variant of a pixel kernel runs.
 
 Every choice draws the same image and the same gradients, up to rounding where a field says so. The defaults come from a
-model of the device (tests/ops/triton/device_model.py) and from machine code. **None has been measured.**
+model of the device (tests/ops/triton/device_model.py) and from machine code. **No choice has been measured.**
 """
 
 from collections.abc import Iterator

@@ -62,7 +62,7 @@ class Affine(Effect):
 
     def matrix(self) -> Float[Tensor, "3 3"]:
         """Returns A."""
-        return self.deltas[:, :3] + torch.eye(3).to(self.deltas)
+        return self.deltas[:, :3] + torch.eye(3, dtype=self.deltas.dtype, device=self.deltas.device)
 
     def image(
         self, rgb: Float[Tensor, "h w 3"], splats: Rendering, view: View, options: RenderOptions

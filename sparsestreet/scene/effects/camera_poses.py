@@ -145,12 +145,18 @@ class CameraPoses(Effect):
         self.register_buffer("poses", recorded.poses)
         self.register_buffer("start", start)
         self.register_buffer("expected", expected)
+        self._newest: tuple[int, Tensor] | None = None
+        """Place and pose of the training image that was corrected last: to ask again would wait for a GPU."""
 
     def view(self, view: View, state: SceneState) -> View:
         place = self.recorded.place(view)
         if place is not None:
             as_recorded = torch.equal(self.recorded.poses[place], view.camera.camera_from_world)
-            return replace(view, camera=self._corrected(place, view.camera)) if as_recorded else view
+            if not as_recorded:
+                return view
+            camera = self._corrected(place, view.camera)
+            self._newest = place, camera.camera_from_world
+            return replace(view, camera=camera)
         if view.frame_index is None:
             return view
         predicted = self.recorded.predicted(view, self.corrections())
@@ -162,13 +168,19 @@ class CameraPoses(Effect):
             return gaussians
         recorded = self.recorded.poses[place]
         as_recorded = replace(view.camera, camera_from_world=recorded)
-        if not torch.equal(self._corrected(place, as_recorded).camera_from_world, view.camera.camera_from_world):
+        if self._newest is None or self._newest[0] != place:
+            self._newest = place, self._corrected(place, as_recorded).camera_from_world
+        if not torch.equal(self._newest[1], view.camera.camera_from_world):
             return gaussians
         correction = self._correction()[place]
         motion = torch.cat((quat.to_matrix(quat.from_rotation_vector(correction[3:])), correction[:3, None]), 1)
         center = exact_position(as_recorded)
         means, quaternions = _SeenRigidly.apply(
-            gaussians.means, gaussians.quaternions, motion, recorded[:, :3].to(motion), center.to(motion)
+            gaussians.means,
+            gaussians.quaternions,
+            motion,
+            recorded[:, :3].to(motion, non_blocking=True),
+            center.to(motion, non_blocking=True),
         )
         return replace(gaussians, means=means, quaternions=quaternions)
 

@@ -23,8 +23,9 @@ class Mask(nn.Module, ABC):
     """Names of the mask's columns; they are dropped when mask training ends."""
     sparsity_weight: float
     """lambda_n of the paper."""
-    floor_firings: int = 0
-    """Number of times that K_min kept rows open below the threshold, since the count was last read."""
+    floor_firings: int | Tensor = 0
+    """Number of times that K_min kept rows open below the threshold, since the count was last read; a tensor where
+    counting is left to a device."""
 
     def at_image(self, number: int) -> None:
         """Go to the training image with this number, where steps take several images: their draws follow from it."""

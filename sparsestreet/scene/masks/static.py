@@ -80,16 +80,34 @@ class StaticMask(Mask):
         """Returns no mask: M = 1 for all rows that stayed."""
         return None, {}
 
-    def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float:
+    def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float | Float[Tensor, ""]:
         """Returns the threshold, lowered if needed so that K_min (or all) rows pass; ties all pass."""
-        rows, threshold = scores.shape[0], self.settings.threshold
-        floor = min(self.min_gaussians, rows)
-        if floor == 0 or int((scores > threshold).sum()) >= floor:
+        threshold, floor = self.settings.threshold, min(self.min_gaussians, len(scores))
+        if floor == 0:
             return threshold
-        self.floor_firings += 1
-        lowest_kept = scores.kthvalue(rows - floor + 1).values
-        # One step below the lowest score that must pass, since the comparison is strict.
-        return float(torch.nextafter(lowest_kept, torch.full_like(lowest_kept, -1.0)))
+        # A look at the number of rows that pass saves the sort, but would wait for a GPU.
+        if scores.device.type == "cpu" and int((scores > threshold).sum()) >= floor:
+            return threshold
+        lowered, fires = lowered_threshold(scores, threshold, floor)
+        self.floor_firings = self.floor_firings + fires
+        return lowered
+
+
+def lowered_threshold(
+    scores: Float[Tensor, " n"], threshold: float, floor: int
+) -> tuple[Float[Tensor, ""], Bool[Tensor, ""]]:
+    """The threshold, lowered if needed so that ``floor`` of the scores, 1 to n, pass; and whether it is lower.
+
+    Never waits for a GPU.
+
+    >>> scores = torch.tensor([0.5, 0.25, 0.75])
+    >>> [float(lowered_threshold(scores, 0.6, floor)[0]) < 0.25 for floor in (1, 2, 3)]
+    [False, False, True]
+    """
+    lowest_kept = scores.topk(floor, sorted=False).values.amin()
+    # One step below the lowest score that must pass, since the comparison is strict.
+    lowered = torch.nextafter(lowest_kept, torch.full_like(lowest_kept, -1.0))
+    return lowered.clamp(max=threshold), lowest_kept <= threshold
 
 
 def straight_through(scores: Float[Tensor, " n"], threshold: float | Float[Tensor, ""]) -> Float[Tensor, " n"]:

@@ -44,11 +44,12 @@ class MaskTraining(Callback):
     def _remove(self, trainer: Trainer, system: StreetSystem, name: str, mask: Mask) -> None:
         node = system.scene.nodes[name]
         selection = mask.keep(node.rows)
-        if selection.floor_hit or mask.floor_firings:
+        firings = int(mask.floor_firings)
+        if selection.floor_hit or firings:
             log.info(
                 "step %d: the floor of %d Gaussians (K_min) of node %r held in %d steps since the last removal: "
                 "masks of the best rows stay open",
-                trainer.global_step, node.settings.min_gaussians, name, mask.floor_firings,
+                trainer.global_step, node.settings.min_gaussians, name, firings,
             )  # fmt: skip
             mask.floor_firings = 0
         if selection.removed:

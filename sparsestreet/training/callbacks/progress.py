@@ -25,6 +25,8 @@ class TrainingProgress(Callback):
         self._bar: Progress | None = None
         self._task = TaskID(0)
         self._since = (0, 0.0)
+        self._held_out: float | None = None
+        """PSNR, dB."""
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._since = (trainer.global_step, time.perf_counter())
@@ -46,6 +48,11 @@ class TrainingProgress(Callback):
             self._bar.update(self._task, completed=step, total=trainer.max_steps, description=text)
         else:
             log.info("step %d of %d: %s", step, trainer.max_steps, text)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: StreetSystem) -> None:
+        # Read once, since reading waits for a GPU.
+        psnr = trainer.callback_metrics.get("val/psnr")
+        self._held_out = None if psnr is None else float(psnr)
 
     def teardown(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         self._stop()
@@ -70,8 +77,8 @@ class TrainingProgress(Callback):
         now = time.perf_counter()
         self._since = (trainer.global_step, now)
         parts = [f"{(trainer.global_step - first) / max(now - then, 1e-9):.1f} steps/s"]
-        metrics = trainer.callback_metrics
-        parts += [f"{label} {float(metrics[key]):.2f} dB" for key, label in LABELS.items() if key in metrics]
+        known = {"train": system.said.newest.get("psnr"), "held out": self._held_out}
+        parts += [f"{label} {psnr:.2f} dB" for label, psnr in known.items() if psnr is not None]
         parts += [f"{name} {rows:,}" for name, rows in system.scene.counts().items()]
         return ", ".join(parts)
 
@@ -79,6 +86,3 @@ class TrainingProgress(Callback):
 def last_part(progress: float) -> int:
     """Which of the run's ``LINES`` parts is done."""
     return int(progress * LINES + ROUNDING)
-
-
-LABELS = {"psnr": "train", "val/psnr": "held out"}

@@ -72,7 +72,7 @@ class MovedViewTerm:
         sampled = replace(rendering.options.settings, eps2d=rendering.options.settings.eps2d / settings.divisor**2)
         seen = from_another_camera(scene, rendering, view, replace(rendering.options, settings=sampled))
         device = seen.depth.device
-        depth, color, weight = (each.to(device) for each in (found.depth, found.color, found.weight))
+        depth, color, weight = (each.to(device, non_blocking=True) for each in (found.depth, found.color, found.weight))
         known = (weight > 0) & (seen.depth.detach() > NEAREST)
         weight = torch.where(known, weight, 0.0) / weight.numel()
         inverse = 1 / torch.where(known, seen.depth, 1.0) - 1 / torch.where(known, depth, 1.0)

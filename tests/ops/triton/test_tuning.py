@@ -1,4 +1,6 @@
-"""Every choice of the pixel kernels draws the same bits and the same slots, and reads nothing that is not written."""
+"""Every choice of the pixel kernels draws the same bits and the same slots, and reads nothing that is not written.
+
+On a device up to rounding."""
 
 from dataclasses import replace
 
@@ -63,7 +65,6 @@ def drawn(screen: Screen, view: KernelView, choices: Tuning, cotangents: dict[st
         sums = slots.new_zeros(len(screen.records), slots.shape[1])
         rasterizer._sum_slots(slots, screen.lists, sums, 16, tl.float32, walked)
     if walked is not None:
-        print(walked.sum(), len(walked))
         assert torch.equal(slots.isfinite().all(1), walked.bool())
         slots = torch.where(walked[:, None] != 0, slots, 0.0)
     assert layers.ends.lasts is not None
@@ -83,11 +84,12 @@ def test_every_choice_draws_the_same_bits(case, poisoned):
         assert (screen.lists.ends - screen.lists.begins).tolist() == [10, 11, 6, 3]
         # The first tile's pixels end in its first part, in a later one, and not at all.
         ends = set(expected["lasts"][:16, :16].flatten().tolist())
-        print(ends, screen.lists.ends - screen.lists.begins)
         assert 10 in ends
         assert stop == "never" or (min(ends) < 4 and ends & {5, 6, 7, 8, 9})
         zeros = (expected["slots"] == 0).all(1)
         assert zeros.any() == (stop != "never")
     found = drawn(screen, view, replace(choices, **VARIANTS[variant]), cotangents)
     for image, values in expected.items():
-        assert torch.equal(found[image], values), image
+        # On a device the compiler contracts other products in other kernels.
+        rounding = 0.0 if DEVICE.type == "cpu" else 1e-6 * float(values.abs().max())
+        torch.testing.assert_close(found[image], values, rtol=0.0, atol=rounding, msg=image)

@@ -122,6 +122,34 @@ def test_colors_that_depend_on_the_direction_bias_turns_alone():
     assert 1e-3 < float((found[3:] - differences[3:]).norm() / differences[3:].norm()) < 0.1
 
 
+def test_every_step_asks_once_what_the_step_before_has_learned(monkeypatch: pytest.MonkeyPatch):
+    """To ask waits for a GPU. Each rendering has the newest pose and its gradient, whatever image it is of."""
+    asked = []
+    answer = CameraPoses.corrections
+    monkeypatch.setattr(CameraPoses, "corrections", lambda self: asked.append(1) or answer(self))
+    poses = effect(PLAIN, indices=((0, 0), (2, 0)), times=(0.0, 1.0), dtype=torch.float32)
+    rows = random_rows(5, 0)
+    given = Gaussians(rows.means, rows.quaternions, rows.log_scales.exp(), rows.opacity_logits.sigmoid(), rows.sh_dc)
+    for frame in (0, 0, 2, 0):
+        asked.clear()
+        view = View(PLAIN, 0.5 * frame, frame, 0)
+        seen = poses.view(view, FINISHED)
+        assert torch.equal(seen.camera.camera_from_world, corrected(effect_of(poses), view))
+        asked.clear()
+        wrapped = poses.gaussians(given, seen)
+        assert not asked
+        assert wrapped is not given
+        with torch.no_grad():
+            poses.translations.add_(0.1)
+
+
+def effect_of(poses: CameraPoses) -> CameraPoses:
+    """The same corrections in an effect that has seen no view."""
+    fresh = CameraPoses(poses.settings, poses.recorded, poses.start, poses.expected)
+    fresh.load_state_dict(poses.state_dict())
+    return fresh
+
+
 def corrected(poses: CameraPoses, view: View) -> torch.Tensor:
     return poses.view(view, FINISHED).camera.camera_from_world
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.masks import StaticMaskSettings, straight_through
+from sparsestreet.scene.masks.static import lowered_threshold
 from tests.scene.gaussians.oracle import by_hand
 from tests.scene.street import static_mask
 
@@ -98,6 +99,20 @@ def test_a_floor_that_holds_is_counted():
     mask.keep(rows)
     assert mask.floor_firings == 2
     assert static_mask(2).floor_firings == 0
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.3, 0.5])
+def test_a_threshold_that_no_host_looked_at_closes_the_same_rows(threshold: float):
+    """As on a device, where the number of rows that pass is not read: by sorting, with ties and at every floor."""
+    scores = torch.rand(40, generator=torch.Generator().manual_seed(3)).mul(20).floor().div(20)
+    best_first = scores.sort(descending=True).values
+    passing = int((scores > threshold).sum())
+    for floor in range(1, 41):
+        lowered, fires = lowered_threshold(scores, threshold, floor)
+        expected = scores > threshold if passing >= floor else scores >= best_first[floor - 1]
+        assert torch.equal(scores > lowered, expected)
+        assert bool(fires) == (passing < floor)
+        assert passing < floor or float(lowered) == torch.tensor(threshold)
 
 
 def test_ties_at_the_floor_all_stay_open():

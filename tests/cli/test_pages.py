@@ -1,0 +1,181 @@
+"""What the pages show is what a reader types: commands are understood, and those of the tour and of Python run."""
+
+import importlib
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from sparsestreet.cli import COMMANDS
+from sparsestreet.cli.compose import override_problem
+from sparsestreet.cli.effect_words import with_effect_keys
+from sparsestreet.cli.objects import objects
+from sparsestreet.cli.options import OptionError, parse_options
+from sparsestreet.data.drivestudio import DriveStudioReader
+from tests.conftest import unchecked
+from tests.test_docs import PAGES, ROOT
+
+PREFIX = re.compile(r"^(?:\w+=\S+ )*(?:\.venv/bin/|torchrun .*--no-python |srun (?:-\S+ )*)?(?=sparsestreet )")
+STAND_INS = {"data=auto": "data=drivestudio", "data=NAME": "data=drivestudio"}
+"""The command itself finds the reader of a folder."""
+OF_HYDRA = ("train", "jobs", "effects", "demo", "data")
+
+
+def commands_of(page: Path) -> list[str]:
+    """Commands in blocks and within sentences, without what a page leaves open: [...], ... and names in capitals."""
+    text = page.read_text()
+    blocks = [block for kind, block in re.findall(r"^```([^\n]*)\n(.*?)^```", text, flags=re.S | re.M) if kind == ""]
+    blocks += re.findall(r"(?:^ {4}.*\n)+", text, flags=re.M)
+    lines = [line.strip() for block in blocks for line in re.sub(r"\\\n\s*", "", block).splitlines()]
+    lines += [" ".join(line.split()) for line in re.findall(r"`(sparsestreet [^`]*)`", text)]
+    lines = [re.split(r"\s+#|\s{3,}(?=[a-zL])", PREFIX.sub("", line))[0] for line in lines]
+    found = [re.sub(r" \[.*?\](?= |$)", "", line) for line in lines if line.startswith("sparsestreet ")]
+    return [line for line in found if "..." not in line and "COMMAND" not in line]
+
+
+@cache
+def problem_of(command: str) -> str | None:
+    """Why a command cannot be followed; it is parsed or composed, and does nothing."""
+    name, *words = shlex.split(command)[1:]
+    words = [STAND_INS.get(word, re.sub("=N$", "=3", word)) for word in words]
+    if name not in COMMANDS:
+        return "there is no such command"
+    # Options of one's own are tested in test_extending.py; without words a command says how it is used.
+    if not words or {"--help", "resume=RUN"} & set(words) or any("searchpath" in word for word in words):
+        return None
+    if name in OF_HYDRA:
+        words = [word for word in words if not word.startswith(("from=", "to=", "layout"))]
+        words = [word for word in words if "=" in word or word.startswith("-")] if name == "data" else words
+        several = ["-m"] if any(word.startswith("+sweep=") for word in words) else []
+        return override_problem(with_effect_keys([*several, *words]))
+    module = importlib.import_module(f"sparsestreet.cli.{name}")
+    with pytest.MonkeyPatch.context() as patch:
+        return _bench_problem(module, words, patch) if name == "bench" else _option_problem(module, name, words, patch)
+
+
+def _option_problem(module: ModuleType, name: str, words: list[str], patch: pytest.MonkeyPatch) -> str | None:
+    said: list[str] = []
+
+    def parse(name, usage, words, kind, action, positional=()):
+        try:
+            parse_options(words, kind, positional)
+        except OptionError as error:
+            said.append(str(error))
+        return 0
+
+    patch.setattr(module, "run_command", parse)
+    getattr(module, name)(words)
+    return said[0] if said else None
+
+
+def _bench_problem(module: ModuleType, words: list[str], patch: pytest.MonkeyPatch) -> str | None:
+    patch.setattr(torch, "set_num_threads", lambda number: None)
+    for mode in re.findall(r'": (_\w+),$', Path(module.__file__ or "").read_text(), flags=re.M):
+        patch.setattr(module, mode, lambda options: True)
+    try:
+        assert module.bench(words) == 0
+    except SystemExit:
+        return "bench does not take these words"
+    return None
+
+
+@pytest.mark.lengthy
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_command_is_understood(page):
+    problems = {command: problem_of(command) for command in commands_of(page)}
+    assert {command: problem for command, problem in problems.items() if problem is not None} == {}
+
+
+def test_every_target_of_make_is_there():
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.M)
+    named = {name for page in PAGES for name in re.findall(r"(?:^|`)make ([\w-]+)", page.read_text(), flags=re.M)}
+    assert named <= set(targets)
+
+
+def test_commands_are_found_and_slips_too(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "In a `sparsestreet view\nRUN` sentence.\n\n"
+        "```\n.venv/bin/sparsestreet render RUN a.mp4 \\\n    fsp=3  # note\n"
+        "sparsestreet bench [knobs] [--street RUN]   words\nsparsestreet bench kobs\n```\n\n```yaml\nmove: {}\n```\n\n"
+        "```\nsparsestreet train shedule.max_steps=3\nsrun -N2 sparsestreet look\n```\n"
+    )
+    found = {command: problem_of(command) for command in commands_of(page)}
+    assert found.pop("sparsestreet view RUN") is None
+    assert found.pop("sparsestreet bench") is None
+    assert list(found) == [
+        "sparsestreet render RUN a.mp4 fsp=3",
+        "sparsestreet bench kobs",
+        "sparsestreet train shedule.max_steps=3",
+        "sparsestreet look",
+    ]
+    assert all(found.values())
+
+
+def python_of(name: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / name).read_text(), flags=re.S)
+
+
+def test_the_page_of_python_renders_edits_and_drives(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "RUN").symlink_to(finished)
+    with unchecked():
+        exec("".join(python_of("python.md")[:-1]), {})
+    shapes, error, changed, seen = capsys.readouterr().out.splitlines()[-4:]
+    assert shapes.startswith("torch.Size([")
+    assert 0 < float(error[7:-1]) < 1
+    assert changed.startswith("[")
+    assert seen.endswith("uint8")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The number of training batches")
+def test_the_page_of_python_trains(tiny_street, tmp_path, monkeypatch, capsys):
+    """On the street of the other tests, since tracing one takes seconds; README's training is the daily one."""
+    monkeypatch.chdir(tmp_path)
+    (root,) = (word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
+    code, streets = re.subn(
+        r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", python_of("python.md")[-1]
+    )
+    code, trainings = re.subn("max_steps=200", "max_steps=3", code)
+    assert (streets, trainings) == (1, 1)
+    with unchecked():
+        exec(code, {"DriveStudioReader": DriveStudioReader})
+    assert "'background': 5000" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_tour_of_editing_and_driving_runs(finished, tmp_path, monkeypatch, capsys):
+    """But for the viewer and the server, which go on until they are told to end (test_view, test_serve)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "RUN").symlink_to(finished)
+    page = ROOT / "docs" / "edit_and_drive.md"
+    (edits,) = re.findall(r"```yaml\n(.*?)```", page.read_text(), flags=re.S)
+    commands = [shlex.split(line) for line in commands_of(page)]
+    commands = [words[1:] for words in commands if words[1] not in ("train", "view", "serve")]
+    assert commands.pop(0) == ["objects", "RUN"]
+    assert objects(["RUN", "out=sheet.png"]) == 0  # the run is other tests' too
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:3]]
+    Path("edits.yaml").write_text(edits.replace('"11"', f'"{names[0]}"').replace('"12"', f'"{names[1]}"'))
+    for name, *words in commands:
+        command = getattr(importlib.import_module(f"sparsestreet.cli.{name}"), name)
+        small = ["frames=0:2", "fps=10"] if name == "render" else []
+        assert command([*words, *small]) == 0, capsys.readouterr().err
+    made = {path.name for path in tmp_path.iterdir()} - {"RUN", "edits.yaml", "sheet.png"}
+    assert made == {"edited.mp4", "lane.mp4", "truck.mp4", "labels", "street.html", "street.usdz"}
+
+
+def test_messages_of_the_page_on_troubleshooting_are_those_of_the_program():
+    text = (ROOT / "docs" / "troubleshooting.md").read_text().partition("## What a picture shows")[0]
+    messages = re.findall(r"^\| `([^`]+)` \|", text, flags=re.M)
+    assert len(messages) > 20
+    # A literal may go on in the next line of the source.
+    source = re.sub(r'"\s*\n\s*f?"', "", "".join(path.read_text() for path in (ROOT / "sparsestreet").rglob("*.py")))
+    source = re.sub(r"\{[^{}\n]*\}|%s|%\.1f", "{}", source)
+    for message in messages:
+        for part in re.split(r"\b(?:NAME|N)\b", message):
+            assert part.strip(" ;,:") in source, message
