@@ -15,6 +15,27 @@ from sparsestreet.geometry.transforms import transform_points
 from sparsestreet.types import Camera
 
 
+def numbers_of(camera: Camera) -> tuple[object, ...]:
+    """All that a rendering by the camera depends on: hashable, and equal for cameras of equal numbers.
+
+    What is kept by it cannot grow stale, because a camera whose tensors were changed has other numbers.
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=4, height=4)
+    >>> before = numbers_of(camera)
+    >>> camera.camera_from_world[0, 3] = 1.0
+    >>> before == numbers_of(camera)
+    False
+    """
+    matrices, shutter = (camera.camera_from_world, camera.intrinsics), camera.shutter
+    effects = [] if camera.distortion is None else [camera.distortion]
+    if shutter is not None:
+        effects += (shutter.translation, shutter.rotation)
+    rows = [row for matrix in matrices for row in matrix.tolist()]
+    numbers = [(tensor.shape, *tensor.flatten().tolist()) for tensor in effects]
+    direction = None if shutter is None else shutter.direction
+    return (*map(tuple, rows), *numbers, camera.distortion is None, direction, camera.width, camera.height)
+
+
 def exact_position(camera: Camera) -> Float64[Tensor, "3"]:
     """The camera's center c in R (m - c) = R m + t, meters, in float64 for any dtype of the pose.
 

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+LEAST_ALPHA = 1e-6
+"""Depth is divided by alpha, or by this where a pixel is emptier."""
+
 
 class PairLimitError(RuntimeError):
     """The splats of one view cover more (splat, tile) pairs than memory may hold.

@@ -1,5 +1,6 @@
 """The public signatures of the op: it takes Gaussians and a camera, and returns a differentiable Rendering."""
 
+from functools import cache
 from types import ModuleType
 
 import torch
@@ -10,13 +11,12 @@ from sparsestreet.ops import reference
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.compiling import disable_compile
 from sparsestreet.ops.cpu import rasterizer as cpu
-from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.raster import LEAST_ALPHA, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_pixel_weights, check_structure
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
-_LEAST_ALPHA = 1e-6
 
 
 @disable_compile
@@ -67,7 +67,9 @@ def splat(
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        offsets = _screen_offsets(gaussians, screen_gradients)
+        offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
+        if chosen == "triton":
+            return _module(chosen).render(gaussians, offsets, background, camera, settings)
         raster = _module(chosen).rasterize(gaussians, offsets, camera, settings)
         return _compose(raster, offsets, background)
 
@@ -142,12 +144,21 @@ def _module(backend: str) -> ModuleType:
     return rasterizer
 
 
-def _screen_offsets(gaussians: Gaussians, wanted: bool) -> Float[Tensor, "n 2"]:
-    """A leaf of zeros. It is in the graph only if it is wanted and a field of the Gaussians is in the graph."""
+def _screen_offsets(gaussians: Gaussians, wanted: bool, filled: bool) -> Float[Tensor, "n 2"]:
+    """A leaf of zeros. It is in the graph only if it is wanted and a field of the Gaussians is in the graph.
+
+    ``filled``: whether it has memory of its own, for a backend that reads it; else all rows share one zero."""
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.sh)
     wanted = wanted and torch.is_grad_enabled() and any(field.requires_grad for field in fields)
-    offsets = gaussians.means.new_zeros(len(gaussians), 2)
+    means, shape = gaussians.means, (len(gaussians), 2)
+    offsets = means.new_zeros(shape) if filled else _zero(means.dtype, means.device).expand(shape)
     return offsets.requires_grad_() if wanted else offsets
+
+
+@cache
+@torch.inference_mode(False)
+def _zero(dtype: torch.dtype, device: torch.device) -> Float[Tensor, ""]:
+    return torch.zeros((), dtype=dtype, device=device)
 
 
 def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rendering:
@@ -156,5 +167,5 @@ def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rend
     rgb = raster.rgb
     if background is not None:
         rgb = rgb + raster.transmittance[..., None] * background
-    depth = raster.depth_sum / alpha.clamp(min=_LEAST_ALPHA)
+    depth = raster.depth_sum / alpha.clamp(min=LEAST_ALPHA)
     return Rendering(rgb, alpha, depth, raster.radii, offsets)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from sparsestreet.geometry.cameras import numbers_of
 from sparsestreet.types import Camera, Gaussians, Side
 
 LONGEST_SIDE = 1 << 22
@@ -20,6 +21,9 @@ RIGID_TOLERANCE = 1e-3
 An error of 1e-3 moves a point at the edge of an image by a pixel."""
 LARGEST_DISTORTION = 1e12
 """Largest coefficient of a lens: no real one comes near, and its powers stay finite in float32."""
+_GOOD: set[tuple[object, ...]] = set()
+"""Numbers of cameras that were found good; a log has some thousands."""
+_MOST_GOOD = 1 << 14
 _SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
 
 
@@ -29,16 +33,15 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
     It reads neither values of Gaussians nor anything on a GPU, so it is cheap and never waits.
     """
     means, rows = gaussians.means, gaussians.means.shape[0]
+    dtype, device = means.dtype, means.device
     for name, tail in _SHAPES.items():
         field = getattr(gaussians, name)
-        expected = (rows, *tail)
-        fits = field.dim() == len(expected) and all(
-            want is None or got == want for got, want in zip(field.shape, expected, strict=True)
-        )
-        if not fits:
-            text = f"[{', '.join('k' if want is None else str(want) for want in expected)}]"
+        # Harmonics have any number of terms.
+        expected = (rows, field.shape[1], *tail[1:]) if tail[:1] == (None,) and field.dim() > 1 else (rows, *tail)
+        if field.shape != expected:
+            text = f"[{', '.join('k' if want is None else str(want) for want in (rows, *tail))}]"
             raise ValueError(f"{name} must have shape {text} like the {rows} rows of means, got {list(field.shape)}")
-        if field.dtype != means.dtype or field.device != means.device:
+        if field.dtype != dtype or field.device != device:
             raise ValueError(
                 f"all fields must share one dtype and device: means is {means.dtype} on {means.device}, {name} is "
                 f"{field.dtype} on {field.device}; convert them with .to(means)"
@@ -124,12 +127,26 @@ def _check_size(camera: Camera) -> None:
 
 
 def check_camera(camera: Camera) -> None:
-    """Checks a camera's size, pose, intrinsics and effects; raises ValueError."""
+    """Checks a camera's size, pose, intrinsics and effects; raises ValueError.
+
+    Numbers that were found good are not checked again. NaN equals nothing, so it never was."""
     _check_size(camera)
     for name, shape in (("camera_from_world", (4, 4)), ("intrinsics", (3, 3))):
+        given = getattr(camera, name).shape
+        if given != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, got {list(given)}")
+    numbers = numbers_of(camera)
+    if numbers in _GOOD:
+        return
+    _check_numbers(camera)
+    if len(_GOOD) >= _MOST_GOOD:
+        _GOOD.clear()
+    _GOOD.add(numbers)
+
+
+def _check_numbers(camera: Camera) -> None:
+    for name in ("camera_from_world", "intrinsics"):
         matrix = getattr(camera, name)
-        if tuple(matrix.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, got {list(matrix.shape)}")
         if not all(math.isfinite(value) for row in matrix.tolist() for value in row):
             raise ValueError(f"{name} must be finite, got {matrix.tolist()}: check the pose at its source")
     _check_pose(camera.camera_from_world.tolist())

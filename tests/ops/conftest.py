@@ -1,5 +1,6 @@
 """Triton's interpreter in reasonable time: what it needs not do left out, costly cases left to ``make test-all``."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -20,6 +21,14 @@ if INTERPRETED:
     def _overflow(request: pytest.FixtureRequest) -> None:
         """Integers are watched in the tests that only ``make test-all`` runs."""
         check_overflow(request.node.get_closest_marker("slow") is not None)
+
+
+@pytest.fixture(autouse=True)
+def _unknown_views() -> None:
+    """A rendering takes the same path whatever was rendered before, in other tests."""
+    capacity = sys.modules.get("sparsestreet.ops.triton.capacity")
+    if capacity is not None:
+        capacity.forget()
 
 
 ON_NUMBERS = ("test_hard_", "test_effects_", "test_guards_drawn", "test_properties")

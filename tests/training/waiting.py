@@ -175,7 +175,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
     """Notes where what is done would wait."""
     found = Waits()
 
-    def counted(numbers: Tensor) -> list[int]:
+    def counted(arriving: object) -> list[int]:
         found.places.append(SPLAT)
         found.renderings += 1
         return [40, 5, 0]
@@ -199,6 +199,8 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
         return Queued(torch.zeros(values.shape), None, found.renderings)
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
+        # The copy does not wait, and an event needs a device.
+        patch.setattr(screen.Arriving, "__init__", lambda arriving, numbers: None)
         patch.setattr(screen, "wait_for", counted)
         for module in (finite, quarantine, said_later):
             patch.setattr(module, "on_its_way", queued)

@@ -7,7 +7,8 @@ This takes the host longer than many kernels take the device. Here a repeated la
 
 import warnings
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, reduce
+from operator import attrgetter, or_
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,11 @@ from triton.runtime.jit import KernelInterface
 _KNOWN = ("3.6.", "3.7.")
 """Versions of Triton for which a direct call is known to work.
 
-``_kinds`` is no coarser than their specialization. Their compiled kernels take the grid, what hooks get, and then all
-arguments: tensors by address, and constants too."""
+Kinds of arguments are no coarser than their specialization. Their compiled kernels take the grid, what hooks get, and
+then all arguments: tensors by address, and constants too."""
 _INT32 = 1 << 31
-_COMPILED: dict[tuple, CompiledKernel] = {}
+_DTYPE = attrgetter("dtype")
+_PLANS: dict[tuple, "_Plan"] = {}
 
 
 def launch(
@@ -38,33 +40,55 @@ def launch(
 ) -> None:
     """Runs ``kernel`` over ``items`` in programs of ``block``, passed as BLOCK; without items nothing runs.
 
-    The first of ``arguments`` must be a tensor. ``constants`` are the kernel's other constants, ``options`` those of
-    the
-    compiler (num_warps, maxnreg, enable_fp_fusion). Raises TypeError for arguments other than tensors, ints and floats.
+    ``arguments`` are tensors of one device, at least one, and then numbers. ``constants`` are the kernel's other
+    constants, ``options`` those of the compiler (num_warps, maxnreg, enable_fp_fusion). Raises TypeError for arguments
+    other than tensors, ints and floats.
     """
     if not items:
         return
-    grid, options, constants = (-(-items // block), 1, 1), options or {}, constants | {"BLOCK": block}
-    # Tensors are passed by address; for a tensor the launcher would ask the driver where it lies.
-    given = [value.data_ptr() if isinstance(value, Tensor) else value for value in arguments]
-    key = (kernel.fn, *_kinds(arguments, given), *constants.items(), *options.items())
-    if is_interpreted(kernel):
-        # The interpreter computes in NumPy, which would warn of infinities in masked lanes.
-        with np.errstate(all="ignore"):
-            kernel[grid](*arguments, **constants, **options)
-        return
-    compiled, device = _COMPILED.get(key), arguments[0].get_device()
-    # Triton starts kernels on the current device.
-    elsewhere = device >= 0 and device != torch.cuda.current_device()
-    with torch.cuda.device(device) if elsewhere else nullcontext():
-        if compiled is not None:
-            # Constants only fill their places in the signature; the machine code has them already.
-            _start(compiled, device, grid, (*given, *constants.values()))
+    key = (kernel.fn, block, *constants.items(), *(options.items() if options else ()))
+    plan = _PLANS.get(key)
+    if plan is None:
+        plan = _PLANS[key] = _Plan(kernel, arguments, constants | {"BLOCK": block}, options or {})
+    plan.launch((-(-items // block), 1, 1), arguments)
+
+
+class _Plan:
+    """A kernel with its constants, and what it was compiled to for each kind of arguments."""
+
+    def __init__(self, kernel: KernelInterface, arguments: tuple, constants: dict[str, Any], options: dict[str, Any]):
+        self._kernel, self._constants, self._options = kernel, constants, options
+        self._filling = tuple(constants.values())
+        self._interpreted = is_interpreted(kernel)
+        self._tensors = sum(isinstance(value, Tensor) for value in arguments)
+        self._compiled: dict[tuple, CompiledKernel] = {}
+
+    def launch(self, grid: tuple[int, int, int], arguments: tuple) -> None:
+        if self._interpreted:
+            # The interpreter computes in NumPy, which would warn of infinities in masked lanes.
+            with np.errstate(all="ignore"):
+                self._kernel[grid](*arguments, **self._constants, **self._options)
             return
-        compiled = kernel[grid](*arguments, **constants, **options)
-    # A hook of Triton may have prevented the compilation.
-    if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
-        _COMPILED[key] = compiled
+        tensors, numbers = arguments[: self._tensors], arguments[self._tensors :]
+        # Tensors are passed by address; for a tensor the launcher would ask the driver where it lies.
+        addresses = list(map(Tensor.data_ptr, tensors))
+        device = tensors[0].get_device()
+        kind = (device, _alignment(addresses), *map(_DTYPE, tensors), *map(_kind, numbers))
+        compiled = self._compiled.get(kind)
+        # Triton starts kernels on the current device.
+        elsewhere = device >= 0 and device != torch.cuda.current_device()
+        with torch.cuda.device(device) if elsewhere else _NOTHING:
+            if compiled is not None:
+                # Constants only fill their places in the signature; the machine code has them already.
+                _start(compiled, device, grid, (*addresses, *numbers, *self._filling))
+                return
+            compiled = self._kernel[grid](*arguments, **self._constants, **self._options)
+        # A hook of Triton may have prevented the compilation.
+        if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
+            self._compiled[kind] = compiled
+
+
+_NOTHING = nullcontext()
 
 
 def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], arguments: tuple) -> None:
@@ -77,24 +101,18 @@ def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], ar
         compiled.run(*grid, stream, compiled.function, compiled.packed_metadata, None, None, None, *arguments)
 
 
-def _kinds(arguments: tuple, given: list) -> list[tuple[object, ...] | type]:
-    """The properties of arguments (``given`` by value or address) that select a compiled kernel.
-
-    They are at least as fine as Triton's specialization, and include the device."""
-    return [
-        (value.dtype, value.get_device(), number % 16 == 0)
-        if value is not number
-        else (value == 1, value % 16 == 0, -_INT32 <= value < _INT32)
-        if type(value) is int
-        else _float_of(value)
-        for value, number in zip(arguments, given, strict=True)
-    ]
+def _alignment(addresses: list[int]) -> tuple[bool, ...] | None:
+    """Which addresses are multiples of 16, as kernels are compiled for; None: all, as almost always."""
+    return tuple(address % 16 == 0 for address in addresses) if reduce(or_, addresses) % 16 else None
 
 
-def _float_of(value: Any) -> type:
-    if type(value) is float:
+def _kind(number: Any) -> object:
+    """The properties of a number that select a compiled kernel, at least as fine as Triton's specialization."""
+    if type(number) is int:
+        return number == 1, number % 16 == 0, -_INT32 <= number < _INT32
+    if type(number) is float:
         return float
-    raise TypeError(f"arguments of kernels must be tensors, ints or floats, got {value!r}: pass it as a constant")
+    raise TypeError(f"arguments of kernels must be tensors, ints or floats, got {number!r}: pass it as a constant")
 
 
 @cache
@@ -107,6 +125,11 @@ def _is_known(version: str) -> bool:
             stacklevel=2,
         )
     return known
+
+
+def stream_of(device: torch.device) -> int:
+    """The stream on which kernels and copies of a device start; 0 on the host."""
+    return 0 if device.type == "cpu" else driver.active.get_current_stream(device.index)
 
 
 def is_interpreted(kernel: KernelInterface) -> bool:

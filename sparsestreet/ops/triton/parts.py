@@ -10,21 +10,16 @@ transmittance of parts in the middle is computed twice, which pays only if other
 """
 
 from dataclasses import dataclass
-from functools import partial
 
-import torch
 import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestreet.ops.triton.arena import vectors
 from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS, part_pixels, pixels_of
 from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.thin import thin_pairs
 from sparsestreet.ops.triton.tuning import tuning
-
-_BLOCK = 128
 
 
 @dataclass(frozen=True)
@@ -42,6 +37,8 @@ class Parts:
     """End of each tile's pairs; their beginning where the tile is split."""
     ahead: Int[Tensor, " 1"]
     """Number of tiles that are at least about as long as a part, and start before the parts."""
+    lasts: Int[Tensor, " p"]
+    """Room for those of ``PartLayers``."""
 
     def __len__(self) -> int:
         return len(self.tiles)
@@ -49,23 +46,23 @@ class Parts:
 
 @dataclass(frozen=True)
 class PartLayers:
-    """What each part adds to its tile's pixels (as in ``Raster``), and the light after it."""
+    """What each part adds to its tile's pixels (as in ``Raster``), and the light after it: p = 256 s pixels, one part
+    after the other, c = 3 p."""
 
-    products: Float[Tensor, "s 256"]
+    products: Float[Tensor, " p"]
     """Light that the part alone lets through; unwritten for the last part of a tile."""
-    rgb: Float[Tensor, "s 256 3"]
-    transmittance: Float[Tensor, "s 256"]
-    depth_sum: Float[Tensor, "s 256"]
-    lasts: Int[Tensor, "s 256"]
+    rgb: Float[Tensor, " c"]
+    transmittance: Float[Tensor, " p"]
+    depth_sum: Float[Tensor, " p"]
+    lasts: Int[Tensor, " p"]
     """Index after the last pair of the part that each pixel was open to."""
 
     @staticmethod
     def empty(parts: Parts, like: Tensor) -> "PartLayers":
         """Unwritten layers on the device of ``like``."""
-        count = len(parts)
-        pixels = [like.new_empty(count, PIXEL_COUNT) for _ in range(3)]
-        rgb, lasts = like.new_empty(count, PIXEL_COUNT, 3), parts.tiles.new_empty(count, PIXEL_COUNT)
-        return PartLayers(pixels[0], rgb, pixels[1], pixels[2], lasts)
+        count = len(parts) * PIXEL_COUNT
+        products, rgb, transmittance, depth_sum = vectors(like, count, 3 * count, count, count, dtype=like.dtype)
+        return PartLayers(products, rgb, transmittance, depth_sum, parts.lasts)
 
 
 def part_length(pairs: int) -> int:
@@ -82,63 +79,31 @@ def split_length(pairs: int) -> int:
     return tuning().fewest_parts * part_length(pairs)
 
 
-def split_tiles(
-    begins: Int[Tensor, " t"], ends: Int[Tensor, " t"], order: Int[Tensor, " t"], lengths: Int[Tensor, " t"], pairs: int
-) -> Parts | None:
-    """Parts of all tiles of ``split_length`` and more; None if there are too few pairs for one.
-
-    ``order`` holds the tiles, split ones first, and ``lengths`` the number of pairs of each tile. It does not wait for
-    the device, but makes room for the most parts that this number of pairs could need.
-    """
-    length, least = part_length(pairs), split_length(pairs)
-    if pairs < least:
-        return None
-    # No more tiles can be that long. Shorter ones come last, so they do not shift the parts of others.
-    most, split = pairs // length, pairs // least
-    nexts = (lengths.index_select(0, order[:split]) // length).cumsum(0, dtype=torch.int32)
-    parts = Parts(*(begins.new_empty(most) for _ in range(5)), torch.empty_like(ends), begins.new_empty(1))
-    launch(
-        list_parts, max(most, len(order)), _BLOCK,
-        begins, ends, order, lengths, nexts,
-        parts.tiles, parts.begins, parts.ends, parts.firsts, parts.nexts, parts.whole_ends, parts.ahead,
-        len(order), len(nexts), len(nexts).bit_length(), most, length, least,
-    )  # fmt: skip
-    return parts
+def most_parts_of(room: int) -> int:
+    """Most parts that up to ``room`` pairs of a view can need; 0 if no tile can be long enough for some."""
+    most = min(tuning().most_parts, room // tuning().shortest_part)
+    # In fours, as memory is laid out (arena.py).
+    return -(-most // 4) * 4 if most >= tuning().fewest_parts else 0
 
 
-@partial(jit, do_not_specialize=["tile_count", "split_count", "steps", "part_count", "length", "least"])
-def list_parts(
-    begins, ends, order, lengths, split_nexts, tiles, part_begins, part_ends, firsts, nexts, whole_ends, ahead,
-    tile_count, split_count, steps, part_count, length, least, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """One lane per part and per tile. ``split_nexts``: the part after the last of each of the first tiles in order."""
-    number = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    given = number < tile_count
-    tile = tl.load(order + number, given, 0)
-    begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
-    tl.store(whole_ends + tile, tl.where(end - begin < least, end, begin), given)
+@jit
+def shortest_split(pairs, shortest_part, most_parts, fewest_parts):
+    """As ``part_length`` and ``split_length``: of a part, and of a tile that is split."""
+    length = tl.maximum(shortest_part, tl.cdiv(pairs, most_parts))
+    return length, fewest_parts * length
 
-    following = tl.load(lengths + tl.load(order + number + 1, number + 1 < tile_count, 0), number + 1 < tile_count, 0)
-    is_long = given & (4 * (end - begin) >= least)
-    tl.store(ahead + 0 * number, number + 1, is_long & (4 * following < least))
-    tl.store(ahead + 0 * number, 0, (number == 0) & (4 * (end - begin) < least))
 
-    # The first tile whose parts end after this one.
-    rank = first_at_least(split_nexts, number + 1, split_count, steps)
-    tile = tl.load(order + rank, rank < split_count, 0)
-    pairs = tl.load(lengths + tile, rank < split_count, 0)
-    used = pairs >= least
-    tile, pairs, count = tl.where(used, tile, 0), tl.where(used, pairs, 0), tl.where(used, pairs // length, 1)
-    next_part = tl.where(used, tl.load(split_nexts + rank, used, 0), number)
-    first = tl.where(used, next_part - count, number)
-    share, longer, place = pairs // count, pairs % count, number - first
-    begin = tl.load(begins + tile, used, 0) + place * share + tl.minimum(place, longer)
-    given = number < part_count
-    tl.store(tiles + number, tile, given)
-    tl.store(part_begins + number, begin, given)
-    tl.store(part_ends + number, begin + share + (place < longer), given)
-    tl.store(firsts + number, first, given)
-    tl.store(nexts + number, next_part, given)
+@jit
+def parts_of(pairs, length, least):
+    """Number of parts of a tile of ``pairs``; 0: it is not split."""
+    return tl.where(pairs >= least, pairs // length, 0)
+
+
+@jit
+def part_begin(begin, end, count, i):
+    """Where the i-th of a tile's ``count`` parts begins; they differ by one pair at most."""
+    pairs, count = end - begin, tl.maximum(count, 1)
+    return begin + i * (pairs // count) + tl.minimum(i, pairs % count)
 
 
 @jit

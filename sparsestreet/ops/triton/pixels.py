@@ -102,7 +102,7 @@ def differentiate_view(
 
     Also which slots are written, as bytes; None: all."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
-    slots = passed.new_empty(len(lists.slots), blend_backward.SLOT_LENGTH)
+    slots = passed.new_empty(lists.sizes.pairs, blend_backward.SLOT_LENGTH)
     walked = slots.new_zeros(len(slots), dtype=torch.uint8) if tuning().marked_slots else None
     parts, part = lists.parts, ends.parts
     nexts, part_layers = lists.order, (passed, passed, passed, lists.order)

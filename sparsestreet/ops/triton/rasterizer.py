@@ -1,7 +1,7 @@
 """The Triton backend as an autograd function over torch tensors.
 
-A forward pass waits for the device once, for the numbers of visible rows, pairs and bad values. A backward pass never
-waits.
+A forward pass waits for the device once, for the numbers of visible rows, pairs and bad values, when all is queued. A
+backward pass never waits.
 """
 
 import torch
@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend, blend_backward, count, rows_backward, slots
 from sparsestreet.ops.triton import leave_one_out as remove
+from sparsestreet.ops.triton.compose import Composed, compose, decompose
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
 from sparsestreet.ops.triton.pixels import (
@@ -25,27 +25,33 @@ from sparsestreet.ops.triton.pixels import (
     pixel_arguments,
 )
 from sparsestreet.ops.triton.quadrants import MOST_ROWS
-from sparsestreet.ops.triton.screen import contiguous, effects, fields_of, given_or, project
+from sparsestreet.ops.triton.screen import contiguous, draw, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import KernelView
-from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 
-def rasterize(
-    gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
-) -> Raster:
-    """Projects, sorts by tile and blends, in float32. Bitwise the same in every run on one device."""
+def render(
+    gaussians: Gaussians,
+    screen_offsets: Float[Tensor, "n 2"],
+    background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None,
+    camera: Camera,
+    settings: SplatSettings,
+) -> Rendering:
+    """Projects, sorts by tile, blends and composes, in float32. Bitwise the same in every run on one device."""
     g = gaussians
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*fields, screen_offsets))
-    return Raster(*_Blend.apply(*fields, screen_offsets, g.displacements, KernelView(camera, settings), differentiated))
+    view = KernelView.of(camera, settings)
+    images = _Blend.apply(*fields, screen_offsets, background, g.displacements, view, differentiated)
+    return Rendering(*images, screen_offsets)
 
 
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
     _check(gaussians)
-    view = KernelView(camera, settings)
+    view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists = screen.lists
     counters = screen.records.new_empty(len(lists.slots), count.COUNTER_COUNT)
@@ -70,7 +76,7 @@ def leave_one_out(
 ) -> LeaveOneOut:
     """How much the view changes when each row alone is removed, over a background (None: black)."""
     _check(gaussians)
-    view = KernelView(camera, settings)
+    view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists, layers = screen.lists, blend_view(screen, view, lasts=True)
     changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)
@@ -91,31 +97,36 @@ def leave_one_out(
 
 
 class _Blend(torch.autograd.Function):
-    """Maps five fields and the screen offsets to the layers of a Raster."""
+    """Maps five fields, the screen offsets and the background to the images of a Rendering, and the radii."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, differentiated):
+    def forward(
+        ctx, means, quaternions, scales, opacities, sh, screen_offsets, background, displacements, view, differentiated
+    ):  # fmt: skip
         ctx.set_materialize_grads(False)
         gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
-        screen = project(gaussians, view)
-        layers = blend_view(screen, view, lasts=differentiated)
+        screen, layers = draw(gaussians, view, lambda screen: blend_view(screen, view, lasts=differentiated))
+        rgb, depth, passed, background = layers.rgb, layers.depth_sum, layers.ends.transmittance, contiguous(background)
+        alpha = compose(rgb, passed, depth, background)
         ctx.mark_non_differentiable(screen.radii)
-        ctx.save_for_backward(*fields_of(gaussians), layers.ends.transmittance)
+        ctx.save_for_backward(*fields_of(gaussians), passed, depth, background)
         ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
         ctx.lasts, ctx.parts = layers.ends.lasts, layers.ends.parts
-        return layers.rgb, layers.ends.transmittance, layers.depth_sum, screen.radii
+        return rgb, alpha, depth, screen.radii
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, transmittance = ctx.saved_tensors
+    def backward(ctx, v_rgb, v_alpha, v_depth, _v_radii):
+        *fields, transmittance, depth, background = ctx.saved_tensors
         screen, view, lists = ctx.screen, ctx.view, ctx.screen.lists
-        cotangents = Cotangents(
-            transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous(),
-            torch.zeros_like(transmittance) if v_transmittance is None else v_transmittance.contiguous(),
-            contiguous(v_depth_sum),
+        v_rgb = transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous()
+        composed = Composed(transmittance, depth, background)
+        v_passed, v_depth_sum, v_background = decompose(
+            composed, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[6]
         )
-        ends = Ends(transmittance, ctx.lasts, ctx.parts)
+        if not any(ctx.needs_input_grad[:6]):
+            return *[None] * 6, v_background, None, None, None
+        cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
         plain = view.settings.plain_gradients
         absolute = ctx.needs_input_grad[5] and not plain
         gradients, walked = differentiate_view(screen, view, ends, cotangents, absolute)
@@ -130,15 +141,15 @@ class _Blend(torch.autograd.Function):
             TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, CLAMPED=view.settings.clamp_colors,
             DETACHED=view.settings.detach_directions, PLAIN=plain, **effects(view, ctx.displacements),
         )  # fmt: skip
-        return *outputs, v_screen, None, None, None
+        return *outputs, v_screen, v_background, None, None, None
 
 
 def _sum_slots(
     values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype, walked: Tensor | None = None
 ) -> None:
     launch(
-        slots.sum_slots, len(lists.rows), slots.ROWS,
-        values, given_or(walked, lists.rows), lists.rows, lists.first_pairs, lists.tile_counts, sums, len(lists.rows),
+        slots.sum_slots, lists.sizes.rows, slots.ROWS,
+        values, given_or(walked, lists.rows), lists.rows, lists.row_ends, lists.tile_counts, sums, lists.sizes.rows,
         COUNT=values.shape[1], PADDED=padded, SUM=kind, MARKED=walked is not None, options=slots.OPTIONS,
     )  # fmt: skip
 

@@ -121,8 +121,8 @@ def project_rows(
 ):  # fmt: skip
     """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    ``numbers``: each program's count of pairs, of rows with tiles, and of bad rows. Comparisons are written so that NaN
-    culls.
+    ``numbers`` [3 programs]: each program's count of pairs, then of rows with tiles, then of bad rows. Comparisons are
+    written so that NaN culls.
     """
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = row < rows
@@ -164,4 +164,4 @@ def project_rows(
     bad = tl.sum((wrong | (good == 0)).to(tl.int32))
     place = tl.arange(0, 4)
     number = tl.where(place == 0, pairs, tl.where(place == 1, drawn, bad))
-    tl.store(numbers + 3 * tl.program_id(0) + place, number.to(tl.int64), place < 3)
+    tl.store(numbers + place * tl.num_programs(0) + tl.program_id(0), number.to(tl.int64), place < 3)

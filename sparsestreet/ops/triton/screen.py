@@ -1,18 +1,33 @@
 """Prepares a scene for the pixel kernels: records of the visible rows, and the tiles' lists."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.ops.triton import records, rows
+from sparsestreet.ops.triton import capacity, records, rows
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.lists import Lists, check_pairs, list_tiles
+from sparsestreet.ops.triton.lists import PAIR_LIMIT, Lists, Visible, check_pairs, list_rows, list_tiles
+from sparsestreet.ops.triton.sizes import COUNTED, Room, Sizes
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.ops.validate import check_values
 from sparsestreet.types import Gaussians
+
+Layers = TypeVar("Layers")
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A scene projected to the screen of one view, and the running sum over what each program counted (rows.py)."""
+
+    table: Float[Tensor, " numbers"]
+    records: Float[Tensor, "n 12"]
+    tile_counts: Int[Tensor, " n"]
+    radii: Float[Tensor, " n"]
+    sums: Int[Tensor, " b"]
 
 
 @dataclass(frozen=True)
@@ -27,34 +42,101 @@ class Screen:
 
 
 def project(gaussians: Gaussians, view: KernelView) -> Screen:
-    """Projects all rows; waits for the device once, for the numbers of rows and of pairs.
+    """Projects and lists all rows; waits for the device in between, for the numbers of rows and of pairs.
 
     Raises ValueError for bad values, PairLimitError.
     """
+    return list_exactly(gaussians, project_all(gaussians, view), view)
+
+
+def draw(gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers]) -> tuple[Screen, Layers]:
+    """As ``project``, with what ``work`` makes of it, but the wait comes when all is queued, also the work.
+
+    The room for the lists is a guess. If it is too small all that follows the projection is done again. Where views are
+    known too little for a guess, it waits in between.
+    """
+    projection, rows = project_all(gaussians, view), len(gaussians)
+    place = capacity.like(rows, view, projection.records.device)
+    room = capacity.predicted(place, rows, PAIR_LIMIT)
+    if room is not None:
+        visible = list_visible_rows(projection, room, view)
+        arriving = Arriving(visible.sizes.on_device)
+        screen = list_in(room, projection, visible, view)
+        layers = work(screen)
+        read(visible.sizes, arriving, gaussians, projection)
+        if room.holds(visible.sizes.pairs, visible.sizes.rows):
+            capacity.remember(place, visible.sizes.rows, visible.sizes.pairs)
+            return screen, layers
+        capacity.count_repeated()
+        del screen, layers
+    screen = list_exactly(gaussians, projection, view)
+    capacity.remember(place, screen.lists.sizes.rows, screen.lists.sizes.pairs)
+    return screen, work(screen)
+
+
+def project_all(gaussians: Gaussians, view: KernelView) -> Projection:
+    """Projects all rows."""
     fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
     means, sh = fields[0], fields[4]
     n, settings, table = len(means), view.settings, view.table(means.device)
     splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
     tile_counts = means.new_empty(n, dtype=torch.int32)
-    numbers = means.new_empty(-(-n // rows.block_of(view)), 3, dtype=torch.int64)
+    # A program counts an empty scene too.
+    numbers = means.new_empty(3 * max(-(-n // rows.block_of(view)), 1), dtype=torch.int64)
     launch(
-        rows.project_rows, n, rows.block_of(view),
+        rows.project_rows, max(n, 1), rows.block_of(view),
         *fields, given_or(displacements, means), table, splats, tile_counts, radii, numbers, n,
         TERMS=sh.shape[1], ANTIALIAS=settings.antialias, CLAMPED=settings.clamp_colors,
         HALF_COLORS=settings.half_colors, BOUNDED=view.bounded, **effects(view, displacements),
         options={"enable_fp_fusion": False},
     )  # fmt: skip
-    places = (tile_counts > 0).cumsum(0, dtype=torch.int32)
-    pairs, visible, bad = wait_for(numbers.sum(0))
+    # Of one line, because torch sums the columns of a table one row after the other.
+    return Projection(table, splats, tile_counts, radii, numbers.cumsum(0))
+
+
+def list_exactly(gaussians: Gaussians, projection: Projection, view: KernelView) -> Screen:
+    """Lists what is visible, in no more room than that takes: waits for its size."""
+    visible = list_visible_rows(projection, Room(len(gaussians), PAIR_LIMIT), view)
+    sizes = visible.sizes
+    read(sizes, Arriving(sizes.on_device), gaussians, projection)
+    return list_in(Room(sizes.rows, sizes.pairs), projection, visible, view)
+
+
+def list_visible_rows(projection: Projection, room: Room, view: KernelView) -> Visible:
+    return list_rows(projection.records, projection.tile_counts, projection.sums, room, view)
+
+
+def list_in(room: Room, projection: Projection, visible: Visible, view: KernelView) -> Screen:
+    p = projection
+    return Screen(p.table, p.records, p.tile_counts, p.radii, list_tiles(p.records, visible, room, view))
+
+
+class Arriving:
+    """A copy of numbers to the host that was queued, and the event after it."""
+
+    def __init__(self, numbers: Int[Tensor, " numbers"]):
+        # Memory of the host that the device can write while the host goes on.
+        self.numbers = numbers.to("cpu", non_blocking=True)
+        self.event = None
+        if numbers.device.type != "cpu":
+            self.event = torch.cuda.Event()
+            self.event.record(torch.cuda.current_stream(numbers.device))
+
+
+def wait_for(arriving: Arriving) -> list[int]:
+    """The numbers, once they are there. Only here does the op wait for the device."""
+    if arriving.event is not None:
+        arriving.event.synchronize()
+    return arriving.numbers.tolist()
+
+
+def read(sizes: Sizes, arriving: Arriving, gaussians: Gaussians, projection: Projection) -> None:
+    """Waits for the sizes; raises what ``project`` raises."""
+    pairs, rows, bad = wait_for(arriving)[:COUNTED]
     if bad:
         check_values(gaussians)
-    check_pairs(pairs, tile_counts)
-    return Screen(table, splats, tile_counts, radii, list_tiles(splats, tile_counts, places, visible, pairs, view))
-
-
-def wait_for(numbers: Int[Tensor, " numbers"]) -> list[int]:
-    """Copies the numbers to the host. Only here does the op wait for the device."""
-    return numbers.tolist()
+    check_pairs(pairs, projection.tile_counts)
+    sizes.pairs, sizes.rows = pairs, rows
 
 
 def fields_of(gaussians: Gaussians) -> tuple[Tensor, ...]:

@@ -15,7 +15,7 @@ STEP = constant(4)
 
 @partial(jit, do_not_specialize=["visible"])
 def sum_slots(
-    slots, walked, rows, first_pairs, tile_counts, sums, visible,
+    slots, walked, rows, row_ends, tile_counts, sums, visible,
     COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, MARKED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two.
@@ -23,7 +23,8 @@ def sum_slots(
     MARKED: of the slots that are marked in ``walked``; the others are not written."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = rank < visible
-    first, count = tl.load(first_pairs + rank, given, 0).to(tl.int64), tl.load(tile_counts + rank, given, 0)
+    count = tl.load(tile_counts + rank, given, 0)
+    first = (tl.load(row_ends + rank, given, 0) - count).to(tl.int64)
     field = tl.arange(0, PADDED)
     slot = slots + first[:, None] * COUNT + field[None, :]
     total = tl.zeros((BLOCK, PADDED), SUM)

@@ -1,18 +1,19 @@
 """A camera and the settings as the table of numbers that the row kernels read, and the grid of tiles."""
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.geometry.cameras import exact_position
+from sparsestreet.geometry.cameras import exact_position, numbers_of
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton.language import constant, jit
+from sparsestreet.ops.triton.launch import stream_of
 from sparsestreet.ops.triton.vectors import times
 from sparsestreet.types import Camera
 
@@ -53,10 +54,23 @@ def in_camera(view, rotation, mean):
 
 @dataclass(frozen=True)
 class KernelView:
-    """One camera and the settings, with the switches that kernels are compiled for."""
+    """One camera and the settings, with the switches that kernels are compiled for.
+
+    ``KernelView.of`` gives the same one for equal numbers, with the table it already has on the device."""
 
     camera: Camera
     settings: SplatSettings
+    _numbers: list[float] = field(init=False, repr=False, compare=False)
+    _tables: dict[tuple[torch.device, int], Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # At once, because the camera's tensors may change.
+        object.__setattr__(self, "_numbers", _numbers(self.camera, self.settings))
+
+    @staticmethod
+    def of(camera: Camera, settings: SplatSettings) -> "KernelView":
+        """The view of the camera as it is now."""
+        return _view_of(_ByNumbers(numbers_of(camera), camera), settings)
 
     @property
     def tiles(self) -> tuple[int, int]:
@@ -91,38 +105,54 @@ class KernelView:
         return max(self.settings.transmittance_min, LEAST_LIGHT)
 
     def table(self, device: torch.device) -> Float[Tensor, " numbers"]:
-        """The numbers on the device: one small copy, rounded from float64."""
-        return torch.tensor(self._numbers, dtype=torch.float32).to(device, non_blocking=True)
+        """The numbers on the device, rounded from float64: one small copy when a stream first asks."""
+        place = device, stream_of(device)
+        table = self._tables.get(place)
+        if table is None:
+            table = torch.tensor(self._numbers, dtype=torch.float32).to(device, non_blocking=True)
+            self._tables[place] = table
+        return table
 
-    @cached_property
-    def _numbers(self) -> list[float]:
-        camera, s = self.camera, self.settings
-        pose, K = camera.camera_from_world.double().tolist(), camera.intrinsics.double().tolist()
-        position = exact_position(camera)
-        slopes = [
-            _slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))
-        ]
-        distortion = [0.0] * 5 if camera.distortion is None else camera.distortion.double().tolist()
-        motion, sign = [0.0] * 6, 0
-        if camera.shutter is not None:
-            motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
-            sign = camera.shutter.sign
-        numbers = (
-            *(value for row in pose[:3] for value in row[:3]),
-            *position.tolist(),
-            *(K[0][0], K[1][1], K[0][2], K[1][2]),
-            *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
-            *(camera.width, camera.height, s.eps2d, s.near_plane),
-            # Without a cut-off the exponent still ends where float32 does: 2^-126.
-            *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.max_sigma * s.max_sigma),
-            *distortion,
-            math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
-            *motion,
-            # The rest of the position, which float32 cannot hold.
-            *(position - position.float().double()).tolist(),
-            *(sign * K[0][0], sign * K[1][1]),
-        )
-        return list(map(float, numbers))
+
+@dataclass(frozen=True)
+class _ByNumbers:
+    """A camera that is found by its numbers."""
+
+    numbers: tuple[object, ...]
+    camera: Camera = field(compare=False)
+
+
+@lru_cache(maxsize=1 << 12)  # the cameras of a log; half a kilobyte of the device each
+def _view_of(known: _ByNumbers, settings: SplatSettings) -> KernelView:
+    return KernelView(known.camera, settings)
+
+
+def _numbers(camera: Camera, s: SplatSettings) -> list[float]:
+    """In the order of the places above."""
+    pose, K = camera.camera_from_world.double().tolist(), camera.intrinsics.double().tolist()
+    position = exact_position(camera)
+    slopes = [_slope_limits(K[axis][axis], K[axis][2], size) for axis, size in enumerate((camera.width, camera.height))]
+    distortion = [0.0] * 5 if camera.distortion is None else camera.distortion.double().tolist()
+    motion, sign = [0.0] * 6, 0
+    if camera.shutter is not None:
+        motion = [*camera.shutter.translation.double().tolist(), *camera.shutter.rotation.double().tolist()]
+        sign = camera.shutter.sign
+    numbers = (
+        *(value for row in pose[:3] for value in row[:3]),
+        *position.tolist(),
+        *(K[0][0], K[1][1], K[0][2], K[1][2]),
+        *(slopes[0][0], slopes[1][0], slopes[0][1], slopes[1][1]),
+        *(camera.width, camera.height, s.eps2d, s.near_plane),
+        # Without a cut-off the exponent still ends where float32 does: 2^-126.
+        *(s.alpha_min, math.log2(s.alpha_min) if s.alpha_min > 0 else -126.0, s.max_sigma * s.max_sigma),
+        *distortion,
+        math.inf if camera.distortion is None else fold_radius_squared(camera.distortion),
+        *motion,
+        # The rest of the position, which float32 cannot hold.
+        *(position - position.float().double()).tolist(),
+        *(sign * K[0][0], sign * K[1][1]),
+    )
+    return list(map(float, numbers))
 
 
 def _slope_limits(focal: float, center: float, size: int) -> tuple[float, float]:

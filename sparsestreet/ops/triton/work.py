@@ -20,7 +20,7 @@ def count_work(gaussians: Gaussians, camera: Camera, settings: SplatSettings) ->
     A tile is counted up to the block of 32 pairs in which its last pixel is still open, and for each pair the quadrants
     that it touches. Long tiles count as unsplit, without the second computation of the light through their parts.
     """
-    view = KernelView(camera, settings)
+    view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists = screen.lists
     counts, seen = lists.ends - lists.begins, _last_of_tiles(blend_view(screen, view, lasts=True).ends.lasts, view)

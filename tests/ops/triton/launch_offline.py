@@ -14,32 +14,36 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sparsestreet.ops import splat
-from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
+from sparsestreet.ops import splat, validate
+from sparsestreet.ops.triton import compose, lists, order, pixels, rasterizer, screen
 from sparsestreet.ops.triton.launch import launch
 from tests.ops.scenes import camera, cast, random_gaussians
 from tests.ops.triton.compile_offline import forbidden_in, instructions_of, resources_of
 from tests.ops.triton.fake_driver import Binary, FakeDevice, install
 
-MODULES: tuple[ModuleType, ...] = (screen, lists, parts, pixels, rasterizer)
+MODULES: tuple[ModuleType, ...] = (screen, lists, order, pixels, rasterizer, compose)
 ROWS, VISIBLE = 40, 30
 _ALLOCATIONS = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 
 
 class Dispatches(TorchDispatchMode):
-    """Names of torch's operations from the wait on, those that start something on a device: no views (something that
-    is returned shares memory with an argument that is not written) and no bare allocations."""
+    """Names of torch's operations: all of them, and those that start something on a device: no views (something that is
+    returned shares memory with an argument that is not written) and no bare allocations."""
 
     def __init__(self) -> None:
         super().__init__()
+        self.all: list[str] = []
         self.names: list[str] = []
+        self.after_wait: list[str] = []
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         returned = [result.alias_info for result in func._schema.returns]
         view = any(alias is not None and not alias.is_write for alias in returned)
         name = func._schema.name.removeprefix("aten::")
+        self.all.append(name)
         if not view and name not in _ALLOCATIONS:
             self.names.append(name)
+            self.after_wait.append(name)
         return func(*args, **(kwargs or {}))
 
 
@@ -51,15 +55,19 @@ class Case:
         scene = random_gaussians(ROWS, self.view, terms=case["terms"])
         self.gaussians = cast(scene, torch.float32, requires_grad=True)
         self.background = torch.zeros(3) if case["background"] else None
+        # On a device the values of a background are not read.
+        validate._check_background = lambda *_: None
         self.numbers, self.dispatches = [case["pairs"], VISIBLE, 0], Dispatches()
         screen.wait_for = self.wait_for
 
-    def wait_for(self, numbers: torch.Tensor) -> list[int]:
-        self.dispatches.names.clear()
+    def wait_for(self, arriving: screen.Arriving) -> list[int]:
+        self.dispatches.after_wait.clear()
         return self.numbers
 
     def run(self, backward: bool = True, counted: bool = False) -> list[str]:
-        """Torch's operations after the wait, forward."""
+        """Torch's operations that start something, forward."""
+        self.dispatches.all.clear()
+        self.dispatches.names.clear()
         with self.dispatches if counted else nullcontext():
             drawn = splat(self.gaussians, self.view, background=self.background, backend="triton")
         if backward:
@@ -95,6 +103,16 @@ def launch_time(case: Case, repeats: int) -> float:
     return statistics.median(spent[:-1]) * 1e6
 
 
+def host_time(case: Case, repeats: int) -> list[float]:
+    """Microseconds of the host's thread in a forward pass: the least, the quartiles."""
+    times = []
+    for _ in range(repeats):
+        start = time.thread_time()
+        case.run(backward=False)
+        times.append(1e6 * (time.thread_time() - start))
+    return [min(times), *statistics.quantiles(times, n=4)]
+
+
 def measure(device: FakeDevice, given: dict) -> dict:
     """All that is asked of a case."""
     before = len(device.binaries)
@@ -103,9 +121,11 @@ def measure(device: FakeDevice, given: dict) -> dict:
     answer: dict[str, Any] = {"compiled": found_in(device.binaries[before:], device.arch)}
     device.launches.clear()
     answer["dispatches"] = case.run(backward=False, counted=True)
-    answer["forward"] = [binary.name for binary in device.launches]
+    answer["after_wait"] = list(case.dispatches.after_wait)
+    answer["calls"], answer["forward"] = list(case.dispatches.all), [binary.name for binary in device.launches]
     if given["repeats"]:
         answer["microseconds"] = launch_time(case, given["repeats"])
+        answer["forward_microseconds"] = host_time(case, given["repeats"])
     return answer
 
 

@@ -155,9 +155,9 @@ def test_every_kernel_is_compiled(compiled, request):
         assert names == {*BUDGETS, *ROW_BUDGETS, "count_tiles_pixels", "remove_from_tiles"}
         names |= {*FORWARD_PASS, *BACKWARD_PASS, "thin_parts"}
     assert names == {
-        "project_rows", "list_visible", "list_counts", "list_pairs", "bound_tiles", "list_parts", "blend_tiles",
+        "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
         "count_tiles_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward", "remove_from_tiles",
-        "thin_parts", "merge_parts",
+        "thin_parts", "merge_parts", "compose_pixels", "decompose_pixels",
     }  # fmt: skip
 
 

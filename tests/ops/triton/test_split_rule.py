@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
-from sparsestreet.ops.triton.parts import split_length, split_tiles
+from sparsestreet.ops.triton.parts import split_length
 from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
-from tests.ops.scenes import device_of
 from tests.ops.triton.device_model import (
     BACKWARD,
     FORWARD,
@@ -19,6 +17,7 @@ from tests.ops.triton.device_model import (
     together,
     two_launches,
 )
+from tests.ops.triton.tile_lists import lists_of
 
 # Pairs of a tile, counted on views of two trained streets: ten front views of one, scaled to the mean of a street of
 # 1.6 M splats at 960x640; one view of the other, each splat replaced by nine. The median, 90 %, 99 % and the longest
@@ -33,19 +32,15 @@ UNSPLIT = Tuning(most_parts=1)
 
 def split(lengths: NDArray[np.int64]) -> Split:
     """As the lists of a view with these tiles split them."""
-    ends = torch.from_numpy(lengths).cumsum(0).int().to(device_of("triton"))
-    counts, pairs = torch.from_numpy(lengths).int().to(ends.device), int(lengths.sum())
-    power = torch.floor(torch.log2(counts / split_length(pairs)))
-    order = torch.sort(power, descending=True, stable=True).indices.int()
-    found = split_tiles(ends - counts, ends, order, counts, pairs)
+    begins, ends, order, found = lists_of(lengths.tolist())
     if found is None:
         return Split(lengths[order.cpu()].tolist(), [], 0)
     parts: dict[int, list[int]] = {}
     for first, begin, end in zip(found.firsts.tolist(), found.begins.tolist(), found.ends.tolist(), strict=True):
         if begin < end:
             parts.setdefault(first, []).append(end - begin)
-    whole = (found.whole_ends - (ends - counts))[order].tolist()
-    assert sum(whole) + sum(map(sum, parts.values())) == pairs
+    whole = (found.whole_ends - begins)[order].tolist()
+    assert sum(whole) + sum(map(sum, parts.values())) == int(lengths.sum()) == int(ends[-1])
     return Split(whole, list(parts.values()), int(found.ahead))
 
 

@@ -1,0 +1,214 @@
+"""Room for the lists is guessed: any room that is large enough gives the same bits, and a small one a second try."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from sparsestreet.ops import PairLimitError, SplatSettings, splat
+from sparsestreet.ops.triton import capacity, lists, order, pixels, screen
+from sparsestreet.ops.triton.sizes import Room
+from sparsestreet.ops.triton.tuning import Tuning, tuned
+from sparsestreet.ops.triton.view import KernelView
+from sparsestreet.types import Gaussians
+from tests.ops.scenes import (
+    camera,
+    cast,
+    device_of,
+    fill_buffers_with_nan,
+    first_interpreted,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    render,
+)
+from tests.ops.triton.recording import record_launches
+
+DEVICE = device_of("triton")
+VIEW = camera(19, 17)
+PLACE = capacity.like(1000, KernelView(VIEW, SplatSettings()), DEVICE)
+
+
+def scene() -> Gaussians:
+    """With a row behind the camera, and one over all tiles."""
+    behind, giant = one_gaussian(means=[[0.0, 0.0, -2.0]]), one_gaussian(scales=[[9.0] * 3], opacities=[0.4])
+    return Gaussians.concatenate([behind, random_gaussians(3, VIEW, terms=1), giant])
+
+
+def drawn(room: Room | None) -> dict[str, torch.Tensor]:
+    """Images and gradients with that guess, in short parts."""
+    with pytest.MonkeyPatch.context() as patch, tuned(Tuning(shortest_part=2, fewest_parts=2)):
+        patch.setattr(capacity, "predicted", lambda *_: room)
+        result = render(scene(), VIEW, "triton", torch.float32)
+    return result.images | result.gradients
+
+
+@pytest.fixture(scope="module")
+def exact() -> dict[str, torch.Tensor]:
+    return drawn(None)
+
+
+@pytest.fixture(scope="module")
+def taken() -> Room:
+    """What the scene takes."""
+    sizes = screen.project(cast(scene(), torch.float32, device=DEVICE), KernelView(VIEW, SplatSettings())).lists.sizes
+    return Room(sizes.rows, sizes.pairs)
+
+
+def assert_same_bits(found: dict[str, torch.Tensor], exact: dict[str, torch.Tensor]) -> None:
+    for name, value in exact.items():
+        assert torch.equal(found[name], value), name
+
+
+@pytest.mark.lengthy
+@pytest.mark.parametrize("more", first_interpreted([3, 9], [0, 0], [1, 0], [0, 1], [400, 2000]))
+def test_any_room_that_is_large_enough_gives_the_same_bits(more, exact, taken, monkeypatch):
+    fill_buffers_with_nan(monkeypatch)
+    before = capacity.repeated_forwards()
+    assert_same_bits(drawn(Room(taken.rows + more[0], taken.pairs + more[1])), exact)
+    assert capacity.repeated_forwards() == before
+
+
+@pytest.mark.lengthy
+@pytest.mark.parametrize("short", first_interpreted("pairs", "rows", "both"))
+def test_a_view_that_does_not_fit_is_drawn_again(short, exact, taken, monkeypatch):
+    fill_buffers_with_nan(monkeypatch)
+    room = {"both": Room(1, 1), "rows": Room(taken.rows - 1, taken.pairs), "pairs": Room(taken.rows, taken.pairs - 1)}[
+        short
+    ]
+    before = capacity.repeated_forwards()
+    assert_same_bits(drawn(room), exact)
+    assert capacity.repeated_forwards() == before + 1
+
+
+@pytest.mark.parametrize(("rows", "pairs", "fits"), [(0, 0, True), (-1, 9, False), (9, -1, False)])
+def test_what_does_not_fit_is_listed_as_nothing(rows, pairs, fits, taken, monkeypatch):
+    fill_buffers_with_nan(monkeypatch)
+    view = KernelView(VIEW, SplatSettings())
+    projection = screen.project_all(cast(scene(), torch.float32, device=DEVICE), view)
+    room = Room(taken.rows + rows, taken.pairs + pairs)
+    visible = screen.list_visible_rows(projection, room, view)
+    # All pairs, visible rows, bad rows; listed pairs, listed rows.
+    listed = [taken.pairs, taken.rows] if fits else [0, 0]
+    assert visible.sizes.on_device.tolist() == [taken.pairs, taken.rows, 0, *listed]
+    # Where nothing is written there is no end to write beyond.
+    assert (visible.rows == 1).all().item() is not fits
+
+
+def test_the_wait_comes_after_the_last_launch(monkeypatch):
+    launches, seen = record_launches(monkeypatch), []
+    waited = screen.wait_for
+
+    def wait_for(arriving: screen.Arriving) -> list[int]:
+        seen.append([launch.name for launch in launches])
+        return waited(arriving)
+
+    monkeypatch.setattr(screen, "wait_for", wait_for)
+    gaussians = cast(scene(), torch.float32, device=DEVICE)
+    for known in (False, True):
+        launches.clear()
+        splat(gaussians, VIEW, backend="triton")
+        assert (seen[-1] == ["project_rows", "list_visible"]) is not known
+        assert len(seen) == 1 + known
+    names = [launch.name for launch in launches]
+    # What is composed need not be done twice.
+    assert names[-2:] == ["blend_tiles", "compose_pixels"]
+    assert seen[-1] == names[:-1]
+
+
+def test_views_of_one_room_differ_in_addresses_alone(taken, monkeypatch):
+    """What the host passes for the kernels after the projection, so that one graph could hold them."""
+    passed: list[list] = [[]]
+
+    def launch(kernel, items, block, *arguments, options=None, **constants):
+        numbers = [value for value in arguments if not isinstance(value, torch.Tensor)]
+        passed[-1].append((kernel.fn.__name__, items, block, numbers, options, constants))
+        launches(kernel, items, block, *arguments, options=options, **constants)
+
+    launches = screen.launch
+    for module in (screen, lists, order, pixels):
+        monkeypatch.setattr(module, "launch", launch)
+    monkeypatch.setattr(capacity, "predicted", lambda *_: Room(taken.rows + 5, taken.pairs + 40))
+    other = dataclasses.replace(VIEW, camera_from_world=VIEW.camera_from_world.clone())
+    other.camera_from_world[0, 3] += 0.2
+    images = []
+    for view in (VIEW, other):
+        images.append(splat(cast(scene(), torch.float32, device=DEVICE), view, backend="triton").rgb)
+        passed.append([])
+    assert not torch.equal(*images)
+    assert len(passed[0]) == 6
+    assert passed[0] == passed[1]
+
+
+@pytest.mark.lengthy
+def test_two_renderings_before_one_backward_pass():
+    """Each has memory of its own: the gradients of the sum are the sum of the gradients."""
+    other = dataclasses.replace(VIEW, camera_from_world=VIEW.camera_from_world.clone())
+    other.camera_from_world[0, 3] += 0.2
+    leaves, alone = [
+        cast(random_gaussians(3, VIEW, terms=1), torch.float32, requires_grad=True, device=DEVICE) for _ in range(2)
+    ]
+    splat(leaves, VIEW, backend="triton")  # from now on rooms are guessed
+    together = [splat(leaves, view, backend="triton") for view in (VIEW, other)]
+    torch.stack([drawn.rgb.sum() + drawn.depth.sum() for drawn in together]).sum().backward()
+    for view in (other, VIEW):
+        rendering = splat(alone, view, backend="triton")
+        (rendering.rgb.sum() + rendering.depth.sum()).backward()
+    for name in ("means", "opacities", "sh"):
+        # The order of the two is torch's.
+        torch.testing.assert_close(getattr(leaves, name).grad, getattr(alone, name).grad, rtol=1e-6, atol=1e-6)
+
+
+def test_what_is_refused_is_refused_after_a_guess_too(monkeypatch):
+    gaussians = cast(scene(), torch.float32, device=DEVICE)
+    splat(gaussians, VIEW, backend="triton")
+    wrong = dataclasses.replace(gaussians, sh=gaussians.sh.clone())
+    wrong.sh[3, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="sh must be finite, but row 3 has nan"):
+        splat(wrong, VIEW, backend="triton")
+    monkeypatch.setattr(lists, "PAIR_LIMIT", 3)
+    with pytest.raises(PairLimitError, match="more than the 3"):
+        splat(gaussians, VIEW, backend="triton")
+
+
+def test_pairs_beyond_32_bits_after_a_guess(monkeypatch):
+    giant = one_gaussian(scales=[[1e7] * 3], opacities=[1.0])
+    gaussians = cast(Gaussians.concatenate([giant] * 1050), torch.float32, device=DEVICE)
+    monkeypatch.setattr(screen, "list_in", lambda *_: None)  # an image of gigabytes
+    monkeypatch.setattr(capacity, "predicted", lambda *_: Room(2000, 16))
+    view = KernelView(front_camera(2**22, 128, 100.0), SplatSettings())
+    with pytest.raises(PairLimitError, match=f"cover {1050 * 2**21} tiles"):
+        screen.draw(gaussians, view, lambda _: None)
+
+
+def test_room_for_a_quarter_more_than_the_largest_view():
+    assert capacity.predicted(PLACE, 1000, 10**9) is None
+    capacity.remember(PLACE, 600, 40_000)
+    capacity.remember(PLACE, 500, 80_000)
+    # 750 and 100,000 in steps of an eighth of the power of two below.
+    assert capacity.predicted(PLACE, 1000, 10**9) == Room(768, 106_496)
+    # No more rows than there are, and no more pairs than may be held.
+    capacity.remember(PLACE, 1000, 80_000)
+    assert capacity.predicted(PLACE, 1000, 90_000) == Room(1024, 90_000)
+
+
+def test_a_large_view_is_forgotten():
+    capacity.remember(PLACE, 800, 80_000)
+    for _ in range(28):
+        capacity.remember(PLACE, 80, 8_000)
+    room = capacity.predicted(PLACE, 1000, 10**9)
+    assert room is not None
+    assert room.holds(80_000, 800)
+    for _ in range(600):
+        capacity.remember(PLACE, 80, 8_000)
+    assert capacity.predicted(PLACE, 1000, 10**9) == Room(112, 10_240)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [(2048, KernelView(VIEW, SplatSettings()), DEVICE), (1000, KernelView(camera(36, 33), SplatSettings()), DEVICE)],
+    ids=["rows", "image"],
+)
+def test_other_views_tell_nothing(other):
+    capacity.remember(PLACE, 5, 9)
+    assert capacity.predicted(capacity.like(*other), 1000, 10**9) is None
