@@ -214,7 +214,7 @@ def files_up_to(size: int) -> Iterator[None]:
 
 def test_a_write_that_the_system_refuses(path: Path):
     content = path.read_bytes()
-    with files_up_to(len(content) // 2), pytest.raises(OSError, match=f"cannot write {path}"):
+    with files_up_to(len(content) // 2), pytest.raises(OSError, match=f"{path} cannot be written"):
         save_scene(path, stored(3))
     assert only(path, content)
 
