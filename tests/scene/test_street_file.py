@@ -106,7 +106,7 @@ def test_every_node_comes_back(tmp_path: Path, made: Callable):
         assert torch.equal(one.rows.mask_bits.long().sum(0), other.rows.mask_bits.long().sum(0))
 
 
-@pytest.mark.parametrize("rows", [0, 1, 255, 256, 257, pytest.param(1_000_000, marks=pytest.mark.lengthy)])
+@pytest.mark.parametrize("rows", [0, 1, 255, 256, 257, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_tables_of_all_sizes(tmp_path: Path, rows: int):
     node = background(0, 0, sh_degree=0)
     whole = scene_of(
