@@ -56,11 +56,15 @@ def json_line(value: object, where: str) -> str:
 
 def read_json(path: Path, kind: type[Record]) -> Record:
     """Reads a dataclass back and checks every type. Raises RecordError naming the file and the entry."""
+    return decoded_json(read_text(path), kind, str(path))
+
+
+def read_text(path: Path) -> str:
+    """The text of a record. Raises RecordError, naming the file, where it is missing or no text."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (FileNotFoundError, UnicodeDecodeError) as error:
         raise RecordError(f"{path}: cannot be read ({error}); write the record again") from error
-    return decoded_json(text, kind, str(path))
 
 
 def decoded_json(text: str, kind: type[Record], where: str) -> Record:

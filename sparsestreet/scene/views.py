@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.trajectories import frame_periods
-from sparsestreet.records.strict_json import EXACT, decoded_json, json_line, version, write_atomically
+from sparsestreet.records.strict_json import EXACT, decoded_json, json_line, read_text, version, write_atomically
 from sparsestreet.types import Camera, Shutter, Side, View
 
 FORMAT = 2
@@ -119,7 +119,7 @@ def read_views(path: Path | str) -> RecordedViews:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no {path}: training writes a {FILE_NAME} into the folder of its run")
-    return parsed_views(path.read_text(encoding="utf-8"), str(path))
+    return parsed_views(read_text(path), str(path))
 
 
 def parsed_views(text: str, where: str) -> RecordedViews:

@@ -133,3 +133,9 @@ def test_seconds_of_a_log_are_those_of_its_clock_else_of_its_frames():
     assert seconds_of(RecordedViews((clock[2], clock[0]), (clock[1],), 25.0), 5.0) == pytest.approx(10.0)
     frames = [View(camera, place / 4, place, 0) for place in range(5)]
     assert seconds_of(RecordedViews(tuple(frames), ()), 5.0) == pytest.approx(4 / 5)
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    (tmp_path / "views.json").write_bytes(b'{"format": \xac}')
+    with pytest.raises(ValueError, match=r"views\.json: cannot be read"):
+        read_views(tmp_path / "views.json")
