@@ -53,7 +53,7 @@ test: style ## what a change must pass: lint and all tests but those marked slow
 test-all: style ## lint and all tests: every kernel for every architecture, every size of tiles
 	$(call beside_types,$(PYTEST) -m "not stress")
 
-stress: $(VENV)/.ok ## kills, damaged and hostile files, 20,000 steps, shared caches: a quarter of an hour
+stress: $(VENV)/.ok ## kills, damaged and hostile files, 20,000 steps, shared caches: seven minutes
 	$(PYTEST) -m stress --durations=20 tests/stress
 
 lint: style types ## style, format, imports that go downwards, types
