@@ -167,6 +167,7 @@ def test_figures_are_drawn(swept, tmp_path):
     assert all(path.stat().st_size > 10_000 for path in paths)
 
 
+@pytest.mark.slow
 def test_many_names_at_one_place_stay_inside_the_panel(swept, tmp_path):
     records = [record | {"preset": "a name"} for record in swept[0] if record["kind"] == "knob"]
     assert len(figures.draw_pareto(records, tmp_path)) == 4

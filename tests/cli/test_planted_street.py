@@ -81,6 +81,7 @@ def test_removal_finds_what_was_planted_and_spares_what_is_visible(planted_stree
     assert int((~keep & ~planted).sum()) > 100
 
 
+@pytest.mark.slow
 def test_a_budget_takes_what_is_missed_least(planted_street):
     """0.01 dB: more rows than nobody sees, but none whose removal moves a pixel by more than 16/255."""
     out, data, rows, planted, _ = planted_street

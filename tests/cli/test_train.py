@@ -228,6 +228,7 @@ def test_the_tables_numbers_follow_from_predictions_and_images(finished, evaluat
     assert len(stored) == SUMMARY.read(evaluated_again).images["held_out"]
 
 
+@pytest.mark.slow
 def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monkeypatch):
     """The street knows the truth beside the path; the networks' weights are random ones."""
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))

@@ -140,7 +140,7 @@ def test_views_of_one_room_differ_in_addresses_alone(taken, monkeypatch):
     assert passed[0] == passed[1]
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 def test_two_renderings_before_one_backward_pass():
     """Each has memory of its own: the gradients of the sum are the sum of the gradients."""
     other = dataclasses.replace(VIEW, camera_from_world=VIEW.camera_from_world.clone())

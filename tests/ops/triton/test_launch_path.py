@@ -57,6 +57,7 @@ def check(case: dict, found: dict) -> None:
             assert known == wanted, (kernel["name"], name)
 
 
+@pytest.mark.slow
 def test_every_kernel_compiles_as_it_is_launched():
     (found,) = run_compiler("launch_offline", [DAILY])
     check(DAILY, found)
