@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from sparsestreet.ops.fused import fused_backend
-from sparsestreet.ops.visible_adam import AdamStep, adam_step_
+from sparsestreet.ops.visible_adam import AdamStep, adam_step_, check_shapes
 
 NONE = torch.iinfo(torch.int64).max
 """In place of the first refused row where there is none."""
@@ -44,9 +44,7 @@ def adam_rows_(
         ValueError: for tensors of different shapes, a width that does not divide them, and as ``fused_backend`` does.
         RuntimeError: as ``fused_backend`` does.
     """
-    shapes = [tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)]
-    if len(set(shapes)) != 1:
-        raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")
+    check_shapes(parameter, gradient, exp_avg, exp_avg_sq)
     if not parameter.numel():
         return
     if width < 1 or parameter.numel() % width:

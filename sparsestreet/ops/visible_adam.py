@@ -55,9 +55,7 @@ def adam_step_(
     the one that suits the tensors. Raises as :func:`sparsestreet.ops.fused.fused_backend` does, and ValueError for
     tensors of different shapes.
     """
-    shapes = [tuple(tensor.shape) for tensor in (parameter, gradient, exp_avg, exp_avg_sq)]
-    if len(set(shapes)) != 1:
-        raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")
+    check_shapes(parameter, gradient, exp_avg, exp_avg_sq)
     if fused_backend(backend, parameter, exp_avg, exp_avg_sq, choices=("torch", "triton")) == "triton":
         from sparsestreet.ops.triton.adam import step_rows_
 
@@ -74,3 +72,10 @@ def adam_step_(
     value.addcdiv_(first, second.sqrt().div_(step.root).add_(step.eps), value=-step.size)
     for whole, part in ((parameter, value), (exp_avg, first), (exp_avg_sq, second)):
         whole.index_copy_(0, rows, part)
+
+
+def check_shapes(*tensors: Tensor) -> None:
+    """Raises ValueError unless a parameter, its gradient and both moments have one shape."""
+    shapes = [tuple(tensor.shape) for tensor in tensors]
+    if len(set(shapes)) != 1:
+        raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")

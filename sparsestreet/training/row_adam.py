@@ -49,8 +49,10 @@ class RowAdam(torch.optim.Adam):
     fused Adam; on a GPU Triton's differ from them by rounding.
     """
 
-    def __init__(self, params: Any, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15) -> None:
-        super().__init__(params, betas=betas, eps=eps)
+    def __init__(
+        self, params: Any, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15
+    ) -> None:
+        super().__init__(params, lr=lr, betas=betas, eps=eps)
         self.refused: RefusedRows | None = None
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -75,9 +77,14 @@ class RowAdam(torch.optim.Adam):
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
             state["step"] += 1
             step = AdamStep(int(state["step"]), group["lr"], tuple(group["betas"]), group["eps"])
-            moments = (state["exp_avg"], state["exp_avg_sq"])
-            adam_rows_(parameter, gradient, *moments, counts, step, width=_width(parameter))
+            self._update(parameter, gradient, (state["exp_avg"], state["exp_avg_sq"]), counts, step)
         return loss
+
+    def _update(
+        self, parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], refused: Tensor, step: AdamStep
+    ) -> None:
+        """One parameter's step in place; ``refused``: as in ``adam_rows_``."""
+        adam_rows_(parameter, gradient, *moments, refused, step, width=_width(parameter))
 
 
 def _width(parameter: Tensor) -> int:

@@ -44,13 +44,23 @@ def step_rows_(
     increment_version((parameter, exp_avg, exp_avg_sq))
 
 
+@jit
+def stepped(g, m, v, share, beta, square_share, root, eps, size):
+    """Both moments after a gradient, and what the parameter loses. ``share`` and ``square_share``: one minus the decay
+    of the first and of the second moment, ``beta``."""
+    m += share * (g - m)
+    v = beta * v + square_share * g * g
+    # Rounded as torch rounds. The kernel waits for memory anyway; approximate operations would differ by two units.
+    return m, v, size * tl.div_rn(m, tl.div_rn(tl.sqrt_rn(v), root + tl.zeros_like(v)) + eps)
+
+
 @partial(jit, do_not_specialize=["numbers"])
 def step_numbers(
     parameter, gradient, exp_avg, exp_avg_sq, visible, numbers,
     share, beta, square_share, root, eps, size,
     ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``share`` and ``square_share``: one minus the decay of the first and of the second moment, ``beta``."""
+    """Rows of ROW numbers that are ``visible``."""
     first = tl.program_id(0).to(tl.int64) * BLOCK
     lane = tl.arange(0, BLOCK)
     # A division in 64 bits for the program, in 32 for the lanes.
@@ -60,10 +70,7 @@ def step_numbers(
     seen = given & (tl.load(visible + row, given, 0) != 0)
     g = tl.load(gradient + at, seen, 0.0)
     m, v = tl.load(exp_avg + at, seen, 0.0), tl.load(exp_avg_sq + at, seen, 0.0)
-    m += share * (g - m)
-    v = beta * v + square_share * g * g
-    # Rounded as torch rounds. The kernel waits for memory anyway; approximate operations would differ by two units.
-    change = size * tl.div_rn(m, tl.div_rn(tl.sqrt_rn(v), root + tl.zeros_like(v)) + eps)
+    m, v, change = stepped(g, m, v, share, beta, square_share, root, eps, size)
     tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
     tl.store(exp_avg + at, m, seen)
     tl.store(exp_avg_sq + at, v, seen)
@@ -110,9 +117,7 @@ def step_finite_rows(
     seen = given & (wrong == 0)[:, None]
     m, v = tl.load(exp_avg + at, seen, 0.0), tl.load(exp_avg_sq + at, seen, 0.0)
     g = tl.where(seen, g, 0.0)
-    m += share * (g - m)
-    v = beta * v + square_share * g * g
-    change = size * tl.div_rn(m, tl.div_rn(tl.sqrt_rn(v), root + tl.zeros_like(v)) + eps)
+    m, v, change = stepped(g, m, v, share, beta, square_share, root, eps, size)
     tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
     tl.store(exp_avg + at, m, seen)
     tl.store(exp_avg_sq + at, v, seen)
