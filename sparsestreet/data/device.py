@@ -22,35 +22,6 @@ def to_device(value: T, device: torch.device) -> T:
     return _moved(value, device)
 
 
-@dataclass(frozen=True)
-class OnItsWay:
-    """Numbers whose copy to the host may still be under way."""
-
-    values: torch.Tensor
-    done: torch.cuda.Event | None
-    """None: they are there."""
-
-    @property
-    def is_there(self) -> bool:
-        return self.done is None or self.done.query()
-
-    def arrived(self) -> torch.Tensor:
-        """The numbers on the host, which waits for them if it must."""
-        if self.done is not None:
-            self.done.synchronize()
-        return self.values
-
-
-def on_its_way(values: torch.Tensor) -> OnItsWay:
-    """A copy on the host of what the device is about to compute; the host goes on at once."""
-    if values.device.type != "cuda":
-        return OnItsWay(values.cpu(), None)
-    copy = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
-    done = torch.cuda.Event()
-    done.record()
-    return OnItsWay(copy, done)
-
-
 def _moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, torch.Tensor):
         pinned = value.pin_memory() if device.type == "cuda" and value.device.type == "cpu" else value

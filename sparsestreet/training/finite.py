@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from sparsestreet.data.device import OnItsWay, on_its_way
+from sparsestreet.on_its_way import OnItsWay, on_its_way
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import View
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from sparsestreet.data.device import OnItsWay, on_its_way
+from sparsestreet.on_its_way import OnItsWay, on_its_way
 from sparsestreet.training.finite import NotFiniteError, seen_from
 from sparsestreet.training.row_adam import RefusedRows
 from sparsestreet.types import View

@@ -8,7 +8,7 @@ import torch
 from lightning import Trainer
 from torch import Tensor
 
-from sparsestreet.data.device import OnItsWay, on_its_way
+from sparsestreet.on_its_way import OnItsWay, on_its_way
 from sparsestreet.training.lightning import log_numbers, logged_number
 
 

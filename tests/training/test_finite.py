@@ -6,7 +6,7 @@ import pickle
 import pytest
 import torch
 
-from sparsestreet.data.device import OnItsWay
+from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.training import finite
 from sparsestreet.training.callbacks import Checkpoints, step_of
 from sparsestreet.training.finite import LossWatch, NotFiniteError, not_finite

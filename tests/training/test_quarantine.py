@@ -5,7 +5,7 @@ import logging
 import pytest
 import torch
 
-from sparsestreet.data.device import OnItsWay
+from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.training import quarantine
 from sparsestreet.training.callbacks import Checkpoints
 from sparsestreet.training.finite import NotFiniteError

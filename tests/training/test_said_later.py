@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.data.device import OnItsWay, on_its_way
+from sparsestreet.on_its_way import OnItsWay, on_its_way
 from sparsestreet.training import said_later
 from sparsestreet.training.said_later import SaidLater
 from tests.training.stubs import StubTrainer, background, make_system

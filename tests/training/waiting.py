@@ -21,7 +21,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import sparsestreet
-from sparsestreet.data.device import OnItsWay
+from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.ops import backend, fused, triton
 from sparsestreet.ops.triton import launch, rasterizer, screen
 from sparsestreet.training import finite, quarantine, said_later
@@ -199,9 +199,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
         return Queued(torch.zeros(values.shape), None, found.renderings)
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
-        # The copy does not wait, and an event needs a device.
-        patch.setattr(screen.Arriving, "__init__", lambda arriving, numbers: None)
         patch.setattr(screen, "wait_for", counted)
-        for module in (finite, quarantine, said_later):
+        for module in (finite, quarantine, said_later, screen):
             patch.setattr(module, "on_its_way", queued)
         yield found

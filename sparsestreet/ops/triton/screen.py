@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestreet.on_its_way import OnItsWay, on_its_way
 from sparsestreet.ops.triton import capacity, records, rows
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.lists import PAIR_LIMIT, Lists, Visible, check_pairs, list_rows, list_tiles
@@ -60,10 +61,10 @@ def draw(gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers
     room = capacity.predicted(place, rows, PAIR_LIMIT)
     if room is not None:
         visible = list_visible_rows(projection, room, view)
-        arriving = Arriving(visible.sizes.on_device)
+        counted = on_its_way(visible.sizes.on_device)
         screen = list_in(room, projection, visible, view)
         layers = work(screen)
-        read(visible.sizes, arriving, gaussians, projection)
+        read(visible.sizes, counted, gaussians, projection)
         if room.holds(visible.sizes.pairs, visible.sizes.rows):
             capacity.remember(place, visible.sizes.rows, visible.sizes.pairs)
             return screen, layers
@@ -98,7 +99,7 @@ def list_exactly(gaussians: Gaussians, projection: Projection, view: KernelView)
     """Lists what is visible, in no more room than that takes: waits for its size."""
     visible = list_visible_rows(projection, Room(len(gaussians), PAIR_LIMIT), view)
     sizes = visible.sizes
-    read(sizes, Arriving(sizes.on_device), gaussians, projection)
+    read(sizes, on_its_way(sizes.on_device), gaussians, projection)
     return list_in(Room(sizes.rows, sizes.pairs), projection, visible, view)
 
 
@@ -111,28 +112,14 @@ def list_in(room: Room, projection: Projection, visible: Visible, view: KernelVi
     return Screen(p.table, p.records, p.tile_counts, p.radii, list_tiles(p.records, visible, room, view))
 
 
-class Arriving:
-    """A copy of numbers to the host that was queued, and the event after it."""
-
-    def __init__(self, numbers: Int[Tensor, " numbers"]):
-        # Memory of the host that the device can write while the host goes on.
-        self.numbers = numbers.to("cpu", non_blocking=True)
-        self.event = None
-        if numbers.device.type != "cpu":
-            self.event = torch.cuda.Event()
-            self.event.record(torch.cuda.current_stream(numbers.device))
-
-
-def wait_for(arriving: Arriving) -> list[int]:
+def wait_for(numbers: OnItsWay) -> list[int]:
     """The numbers, once they are there. Only here does the op wait for the device."""
-    if arriving.event is not None:
-        arriving.event.synchronize()
-    return arriving.numbers.tolist()
+    return numbers.arrived().tolist()
 
 
-def read(sizes: Sizes, arriving: Arriving, gaussians: Gaussians, projection: Projection) -> None:
+def read(sizes: Sizes, counted: OnItsWay, gaussians: Gaussians, projection: Projection) -> None:
     """Waits for the sizes; raises what ``project`` raises."""
-    pairs, rows, bad = wait_for(arriving)[:COUNTED]
+    pairs, rows, bad = wait_for(counted)[:COUNTED]
     if bad:
         check_values(gaussians)
     check_pairs(pairs, projection.tile_counts)
