@@ -1,19 +1,14 @@
-"""When nodes are refined and reset, which rows go, and what a resumed run knows of it."""
-
-import copy
-import logging
+"""When nodes are refined and reset, and which rows go."""
 
 import pytest
 import torch
 
-from sparsestreet.ranks import Ranks
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_seed
-from sparsestreet.scene.nodes import Node
-from sparsestreet.training.callbacks import DensityControl, density_control
+from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.schedule import Interval
-from sparsestreet.training.system import StreetSystem
+from tests.training.callbacks.refining import asked_at, every_ten, started
 from tests.training.stubs import (
     AskedStrategy,
     Listener,
@@ -26,27 +21,7 @@ from tests.training.stubs import (
     set_rows,
 )
 
-NEVER = Interval(0.0, 0.0)
 KEEPS_ALL = GradientDensity(grad_threshold=1e9, cull_opacity=0.0, cull_scale=1e9)
-
-
-def every_ten(
-    reset_in: Interval = NEVER, *, pause: int = 0, seed: int = 0, densify_until: float = 0.9
-) -> DensityControl:
-    """Refines at 10, 20 ... 90 of 100 steps."""
-    return DensityControl(Interval(0.1, 0.9, every=10), densify_until, reset_in, pause_after_reset=pause, seed=seed)
-
-
-def started(control: DensityControl, **nodes: Node) -> tuple[StubTrainer, StreetSystem, Listener]:
-    listener = Listener()
-    system = make_system(nodes)
-    trainer = StubTrainer(system, [control, listener])
-    trainer.start()
-    return trainer, system, listener
-
-
-def asked_at(strategy: AskedStrategy, what: str) -> list[int]:
-    return [round(100 * given["progress"]) for given in strategy.asked if given["what"] == what]
 
 
 def test_densify_until_its_fraction_and_cull_to_the_end_of_the_interval():
@@ -180,74 +155,6 @@ def test_a_reset_lowers_opacities_and_forgets_their_moments_only():
         assert optimizer.state[node.rows.means][moment].any()
 
 
-def splitting(count: int = 20) -> Node:
-    """Rows of which all that have been seen are split or cloned: a refinement asks chance."""
-    return background(count, density=GradientDensity(grad_threshold=0.0, split_scale=0.01, cull_opacity=0.0))
-
-
-def test_seeds_decide_where_children_lie():
-    means = []
-    for seed in (1, 1, 2):
-        node = splitting()
-        trainer, _, _ = started(every_ten(seed=seed), background=node)
-        trainer.global_step = 9
-        trainer.train(1, frame_at())
-        means.append(node.rows.means.detach())
-    assert len(means[0]) > 20
-    assert torch.equal(means[0], means[1])
-    assert not torch.equal(means[0], means[2])
-
-
-def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tmp_path):
-    """Statistics, the generator and the pause after a reset come back: cut after 24 of 30 steps, inside a pause."""
-    resets = Interval(0.1, 0.2, every=10)
-    control, node = every_ten(resets, pause=9), splitting()
-    trainer, _, _ = started(control, background=node)
-    trainer.global_step = 9
-    trainer.train(1, frame_at())
-    trainer.global_step = 18
-    trainer.train(6, frame_at())
-    torch.save(control.state_dict(), tmp_path / "control.pt")
-    resumed_node, step = copy.deepcopy(node), trainer.global_step
-    optimizer_state = copy.deepcopy(trainer.optimizers[0].state_dict())
-    trainer.train(6, frame_at())
-
-    resumed = every_ten(resets, pause=9, seed=5)
-    later = StubTrainer(make_system({"background": resumed_node}), [resumed])
-    resumed.load_state_dict(torch.load(tmp_path / "control.pt", weights_only=True))
-    later.optimizers[0].load_state_dict(optimizer_state)
-    later.global_step = step
-    later.start()
-    later.train(6, frame_at())
-    assert len(node.rows) > 40
-    for name, column in node.rows.columns().items():
-        assert torch.equal(resumed_node.rows.columns()[name], column), name
-
-
-def test_a_pause_outlives_a_resume():
-    resets = Interval(0.3, 0.3, every=10)
-    trainer, _, _ = started(control := every_ten(resets, pause=20), background=background(4, density=AskedStrategy()))
-    trainer.walk(34)
-    strategy = AskedStrategy()
-    resumed = every_ten(resets, pause=20)
-    later = StubTrainer(make_system({"background": background(4, density=strategy)}), [resumed])
-    resumed.load_state_dict(control.state_dict())
-    later.global_step = 34
-    later.start()
-    later.walk(70)
-    assert asked_at(strategy, "cull") == [60, 70]
-
-
-def test_a_state_has_the_number_of_rows_of_its_moment():
-    """A checkpoint comes from after a growth: setup, which saw the rows before, does not count."""
-    control = every_ten()
-    started(control, background=background(4, density=KEEPS_ALL))
-    resumed = every_ten()
-    started(resumed, background=background(9, density=KEEPS_ALL))
-    resumed.load_state_dict(control.state_dict())
-    assert len(resumed.statistics["background"]) == 4
-
-
 @pytest.mark.parametrize("densify_until", [0.05, 0.95])
 def test_densification_outside_the_refinement_is_refused(densify_until):
     with pytest.raises(ValueError, match="densify_until must lie between"):
@@ -321,109 +228,3 @@ def test_images_that_leave_no_time_to_refine_are_refused():
     trainer = StubTrainer(system, [drivestudio(every=10)], train=tuple(map(frame_at, range(12))))
     with pytest.raises(ValueError, match="the 12 training images fill the 10 steps between two opacity resets"):
         trainer.start()
-
-
-class Together(Ranks):
-    """One of two processes, of which the other says what it is told."""
-
-    def gathered(self, value):
-        return [value, {name: state | {"visits": state["visits"] + 5} for name, state in value.items()}]
-
-
-def resumed_by(rank: int, size: int) -> DensityControl:
-    """After a checkpoint of two processes: the first has seen its rows once, the other five times more."""
-    before = every_ten()
-    StubTrainer(make_system({"background": background(3, density=AskedStrategy())}), [before])
-    before.statistics["background"].visits += 1
-    before._ranks = Together(0, 2)
-    after = every_ten()
-    after.load_state_dict(copy.deepcopy(before.state_dict()))
-    after._take_own(Ranks(rank, size))
-    return after
-
-
-@pytest.mark.parametrize(("rank", "size", "visits"), [(0, 2, 1), (1, 2, 6), (0, 1, 7), (0, 3, 7), (2, 3, 0)])
-def test_processes_go_on_with_their_own_statistics_and_another_number_of_them_with_all(rank, size, visits):
-    statistics = resumed_by(rank, size).statistics["background"]
-    assert statistics.visits.tolist() == [visits] * 3
-
-
-GROWS_ALL = GradientDensity(grad_threshold=1e-12, cull_opacity=0.0, cull_scale=1e9)
-
-
-def grown(monkeypatch: pytest.MonkeyPatch, *free: float) -> tuple[DensityControl, StreetSystem, Listener]:
-    """Two refinements of 20 rows that all want to grow, where memory says it has ``free`` bytes."""
-    said = iter(free)
-    monkeypatch.setattr(density_control, "bytes_for_growth", lambda device: next(said))
-    control = every_ten()
-    trainer, system, listener = started(control, background=background(20, density=GROWS_ALL))
-    for _ in free:
-        statistics = control.statistics["background"]
-        statistics.gradient_sum += 1 + torch.arange(len(statistics))
-        statistics.visits += 1
-        trainer.walk(trainer.global_step + 10)
-    return control, system, listener
-
-
-def rows_after(listener: Listener) -> list[int]:
-    return [change.after for change, _ in listener.heard if change.reason == "densify"]
-
-
-def test_memory_holds_growth_back_which_is_said_once(monkeypatch, caplog):
-    """20 rows of 59 numbers and a label of 8 bytes each would be 60."""
-    each = 4 * (59 * 4 + 8) + 350
-    with caplog.at_level(logging.WARNING):
-        _, system, listener = grown(monkeypatch, 6 * each, 0.5 * each)
-    first, second = rows_after(listener)
-    assert 20 < first <= 26
-    assert second == first
-    assert system.held_back == {"background": 40 - 6 + 2 * first}
-    (said,) = [record.message for record in caplog.records if "memory" in record.message]
-    assert said.startswith(f"step 10: 'background' would grow by 40 Gaussians of {each:,} bytes each, and memory has")
-    assert " room for 6: no more are added." in said
-
-
-def test_where_memory_has_room_nothing_changes(monkeypatch):
-    """Not even the draws: rows are those of a run that is not asked."""
-    ends = []
-    for free in (float("inf"), 40 * (4 * (59 * 4 + 8) + 350.0)):
-        _, system, _ = grown(monkeypatch, free)
-        assert system.held_back == {}
-        ends.append(system.scene.nodes["background"].rows)
-    assert torch.equal(ends[0].means, ends[1].means)
-    assert len(ends[0]) == 60
-
-
-def test_what_fits_is_what_a_limit_would_allow(monkeypatch):
-    """A plan that is made again draws the same numbers."""
-    _, system, _ = grown(monkeypatch, 6 * (4 * (59 * 4 + 8) + 350.0))
-    strategy = GROWS_ALL
-    limited = every_ten()
-    monkeypatch.setattr(density_control, "bytes_for_growth", lambda device: float("inf"))
-    trainer, other, _ = started(limited, background=background(20, density=strategy, max_gaussians=26))
-    limited.statistics["background"].gradient_sum += 1 + torch.arange(20)
-    limited.statistics["background"].visits += 1
-    trainer.walk(10)
-    assert torch.equal(system.scene.nodes["background"].rows.means, other.scene.nodes["background"].rows.means)
-
-
-def test_several_processes_add_what_the_fullest_has_room_for(monkeypatch):
-    """The largest of the negated rooms, as all of them hear it."""
-    heard = []
-
-    class Fuller(Ranks):
-        def largest(self, values):
-            if values.dim() == 0:
-                heard.append(float(values))
-                return torch.maximum(values, torch.tensor(-3 * (4 * (59 * 4 + 8) + 350.0), dtype=torch.float64))
-            return values
-
-        def sum(self, values):
-            return values
-
-    monkeypatch.setattr(density_control, "bytes_for_growth", lambda device: 1e9)
-    control = every_ten()
-    trainer, system, _ = started(control, background=background(20, density=GROWS_ALL))
-    control._ranks = Fuller(0, 2)
-    assert control._fits(trainer, system, "background", 40) == 23
-    assert heard == [-1e9]
