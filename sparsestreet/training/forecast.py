@@ -92,6 +92,14 @@ def largest(system: StreetSystem) -> int:
     return int(sum(max(limit, len(node.rows)) for limit, node in zip(limits, nodes, strict=True)))
 
 
+def size_in_words(system: StreetSystem) -> str:
+    """The Gaussians that a run may end with: a limit, or a guess where a node that grows has none."""
+    settings = [node.settings for node in system.scene.nodes.values()]
+    if any(one.density is not None and one.max_gaussians is None for one in settings):
+        return f"some {largest(system):,} Gaussians ({GROWS_TO:g} times those of now, as no limit holds them)"
+    return f"at most {largest(system):,} Gaussians"
+
+
 def measured_step(system: StreetSystem, data: StreetData) -> float:
     """Seconds of a training step. The loss is the photometric one, which counts and draws nothing: what is trained
     afterwards stays the same to the bit."""

@@ -18,6 +18,7 @@ from sparsestreet.training.forecast import (
     measured_evaluation,
     measured_step,
     renders_of,
+    size_in_words,
 )
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
 from sparsestreet.training.moved_views.returns import StreetReturns
@@ -57,7 +58,10 @@ def test_a_node_grows_to_its_limit_or_to_a_few_times_its_start():
     system = make_system({"kept": kept, "limited": limited, "free": free, "full": full})
     most = 20 + 50 + GROWS_TO * 30 + 40
     assert largest(system) == most
+    assert size_in_words(system) == f"some {most:,.0f} Gaussians (3 times those of now, as no limit holds them)"
     assert growth_of(system) == pytest.approx((most / 100) ** GROWTH)
+    del system.scene.nodes["free"]
+    assert size_in_words(system) == "at most 110 Gaussians"
 
 
 def test_moved_views_take_their_part_of_the_steps(monkeypatch):

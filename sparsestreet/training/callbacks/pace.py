@@ -12,10 +12,10 @@ from sparsestreet.training.callbacks.pruning import Pruning
 from sparsestreet.training.forecast import (
     Forecast,
     growth_of,
-    largest,
     measured_evaluation,
     measured_step,
     renders_of,
+    size_in_words,
 )
 from sparsestreet.training.lightning import (
     callbacks_of,
@@ -72,9 +72,9 @@ class Pace(Callback):
         steps, step = pl_module.course.steps, trainer.global_step
         left = forecast.training(steps - step, pl_module.course.progress(step)) + self._passes(trainer, pl_module)
         log.info(
-            "%s steps, at most %s Gaussians, about %.1f minutes and %.1f for evaluation: a step takes %.0f ms now, as "
+            "%s steps, %s, about %.1f minutes and %.1f for evaluation: a step takes %.0f ms now, as "
             "a few show, and %.0f ms with all Gaussians",
-            f"{steps:,}", f"{largest(pl_module):,}", left / 60, forecast.evaluation / 60,
+            f"{steps:,}", size_in_words(pl_module), left / 60, forecast.evaluation / 60,
             1e3 * forecast.step, 1e3 * forecast.step * forecast.growth,
         )  # fmt: skip
         self._seen = (step, self._seconds("train"))
