@@ -13,6 +13,9 @@ PER_IMAGE = 56.0
 IMAGES_PER_CAPACITY = 54.0
 """Training images of a recorded drive that the numbers of ``capacity=small`` are made for (docs/length.md)."""
 
+PRESSED_STEPS = 2000
+"""Steps that the weight of masks in ``schedule=short`` is made for (docs/length.md)."""
+
 
 def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
     """Of conf/node: the entry of the capacity that is chosen."""
@@ -68,6 +71,12 @@ def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:
     images = _root_.training_views.images
     enough = float(_root_.data.get("images_per_capacity", IMAGES_PER_CAPACITY))
     return least if images is None else max(least, 100 * round(least * images / enough / 100))
+
+
+def of_pressure(weight: float, *, _root_: DictConfig) -> float:
+    """Of conf/schedule: a weight that presses in every step, such that a run of more than ``PRESSED_STEPS`` has as much
+    of it in all as one of so many (docs/length.md)."""
+    return float(weight) * min(1.0, PRESSED_STEPS / _root_.schedule.max_steps)
 
 
 def of_30000(step: int) -> float:
@@ -140,6 +149,7 @@ _RESOLVERS = {
     "gaussians_of_log": gaussians_of_log,
     "min": min,
     "of_30000": of_30000,
+    "of_pressure": of_pressure,
     "at_scale": at_scale,
     "of_preset": of_preset,
     "gaussians_of": gaussians_of,

@@ -59,3 +59,13 @@ def test_gaussians_of_every_method_follow_the_training_images(method):
     assert limits
     assert {name: many[name].max_gaussians for name in limits} == {name: 2 * most for name, most in limits.items()}
     assert many.background.num_points == 2 * few.background.num_points
+
+
+@pytest.mark.parametrize(
+    ("words", "images", "removal", "weight"),
+    [((), None, 6.0, 12.0), (("schedule.max_steps=1200",), None, 6.0, 12.0), (DRIVE, 108, 2.0, 4.0),
+     (("schedule.max_steps=10000",), 108, 1.2, 2.4), (("schedule=paper",), 108, 1.0, 1.0)],
+)  # fmt: skip
+def test_masks_press_in_a_long_run_as_much_in_all_as_in_2000_steps(words, images, removal, weight):
+    schedule = with_images(composed(*words), images).schedule
+    assert (schedule.removal_lambda_m, schedule.lambda_m) == pytest.approx((removal, weight))
