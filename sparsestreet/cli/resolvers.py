@@ -76,7 +76,9 @@ def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:
 def of_pressure(weight: float, *, _root_: DictConfig) -> float:
     """Of conf/schedule: a weight that presses in every step, such that a run of more than ``PRESSED_STEPS`` has as much
     of it in all as one of so many (docs/length.md)."""
-    return float(weight) * min(1.0, PRESSED_STEPS / _root_.schedule.max_steps)
+    steps = _root_.schedule.max_steps
+    whole = isinstance(steps, int) and steps > 0  # others are refused (cli/limits.py)
+    return float(weight) * (min(1.0, PRESSED_STEPS / steps) if whole else 1.0)
 
 
 def of_30000(step: int) -> float:
