@@ -25,6 +25,17 @@ def refined(scene: BenchScene, factor: int, seed: int = 0) -> BenchScene:
     return BenchScene(scene.name, source, _split(scene.gaussians, factor, seed), camera)
 
 
+def enlarged(scene: BenchScene, factor: int) -> BenchScene:
+    """The same splats in an image ``factor`` times as wide and high.
+
+    Raises ValueError for a factor below 1.
+    """
+    if factor < 1:
+        raise ValueError(f"an image is enlarged by a whole factor of at least 1, got {factor}")
+    camera = resized(scene.camera, factor * scene.camera.height, factor * scene.camera.width)
+    return BenchScene(scene.name, scene.source, scene.gaussians, camera)
+
+
 def _split(gaussians: Gaussians, factor: int, seed: int) -> Gaussians:
     def repeated(field: torch.Tensor) -> torch.Tensor:
         return field.repeat_interleave(factor * factor, 0)

@@ -45,6 +45,7 @@ examples:
   sparsestreet bench scaling --threads 2        time against pairs, 1,000 to 3,000,000 splats, and a straight line
   sparsestreet bench gpu                        a CUDA device at 0.1 to 5 M splats; beside it gsplat, if installed
   sparsestreet bench gpu --street RUN --refine 3   and a trained street, each splat as 3 x 3, the image 3 times as wide
+  sparsestreet bench gpu --street RUN --enlarge 2  that street alone, also in images twice as wide
   sparsestreet bench gpu --tuning most_parts=1 --tuning two_launches=false   and other choices of the kernels
 
 Records go to OUT/MODE.jsonl, one JSON object a line; figures beside them as SVG and PNG.
@@ -72,6 +73,8 @@ def bench(arguments: list[str]) -> int:
         parser.error(f"{options.mode} takes no options of train, got {' '.join(options.overrides)}")
     if options.refine is not None and (options.mode != "gpu" or options.street is None or options.refine < 1):
         parser.error("--refine N, at least 1, makes the street of gpu --street RUN finer")
+    if options.enlarge is not None and (options.mode != "gpu" or options.street is None or options.enlarge < 1):
+        parser.error("--enlarge N, at least 1, shows the street of gpu --street RUN alone, in larger images too")
     if options.tuning and options.mode != "gpu":
         parser.error("--tuning compares choices of the kernels of gpu")
     if options.threads is not None:
@@ -98,6 +101,9 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--refine", type=int, metavar="N", help="gpu: N x N smaller splats for each of the street's, N times the image"
+    )
+    parser.add_argument(
+        "--enlarge", type=int, metavar="N", help="gpu: the street alone, also in images N times as large a side"
     )
     parser.add_argument(
         "--tuning", action="append", default=[], metavar="NAME=VALUE,...",
@@ -279,25 +285,30 @@ def _gpu(options: argparse.Namespace) -> bool:
         tunings = gpu.DEFAULT | {words: tuning_of(words) for words in options.tuning}
     except ValueError as error:
         raise SystemExit(f"sparsestreet bench gpu: {error}") from error
-    streets = [] if options.street is None else front_streets(options.street, options.refine or 1)
+    streets = [] if options.street is None else front_streets(options.street, options.refine or 1, options.enlarge or 1)
     if options.quick:
         once = TimingBudget(repeats=2, least=1)
-        return gpu.run_gpu([Size(64, 48, 500)], device, once, _file(options), streets=streets, tunings=tunings)
-    sizes = [Size(width, height, rows) for width, height in gpu.IMAGES for rows in gpu.ROWS]
+        sizes = [] if options.enlarge else [Size(64, 48, 500)]
+        return gpu.run_gpu(sizes, device, once, _file(options), streets=streets, tunings=tunings)
+    images = [] if options.enlarge else gpu.IMAGES
+    sizes = [Size(width, height, rows) for width, height in images for rows in gpu.ROWS]
     return gpu.run_gpu(sizes, device, gpu.BUDGET, _file(options), streets=streets, tunings=tunings)
 
 
-def front_streets(run: Path, refine: int) -> list[BenchScene]:
+def front_streets(run: Path, refine: int, enlarge: int = 1) -> list[BenchScene]:
     """A trained run as its camera of the least number sees it in its first and in its middle frame, refined.
+
+    With ``enlarge`` above 1 both come once more, in images that are as many times as wide and high.
 
     Raises FileNotFoundError if the folder holds no scene or no views.
     """
-    from sparsestreet.bench.refine import refined
+    from sparsestreet.bench.refine import enlarged, refined
 
     stored, views = _scene_and_views(run)
     front = [view for view in views if view.camera_index == min(view.indices[1] for view in views)]
     chosen = {place: front[place] for place in (0, len(front) // 2)}
-    return [refined(_street(run, stored, view), refine) for view in chosen.values()]
+    streets = [refined(_street(run, stored, view), refine) for view in chosen.values()]
+    return streets if enlarge == 1 else [*streets, *(enlarged(street, enlarge) for street in streets)]
 
 
 def trained_street(run: Path) -> BenchScene:

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from sparsestreet.bench import blend, data, figures, gpu, knobs, masks, scaling, scenes, step, sweep
+from sparsestreet.bench.refine import enlarged
 from sparsestreet.bench.scenes import Size
 from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.cli import bench as cli_bench
 from sparsestreet.cli import step as cli_step
 from sparsestreet.cli.bench import bench, trained_street
+from sparsestreet.geometry.cameras import project
 from sparsestreet.ops import splat
 from sparsestreet.ops.triton.tuning import Tuning
 from sparsestreet.records.provenance import this_machine, this_source
@@ -188,10 +190,12 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
 
 def test_a_street_is_beside_the_sizes_of_a_gpu(handed, monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(cli_bench, "front_streets", lambda run, refine: [(run, refine)])
-    for words, refine in (([], 1), (["--quick", "--refine", "3"], 3)):
+    monkeypatch.setattr(cli_bench, "front_streets", lambda *given: [given])
+    for words, refine, enlarge in (([], 1, 1), (["--quick", "--refine", "3"], 3, 1), (["--enlarge", "2"], 1, 2)):
         assert bench(["gpu", "--street", "RUN", *words, "--out", str(tmp_path)]) == 0
-        assert handed["run_gpu"][1]["streets"] == [(Path("RUN"), refine)]
+        (sizes, *_), named = handed["run_gpu"]
+        assert named["streets"] == [(Path("RUN"), refine, enlarge)]
+        assert bool(sizes) == (enlarge == 1)  # larger images are of the street alone
 
 
 def test_other_choices_of_the_kernels_are_beside_todays(handed, monkeypatch, tmp_path, capsys):
@@ -213,12 +217,14 @@ def test_other_choices_of_the_kernels_are_beside_todays(handed, monkeypatch, tmp
     assert ended.value.code == 2
 
 
-@pytest.mark.parametrize("words", [["gpu"], ["knobs", "--street", "RUN"], ["gpu", "--street", "RUN", "--refine", "0"]])
-def test_only_the_street_of_a_gpu_is_refined(words, capsys):
+@pytest.mark.parametrize("flag", ["--refine", "--enlarge"])
+@pytest.mark.parametrize("words", [["gpu"], ["knobs", "--street", "RUN"], ["gpu", "--street", "RUN", "0"]])
+def test_only_the_street_of_a_gpu_is_refined(words, flag, capsys):
+    *words, number = [*words] if words[-1] == "0" else [*words, "3"]
     with pytest.raises(SystemExit) as ended:
-        bench([*words, *(() if "--refine" in words else ("--refine", "3"))])
+        bench([*words, flag, number])
     assert ended.value.code == 2
-    assert "--refine N, at least 1" in capsys.readouterr().err
+    assert f"{flag} N, at least 1" in capsys.readouterr().err
 
 
 def made_street(folder: Path) -> Path:
@@ -239,6 +245,18 @@ def test_the_front_camera_sees_the_first_frame_and_the_middle_one(tmp_path):
         assert (street.camera.width, street.camera.height) == (3 * view.camera.width, 3 * view.camera.height)
         assert torch.equal(street.camera.camera_from_world, view.camera.camera_from_world)
     assert [street.source.split(", ")[1] for street in streets] == ["frame 0", "frame 2"]
+
+
+def test_a_street_comes_once_more_in_larger_images(tmp_path):
+    first, middle, *larger = cli_bench.front_streets(made_street(tmp_path / "run"), 1, 2)
+    for street, wide in zip((first, middle), larger, strict=True):
+        assert wide.gaussians is street.gaussians
+        assert (wide.camera.width, wide.camera.height) == (2 * street.camera.width, 2 * street.camera.height)
+        pixels, depths, _ = project(street.camera, street.gaussians.means)
+        seen = depths > 0
+        torch.testing.assert_close(project(wide.camera, street.gaussians.means)[0][seen], 2 * pixels[seen])
+    with pytest.raises(ValueError, match="factor of at least 1, got 0"):
+        enlarged(first, 0)
 
 
 @pytest.mark.lengthy
