@@ -84,7 +84,7 @@ tables: $(VENV)/.ok ## five methods, pruned, and controls on three streets (75 t
 	$(TRAIN) +sweep=streets; status=$$?; \
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/streets; exit $$status
 
-claims: $(VENV)/.ok ## what the paper claims, at equal count, and what accuracy costs a trained scene (27 trainings): outputs/sweeps
+claims: $(VENV)/.ok ## what the paper claims, at equal count, and what accuracy costs a trained scene (39 trainings): outputs/sweeps
 	for sweep in claims renders; do $(TRAIN) +sweep=$$sweep || exit $$?; done
 	for sweep in claims renders; do $(BIN)/sparsestreet report sweep=outputs/sweeps/$$sweep; done
 

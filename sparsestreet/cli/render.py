@@ -27,6 +27,7 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN flight.mp4 path=keys.json               along poses of your own (docs/rendering.md)
   sparsestreet render outputs/RUN truck.mp4 cameras=0 up=1.2 fov=100 width=960 height=400    another camera
   sparsestreet render outputs/RUN labels layers=[rgb,depth,instances]     a folder of PNGs for each layer
+  sparsestreet render outputs/RUN sure.mp4 layers=[rgb,seen] edits=edits.yaml   and where the scene only guesses
   sparsestreet render outputs/RUN lidar.mp4 layers=[rgb,lidar] cameras=0  the log's lidar on the picture
 
   scene     a run's folder, a scene.safetensors, or a .street; the first word without a key
@@ -49,16 +50,16 @@ the cameras:
   height    pixels; rows come or go above and below (default: in proportion)
 
 the pictures:
-  layers    [rgb,depth,alpha,nodes,instances,lidar]: in a .mp4 one below the other, in colors; in a folder one folder
-            each, exact: depth in millimeters, ids of nodes and objects with tables (default: rgb). lidar needs the log:
-            its returns, drawn on the picture
+  layers    [rgb,depth,alpha,nodes,instances,seen,lidar]: in a .mp4 one below the other, in colors; in a folder one
+            folder each, exact: depth in millimeters, ids of nodes and objects with tables (default: rgb). seen: how
+            many recorded images showed it; 0 is a guess. lidar needs the log: its returns, drawn on the picture
   fps       frames a second of the video; poses between the recorded ones are interpolated (default: as the log)
   log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
 """
 
 PATHS = ("recorded", "shifted", "lane_change")
-LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "lidar")
+LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "seen", "lidar")
 
 
 @dataclass(frozen=True)
@@ -118,8 +119,10 @@ def render(arguments: list[str]) -> int:
 def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.edits import with_edits
+    from sparsestreet.cli.progress import shown
     from sparsestreet.cli.returns import returns_of
     from sparsestreet.cli.scene import folder_of, open_scene, recorded_views
+    from sparsestreet.export.seen import count_images
     from sparsestreet.export.video import check_destination
     from sparsestreet.scene.views import DEFAULT_FRAME_RATE
 
@@ -127,6 +130,8 @@ def _render(request: RenderRequest) -> None:
     check_destination(request.out)
     stored = open_scene(request.scene, request.device)
     views = recorded_views(request.scene, request.views)
+    if "seen" in request.layers:
+        count_images(stored, shown(views.training, len(views.training), "images looked at"))
     stored = with_edits(stored, views, request.edits)
     log_fps = request.log_fps or views.frame_rate
     if log_fps is None:

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped, UInt8
 from PIL import Image
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_folder
 from sparsestreet.export.lidar import FARTHEST, LidarReturns, enlarged
 from sparsestreet.export.path import CameraPath
+from sparsestreet.export.seen import images_seen
 from sparsestreet.export.video import Picture, side_by_side
 from sparsestreet.ops import splat
 from sparsestreet.pictures.images import color_map
@@ -26,10 +27,11 @@ from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
 
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
-"""Those that are of the scene; ``lidar`` is of the log."""
+"""Those that are of the scene; ``lidar`` is of the log, ``seen`` of its images."""
 
 Values = Shaped[np.ndarray, "_h _w *_c"]
-"""rgb uint8 [h, w, 3]; depth and lidar uint16, millimeters; alpha uint8; ids of nodes uint8, of instances uint16."""
+"""rgb uint8 [h, w, 3]; depth and lidar uint16, millimeters; alpha uint8; ids of nodes uint8, of instances uint16;
+seen uint8, images."""
 
 _SOLID = 0.5
 """Of alpha, from which a pixel has a depth."""
@@ -37,6 +39,9 @@ _DOTS = 320
 """Dots of the lidar that fit side by side into a picture, at most."""
 _NEAR, _FAR = 1.0, 100.0
 """Meters of the lightest and of the darkest color in a picture of depth."""
+_MANY = 32
+"""Images that have seen enough: the lightest color in a picture of ``seen``."""
+_MOST = 255
 _FIRST_HARMONIC = 0.28209479177387814
 
 
@@ -70,7 +75,8 @@ def layer_values(
 
     A pixel shows the node, or the object, that has the largest part of its color. Id 0 is what is none of them: the
     sky, and for objects all that is no object. The layer ``lidar`` is made of the log's ``returns``, not of the scene:
-    the nearest one in each pixel, of the sweep that is nearest in time, and 0 where there is none.
+    the nearest one in each pixel, of the sweep that is nearest in time, and 0 where there is none. ``seen`` needs
+    ``count_images``, before the scene is edited: it is the mean count of the Gaussians in a pixel, by their weights.
     """
     rendering = stored.render(view)
     found: dict[str, Values] = {}
@@ -87,6 +93,8 @@ def layer_values(
             if returns is None:
                 raise ValueError("the layer lidar is made of a log's returns: give them")
             found[layer] = returns.millimeters(stored.scene.seen(view).camera, view.time)
+        elif layer == "seen":
+            found[layer] = _seen(stored, view, rendering)
         elif layer == "nodes":
             found[layer] = _shown_ids(stored, view, rendering, _node_ids(rendering)).astype(np.uint8)
         else:
@@ -97,6 +105,8 @@ def layer_values(
 def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Picture | None = None) -> Picture:
     """Returns a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own.
 
+    What few images have seen is dark.
+
     Returns of the lidar are dots on the picture ``under`` them, darkened to half, or on black without one.
     """
     if layer == "rgb":
@@ -105,6 +115,8 @@ def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Pictu
         return np.repeat(values[..., None], 3, axis=-1)
     if layer == "depth":
         return np.where(values[..., None] > 0, _by_distance(values), 0).astype(np.uint8)
+    if layer == "seen":
+        return color_map(np.log2(1.0 + values) / np.log2(1.0 + _MANY))
     if layer == "lidar":
         dots = enlarged(values, math.ceil(values.shape[1] / _DOTS))
         return np.where(dots[..., None] > 0, _by_distance(dots), 0 if under is None else under // 2).astype(np.uint8)
@@ -173,6 +185,14 @@ def tables(stored: StoredScene, layers: Sequence[str]) -> Mapping[str, Any]:
             str(one.id): {"name": one.name, "class": one.class_name, "node": one.node} for one in instance_table(stored)
         }
     return found
+
+
+def _seen(stored: StoredScene, view: View, rendering: SceneRendering) -> UInt8[np.ndarray, "h w"]:
+    """Images that showed what the pixel shows, rounded; 0 also where the pixel has no depth."""
+    share = images_seen(stored.scene, rendering.spans).clamp(max=_MOST) / _MOST
+    summed = _splatted(stored, stored.scene.seen(view), rendering, share[:, None].expand(-1, 3))[..., 0]
+    mean = _MOST * summed / rendering.alpha.clamp(min=_SOLID)
+    return torch.where(rendering.alpha >= _SOLID, mean.round().clamp(0, _MOST), 0.0).byte().cpu().numpy()
 
 
 def _node_ids(rendering: SceneRendering) -> Int[Tensor, " n"]:

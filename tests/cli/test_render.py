@@ -17,7 +17,9 @@ from sparsestreet.cli.render import USAGE, RenderRequest, render
 from sparsestreet.export import rig, video
 from sparsestreet.export.layers import LAYERS, layer_values
 from sparsestreet.export.path import recorded, resized, shifted
+from sparsestreet.export.seen import count_images
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.scene.edits import REMOVED, Edits, edited
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
@@ -125,7 +127,7 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
         ({"path": "circle"}, 2, "or a .json, got 'circle'"),
         ({"path": "a.json", "frames": "0:2"}, 2, "frames= chooses of the log's"),
         ({"path": "a.json"}, 1, "there is no path at a.json"),
-        ({"layers": "rgb,radar"}, 2, "layers are rgb, depth, alpha, nodes, instances, lidar, each once"),
+        ({"layers": "rgb,radar"}, 2, "layers are rgb, depth, alpha, nodes, instances, seen, lidar, each once"),
         ({"layers": "rgb,lidar"}, 1, "the layer lidar needs the log that the scene was trained on"),
         ({"layers": "rgb,rgb"}, 2, "each once, got rgb, rgb"),
         ({"fov": 180}, 2, "fov lies between 0 and 180 degrees"),
@@ -274,6 +276,20 @@ def test_layers_are_folders_of_exact_values_with_tables(run, tmp_path):
         assert found.dtype == expected[layer].dtype
     assert json.loads((out / "nodes.json").read_text()) == {"1": "background", "2": "rigid"}
     assert json.loads((out / "instances.json").read_text())["2"]["name"] == "tram"
+
+
+def test_seen_images_are_training_images_and_counted_before_edits(run, tmp_path):
+    (tmp_path / "edits.yaml").write_text("remove: [car]", encoding="utf-8")
+    words = ["layers=[seen]", f"edits={tmp_path / 'edits.yaml'}", "cameras=0", "frames=1:2"]
+    assert render([f"{run}", f"{tmp_path / 'out'}", *words]) == 0
+    stored, views = stored_street(), read_views(run / "views.json")
+    count_images(stored, views.training)
+    bare = replace(stored, scene=edited(stored.scene.eval(), Edits({"car": REMOVED})))
+    view = next(view for view in views.all if view.indices == (1, 0))
+    (shown,) = pictures(tmp_path / "out" / "seen")
+    assert np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
+    count_images(bare, views.all)
+    assert not np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
 
 
 def test_a_video_of_layers(run, tmp_path):
