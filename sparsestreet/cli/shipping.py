@@ -7,11 +7,12 @@ from sparsestreet.cli.scene import recorded_views
 from sparsestreet.export.check import check_file, turned_camera
 from sparsestreet.export.compressed_ply import read_compressed_ply, write_compressed_ply
 from sparsestreet.export.frame import VIEWER_FROM_WORLD, frame_gaussians
+from sparsestreet.export.sog import read_sog, write_sog
 from sparsestreet.export.spz import read_spz, write_spz
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians
 
-_READERS = {".spz": read_spz, ".compressed.ply": read_compressed_ply}
+_READERS = {".spz": read_spz, ".sog": read_sog, ".compressed.ply": read_compressed_ply}
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class FrameExport:
     views: Path | None
     out: Path
     kind: str
-    """``.spz`` or ``.compressed.ply``."""
+    """``.spz``, ``.sog`` or ``.compressed.ply``."""
     time: float
     nodes: tuple[str, ...] | None
     instance: str | None
@@ -35,10 +36,11 @@ def export_frame(request: FrameExport, stored: StoredScene) -> None:
     time = request.time
     instances = None if request.instance is None else [request.instance]
     gaussians = frame_gaussians(stored, time, nodes=request.nodes, instances=instances, sky=request.sky)
-    if request.kind == ".spz":
-        count = write_spz(request.out, gaussians, antialiased=stored.options.settings.antialias)
-    else:
+    if request.kind == ".compressed.ply":
         count = write_compressed_ply(request.out, gaussians)
+    else:
+        write = write_spz if request.kind == ".spz" else write_sog
+        count = write(request.out, gaussians, antialiased=stored.options.settings.antialias)
     size = request.out.stat().st_size
     print(f"{request.out}: {count:,} Gaussians at time {time:g}, {size / 1e6:.2f} MB, {size / count:.1f} bytes each")
     if request.check:

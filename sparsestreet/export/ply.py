@@ -24,6 +24,9 @@ _FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 _LARGEST_OPACITY = 1 - 2.0**-25
 """Halfway between 1 and the largest float32 below 1. Its logit is finite, and the sigmoid of this logit is 1 again."""
 
+_TOLD_APART = 1000
+"""Times that are said with three decimals, however many frames a scene file claims."""
+
 _SMALLEST_SCALE = 1e-30
 """Smallest scale that is written, meters; a scale of 0 has no logarithm."""
 
@@ -116,10 +119,10 @@ def _rows_of_instances(
 
 def _presence(stored: StoredScene, node: Node, objects: Instances, name: str) -> str:
     """Says between which times an object's Gaussians have an opacity: of even frames, and of the ends of its span."""
-    last, place = max(stored.num_frames - 1, 1), objects.names.index(name)
+    steps, place = min(max(stored.num_frames - 1, 1), _TOLD_APART), objects.names.index(name)
     rows = objects.ids == place
     ends = [] if objects.spans is None else objects.spans[place].tolist()
-    times = {*ends, *(frame / last for frame in range(stored.num_frames))}
+    times = {*ends, *(step / steps for step in range(steps + 1))}
     seen = [time for time in sorted(times) if bool((_at(node, time).opacities[rows] > 0).any())]
     return f"it is there from {seen[0]:.3f} to {seen[-1]:.3f}" if seen else "it has no Gaussians"
 

@@ -23,6 +23,8 @@ VERSION = 3
 ROWS = "rows."
 """Begins the names of a node's tensors that are columns."""
 
+_HIGHER_HARMONICS = [(terms - 1, 3) for terms in (1, 4, 9, 16)]
+
 
 @dataclass(frozen=True)
 class StoredScene:
@@ -92,6 +94,9 @@ def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
         {name: column for name, column in columns.items() if column.is_floating_point()},
         {name: column for name, column in columns.items() if not column.is_floating_point()},
     )
+    terms = tuple(rows.sh_rest.shape[1:])
+    if terms not in _HIGHER_HARMONICS:  # others would pass for columns, of which tables of squared size are made
+        raise ValueError(f"a row has 0, 3, 8 or 15 x 3 harmonics above the first, got {terms}: write the file again")
     node = decode_as(NodeSettings, entry["settings"]).restore(rows, tensors, entry["header"])
     if entry["mask"] is not None:
         node.mask = decode_as(BakedMaskSettings, entry["mask"]).restored(tensors["mask.times"])

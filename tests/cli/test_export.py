@@ -62,7 +62,7 @@ def test_a_street_is_one_file_that_commands_open(run, tmp_path, capsys):
     assert "2 objects and poses.json: car, tram" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["street.spz", "street.compressed.ply"])
+@pytest.mark.parametrize("name", ["street.spz", "street.sog", "street.compressed.ply"])
 def test_a_frame_for_viewers_and_what_it_lost(run, tmp_path, name, capsys):
     write_views(run / "views.json", street_views(), [], frame_rate=10.0)
     assert export([str(run), str(tmp_path / name), "time=0.25", "nodes=background", "check=true"]) == 0
@@ -80,7 +80,7 @@ def test_a_frame_for_viewers_and_what_it_lost(run, tmp_path, name, capsys):
         ({"shapes": 4}, 2, "shapes is no option of a .ply: leave it out"),
         ({"out": "street.html", "shapes": 0}, 2, "shapes must be above 0 a second, got 0"),
         ({"out": "street.html"}, 1, "training writes a views.json"),
-        ({"out": "street.obj"}, 2, "must end in .street, .ply, .compressed.ply, .spz, .html, .usdz, got 'street.obj'"),
+        ({"out": "street.obj"}, 2, "must end in .street, .ply, .compressed.ply, .spz, .sog, .html, .usdz, got 'street.obj'"),
         ({"out": "street.ply", "car": "[4,2,1]"}, 2, "car is no option of a .ply: leave it out"),
         ({"out": "a.street", "time": 0.5}, 2, "time is no option of a .street: leave it out"),
         ({"out": "a.ply", "check": "true"}, 2, "check is no option of a .ply: leave it out"),

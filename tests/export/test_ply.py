@@ -145,6 +145,12 @@ def test_an_object_that_is_there_between_two_even_frames_is_found():
         scene_gaussians(stored, 0.8, instances=["tram"])
 
 
+def test_a_file_that_claims_frames_without_end_is_answered_in_time():
+    endless = replace(stored_street(), num_frames=10**12)
+    with pytest.raises(ValueError, match=r"tram is not in the scene at time 0\.8: it is there from 0\.000 to 0\.500"):
+        scene_gaussians(endless, 0.8, instances=["tram"])
+
+
 def test_time_lies_in_the_log():
     with pytest.raises(ValueError, match=r"time runs from 0 .* got 1\.2"):
         scene_gaussians(stored_street(), 1.2)

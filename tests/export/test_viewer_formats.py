@@ -17,6 +17,7 @@ from sparsestreet.export.check import PROGRAM, check_file, read_plain_ply, turne
 from sparsestreet.export.compressed_ply import read_compressed_ply, write_compressed_ply
 from sparsestreet.export.frame import VIEWER_FROM_WORLD, frame_gaussians, turned
 from sparsestreet.export.ply import write_ply
+from sparsestreet.export.sog import read_sog, write_sog
 from sparsestreet.export.spz import read_spz, write_spz
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Gaussians
@@ -144,7 +145,11 @@ def test_a_frame_is_upright_and_has_its_sky_above():
     assert len(frame_gaussians(stored, 0.0, nodes=["rigid"])) == CAR_ROWS + TRAM_ROWS
 
 
-WRITERS = {"spz": (write_spz, read_spz, ".spz"), "ply": (write_compressed_ply, read_compressed_ply, ".compressed.ply")}
+WRITERS = {
+    "spz": (write_spz, read_spz, ".spz"),
+    "sog": (write_sog, read_sog, ".sog"),
+    "ply": (write_compressed_ply, read_compressed_ply, ".compressed.ply"),
+}
 
 
 @pytest.mark.parametrize(("write", "read", "suffix"), WRITERS.values(), ids=WRITERS.keys())

@@ -82,6 +82,10 @@ class MotionBlurSettings(EffectSettings):
             (int(frame), int(camera)): Shutter(torch.tensor(moved), torch.tensor(turned), seconds=seconds, span=span)
             for (frame, camera), moved, turned, (seconds, span) in rows
         }
+        if header["moments"] not in range(1, MOST_MOMENTS + 1):  # their weights take a matrix, each of them an image
+            raise ValueError(
+                f"an exposure has 1 to {MOST_MOMENTS} moments, got {header['moments']!r}: write the file again"
+            )
         return MotionBlur(self, motions, header["moments"])
 
 

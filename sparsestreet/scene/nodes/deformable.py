@@ -1,5 +1,6 @@
 """Objects that change their shape while they move, such as cyclists (as in OmniRe, Chen et al. 2025)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -9,8 +10,9 @@ from torch import Tensor, nn
 
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
+from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings, check_stored
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
 from sparsestreet.scene.state import SceneState
@@ -43,6 +45,13 @@ class DeformableSettings(TrackedSettings):
         if node is not None:
             node.start_network(generator.initial_seed())
         return node
+
+    def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Tracked:
+        found, wanted = tuple(tensors["embeddings"].shape), (len(header["names"]), self.features)
+        if found != wanted:
+            raise ValueError(f"embeddings have shape {found}, names and settings say {wanted}: write the file again")
+        check_stored(self.network, tensors, self.features)
+        return super().restore(rows, tensors, header)
 
 
 class Deformable(Tracked):

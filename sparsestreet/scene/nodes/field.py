@@ -16,7 +16,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings
-from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings
+from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings, check_stored
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Node, stored_frame_periods
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import View
@@ -63,6 +63,7 @@ class FieldSettings(BackgroundSettings):
         )
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Field":
+        check_stored(self.network, tensors)
         periods = stored_frame_periods(header)
         return Field(
             self, rows, center=tensors["center"], radius=header["radius"], frame_periods=periods, seed=header["seed"]

@@ -1,5 +1,6 @@
 """A network that deforms each Gaussian of a node at a time (Deformable 3DGS, Yang et al. 2024)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -92,6 +93,23 @@ class DeformationNetwork(nn.Module):
             values = torch.relu_(values)
         means, quaternions, *scales = self.last(values).split((3, 4, 3)[: 3 if self.settings.scales else 2], dim=1)
         return Deformation(means, quaternions, scales[0] if scales else None)
+
+
+def check_stored(settings: NetworkSettings, tensors: Mapping[str, Tensor], features: int = 0) -> None:
+    """Raises ValueError unless a node's tensors in a scene file hold the network that its settings say.
+
+    For whoever restores a node: settings decide how much memory a network takes, and a damaged file says anything.
+    """
+    stored = {name: value.shape for name, value in tensors.items() if name.startswith("network.")}
+    if settings.depth <= len(stored):  # each layer has a tensor or two
+        with torch.device("meta"):  # shapes alone
+            made = DeformationNetwork(settings, features).state_dict()
+        if stored == {f"network.{name}": value.shape for name, value in made.items()}:
+            return
+    raise ValueError(
+        f"the file's {len(stored)} tensors of a network are not those of {settings} with {features} features: "
+        "write the file again"
+    )
 
 
 class _Inputs(nn.Module):
