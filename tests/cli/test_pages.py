@@ -1,4 +1,4 @@
-"""What the pages show is what a reader types: commands are understood, and those of the tour and of Python run."""
+"""What the pages show is what a reader types: commands are understood (and run: test_pages_run.py), and Python runs."""
 
 import importlib
 import re
@@ -13,28 +13,15 @@ import torch
 from sparsestreet.cli import COMMANDS
 from sparsestreet.cli.compose import override_problem
 from sparsestreet.cli.effect_words import with_effect_keys
-from sparsestreet.cli.objects import objects
 from sparsestreet.cli.options import OptionError, parse_options
 from sparsestreet.data.drivestudio import DriveStudioReader
+from tests.cli.page_commands import RUN_ELSEWHERE, SHOWN, commands_of, elsewhere
 from tests.conftest import unchecked
 from tests.test_docs import PAGES, ROOT
 
-PREFIX = re.compile(r"^(?:\w+=\S+ )*(?:\.venv/bin/|torchrun .*--no-python |srun (?:-\S+ )*)?(?=sparsestreet )")
 STAND_INS = {"data=auto": "data=drivestudio", "data=NAME": "data=drivestudio"}
 """The command itself finds the reader of a folder."""
 OF_HYDRA = ("train", "jobs", "effects", "demo", "data")
-
-
-def commands_of(page: Path) -> list[str]:
-    """Commands in blocks and within sentences, without what a page leaves open: [...], ... and names in capitals."""
-    text = page.read_text()
-    blocks = [block for kind, block in re.findall(r"^```([^\n]*)\n(.*?)^```", text, flags=re.S | re.M) if kind == ""]
-    blocks += re.findall(r"(?:^ {4}.*\n)+", text, flags=re.M)
-    lines = [line.strip() for block in blocks for line in re.sub(r"\\\n\s*", "", block).splitlines()]
-    lines += [" ".join(line.split()) for line in re.findall(r"`(sparsestreet [^`]*)`", text)]
-    lines = [re.split(r"\s+#|\s{3,}(?=[a-zL])", PREFIX.sub("", line))[0] for line in lines]
-    found = [re.sub(r" \[.*?\](?= |$)", "", line) for line in lines if line.startswith("sparsestreet ")]
-    return [line for line in found if "..." not in line and "COMMAND" not in line]
 
 
 @cache
@@ -116,6 +103,13 @@ def test_commands_are_found_and_slips_too(tmp_path):
     assert all(found.values())
 
 
+def test_what_does_not_run_in_the_test_of_all_commands_has_a_test_of_its_own():
+    """And each reason is needed by a command."""
+    assert [file for _, _, file in RUN_ELSEWHERE if not (ROOT / file).is_file()] == []
+    needed = {reason for one in SHOWN if (reason := elsewhere(one))}
+    assert needed == {(why, file) for _, why, file in RUN_ELSEWHERE}
+
+
 def python_of(name: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / name).read_text(), flags=re.S)
 
@@ -146,27 +140,6 @@ def test_the_page_of_python_trains(tiny_street, tmp_path, monkeypatch, capsys):
     with unchecked():
         exec(code, {"DriveStudioReader": DriveStudioReader})
     assert "'background': 5000" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_the_tour_of_editing_and_driving_runs(finished, tmp_path, monkeypatch, capsys):
-    """But for the viewer and the server, which go on until they are told to end (test_view, test_serve)."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "RUN").symlink_to(finished)
-    page = ROOT / "docs" / "edit_and_drive.md"
-    (edits,) = re.findall(r"```yaml\n(.*?)```", page.read_text(), flags=re.S)
-    commands = [shlex.split(line) for line in commands_of(page)]
-    commands = [words[1:] for words in commands if words[1] not in ("train", "view", "serve")]
-    assert commands.pop(0) == ["objects", "RUN"]
-    assert objects(["RUN", "out=sheet.png"]) == 0  # the run is other tests' too
-    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:3]]
-    Path("edits.yaml").write_text(edits.replace('"11"', f'"{names[0]}"').replace('"12"', f'"{names[1]}"'))
-    for name, *words in commands:
-        command = getattr(importlib.import_module(f"sparsestreet.cli.{name}"), name)
-        small = ["frames=0:2", "fps=10"] if name == "render" else []
-        assert command([*words, *small]) == 0, capsys.readouterr().err
-    made = {path.name for path in tmp_path.iterdir()} - {"RUN", "edits.yaml", "sheet.png"}
-    assert made == {"edited.mp4", "lane.mp4", "truck.mp4", "labels", "street.html", "street.usdz"}
 
 
 def test_messages_of_the_page_on_troubleshooting_are_those_of_the_program():
