@@ -12,14 +12,14 @@ from sparsestreet.ops import splat
 from sparsestreet.types import Camera, Gaussians, Shutter
 
 CASES = ("plain", "lens", "shutter", "both")
-ROWS = 200
+ROWS = 140
 """More than a program of either kind of camera has, and no multiple of its rows."""
 
 
 def camera_of(case: str) -> Camera:
     """A camera at the origin that looks along z."""
-    intrinsics = torch.tensor([[40.0, 0.0, 20.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]])
-    camera = Camera(torch.eye(4), intrinsics, width=40, height=24)
+    intrinsics = torch.tensor([[24.0, 0.0, 12.0], [0.0, 24.0, 8.0], [0.0, 0.0, 1.0]])
+    camera = Camera(torch.eye(4), intrinsics, width=24, height=16)
     if case in ("lens", "both"):
         camera = replace(camera, distortion=torch.tensor([0.1, 0.01, 0.0, 0.0, 0.0]))
     if case in ("shutter", "both"):
