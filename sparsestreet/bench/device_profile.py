@@ -15,7 +15,7 @@ STAGES = {
     "blend_backward": r"(blend|raster).*(backward|bwd)",
     "project_backward": r"(project|spherical|quat_scale).*(backward|bwd)|slots",
     "project": r"project|spherical|quat_scale",
-    "blend": r"blend|raster|_parts",
+    "blend": r"blend|raster|_parts|^compose",
     "sort": r"(?<!search)sort|radix",
     "bin": r"list_|tile|pairs|isect|intersect|scan|search",
 }

@@ -26,14 +26,14 @@ def numbers_of(camera: Camera) -> tuple[object, ...]:
     >>> before == numbers_of(camera)
     False
     """
-    matrices, shutter = (camera.camera_from_world, camera.intrinsics), camera.shutter
+    pose, intrinsics, shutter = camera.camera_from_world.tolist(), camera.intrinsics.tolist(), camera.shutter
     effects = [] if camera.distortion is None else [camera.distortion]
     if shutter is not None:
         effects += (shutter.translation, shutter.rotation)
-    rows = [row for matrix in matrices for row in matrix.tolist()]
     numbers = [(tensor.shape, *tensor.flatten().tolist()) for tensor in effects]
     direction = None if shutter is None else shutter.direction
-    return (*map(tuple, rows), *numbers, camera.distortion is None, direction, camera.width, camera.height)
+    size = camera.width, camera.height
+    return (*map(tuple, pose), *map(tuple, intrinsics), *numbers, camera.distortion is None, direction, *size)
 
 
 def exact_position(camera: Camera) -> Float64[Tensor, "3"]:

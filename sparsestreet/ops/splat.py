@@ -1,5 +1,6 @@
 """The public signatures of the op: it takes Gaussians and a camera, and returns a differentiable Rendering."""
 
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from types import ModuleType
 
@@ -66,7 +67,7 @@ def splat(
     """
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
-    with torch.autocast(gaussians.means.device.type, enabled=False):
+    with _without_autocast(gaussians.means.device.type):
         offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
         if chosen == "triton":
             return _module(chosen).render(gaussians, offsets, background, camera, settings)
@@ -133,6 +134,11 @@ def leave_one_out(
             check_pixel_weights(pixel_weights, camera, gaussians.means)
         behind = None if background is None else background.expand(camera.height, camera.width, 3)
         return _module(chosen).leave_one_out(gaussians, behind, pixel_weights, camera, settings)
+
+
+def _without_autocast(device: str) -> AbstractContextManager:
+    # To enter it takes the host as long as a launch, also where it is off.
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 def _module(backend: str) -> ModuleType:

@@ -216,7 +216,9 @@ def test_a_peer_that_disagrees_is_a_failure(tmp_path, monkeypatch):
         ("list_pairs", "bin"),
         ("void at_cuda_detail::cub::DeviceRadixSortOnesweepKernel<...>", "sort"),
         ("void at::native::(anonymous namespace)::searchsorted_cuda_kernel<long, int>(...)", "bin"),
-        ("merge_parts", "blend"),
+        ("thin_parts", "blend"),
+        ("compose_pixels", "blend"),
+        ("decompose_pixels", "other"),
         ("Memset (Device)", "other"),
         # gsplat 1.5.3
         ("void gsplat::projection_ewa_3dgs_fused_fwd_kernel<float>(...)", "project"),

@@ -1,5 +1,8 @@
 """Many vectors in one piece of memory, because an allocation takes the host as long as a short kernel the device."""
 
+from functools import reduce
+from operator import or_
+
 import torch
 from torch import Tensor
 
@@ -15,6 +18,8 @@ def vectors(like: Tensor, *lengths: int, dtype: torch.dtype = torch.int32) -> tu
     >>> [len(vector) for vector in vectors(torch.zeros(1), 3, 8)]
     [3, 8]
     """
+    if not reduce(or_, lengths) % _ALIGNED:
+        return like.new_empty(sum(lengths), dtype=dtype).split_with_sizes(lengths)
     pieces, places = [], []
     for length in lengths:
         places.append(len(pieces))
@@ -22,4 +27,4 @@ def vectors(like: Tensor, *lengths: int, dtype: torch.dtype = torch.int32) -> tu
         if length % _ALIGNED:
             pieces.append(_ALIGNED - length % _ALIGNED)
     found = like.new_empty(sum(pieces), dtype=dtype).split_with_sizes(pieces)
-    return found if len(found) == len(places) else tuple(found[place] for place in places)
+    return tuple(found[place] for place in places)

@@ -50,13 +50,6 @@ def pixels_of(tile, width, height, tiles_x):
 
 
 @jit
-def part_pixels(part):
-    """Indices of a part's pixels in the layers of all parts [256], line by line as in the image."""
-    p = tl.arange(0, PIXELS)
-    return part * PIXELS + p % TILE * TILE + (p // WARP) * (WARP // TILE) + p % WARP // TILE
-
-
-@jit
 def whitened(s, px, py):
     """d = pixel - mean along both axes, L d, and log2 of alpha before the clamp; all [256]."""
     dx, dy = px - tl.load(s + record.X), py - tl.load(s + record.Y)

@@ -1,6 +1,7 @@
 """The last step of a rendering and the first of its gradient: background, alpha and expected depth of each pixel.
 
-The same bits as ops/splat.py computes by torch, which takes five passes over the image, and eight back.
+The last step also adds up the parts of long tiles (parts.py). Otherwise both have the bits of ops/splat.py, where torch
+takes five passes over the image, and eight back.
 """
 
 from dataclasses import dataclass
@@ -8,19 +9,22 @@ from functools import partial
 
 import torch
 import triton.language as tl
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.ops.raster import LEAST_ALPHA
+from sparsestreet.ops.triton.blend import PIXELS
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.parts import PartLayers, Parts, merged
+from sparsestreet.ops.triton.view import TILE, TILE_SIZE
 
 _BLOCK = 512
 _OPTIONS = {"enable_fp_fusion": False}
 LEAST = constant(LEAST_ALPHA)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Composed:
     """What backward needs of a composed image."""
 
@@ -30,18 +34,41 @@ class Composed:
     """[3] or [h, w, 3]."""
 
 
+@dataclass
+class Split:
+    """Tiles whose pixels are still in parts."""
+
+    parts: Parts
+    layers: PartLayers
+    limit: float
+    """Light at which a pixel is finished."""
+
+
 def compose(
     rgb: Float[Tensor, "h w 3"],
     transmittance: Float[Tensor, "h w"],
     depth_sum: Float[Tensor, "h w"],
     background: Float[Tensor, "..."] | None,
+    lasts: Int[Tensor, "h w"] | None = None,
+    split: Split | None = None,
 ) -> Float[Tensor, "h w"]:
-    """Returns alpha; puts the background behind ``rgb`` and turns ``depth_sum`` into a depth, both in place."""
-    alpha = torch.empty_like(transmittance)
+    """Returns alpha; puts the background behind ``rgb`` and turns ``depth_sum`` into a depth, both in place.
+
+    The pixels of ``split`` tiles it first adds up from their parts, with where they end if ``lasts`` are given."""
+    alpha, (height, width) = transmittance.new_empty(transmittance.shape), transmittance.shape
+    columns = -(-width // TILE_SIZE)
+    tables, limit = (rgb,) * 7, 0.0
+    if split is not None:
+        part, limit = split.layers, split.limit
+        tables = (
+            split.parts.of_tiles, split.parts.nexts,
+            part.products, part.rgb, part.transmittance, part.depth_sum, part.lasts,
+        )  # fmt: skip
     launch(
-        compose_pixels, alpha.numel(), _BLOCK,
-        rgb, transmittance, depth_sum, rgb if background is None else background, alpha, alpha.numel(),
-        **_behind(background), options=_OPTIONS,
+        compose_pixels, columns * -(-height // TILE_SIZE), 1,
+        rgb, transmittance, depth_sum, rgb if lasts is None else lasts, rgb if background is None else background,
+        alpha, *tables, width, height, columns, limit,
+        PARTS=split is not None, LASTS=split is not None and lasts is not None, **_behind(background), options=_OPTIONS,
     )  # fmt: skip
     return alpha
 
@@ -72,22 +99,48 @@ def _behind(background: Tensor | None) -> dict[str, int]:
     return {"APART": -1 if background is None else 3 * (background.dim() == 3)}
 
 
-@partial(jit, do_not_specialize=["pixels"])
+@jit
 def compose_pixels(
-    rgb, transmittance, depth_sum, background, alpha, pixels, APART: tl.constexpr, BLOCK: tl.constexpr
+    rgb, transmittance, depth_sum, lasts, background, alpha,
+    of_tiles, nexts, products, part_rgb, part_transmittance, part_depth, part_lasts,
+    width, height, tiles_x, limit,
+    PARTS: tl.constexpr, LASTS: tl.constexpr, APART: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    given = pixel < pixels
-    passed = tl.load(transmittance + pixel, given, 1.0)
+    """The pixels of one tile, line by line."""
+    tl.static_assert(BLOCK == 1)
+    tile, p = tl.program_id(0), tl.arange(0, PIXELS)
+    x, y = tile % tiles_x * TILE + p % TILE, tile // tiles_x * TILE + p // TILE
+    inside, at = (x < width) & (y < height), y * width + x
+    first = tile
+    whole, split = inside, inside
+    if PARTS:
+        first = tl.load(of_tiles + tile)
+        whole, split = inside & (first < 0), inside & (first >= 0)
+    passed, depth = tl.load(transmittance + at, whole, 1.0), tl.load(depth_sum + at, whole, 0.0)
+    red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
+    if PARTS or APART >= 0:
+        to = rgb + 3 * at
+        red, green, blue = tl.load(to, whole, 0.0), tl.load(to + 1, whole, 0.0), tl.load(to + 2, whole, 0.0)
+    if PARTS:
+        layers = (products, part_rgb, part_transmittance, part_depth, part_lasts)
+        pixel = (passed, red, green, blue, depth, p)
+        passed, red, green, blue, depth, last = merged(first, p, pixel, nexts, *layers, limit, LASTS)
+        tl.store(transmittance + at, passed, split)
+        if LASTS:
+            tl.store(lasts + at, last, split)
     opaque = 1 - passed
-    tl.store(alpha + pixel, opaque, given)
-    depth = tl.div_rn(tl.load(depth_sum + pixel, given, 0.0), tl.maximum(opaque, LEAST))
-    tl.store(depth_sum + pixel, depth, given)
+    tl.store(alpha + at, opaque, inside)
+    tl.store(depth_sum + at, tl.div_rn(depth, tl.maximum(opaque, LEAST)), inside)
     if APART >= 0:
-        for i in tl.static_range(3):
-            behind = tl.load(background + APART * pixel + i, given, 0.0)
-            at = rgb + 3 * pixel + i
-            tl.store(at, tl.load(at, given, 0.0) + passed * behind, given)
+        behind = background + APART * at
+        red += passed * tl.load(behind, inside, 0.0)
+        green += passed * tl.load(behind + 1, inside, 0.0)
+        blue += passed * tl.load(behind + 2, inside, 0.0)
+        split = inside
+    if PARTS or APART >= 0:
+        tl.store(to, red, split)
+        tl.store(to + 1, green, split)
+        tl.store(to + 2, blue, split)
 
 
 @partial(jit, do_not_specialize=["pixels"])

@@ -6,7 +6,6 @@ This takes the host longer than many kernels take the device. Here a repeated la
 """
 
 import warnings
-from contextlib import nullcontext
 from functools import cache, reduce
 from operator import attrgetter, or_
 from typing import Any
@@ -27,6 +26,9 @@ Kinds of arguments are no coarser than their specialization. Their compiled kern
 then all arguments: tensors by address, and constants too."""
 _INT32 = 1 << 31
 _DTYPE = attrgetter("dtype")
+_NONE: dict[str, Any] = {}
+_MOST_NUMBERS = 256
+"""Most numbers that are kept for a kernel, because counts of rows are new in many views."""
 _PLANS: dict[tuple, "_Plan"] = {}
 
 
@@ -46,10 +48,12 @@ def launch(
     """
     if not items:
         return
-    key = (kernel.fn, block, *constants.items(), *(options.items() if options else ()))
+    options = options or _NONE
+    # Names and values apart, because that takes half the time of pairs.
+    key = (kernel.fn, block, *constants, *constants.values(), *options, *options.values())
     plan = _PLANS.get(key)
     if plan is None:
-        plan = _PLANS[key] = _Plan(kernel, arguments, constants | {"BLOCK": block}, options or {})
+        plan = _PLANS[key] = _Plan(kernel, arguments, constants | {"BLOCK": block}, options)
     plan.launch((-(-items // block), 1, 1), arguments)
 
 
@@ -61,7 +65,8 @@ class _Plan:
         self._filling = tuple(constants.values())
         self._interpreted = is_interpreted(kernel)
         self._tensors = sum(isinstance(value, Tensor) for value in arguments)
-        self._compiled: dict[tuple, CompiledKernel] = {}
+        self._by_kind: dict[tuple, CompiledKernel] = {}
+        self._by_numbers: dict[tuple, CompiledKernel] = {}
 
     def launch(self, grid: tuple[int, int, int], arguments: tuple) -> None:
         if self._interpreted:
@@ -71,24 +76,35 @@ class _Plan:
             return
         tensors, numbers = arguments[: self._tensors], arguments[self._tensors :]
         # Tensors are passed by address; for a tensor the launcher would ask the driver where it lies.
-        addresses = list(map(Tensor.data_ptr, tensors))
+        addresses = tuple(map(Tensor.data_ptr, tensors))
         device = tensors[0].get_device()
-        kind = (device, _alignment(addresses), *map(_DTYPE, tensors), *map(_kind, numbers))
-        compiled = self._compiled.get(kind)
         # Triton starts kernels on the current device.
-        elsewhere = device >= 0 and device != torch.cuda.current_device()
-        with torch.cuda.device(device) if elsewhere else _NOTHING:
-            if compiled is not None:
-                # Constants only fill their places in the signature; the machine code has them already.
-                _start(compiled, device, grid, (*addresses, *numbers, *self._filling))
+        if device >= 0 and device != torch.cuda.current_device():
+            with torch.cuda.device(device):
+                self._start(grid, device, addresses, tensors, numbers)
+        else:
+            self._start(grid, device, addresses, tensors, numbers)
+
+    def _start(
+        self, grid: tuple[int, int, int], device: int, addresses: tuple[int, ...], tensors: tuple, numbers: tuple
+    ) -> None:
+        key = (device, _alignment(addresses), *map(_DTYPE, tensors), *map(type, numbers), *numbers)
+        compiled = self._by_numbers.get(key)
+        if compiled is None:
+            # Most numbers come again, and are then not looked at one by one.
+            kind = (*key[: 2 + len(tensors)], *map(_kind, numbers))
+            compiled = self._by_kind.get(kind)
+            if compiled is None:
+                compiled = self._kernel[grid](*tensors, *numbers, **self._constants, **self._options)
+                # A hook of Triton may have prevented the compilation.
+                if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
+                    self._by_kind[kind] = compiled
                 return
-            compiled = self._kernel[grid](*arguments, **self._constants, **self._options)
-        # A hook of Triton may have prevented the compilation.
-        if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
-            self._compiled[kind] = compiled
-
-
-_NOTHING = nullcontext()
+            if len(self._by_numbers) >= _MOST_NUMBERS:
+                self._by_numbers.clear()
+            self._by_numbers[key] = compiled
+        # Constants only fill their places in the signature; the machine code has them already.
+        _start(compiled, device, grid, (*addresses, *numbers, *self._filling))
 
 
 def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], arguments: tuple) -> None:
@@ -101,7 +117,7 @@ def _start(compiled: CompiledKernel, device: int, grid: tuple[int, int, int], ar
         compiled.run(*grid, stream, compiled.function, compiled.packed_metadata, None, None, None, *arguments)
 
 
-def _alignment(addresses: list[int]) -> tuple[bool, ...] | None:
+def _alignment(addresses: tuple[int, ...]) -> tuple[bool, ...] | None:
     """Which addresses are multiples of 16, as kernels are compiled for; None: all, as almost always."""
     return tuple(address % 16 == 0 for address in addresses) if reduce(or_, addresses) % 16 else None
 

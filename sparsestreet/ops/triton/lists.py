@@ -31,13 +31,15 @@ PAIR_LIMIT = 1 << 28
 tiles). 12 of them are kept for the backward pass, which takes 48 more: 9 and 16 GB at the limit. Room that a view does
 not fill takes the first two as well (capacity.py)."""
 _SHORT_KEYS = 1 << 15
+_LAST = {kind: torch.iinfo(kind).max for kind in (torch.int16, torch.int32)}
+"""Keys that are sorted to the end."""
 _LANES = 2
 """Lanes per splat in the listing of pairs, because most splats reach one or two rows of tiles."""
 GIANT = constant(32)
 """Splats that cover at least this many tiles get a warp each."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Visible:
     """Visible rows in the order of the scene, and room behind them."""
 
@@ -47,7 +49,7 @@ class Visible:
     sizes: Sizes
 
 
-@dataclass(frozen=True)
+@dataclass
 class Lists:
     """The tiles' lists of splats: room for v visible rows and p (splat, tile) pairs, t tiles."""
 
@@ -179,13 +181,13 @@ def list_pairs(
 
 def list_rows(records: Tensor, tile_counts: Tensor, sums: Tensor, room: Room, view: KernelView) -> Visible:
     """Visible rows, if they and their pairs fit the room, and how many of both there are."""
-    keys, rows, counts = vectors(tile_counts, *(room.rows,) * 3)
+    given, (keys, rows, counts) = tile_counts.shape[0], vectors(tile_counts, *(room.rows,) * 3)
     sizes = Sizes(sums.new_empty(LENGTH))
     launch(
-        list_visible, max(len(tile_counts), room.rows, 1), block_of(view),
+        list_visible, max(given, room.rows, 1), block_of(view),
         records, tile_counts, sums, keys, rows, counts, sizes.on_device,
-        len(tile_counts), len(sums) // 3, room.rows, room.pairs,
-        KEY_MASK=-1 << (32 - view.settings.depth_bits), LAST=torch.iinfo(keys.dtype).max,
+        given, sums.shape[0] // 3, room.rows, room.pairs,
+        KEY_MASK=-1 << (32 - view.settings.depth_bits), LAST=_LAST[keys.dtype],
     )  # fmt: skip
     return Visible(keys, rows, counts, sizes)
 
@@ -196,7 +198,7 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
     The device has nothing else to do, so every host call between two of our kernels is a gap.
     """
     keys, counts = visible.keys, visible.counts
-    if len(keys) > room.rows:
+    if keys.shape[0] > room.rows:
         keys, counts = keys[: room.rows], counts[: room.rows]
     # The sorted keys are not needed: their memory takes the sorted rows.
     rows, order = torch.sort(keys, stable=True)
@@ -206,7 +208,7 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
     kind = torch.int16 if columns * lines <= _SHORT_KEYS else torch.int32
     # Those of no pair are sorted to the end.
     keys, unsorted_rows = (
-        counts.new_full((room.pairs,), torch.iinfo(kind).max, dtype=kind),
+        counts.new_full((room.pairs,), _LAST[kind], dtype=kind),
         counts.new_empty(room.pairs),
     )
     launch(

@@ -30,6 +30,9 @@ AHEAD_CLASS = constant(13)
 
 Up to AHEAD_CLASS tiles have a quarter of that length and more, about that of a part."""
 CHUNK = constant(32)
+_AHEAD = 4
+AHEAD = constant(_AHEAD)
+"""Room for one number, which the pixel kernels read, as memory is laid out (arena.py)."""
 
 
 def list_by_tile(
@@ -40,21 +43,22 @@ def list_by_tile(
     ``keys``: the sorted tiles of the pairs, ``slots``: which each was before the sort.
 
     It does not wait for the device: there is room for the most parts that this room of pairs could need."""
-    room, part_count, blocks = len(keys), most_parts_of(len(keys)), -(-tiles // _BLOCK)
-    rule = (tuning().shortest_part, tuning().most_parts, tuning().fewest_parts)
-    pair_rows, begins, ends, whole_ends, order, classes, part_counts, table, ahead, lasts, *part_vectors = vectors(
-        keys, room, *(tiles,) * 6, 2 * _CLASS_COUNT * blocks, 1, part_count * PIXEL_COUNT, *(part_count,) * 5
+    room, blocks, choices = keys.shape[0], -(-tiles // _BLOCK), tuning()
+    part_count, rule = most_parts_of(room), (choices.shortest_part, choices.most_parts, choices.fewest_parts)
+    scratch = _AHEAD + 2 * tiles + 2 * _CLASS_COUNT * blocks
+    pair_rows, begins, ends, whole_ends, order, of_tiles, ahead, lasts, *part_vectors = vectors(
+        keys, room, *(tiles,) * 5, scratch, part_count * PIXEL_COUNT, *(part_count,) * 5
     )
     launch(
         bound_tiles, max(room, tiles), _BLOCK,
-        keys, slots, unsorted_rows, pair_rows, begins, ends, whole_ends, classes, part_counts, table, sizes.on_device,
+        keys, slots, unsorted_rows, pair_rows, begins, ends, whole_ends, ahead, sizes.on_device,
         tiles, blocks, room.bit_length(), *rule,
     )  # fmt: skip
     launch(
         order_tiles, max(tiles, part_count), _BLOCK,
-        begins, ends, classes, part_counts, table, order, *part_vectors, ahead, tiles, blocks, part_count,
+        begins, ends, ahead, order, of_tiles, *part_vectors, tiles, blocks, part_count,
     )  # fmt: skip
-    parts = Parts(*part_vectors, whole_ends, ahead, lasts) if part_count else None
+    parts = Parts(*part_vectors, of_tiles, whole_ends, ahead, lasts) if part_count else None
     return pair_rows, begins, ends, order, parts
 
 
@@ -68,18 +72,26 @@ def length_class(length, whole):
     return tl.minimum(tl.maximum(LONGEST_CLASS - power, 0), CLASSES - 1)
 
 
+@jit
+def counted(scratch, tiles):
+    """What the first kernel hands to the second: the classes of tiles, their numbers of parts, and a table [2, CLASSES,
+    blocks] of the tiles, and the parts, of each class in each program's share."""
+    classes = scratch + AHEAD
+    return classes, classes + tiles, classes + 2 * tiles
+
+
 @partial(
     jit,
     do_not_specialize=["tiles", "blocks", "steps", "shortest_part", "most_parts", "fewest_parts"],
 )
 def bound_tiles(
-    keys, slots, unsorted_rows, pair_rows, begins, ends, whole_ends, classes, part_counts, table, sizes,
+    keys, slots, unsorted_rows, pair_rows, begins, ends, whole_ends, scratch, sizes,
     tiles, blocks, steps, shortest_part, most_parts, fewest_parts, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Rows of the sorted pairs; where each tile's pairs begin and end, the class of its length, and its parts.
 
-    Each program does its share of pairs and of tiles. ``table`` [2, CLASSES, blocks]: the tiles, and the parts, of each
-    class in each program's share."""
+    Each program does its share of pairs and of tiles."""
+    classes, part_counts, table = counted(scratch, tiles)
     start = tl.program_id(0) * BLOCK
     pairs = tl.load(sizes + LISTED_PAIRS).to(tl.int32)
     pair = start + tl.arange(0, BLOCK)
@@ -130,10 +142,11 @@ def of_class(values, kind):
 
 @partial(jit, do_not_specialize=["tiles", "blocks", "part_count"])
 def order_tiles(
-    begins, ends, classes, part_counts, table, order, part_tiles, part_begins, part_ends, firsts, nexts, ahead,
+    begins, ends, scratch, order, of_tiles, part_tiles, part_begins, part_ends, firsts, nexts,
     tiles, blocks, part_count, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Tiles by class, how many of them start before the parts, and the parts; those behind the last are empty."""
+    classes, part_counts, table = counted(scratch, tiles)
     block = tl.program_id(0)
     tile = block * BLOCK + tl.arange(0, BLOCK)
     given = tile < tiles
@@ -149,8 +162,9 @@ def order_tiles(
         place += tl.sum(same.to(tl.int32), 1)
         part += tl.sum(tl.where(same, tl.load(part_counts + other, other < tiles, 0)[None, :], 0), 1)
     tl.store(order + place, tile, given)
+    tl.store(of_tiles + tile, tl.where(count > 0, part, -1), given)
     if (part_count > 0) & (block == 0):
-        tl.store(ahead, tl.sum(tl.where(tl.arange(0, CLASSES) <= AHEAD_CLASS, tiles_of_class, 0)))
+        tl.store(scratch, tl.sum(tl.where(tl.arange(0, CLASSES) <= AHEAD_CLASS, tiles_of_class, 0)))
 
     begin, end = tl.load(begins + tile, given, 0), tl.load(ends + tile, given, 0)
     for i in range(tl.max(count)):

@@ -2,7 +2,7 @@
 
 A part starts with the light that the parts before it let through. First it is computed for all parts at once what each
 lets through alone: a first part is blended for that, behind a last one nothing lies. Then the other parts are blended
-from their true start, with the stop rule of the whole tile, and ``merge_parts`` adds up the parts. The image differs
+from their true start, with the stop rule of the whole tile, and ``merged`` adds up the parts. The image differs
 from that of an unsplit tile only by rounding. In backward the light behind a part is the sum of the parts behind it.
 
 A tile is split only if it is longer than the share of all pairs of a warp that a large GPU runs. The
@@ -16,13 +16,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.ops.triton.arena import vectors
-from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS, part_pixels, pixels_of
+from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS
 from sparsestreet.ops.triton.language import jit
 from sparsestreet.ops.triton.thin import thin_pairs
 from sparsestreet.ops.triton.tuning import tuning
 
 
-@dataclass(frozen=True)
+@dataclass
 class Parts:
     """The tile and the pairs of each part. Those after the last needed one are empty, of no tile, and never read."""
 
@@ -33,18 +33,20 @@ class Parts:
     """First part of the same tile."""
     nexts: Int[Tensor, " s"]
     """The part after the last one of the same tile."""
+    of_tiles: Int[Tensor, " t"]
+    """First part of each tile; -1 where it is not split."""
     whole_ends: Int[Tensor, " t"]
     """End of each tile's pairs; their beginning where the tile is split."""
-    ahead: Int[Tensor, " 1"]
-    """Number of tiles that are at least about as long as a part, and start before the parts."""
+    ahead: Int[Tensor, " a"]
+    """First: the number of tiles that are at least about as long as a part, and start before the parts."""
     lasts: Int[Tensor, " p"]
     """Room for those of ``PartLayers``."""
 
     def __len__(self) -> int:
-        return len(self.tiles)
+        return self.tiles.shape[0]
 
 
-@dataclass(frozen=True)
+@dataclass
 class PartLayers:
     """What each part adds to its tile's pixels (as in ``Raster``), and the light after it: p = 256 s pixels, one part
     after the other, c = 3 p."""
@@ -81,9 +83,10 @@ def split_length(pairs: int) -> int:
 
 def most_parts_of(room: int) -> int:
     """Most parts that up to ``room`` pairs of a view can need; 0 if no tile can be long enough for some."""
-    most = min(tuning().most_parts, room // tuning().shortest_part)
+    choices = tuning()
+    most = min(choices.most_parts, room // choices.shortest_part)
     # In fours, as memory is laid out (arena.py).
-    return -(-most // 4) * 4 if most >= tuning().fewest_parts else 0
+    return -(-most // 4) * 4 if most >= choices.fewest_parts else 0
 
 
 @jit
@@ -122,37 +125,27 @@ def thin_parts(
 
 
 @jit
-def merge_parts(
-    tiles, firsts, nexts, products, part_rgb, part_transmittance, part_depth, part_lasts,
-    rgb, transmittance, depth_sum, lasts, width, height, tiles_x, transmittance_min,
-    LASTS: tl.constexpr, BLOCK: tl.constexpr,
+def merged(
+    first, at, pixel, nexts, products, part_rgb, part_transmittance, part_depth, part_lasts, limit,
+    LASTS: tl.constexpr,
 ):  # fmt: skip
-    """Writes the pixels of each split tile. There is one program per part; only that of a tile's first part works."""
-    tl.static_assert(BLOCK == 1)
-    part = tl.program_id(0)
-    x, y, inside = pixels_of(tl.load(tiles + part), width, height, tiles_x)
-    end = tl.where(tl.load(firsts + part) == part, tl.load(nexts + part), part)
-    passed, rest = tl.full((PIXELS,), 1.0, tl.float32), tl.full((PIXELS,), 1.0, tl.float32)
-    red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
-    depth, last = tl.zeros_like(passed), tl.zeros_like(passed).to(tl.int32)
-    for i in range(part, end):
-        at = part_pixels(i)
-        red += tl.load(part_rgb + 3 * at)
-        green += tl.load(part_rgb + 3 * at + 1)
-        blue += tl.load(part_rgb + 3 * at + 2)
-        depth += tl.load(part_depth + at)
+    """Pixels of a tile that is split into the parts from ``first`` on; those of others (-1) as they are.
+
+    ``at``: places of the pixels in a part, ``pixel``: light, three colors, sum of depths, and the index after the last
+    pair it was open to. Nothing of a pixel of a split tile comes from the image."""
+    rest, red, green, blue, depth, last = pixel
+    passed = tl.full(rest.shape, 1.0, tl.float32)
+    following = tl.load(nexts + first, first >= 0, 0)
+    for part in range(tl.maximum(first, 0), following):
+        to = part * PIXELS + at
+        red += tl.load(part_rgb + 3 * to)
+        green += tl.load(part_rgb + 3 * to + 1)
+        blue += tl.load(part_rgb + 3 * to + 2)
+        depth += tl.load(part_depth + to)
         # Parts that begin after a pixel's end do not contribute to it.
-        reached = passed > transmittance_min
-        rest = tl.where(reached, tl.load(part_transmittance + at), rest)
+        reached = passed > limit
+        rest = tl.where(reached, tl.load(part_transmittance + to), rest)
         if LASTS:
-            last = tl.where(reached, tl.load(part_lasts + at), last)
-        passed *= tl.load(products + at, i + 1 < end, 0.0)
-    at = y * width + x
-    written = inside & (end > part)
-    tl.store(rgb + 3 * at, red, written)
-    tl.store(rgb + 3 * at + 1, green, written)
-    tl.store(rgb + 3 * at + 2, blue, written)
-    tl.store(transmittance + at, rest, written)
-    tl.store(depth_sum + at, depth, written)
-    if LASTS:
-        tl.store(lasts + at, last, written)
+            last = tl.where(reached, tl.load(part_lasts + to), last)
+        passed *= tl.load(products + to, part + 1 < following, 0.0)
+    return rest, red, green, blue, depth, last

@@ -7,9 +7,10 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sparsestreet.ops.triton import blend, blend_backward
+from sparsestreet.ops.triton.compose import Split, compose
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.lists import Lists
-from sparsestreet.ops.triton.parts import PartLayers, Parts, merge_parts, thin_parts
+from sparsestreet.ops.triton.parts import PartLayers, Parts, thin_parts
 from sparsestreet.ops.triton.screen import Screen, given_or
 from sparsestreet.ops.triton.tuning import tuning
 from sparsestreet.ops.triton.view import KernelView
@@ -20,7 +21,7 @@ PARTS = {"PARTS": True, "TOGETHER": False}
 TOGETHER = {"PARTS": False, "TOGETHER": True}
 
 
-@dataclass(frozen=True)
+@dataclass
 class Ends:
     """Where backward begins."""
 
@@ -30,69 +31,63 @@ class Ends:
     parts: PartLayers | None
 
 
-@dataclass(frozen=True)
+@dataclass
 class Layers:
-    """A blended view."""
+    """A blended view: the images of a Rendering."""
 
     rgb: Float[Tensor, "h w 3"]
-    depth_sum: Float[Tensor, "h w"]
+    alpha: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
     ends: Ends
 
 
-@dataclass(frozen=True)
+@dataclass
 class Cotangents:
-    """Derivatives of the loss by the layers; a missing one is 0."""
+    """Derivatives of the loss by what is blended, before it is composed; a missing one is 0."""
 
     rgb: Float[Tensor, "h w 3"]
     transmittance: Float[Tensor, "h w"]
     depth_sum: Float[Tensor, "h w"] | None
 
 
-def blend_view(screen: Screen, view: KernelView, lasts: bool) -> Layers:
-    """Blends all tiles; ``lasts``: whether a backward pass will follow."""
-    lists, shape, limit = screen.lists, (view.camera.height, view.camera.width), view.transmittance_min
-    rgb = screen.records.new_empty(*shape, 3)
-    transmittance, depth_sum = screen.records.new_empty(shape), screen.records.new_empty(shape)
-    last, parts = lists.begins.new_empty(shape) if lasts else None, lists.parts
+def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[Tensor, "..."] | None = None) -> Layers:
+    """Blends all tiles over a background; ``lasts``: whether a backward pass will follow."""
+    lists, shape, new = screen.lists, (view.camera.height, view.camera.width), screen.records.new_empty
+    rgb, transmittance, depth_sum = new((*shape, 3)), new(shape), new(shape)
+    last, parts, limit = lists.begins.new_empty(shape) if lasts else None, lists.parts, view.transmittance_min
     layers = part_layers = (rgb, transmittance, depth_sum, given_or(last, lists.begins))
-    neighbors, part = (lists.order, lists.order, transmittance), None
+    neighbors, part, split = (lists.order, lists.order, transmittance), None, None
     if parts is not None:
         part = PartLayers.empty(parts, rgb)
         part_layers = (part.rgb, part.transmittance, part.depth_sum, part.lasts)
-        neighbors = (parts.firsts, parts.nexts, part.products)
-
-    staged = len(lists.order) <= tuning().staged_tiles
+        neighbors, split = (parts.firsts, parts.nexts, part.products), Split(parts, part, limit)
+    tables = (screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers)
+    numbers = (*sizes(view, parts), view.settings.alpha_max, limit)
+    tiles, part_count, choices = lists.order.shape[0], numbers[3], tuning()
+    staged = tiles <= choices.staged_tiles
+    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged)}
 
     def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
         launch(
-            blend.blend_tiles, count, 1,
-            screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers,
-            *sizes(view, parts), view.settings.alpha_max, limit,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, **work,
-            options=ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged)},
+            blend.blend_tiles, count, 1, *tables, *numbers,
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, **work, options=options,
         )  # fmt: skip
 
-    tiles = len(lists.order)
     if parts is None or part is None:
         blend_each(tiles, WHOLE_TILES)
-        return Layers(rgb, depth_sum, Ends(transmittance, last, None))
-    if tuning().two_launches:
-        blend_each(tiles + len(parts), TOGETHER)
-        blend_each(len(parts), PARTS, rest=True)
+    elif choices.two_launches:
+        blend_each(tiles + part_count, TOGETHER)
+        blend_each(part_count, PARTS, rest=True)
     else:
         blend_each(tiles, WHOLE_TILES)
         launch(
-            thin_parts, len(parts), 1,
+            thin_parts, part_count, 1,
             screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, parts.nexts, part.products,
             *pixel_arguments(view), limit, options=ONE_WARP,
         )  # fmt: skip
-        blend_each(len(parts), PARTS)
-    launch(
-        merge_parts, len(parts), 1,
-        parts.tiles, parts.firsts, parts.nexts, part.products, *part_layers, *layers,
-        *pixel_arguments(view)[:3], limit, LASTS=lasts, options=ONE_WARP,
-    )  # fmt: skip
-    return Layers(rgb, depth_sum, Ends(transmittance, last, part))
+        blend_each(part_count, PARTS)
+    alpha = compose(rgb, transmittance, depth_sum, background, last, split)
+    return Layers(rgb, alpha, depth_sum, Ends(transmittance, last, part))
 
 
 def differentiate_view(

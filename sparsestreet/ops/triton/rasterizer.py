@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend, blend_backward, count, rows_backward, slots
 from sparsestreet.ops.triton import leave_one_out as remove
-from sparsestreet.ops.triton.compose import Composed, compose, decompose
+from sparsestreet.ops.triton.compose import Composed, decompose
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
 from sparsestreet.ops.triton.pixels import (
@@ -105,14 +105,13 @@ class _Blend(torch.autograd.Function):
     ):  # fmt: skip
         ctx.set_materialize_grads(False)
         gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
-        screen, layers = draw(gaussians, view, lambda screen: blend_view(screen, view, lasts=differentiated))
-        rgb, depth, passed, background = layers.rgb, layers.depth_sum, layers.ends.transmittance, contiguous(background)
-        alpha = compose(rgb, passed, depth, background)
+        background = contiguous(background)
+        screen, drawn = draw(gaussians, view, lambda screen: blend_view(screen, view, differentiated, background))
         ctx.mark_non_differentiable(screen.radii)
-        ctx.save_for_backward(*fields_of(gaussians), passed, depth, background)
+        ctx.save_for_backward(*fields_of(gaussians), drawn.ends.transmittance, drawn.depth, background)
         ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
-        ctx.lasts, ctx.parts = layers.ends.lasts, layers.ends.parts
-        return rgb, alpha, depth, screen.radii
+        ctx.lasts, ctx.parts = drawn.ends.lasts, drawn.ends.parts
+        return drawn.rgb, drawn.alpha, drawn.depth, screen.radii
 
     @staticmethod
     @once_differentiable
@@ -156,8 +155,8 @@ def _sum_slots(
 
 def _check(gaussians: Gaussians) -> None:
     means = gaussians.means
-    if len(means) > MOST_ROWS:
-        raise ValueError(f"backend 'triton' takes at most 2^28 rows, got {len(means)}: render a part of them")
+    if len(gaussians) > MOST_ROWS:
+        raise ValueError(f"backend 'triton' takes at most 2^28 rows, got {len(gaussians)}: render a part of them")
     if means.dtype != torch.float32:
         raise ValueError(
             f"backend 'triton' computes in float32, got {means.dtype}: convert the Gaussians with dataclasses.replace "

@@ -20,7 +20,7 @@ from sparsestreet.types import Gaussians
 Layers = TypeVar("Layers")
 
 
-@dataclass(frozen=True)
+@dataclass
 class Projection:
     """A scene projected to the screen of one view, and the running sum over what each program counted (rows.py)."""
 
@@ -31,7 +31,7 @@ class Projection:
     sums: Int[Tensor, " b"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Screen:
     """A scene projected to the screen of one view."""
 
@@ -79,7 +79,7 @@ def project_all(gaussians: Gaussians, view: KernelView) -> Projection:
     """Projects all rows."""
     fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
     means, sh = fields[0], fields[4]
-    n, settings, table = len(means), view.settings, view.table(means.device)
+    n, settings, table = len(gaussians), view.settings, view.table(means.device)
     splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
     tile_counts = means.new_empty(n, dtype=torch.int32)
     # A program counts an empty scene too.
@@ -129,7 +129,7 @@ def read(sizes: Sizes, counted: OnItsWay, gaussians: Gaussians, projection: Proj
 def fields_of(gaussians: Gaussians) -> tuple[Tensor, ...]:
     """Means, quaternions, scales, opacities and harmonics as kernels read them."""
     g = gaussians
-    return tuple(field.contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
+    return tuple(map(Tensor.contiguous, (g.means, g.quaternions, g.scales, g.opacities, g.sh)))
 
 
 def contiguous(tensor: Tensor | None) -> Tensor | None:

@@ -1,6 +1,7 @@
 """How much of its room a view's lists fill: known on the device at once, on the host only after a wait."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import triton.language as tl
 from jaxtyping import Int
@@ -15,8 +16,7 @@ LISTED_PAIRS, LISTED_ROWS = constant(3), constant(4)
 LENGTH = 5
 
 
-@dataclass(frozen=True)
-class Room:
+class Room(NamedTuple):
     """Most visible rows and pairs that lists can hold."""
 
     rows: int

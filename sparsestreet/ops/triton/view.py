@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property
 
 import torch
 import triton.language as tl
@@ -70,9 +70,15 @@ class KernelView:
     @staticmethod
     def of(camera: Camera, settings: SplatSettings) -> "KernelView":
         """The view of the camera as it is now."""
-        return _view_of(_ByNumbers(numbers_of(camera), camera), settings)
+        key = numbers_of(camera), settings
+        view = _VIEWS.get(key)
+        if view is None:
+            if len(_VIEWS) >= _MOST_VIEWS:
+                _VIEWS.clear()
+            view = _VIEWS[key] = KernelView(camera, settings)
+        return view
 
-    @property
+    @cached_property
     def tiles(self) -> tuple[int, int]:
         """Columns and rows of 16x16 tiles."""
         return -(-self.camera.width // TILE_SIZE), -(-self.camera.height // TILE_SIZE)
@@ -99,7 +105,7 @@ class KernelView:
     def exclusive(self) -> bool:
         return self.settings.stop == "exclusive"
 
-    @property
+    @cached_property
     def transmittance_min(self) -> float:
         """Never 0, because backward divides the light that is left, which must not vanish."""
         return max(self.settings.transmittance_min, LEAST_LIGHT)
@@ -114,17 +120,8 @@ class KernelView:
         return table
 
 
-@dataclass(frozen=True)
-class _ByNumbers:
-    """A camera that is found by its numbers."""
-
-    numbers: tuple[object, ...]
-    camera: Camera = field(compare=False)
-
-
-@lru_cache(maxsize=1 << 12)  # the cameras of a log; half a kilobyte of the device each
-def _view_of(known: _ByNumbers, settings: SplatSettings) -> KernelView:
-    return KernelView(known.camera, settings)
+_MOST_VIEWS = 1 << 12  # the cameras of a log; half a kilobyte of the device each
+_VIEWS: dict[tuple, KernelView] = {}
 
 
 def _numbers(camera: Camera, s: SplatSettings) -> list[float]:

@@ -104,6 +104,15 @@ def launch_time(case: Case, repeats: int) -> float:
     return statistics.median(spent[:-1]) * 1e6
 
 
+def python_calls(case: Case) -> int:
+    """How many Python functions a forward pass calls, which takes no clock to compare."""
+    called: list[str] = []
+    sys.setprofile(lambda frame, event, _: called.append(frame.f_code.co_name) if event == "call" else None)
+    case.run(backward=False)
+    sys.setprofile(None)
+    return len(called)
+
+
 def host_time(case: Case, repeats: int) -> list[float]:
     """Microseconds of the host's thread in a forward pass: the least, the quartiles."""
     times = []
@@ -124,6 +133,7 @@ def measure(device: FakeDevice, given: dict) -> dict:
     answer["dispatches"] = case.run(backward=False, counted=True)
     answer["after_wait"] = list(case.dispatches.after_wait)
     answer["calls"], answer["forward"] = list(case.dispatches.all), [binary.name for binary in device.launches]
+    answer["python"] = python_calls(case)
     if given["repeats"]:
         answer["microseconds"] = launch_time(case, given["repeats"])
         answer["forward_microseconds"] = host_time(case, given["repeats"])

@@ -22,7 +22,7 @@ from tests.ops.scenes import camera, cast, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
 ARCHITECTURES = (80, 90, 120)
-KERNELS = ("blend_tiles", "thin_parts", "merge_parts", "blend_tiles_backward", "sum_slots")
+KERNELS = ("blend_tiles", "thin_parts", "compose_pixels", "blend_tiles_backward", "sum_slots")
 RECORD = Path("benchmarks") / "pixel_kernels.jsonl"
 COMMAND = "TRITON_INTERPRET=1 python -m tests.ops.triton.pixel_machine_code"
 

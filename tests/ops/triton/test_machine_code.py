@@ -157,7 +157,7 @@ def test_every_kernel_is_compiled(compiled, request):
     assert names == {
         "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
         "count_tiles_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward", "remove_from_tiles",
-        "thin_parts", "merge_parts", "compose_pixels", "decompose_pixels",
+        "thin_parts", "compose_pixels", "decompose_pixels",
     }  # fmt: skip
 
 

@@ -206,8 +206,8 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
         return
     assert len(found) < limit + 4  # in fours
     starts = [4 * counts[tile] >= least for tile in order] + [False]
-    assert int(found.ahead) in [place for place in range(len(counts) + 1) if not starts[place]]
-    assert all(starts[: int(found.ahead)][-1:])
+    assert int(found.ahead[0]) in [place for place in range(len(counts) + 1) if not starts[place]]
+    assert all(starts[: int(found.ahead[0])][-1:])
     listed: dict[int, list[int]] = {}
     for part, (tile, begin, end) in enumerate(zip(found.tiles, found.begins, found.ends, strict=True)):
         if found.nexts[part] > part:

@@ -41,7 +41,7 @@ def split(lengths: NDArray[np.int64]) -> Split:
             parts.setdefault(first, []).append(end - begin)
     whole = (found.whole_ends - begins)[order].tolist()
     assert sum(whole) + sum(map(sum, parts.values())) == int(lengths.sum()) == int(ends[-1])
-    return Split(whole, list(parts.values()), int(found.ahead))
+    return Split(whole, list(parts.values()), int(found.ahead[0]))
 
 
 @pytest.mark.parametrize(("name", "mean", "longest"), [("ten views", 875, 5.7), ("one view", 804, 9.9)])

@@ -59,7 +59,7 @@ def drawn(screen: Screen, view: KernelView, choices: Tuning, cotangents: dict[st
     """Layers, where pixels end, the slots of all pairs, and their sums."""
     with tuned(choices):
         layers = pixels.blend_view(screen, view, lasts=True)
-        images = {"rgb": layers.rgb, "transmittance": layers.ends.transmittance, "depth_sum": layers.depth_sum}
+        images = {"rgb": layers.rgb, "transmittance": layers.ends.transmittance, "depth": layers.depth}
         v = pixels.Cotangents(**cotangents)
         slots, walked = pixels.differentiate_view(screen, view, layers.ends, v, absolute=True)
         sums = slots.new_zeros(len(screen.records), slots.shape[1])
