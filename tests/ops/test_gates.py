@@ -65,9 +65,10 @@ def gated(
     rendering = splat(leaves, view, settings=settings, backend=backend, gates=factors)
     images = {"rgb": rendering.rgb, "alpha": rendering.alpha, "depth": rendering.depth}
     torch.autograd.backward(list(images.values()), [v.to(dtype) for v in cotangents(view)])
-    gradients = {name: getattr(leaves, name).grad for name in FIELDS} | {"screen": rendering.screen_offsets.grad}
+    gradients = {name: there(getattr(leaves, name).grad) for name in FIELDS}
+    gradients["screen"] = there(rendering.screen_offsets.grad)
     if factors is not None:
-        gradients["gates"] = factors.grad
+        gradients["gates"] = there(factors.grad)
     images["radii"] = rendering.radii
     return _doubles(images), _doubles(gradients)
 
