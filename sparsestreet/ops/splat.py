@@ -14,7 +14,7 @@ from sparsestreet.ops.compiling import disable_compile
 from sparsestreet.ops.cpu import rasterizer as cpu
 from sparsestreet.ops.raster import LEAST_ALPHA, Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_pixel_weights, check_structure
+from sparsestreet.ops.validate import check_gates, check_pixel_weights, check_structure
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
@@ -29,11 +29,12 @@ def splat(
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
     screen_gradients: bool = True,
+    gates: Float[Tensor, " n"] | None = None,
 ) -> Rendering:
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
-    Differentiable in ``background`` and in every field of ``gaussians`` except ``displacements``; not in the camera.
-    The gradient of means includes that through the view direction of the colors.
+    Differentiable in ``background``, in ``gates`` and in every field of ``gaussians`` except ``displacements``; not in
+    the camera. The gradient of means includes that through the view direction of the colors.
 
     Only "reference" can be differentiated twice. With the other backends torch refuses, or silently treats the gradient
     as a constant if the loss is linear in the image. Autocast has no effect: everything runs in the dtype of the
@@ -48,6 +49,11 @@ def splat(
         backend: "reference", "cpu", "triton" or "auto".
         screen_gradients: whether ``Rendering.screen_offsets`` gets gradients. Without them the pixel loop of Triton's
             backward pass takes 8 % fewer instructions.
+        gates: a factor M in [0, 1] of each row's alpha in every pixel, after the clamp (MaskGaussian, Liu et al. 2025);
+            None: 1, at no cost. Rows are culled and listed as if all gates were 1. So a row whose gate is 0 changes no
+            pixel and no other field's gradient, but is visible and its gate gets one: in each pixel
+            dL/dM = alpha T (<dL/dC, c - b>), T the light that reaches it and b what is seen behind it. The stop rule
+            sees gated alphas: rows behind the splat that finishes a pixel get none from there. Not in "triton".
 
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is not a rigid motion, or whose size or lens is
@@ -67,11 +73,13 @@ def splat(
     """
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
+    if gates is not None:
+        check_gates(gates, gaussians.means, chosen)
     with _without_autocast(gaussians.means.device.type):
         offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
         if chosen == "triton":
             return _module(chosen).render(gaussians, offsets, background, camera, settings)
-        raster = _module(chosen).rasterize(gaussians, offsets, camera, settings)
+        raster = _module(chosen).rasterize(gaussians, offsets, camera, settings, gates=gates)
         return _compose(raster, offsets, background)
 
 

@@ -30,6 +30,8 @@ class SceneGaussians:
     """Name of a node -> what it answered."""
     view: View
     """As nodes and splats see it (``SceneGraph.seen``)."""
+    gates: Float[Tensor, " n"] | None = None
+    """What masks that sample have drawn for this training step; None: nothing."""
 
 
 class SceneGraph(nn.Module):
@@ -71,7 +73,7 @@ class SceneGraph(nn.Module):
         gaussians = activate(list(parts.values()), sh_degree=state.sh_degree)
         if view.camera.shutter is not None and view.camera.shutter.span > 0:
             gaussians = replace(gaussians, displacements=self.displacements(view, parts, view.camera.shutter.span))
-        return SceneGaussians(gaussians, spans, parts, view)
+        return SceneGaussians(gaussians, spans, parts, view, self._gates(state) if state.training else None)
 
     def exposed(self, view: View) -> Exposed | None:
         """What the view gathers its light over, by the effects; None: nothing blurs it."""
@@ -83,6 +85,15 @@ class SceneGraph(nn.Module):
         """How far each row moves in the world, meters, during a normalized time around the view's."""
         moves = {name: self.nodes[name].displacements_over(span, view, part) for name, part in parts.items()}
         return torch.cat([torch.zeros_like(parts[name].means) if one is None else one for name, one in moves.items()])
+
+    def _gates(self, state: SceneState) -> Float[Tensor, " n"] | None:
+        """Those of all nodes; 1 for the rows of nodes without, None where no node has any."""
+        drawn = [None if node.mask is None else node.mask.gates(node.rows, state.step) for node in self.nodes.values()]
+        if all(gates is None for gates in drawn):
+            return None
+        nodes = self.nodes.values()
+        open_gates = (node.rows.means.new_ones(len(node.rows)) for node in nodes)
+        return torch.cat([one if gates is None else gates for gates, one in zip(drawn, open_gates, strict=True)])
 
     def counts(self) -> dict[str, int]:
         """Number of rows of every node, absent instances included."""

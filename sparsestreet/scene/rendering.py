@@ -46,6 +46,8 @@ class SceneRendering:
     state: SceneState = FINISHED
     options: RenderOptions = DEFAULT_OPTIONS
     """How it was rendered."""
+    gates: Float[Tensor, " n"] | None = None
+    """Which of its Gaussians masks sampled for a training step; None: all."""
 
 
 def render(
@@ -72,7 +74,7 @@ def from_another_camera(
     state = replace(rendering.state, screen_gradients=False)
     with torch.autocast(scene.device.type, enabled=False):
         seen = scene.seen(view, state)
-        placed = SceneGaussians(rendering.gaussians, rendering.spans, rendering.parts, seen)
+        placed = SceneGaussians(rendering.gaussians, rendering.spans, rendering.parts, seen, rendering.gates)
         return _drawn(scene, placed, state, options)
 
 
@@ -132,6 +134,7 @@ def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options
             settings=options.settings,
             backend=options.backend,
             screen_gradients=state.screen_gradients,
+            gates=placed.gates,
         )
     rgb = splats.rgb
     for name, effect in scene.effects.items():
@@ -139,5 +142,14 @@ def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options
             with phase(name):
                 rgb = effect.image(rgb, splats, placed.view, options)
     return SceneRendering(
-        rgb, splats.alpha, splats.depth, splats, placed.spans, placed.parts, placed.gaussians, state, options
+        rgb,
+        splats.alpha,
+        splats.depth,
+        splats,
+        placed.spans,
+        placed.parts,
+        placed.gaussians,
+        state,
+        options,
+        placed.gates,
     )

@@ -20,7 +20,7 @@ from sparsestreet.scene.density import GradientDensity, VibratingDensity
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.sources import ImagePoints
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.masks import SampledMaskSettings, StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.training.losses import MaskSparsity
@@ -43,7 +43,7 @@ EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 def test_the_options_that_tables_need_are_there():
     assert {"3dgs", "streetgs"} <= set(METHODS)
     assert {"none", "masks", "importance", "paper", "paper_short", "removal", "random", "opacity"} <= set(SPARSIFY)
-    assert {"capped", "mcmc", "uncapped"} <= set(SPARSIFY)
+    assert {"capped", "mcmc", "uncapped", "maskgaussian"} <= set(SPARSIFY)
 
 
 @cache
@@ -65,7 +65,9 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     # Which rule and which masks a sparsification has is the paper's matter, and that of its name.
     rules = dict.fromkeys(("importance", "paper", "paper_short"), ImportanceRule)
     rules |= {"removal": LeaveOneOutRule, "random": RandomRule, "opacity": OpacityRule}
-    assert masked or sparsify not in ("masks", "paper", "paper_short", "removal")
+    assert masked or sparsify not in ("masks", "paper", "paper_short", "removal", "maskgaussian")
+    sampled = [type(settings.mask_settings) is SampledMaskSettings for settings in recipe.nodes.values()]
+    assert sampled == [sparsify == "maskgaussian"] * len(sampled)
     added = ([MaskTraining] if masked else []) + ([Pruning] if sparsify in rules else [])
     assert [type(callback) for callback in recipe.callbacks.values()] == [DensityControl, RowLedger, PhaseTimes, *added]
     if sparsify in rules:

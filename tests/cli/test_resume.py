@@ -52,13 +52,23 @@ def whole(tiny_street, tmp_path_factory) -> Path:
     return out
 
 
-def stopped_at(step: int, tiny_street: list[str], out: Path) -> Path:
-    """A run with all stages that failed in a step."""
+SAMPLED = [
+    *TINY_RIGID,
+    "sparsify=maskgaussian",
+    "schedule.max_steps=40",
+    # Of one draw three rows of four come back: some go at each moment.
+    "sparsify.mask.draws=1",
+    "sparsify.mask.initial_logit=1.0",
+]
+
+
+def stopped_at(step: int, tiny_street: list[str], out: Path, stages: list[str] = ALL_STAGES) -> Path:
+    """A run with these stages that failed in a step."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RowLedger, "on_train_batch_start", _raises_at(step), raising=False)
         patch.setenv("HYDRA_FULL_ERROR", "1")
         with pytest.raises(RuntimeError, match="stopped by the test"):
-            train([*tiny_street, *ALL_STAGES, f"out={out}"])
+            train([*tiny_street, *stages, f"out={out}"])
     return out
 
 
@@ -77,6 +87,16 @@ def test_an_interrupted_run_can_be_evaluated(stopped_early, tmp_path):
 
 def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, stopped_early):
     goes_on_to_the_same_end(stopped_early, whole)
+
+
+def test_sampled_masks_go_on_bit_for_bit(tiny_street, tmp_path):
+    """What they draw follows from seed and step; rows go before and after the stop."""
+    whole = tmp_path / "whole"
+    assert train([*tiny_street, *SAMPLED, f"out={whole}"]) == 0
+    ledger = csv.DictReader((whole / "records" / "counts.csv").read_text().splitlines())
+    removed = {row["step"] for row in ledger if row["reason"] == "mask"}
+    assert {"20", "30"} <= removed
+    goes_on_to_the_same_end(stopped_at(23, tiny_street, tmp_path / "part", SAMPLED), whole)
 
 
 @pytest.mark.slow

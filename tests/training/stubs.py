@@ -20,7 +20,7 @@ from sparsestreet.scene.effects import Effect
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.masks import SampledMaskSettings, StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid, RigidSettings
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks.resizing import RowListener
@@ -66,7 +66,9 @@ def make_rows(count: int, seed: int = 0, columns: Mapping[str, Tensor] | None = 
     return Rows(parameters | extra, {"label": torch.arange(count), **buffers}, transient=extra.keys())
 
 
-def background(count: int = 20, *, seed: int = 0, mask: StaticMaskSettings | None = None, **changes: Any) -> Background:
+def background(
+    count: int = 20, *, seed: int = 0, mask: StaticMaskSettings | SampledMaskSettings | None = None, **changes: Any
+) -> Background:
     settings = BackgroundSettings(
         **{**BASE, "mask": mask, "masked": mask is not None, "num_points": 0, "sources": {}, **changes}
     )
@@ -75,7 +77,9 @@ def background(count: int = 20, *, seed: int = 0, mask: StaticMaskSettings | Non
     return Background(settings, make_rows(count, seed, columns), trained)
 
 
-def rigid(count: int = 10, *, seed: int = 1, mask: StaticMaskSettings | None = None, **changes: Any) -> Rigid:
+def rigid(
+    count: int = 10, *, seed: int = 1, mask: StaticMaskSettings | SampledMaskSettings | None = None, **changes: Any
+) -> Rigid:
     """Two objects of 4 x 2 x 1.5 m and 1 x 1 x 2 m that stand at the origin; rows take turns between them."""
     settings = RigidSettings(**{**BASE, "mask": mask, "masked": mask is not None, "box_margin": 0.1, **changes})
     trained = None if mask is None else mask.build(settings.min_gaussians)

@@ -13,7 +13,7 @@ import torch
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, to measure and test it."""
-_INTERFACE_VERSION = 14
+_INTERFACE_VERSION = 15
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -47,7 +47,7 @@ class CRows(ctypes.Structure):
     _fields_ = (
         ("count", c_int64),
         ("terms", c_int64),
-        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "displacements")),
+        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "displacements", "gates")),
     )
 
 
@@ -58,9 +58,11 @@ class CLayers(ctypes.Structure):
 
 
 class CRowGradients(ctypes.Structure):
-    """Pointers to the gradients of the Gaussians' fields and of the screen offsets."""
+    """Pointers to the gradients of the Gaussians' fields, of the screen offsets and of the gates, if there are any."""
 
-    _fields_ = tuple((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "screen"))
+    _fields_ = tuple(
+        (name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "screen", "gates")
+    )
 
 
 class CCounters(ctypes.Structure):

@@ -31,6 +31,8 @@ def rasterize(
     settings: SplatSettings,
     variant: int = FASTEST_VARIANT,
     every_tile: bool = False,
+    *,
+    gates: Float[Tensor, " n"] | None = None,
 ) -> Raster:
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
@@ -41,7 +43,8 @@ def rasterize(
     _check_dtype(gaussians)
     g = gaussians
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
-    return Raster(*_Blend.apply(*fields, screen_offsets, _moved(g), _view(camera, settings, every_tile), variant))
+    view = _view(camera, settings, every_tile)
+    return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant))
 
 
 def contribution(
@@ -96,12 +99,13 @@ def leave_one_out(
 
 
 class _Blend(torch.autograd.Function):
-    """Maps five fields and the screen offsets to the layers of a Raster."""
+    """Maps five fields, the screen offsets and the gates to the layers of a Raster."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, displacements, view, variant):
+    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, displacements, view, variant):
         ctx.set_materialize_grads(False)
         fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
+        gates = None if gates is None else gates.contiguous()
         rgb = means.new_empty(view.height, view.width, 3)
         transmittance, depth_sum = means.new_empty(2, view.height, view.width)
         radii = means.new_empty(means.shape[0])
@@ -109,35 +113,36 @@ class _Blend(torch.autograd.Function):
         status = native.load_library().splat_forward(
             lease.workspace.handle,
             byref(view),
-            byref(_rows(fields, displacements)),
+            byref(_rows(fields, displacements, gates)),
             byref(_layers(rgb, transmittance, depth_sum)),
             radii.data_ptr(),
             byref(report),
         )
         _raise_for(status, fields, displacements, report)
         ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*fields, displacements, transmittance)
+        ctx.save_for_backward(*fields, gates, displacements, transmittance)
         ctx.view, ctx.lease = view, lease
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, displacements, transmittance = ctx.saved_tensors
+        *fields, gates, displacements, transmittance = ctx.saved_tensors
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
+        of_gates = None if gates is None else torch.empty_like(gates)
         with phase("splat backward"):
             status = native.load_library().splat_backward(
                 ctx.lease.workspace.handle,
                 byref(ctx.view),
-                byref(_rows(fields, displacements)),
+                byref(_rows(fields, displacements, gates)),
                 transmittance.data_ptr(),
                 byref(_layers(*cotangents)),
-                byref(native.CRowGradients(*(gradient.data_ptr() for gradient in gradients), screen.data_ptr())),
+                byref(native.CRowGradients(*(_pointer(one) for one in (*gradients, screen, of_gates)))),
             )
         _raise_for(status, fields, displacements, native.CReport())
-        return *gradients, screen, None, None, None
+        return *gradients, screen, of_gates, None, None, None
 
 
 def _check_dtype(gaussians: Gaussians) -> None:
@@ -194,14 +199,19 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
     return view
 
 
-def _rows(fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None) -> native.CRows:
-    pointers = (field.data_ptr() for field in fields)
-    moved = None if displacements is None else displacements.data_ptr()
-    return native.CRows(fields[0].shape[0], fields[4].shape[1], *pointers, moved)
+def _rows(
+    fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, gates: Tensor | None = None
+) -> native.CRows:
+    pointers = (_pointer(field) for field in (*fields, displacements, gates))
+    return native.CRows(fields[0].shape[0], fields[4].shape[1], *pointers)
+
+
+def _pointer(tensor: Tensor | None) -> int | None:
+    return None if tensor is None else tensor.data_ptr()
 
 
 def _layers(*layers: Tensor | None) -> native.CLayers:
-    return native.CLayers(*(None if layer is None else layer.data_ptr() for layer in layers))
+    return native.CLayers(*map(_pointer, layers))
 
 
 def _raise_for(

@@ -17,7 +17,12 @@ _CHUNK_ELEMENTS = 1 << 20
 
 
 def rasterize(
-    gaussians: Gaussians, screen_offsets: Float[Tensor, "n 2"], camera: Camera, settings: SplatSettings
+    gaussians: Gaussians,
+    screen_offsets: Float[Tensor, "n 2"],
+    camera: Camera,
+    settings: SplatSettings,
+    *,
+    gates: Float[Tensor, " n"] | None = None,
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
     check_dtype(gaussians)
@@ -26,9 +31,11 @@ def rasterize(
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     offsets = screen_offsets[rows]
+    factors = None if gates is None else gates[rows, None]
 
     def blend(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        weights, transmittance = _weights(_alphas(pixels, splats, offsets, settings), settings)
+        alphas = _alphas(pixels, splats, offsets, settings)
+        weights, transmittance = _weights(alphas if factors is None else alphas * factors, settings)
         return weights.T @ splats.colors, transmittance, weights.T @ splats.depths
 
     # Backward recomputes chunk by chunk, so that memory does not grow with the image.

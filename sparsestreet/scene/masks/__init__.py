@@ -1,11 +1,13 @@
 """Learnable masks that find the Gaussians which a scene can do without.
 
-``mask`` is the interface. ``static`` has one score per Gaussian for all times. ``temporal`` has a network that gives
-one score per Gaussian and time. ``baked`` is its result, a bit per Gaussian and training frame.
+``mask`` is the interface. ``static`` has one score per Gaussian for all times. ``sampled`` has a probability per
+Gaussian and draws from it in every step. ``temporal`` has a network that gives one score per Gaussian and time.
+``baked`` is its result, a bit per Gaussian and training frame.
 """
 
 from sparsestreet.scene.masks.baked import BakedMask, BakedMaskSettings
 from sparsestreet.scene.masks.mask import Mask, MaskScope, MaskSettings
+from sparsestreet.scene.masks.sampled import SampledMask, SampledMaskSettings
 from sparsestreet.scene.masks.static import StaticMask, StaticMaskSettings, straight_through
 from sparsestreet.scene.masks.temporal import TemporalMask, TemporalMaskSettings
 
@@ -15,6 +17,8 @@ __all__ = [
     "Mask",
     "MaskScope",
     "MaskSettings",
+    "SampledMask",
+    "SampledMaskSettings",
     "StaticMask",
     "StaticMaskSettings",
     "TemporalMask",

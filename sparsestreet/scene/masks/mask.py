@@ -41,6 +41,14 @@ class Mask(nn.Module, ABC):
         Opacity and scale are multiplied by it.
         """
 
+    def gates(self, rows: Rows, step: int) -> Float[Tensor, " n"] | None:
+        """Returns a factor in {0, 1} of each row's alpha in a training step, for masks that sample; None: 1.
+
+        Unlike a multiplier, a gate of 0 leaves the row in the lists of the op, so that its gradient exists
+        (``ops.splat``).
+        """
+        return None
+
     @abstractmethod
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
         """Returns the sum of scores that the sparsity loss lowers; the view at ``time`` draws the ``visible`` rows."""

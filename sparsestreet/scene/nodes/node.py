@@ -56,6 +56,8 @@ class NodeSettings(ABC):
     """None: the node has no mask."""
     masked: bool = True
     """Whether the mask, if there is one, is trained in this run."""
+    run_mask: MaskSettings | None = None
+    """The mask that this run trains in place of ``mask``; None: that one."""
     density: DensityStrategy | None = None
     """None: density control never changes the node."""
     densify_until: float | None = None
@@ -109,7 +111,8 @@ class NodeSettings(ABC):
     @property
     def mask_settings(self) -> MaskSettings | None:
         """The mask that is trained in this run, if any."""
-        return self.mask if self.masked else None
+        own = None if self.mask is None else self.run_mask or self.mask
+        return own if self.masked else None
 
     @abstractmethod
     def build(self, data: TrainingData, generator: torch.Generator) -> "Node | None":

@@ -5,7 +5,7 @@ import logging
 import pytest
 import torch
 
-from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.scene.masks import SampledMaskSettings, StaticMaskSettings
 from sparsestreet.scene.rendering import render
 from sparsestreet.training.callbacks import MaskTraining
 from sparsestreet.training.losses import MaskSparsity, Photometric
@@ -132,3 +132,18 @@ def test_a_floor_that_only_the_removal_meets_is_logged(caplog):
         trainer.walk(20)
     assert labels(node) == [0, 2]
     assert len(caplog.messages) == 1
+
+
+def test_sampled_masks_train_lose_what_is_never_drawn_and_end():
+    node = background(8, mask=SampledMaskSettings(5e-4, initial_logit=0.0))
+    losses = {"photometric": Photometric(), "sparsity": MaskSparsity()}
+    trainer = StubTrainer(make_system({"background": node}, losses), [every_twenty()])
+    trainer.train(2, frame_at())
+    # Rows that the step did not draw have a gradient too, and so have moved.
+    assert (node.rows.mask_logits != 0).all()
+    set_rows(node, "mask_logits", {1: -30.0, 6: -30.0} | dict.fromkeys((0, 2, 3, 4, 5, 7), 30.0))
+    trainer.walk(20)
+    assert labels(node) == [0, 2, 3, 4, 5, 7]
+    trainer.walk(55)
+    assert node.mask is None
+    assert "mask_logits" not in node.rows.columns()

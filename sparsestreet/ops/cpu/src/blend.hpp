@@ -9,20 +9,23 @@ namespace SPLAT_VARIANT {
 
 template <class T>
 struct TileColors {
-  alignas(64) T transmittance[PIXELS], gate[PIXELS], red[PIXELS], green[PIXELS], blue[PIXELS], depth[PIXELS];
+  alignas(64) T transmittance[PIXELS], product[PIXELS], red[PIXELS], green[PIXELS], blue[PIXELS], depth[PIXELS];
   alignas(64) T last[PIXELS];  // the last pair that was blended, counted in the tile
 };
 
-template <class T, bool EXCLUSIVE>
+// GATED: the row's gate multiplies its alpha. Backward reaches what a gate of 0 hides, up to where the pixel ends.
+template <class T, bool EXCLUSIVE, bool GATED>
 inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c, int row, T pair) {
   const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
   for (int x = 0; x < TILE; x += LANES<T>) {
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
-    const Lanes<T> alpha = still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha, cuts,
-                                                    transmittance, c.gate + at);
+    const Lanes<T> drawn = sample(s, load(dx + x), along, base, cuts).alpha;
+    const Lanes<T> alpha = still_open<T, EXCLUSIVE>(GATED ? drawn * s.gate : drawn, cuts, transmittance, c.product + at);
     const Lanes<T> weight = alpha * transmittance;
-    store(c.last + at, alpha > Lanes<T>{} ? same(pair) : load(c.last + at));
+    Lanes<T> reached = alpha;
+    if (GATED) reached = (EXCLUSIVE ? load(c.product + at) : transmittance) > cuts.transmittance_min ? drawn : Lanes<T>{};
+    store(c.last + at, reached > Lanes<T>{} ? same(pair) : load(c.last + at));
     store(c.transmittance + at, transmittance - weight);
     store(c.red + at, load(c.red + at) + weight * s.color[0]);
     store(c.green + at, load(c.green + at) + weight * s.color[1]);
@@ -32,20 +35,20 @@ inline void blend_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts,
 }
 
 // Answers the index after the last pair that was looked at.
-template <class T, bool EXCLUSIVE>
+template <class T, bool EXCLUSIVE, bool GATED>
 int64_t blend_tile(const Workspace<T>& ws, const Cuts<T> cuts, int64_t tile, int64_t x0, int64_t y0,
                    TileColors<T>& c, int64_t& samples) {
   const int64_t begin = ws.tile_begin[tile], end = ws.tile_begin[tile + 1];
   for (int64_t k = begin; k < end; ++k) {
     if ((k - begin) % LOOK == 0 &&
-        tile_finished(EXCLUSIVE ? c.gate : c.transmittance, cuts.transmittance_min))
+        tile_finished(EXCLUSIVE ? c.product : c.transmittance, cuts.transmittance_min))
       return k;
     if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
     const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
     const TileSplat<T> here(s, x0, y0);
     samples += (here.last - here.first + 1) * TILE;
     for (int y = here.first; y <= here.last; ++y)
-      blend_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y, T(k - begin));
+      blend_row<T, EXCLUSIVE, GATED>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y, T(k - begin));
   }
   return end;
 }
@@ -63,7 +66,7 @@ void write_tile(const TileColors<T>& c, const View& view, int64_t x0, int64_t y0
   }
 }
 
-template <class T, bool EXCLUSIVE>
+template <class T, bool EXCLUSIVE, bool GATED>
 void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
   const Cuts<T> cuts(view);
   int64_t samples = 0;
@@ -75,9 +78,9 @@ void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
     std::memset(static_cast<void*>(&c), 0, sizeof(c));
     for (T& pair : c.last) pair = -1;
     open_tile(c.transmittance, view, x0, y0);
-    if (EXCLUSIVE) open_tile(c.gate, view, x0, y0);
+    if (EXCLUSIVE) open_tile(c.product, view, x0, y0);
     sort_tile(ws, tile);
-    ws.tile_end[tile] = blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
+    ws.tile_end[tile] = blend_tile<T, EXCLUSIVE, GATED>(ws, cuts, tile, x0, y0, c, samples);
     write_tile(c, view, x0, y0, image);
     std::memcpy(&ws.last_pairs[tile * PIXELS], c.last, sizeof(c.last));
   }
@@ -85,12 +88,12 @@ void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
 }
 
 template <class T>
-void blend(Workspace<T>& ws, const View& view, const Layers& image) {
+void blend(Workspace<T>& ws, const View& view, bool gated, const Layers& image) {
   const double start = omp_get_wtime();
   if (view.exclusive_stop)
-    blend_tiles<T, true>(ws, view, image);
+    gated ? blend_tiles<T, true, true>(ws, view, image) : blend_tiles<T, true, false>(ws, view, image);
   else
-    blend_tiles<T, false>(ws, view, image);
+    gated ? blend_tiles<T, false, true>(ws, view, image) : blend_tiles<T, false, false>(ws, view, image);
   ws.seconds[BLEND] = omp_get_wtime() - start;
 }
 

@@ -10,7 +10,7 @@ namespace SPLAT_VARIANT {
 
 template <class T>
 struct TileCounters {
-  alignas(64) T transmittance[PIXELS], gate[PIXELS], best[PIXELS];
+  alignas(64) T transmittance[PIXELS], product[PIXELS], best[PIXELS];
   int64_t best_pair[PIXELS];
 };
 
@@ -23,7 +23,7 @@ inline void count_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts,
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
     const Lanes<T> weight = transmittance * still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha,
-                                                                     cuts, transmittance, c.gate + at);
+                                                                     cuts, transmittance, c.product + at);
     store(c.transmittance + at, transmittance - weight);
     for (int i = 0; i < LANES<T>; ++i) {
       count.weight += double(weight[i]), count.pixels += weight[i] > 0;
@@ -38,7 +38,7 @@ void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   TileCounters<T> c;
   sort_tile(ws, tile);
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
+  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
   for (int i = 0; i < PIXELS; ++i) c.best[i] = 0, c.best_pair[i] = -1;
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
     const Splat<T>& s = ws.splats[ws.pairs[k].row];

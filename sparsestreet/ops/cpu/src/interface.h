@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 14;
+constexpr int32_t INTERFACE_VERSION = 15;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -36,6 +36,7 @@ struct Rows {
   int64_t count, terms;  // terms: spherical harmonics per channel
   const void *means, *quaternions, *scales, *opacities, *sh;
   const void* displacements;  // null: none
+  const void* gates;          // factors of alpha in every pixel, null: 1
 };
 
 // Layers of an image: premultiplied color [h,w,3], transmittance [h,w], sum of weighted depths [h,w].
@@ -44,9 +45,9 @@ struct Layers {
 };
 
 // Gradients of the rows; screen: sum over pixels of |dLoss / d mean on the screen|, of plain_gradients without the bars,
-// [n,2].
+// [n,2]; gates: null if the rows have none.
 struct RowGradients {
-  void *means, *quaternions, *scales, *opacities, *sh, *screen;
+  void *means, *quaternions, *scales, *opacities, *sh, *screen, *gates;
 };
 
 struct Counters {

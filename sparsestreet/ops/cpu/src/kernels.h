@@ -17,8 +17,10 @@ struct RowKernels {
 };
 
 struct PixelKernels {
-  void (*blend)(void*, const View&, const Layers&);
-  void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents);
+  void (*blend)(void*, const View&, bool gated, const Layers&);
+  // `gates`: where the gradients of the gates of all `rows` go; null: there are none.
+  void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents, int64_t rows,
+                         void* gates);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
   void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
 };

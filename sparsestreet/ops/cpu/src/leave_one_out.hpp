@@ -35,7 +35,7 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
     const int at = row * TILE + x;
     const Lanes<T> transmittance = load(c.transmittance + at);
     const Lanes<T> alpha = still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha, cuts,
-                                                    transmittance, c.gate + at);
+                                                    transmittance, c.product + at);
     const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
     store(c.transmittance + at, transmittance - weight);
     Lanes<T> sum{};
@@ -56,12 +56,12 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
   TileColors<T> c;
   TileBehind<T> behind;
   std::memset(static_cast<void*>(&c), 0, sizeof(c));
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
+  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
   int64_t samples = 0;
   sort_tile(ws, tile);
-  blend_tile<T, EXCLUSIVE>(ws, cuts, tile, x0, y0, c, samples);
+  blend_tile<T, EXCLUSIVE, false>(ws, cuts, tile, x0, y0, c, samples);
   behind_everything(c, view, sky_image, x0, y0, behind);
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.gate, view, x0, y0);
+  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);

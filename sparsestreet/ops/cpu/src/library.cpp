@@ -126,7 +126,7 @@ SPLAT_API int32_t splat_forward(Handle* h, const View* view, const Rows* rows, c
                                 Report* report) {
   return guarded([&]() -> int32_t {
     const Status status = h->rows().prepare(h->workspace, *view, *rows, radii, *report);
-    if (status == OK) h->pixels().blend(h->workspace, *view, *image);
+    if (status == OK) h->pixels().blend(h->workspace, *view, rows->gates, *image);
     return status;
   });
 }
@@ -135,7 +135,7 @@ SPLAT_API int32_t splat_forward(Handle* h, const View* view, const Rows* rows, c
 SPLAT_API int32_t splat_backward(Handle* h, const View* view, const Rows* rows, const void* transmittance,
                                  const Layers* cotangents, const RowGradients* gradients) {
   return guarded([&]() -> int32_t {
-    h->pixels().blend_backward(h->workspace, *view, transmittance, *cotangents);
+    h->pixels().blend_backward(h->workspace, *view, transmittance, *cotangents, rows->count, gradients->gates);
     h->rows().project_backward(h->workspace, *view, *rows, *gradients);
     return OK;
   });

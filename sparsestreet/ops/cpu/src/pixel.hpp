@@ -50,21 +50,21 @@ inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, 
   return p;
 }
 
-// What of alpha is blended: nothing in finished pixels. `gate` decides whether a pixel is still open: the
-// transmittance itself for the inclusive stop, the product that includes dropped splats for the exclusive one.
+// What of alpha is blended: nothing in finished pixels. Whether a pixel is still open is decided by the transmittance
+// itself for the inclusive stop, by the product that includes dropped splats for the exclusive one.
 template <class T, bool EXCLUSIVE>
-inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lanes<T>& transmittance, T* gate) {
+inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lanes<T>& transmittance, T* product) {
   if (!EXCLUSIVE) return transmittance > cuts.transmittance_min ? alpha : Lanes<T>{};
-  Lanes<T> passed = load(gate);
+  Lanes<T> passed = load(product);
   passed = passed - alpha * passed;
-  store(gate, passed);
+  store(product, passed);
   return passed > cuts.transmittance_min ? alpha : Lanes<T>{};
 }
 
 template <class T>
-inline bool tile_finished(const T* gate, T least) {
+inline bool tile_finished(const T* state, T least) {
   T most = 0;
-  for (int i = 0; i < PIXELS; ++i) most = gate[i] > most ? gate[i] : most;
+  for (int i = 0; i < PIXELS; ++i) most = state[i] > most ? state[i] : most;
   return most <= least;
 }
 

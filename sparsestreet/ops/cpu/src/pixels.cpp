@@ -13,9 +13,9 @@ Workspace<T>& as(void* workspace) { return *static_cast<Workspace<T>*>(workspace
 
 template <class T>
 PixelKernels kernels() {
-  return {[](void* w, const View& v, const Layers& image) { blend(as<T>(w), v, image); },
-          [](void* w, const View& v, const void* transmittance, const Layers& cotangents) {
-            blend_backward(as<T>(w), v, static_cast<const T*>(transmittance), cotangents);
+  return {[](void* w, const View& v, bool gated, const Layers& image) { blend(as<T>(w), v, gated, image); },
+          [](void* w, const View& v, const void* transmittance, const Layers& cotangents, int64_t rows, void* gates) {
+            blend_backward(as<T>(w), v, static_cast<const T*>(transmittance), cotangents, rows, static_cast<T*>(gates));
           },
           [](void* w, const View& v, int64_t rows, const Counters& out) {
             count_contributions(as<T>(w), v, rows, out);

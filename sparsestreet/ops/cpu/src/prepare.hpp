@@ -11,12 +11,12 @@ namespace SPLAT_VARIANT {
 template <class T>
 struct Inputs {
   int64_t count, terms;
-  const T *means, *quaternions, *scales, *opacities, *sh, *displacements;
+  const T *means, *quaternions, *scales, *opacities, *sh, *displacements, *gates;
   explicit Inputs(const Rows& r)
       : count(r.count), terms(r.terms), means(static_cast<const T*>(r.means)),
         quaternions(static_cast<const T*>(r.quaternions)), scales(static_cast<const T*>(r.scales)),
         opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)),
-        displacements(static_cast<const T*>(r.displacements)) {}
+        displacements(static_cast<const T*>(r.displacements)), gates(static_cast<const T*>(r.gates)) {}
 };
 
 // Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorizes.
@@ -103,6 +103,7 @@ bool project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
     return true;
   }
   color_rows(camera, in, row, p.placement.mean, s);
+  if (in.gates) load_columns<T>([&](int lane) { return in.gates + row(lane); }, 1, &s.gate);
   Splat<T>* splats = &ws.splats[first];
   store_columns<T>(&s.x, SPLAT_COLUMNS<T>, [&](int r) { return reinterpret_cast<T*>(&ws.splats[row(r)]); });
   tile_sets(s, grid, seen, splats, count, &ws.tiles[first]);

@@ -29,7 +29,7 @@ struct alignas(16 * sizeof(Scalar<V>)) Splat {
   V depth;
   V half_x, half_y;              // half sides of the box, pixels
   Index<V> first_row, last_row;  // image rows the box reaches, inclusive
-  V unused;
+  V gate;  // factor of alpha, of rows that have gates
 };
 template <class V>
 constexpr int SPLAT_COLUMNS = sizeof(Splat<V>) / sizeof(V);
@@ -79,6 +79,7 @@ struct Workspace {
   Buffer<T> last_pairs;        // by tile and pixel: the last pair that was blended, counted from tile_begin; -1: none
   Buffer<Pair<T>> pairs, other_pairs;  // by tile; other_pairs: room for sorting
   Buffer<Slot<T>> slots;
+  Buffer<T> gate_slots;  // dLoss/d gate of each pair, of rows that have gates
   struct Count {
     double weight;
     int64_t pixels, dominant;
@@ -95,7 +96,7 @@ struct Workspace {
   void poison() {
     splats.poison(), tiles.poison(), histogram.poison(), part_slots.poison(), tile_begin.poison(), tile_end.poison();
     pairs.poison(), other_pairs.poison(), last_pairs.poison(), slots.poison();
-    count_slots.poison(), change_slots.poison();
+    gate_slots.poison(), count_slots.poison(), change_slots.poison();
   }
 };
 
