@@ -80,7 +80,11 @@ def test_a_frame_for_viewers_and_what_it_lost(run, tmp_path, name, capsys):
         ({"shapes": 4}, 2, "shapes is no option of a .ply: leave it out"),
         ({"out": "street.html", "shapes": 0}, 2, "shapes must be above 0 a second, got 0"),
         ({"out": "street.html"}, 1, "training writes a views.json"),
-        ({"out": "street.obj"}, 2, "must end in .street, .ply, .compressed.ply, .spz, .sog, .html, .usdz, got 'street.obj'"),
+        (
+            {"out": "street.obj"},
+            2,
+            "must end in .street, .ply, .compressed.ply, .spz, .sog, .html, .usdz, got 'street.obj'",
+        ),
         ({"out": "street.ply", "car": "[4,2,1]"}, 2, "car is no option of a .ply: leave it out"),
         ({"out": "a.street", "time": 0.5}, 2, "time is no option of a .street: leave it out"),
         ({"out": "a.ply", "check": "true"}, 2, "check is no option of a .ply: leave it out"),
