@@ -2,7 +2,8 @@
 
 An object is removed, moved 3 m to its right, or copied 3 m to its right. The region are the pixels that the edit
 changes in the traced images. A ghost is what is left of an object where it was: the part of the error that looks like
-the object, by projection, and its energy as a share of the object's.
+the object, by projection, and its energy as a share of the object's. Of what is moved or copied, the error is split
+into that of the object's pixels where it is now, of its outline, and of all else: its shadow, and where it was.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,8 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
+from scipy.ndimage import binary_dilation, binary_erosion
 from torch import Tensor
 
 from sparsestreet.bench.records import RecordFile
@@ -28,6 +30,9 @@ from sparsestreet.types import View
 
 Show = Callable[[View], Float64[np.ndarray, "h w 3"]]
 """The image of a view, RGB in [0, 1]."""
+
+Covers = Callable[[View], Bool[np.ndarray, "h w"]]
+"""The pixels of a view that an object covers."""
 
 RIGHT = 3.0
 """Meters."""
@@ -68,6 +73,10 @@ class EditRecord:
     """In the same region, of the scene beside the street as they were, dB."""
     ghost: float | None
     """Energy of what is left of the object, as a share of its own; None: nothing was taken away."""
+    inside: float | None = None
+    """Share of the squared error in pixels that the object covers where it is now; None: it is nowhere."""
+    outline: float | None = None
+    """In pixels on either side of its outline, which count in no other share; the rest is shadow, and where it was."""
 
 
 @torch.no_grad()
@@ -88,7 +97,8 @@ def run_edits(
             other = street_truth(settings, street_from_world, replace(world, actors=tuple(actors)))
             scene = replace(stored, scene=edited(stored.scene, edits))
             shown = (partial(shown_by, stored), partial(shown_by, scene))
-            record = compared(kind, name, actor, shown, views, (truth, other))
+            alone = None if kind == "removed" else covered_by(_beside(actor), world, settings, street_from_world)
+            record = compared(kind, name, actor, shown, views, (truth, other), alone)
             if record is not None:
                 file.write("edit", record)
                 say(in_words(record))
@@ -100,12 +110,19 @@ def in_words(record: EditRecord) -> str:
     ghost = "" if record.ghost is None else f", ghost {100 * record.ghost:.2f} %"
     return (
         f"{record.edit:8} {record.object:16} {record.class_name:10} {record.psnr:5.1f} dB in {record.pixels:,} pixels "
-        f"of {record.views} views (unedited {record.psnr_before:.1f}){ghost}"
+        f"of {record.views} views (unedited {record.psnr_before:.1f}){ghost}{_shares(record)}"
     )
 
 
+def _shares(record: EditRecord) -> str:
+    if record.inside is None or record.outline is None:
+        return ""
+    rest = 1 - record.inside - record.outline
+    return f", of the error {record.inside:.0%} inside, {record.outline:.0%} outline, {rest:.0%} elsewhere"
+
+
 def _edit(kind: str, name: str, actor: Actor, actors: list[Actor], place: int) -> tuple[Edits, list[Actor]]:
-    beside = replace(actor, path=Beside(actor.path, RIGHT))
+    beside = _beside(actor)
     if kind == "removed":
         return Edits({name: REMOVED}), [*actors[:place], *actors[place + 1 :]]
     if kind == "moved":
@@ -113,12 +130,38 @@ def _edit(kind: str, name: str, actor: Actor, actors: list[Actor], place: int) -
     return Edits(added={"copy": Added(name, Change(Moved(right=RIGHT)))}), [*actors, beside]
 
 
+def _beside(actor: Actor) -> Actor:
+    return replace(actor, path=Beside(actor.path, RIGHT))
+
+
+def covered_by(
+    actor: Actor, world: World, settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]
+) -> Covers:
+    """The pixels of an actor: those that show no sky where nothing else is in the world."""
+    truth = street_truth(settings, street_from_world, replace(world, scenery=(), actors=(actor,)))
+
+    def covers(view: View) -> Bool[np.ndarray, "h w"]:
+        frame = truth(view)
+        if frame is None or frame.sky is None:
+            raise ValueError(f"the camera stands in {actor.name}: give a view that shows the street")
+        return ~frame.sky.numpy()
+
+    return covers
+
+
 def compared(
-    kind: str, name: str, actor: Actor, shown: tuple[Show, Show], views: Sequence[View], truths: tuple[Truth, Truth]
+    kind: str,
+    name: str,
+    actor: Actor,
+    shown: tuple[Show, Show],
+    views: Sequence[View],
+    truths: tuple[Truth, Truth],
+    covers: Covers | None = None,
 ) -> EditRecord | None:
     """What is shown without and with an edit, beside the street traced without and with it.
 
-    None where the edit changes too little in every view.
+    ``covers`` says which pixels the object covers after the edit; None: it is nowhere. None is returned where the edit
+    changes too little in every view.
     """
     found = []
     for view in views:
@@ -133,8 +176,14 @@ def compared(
     if not found:
         return None
     errors, old_errors, alike, own = 0.0, 0.0, 0.0, 0.0
+    inside, outline = 0.0, 0.0
     for _, view, (before, after), changed in found:
         error = (shown[1](view) - after)[changed]
+        if covers is not None:
+            covered = covers(view)
+            border = np.not_equal(binary_dilation(covered), binary_erosion(covered, border_value=1))
+            inside += float((error[(covered & ~border)[changed]] ** 2).sum())
+            outline += float((error[border[changed]] ** 2).sum())
         thing = (before - after)[changed]
         errors += float((error**2).sum())
         old_errors += float(((shown[0](view) - before)[changed] ** 2).sum())
@@ -143,7 +192,16 @@ def compared(
     pixels = sum(one[0] for one in found)
     ghost = (max(alike, 0.0) / own) ** 2 if kind == "removed" else None
     return EditRecord(
-        kind, name, actor.model.class_name, len(found), pixels, _db(errors, pixels), _db(old_errors, pixels), ghost
+        kind,
+        name,
+        actor.model.class_name,
+        len(found),
+        pixels,
+        _db(errors, pixels),
+        _db(old_errors, pixels),
+        ghost,
+        None if covers is None else inside / max(errors, 1e-12),
+        None if covers is None else outline / max(errors, 1e-12),
     )
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.bench.edits import actors_of, compared, in_words, shown_by
+from sparsestreet.bench.edits import actors_of, compared, covered_by, in_words, shown_by
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.truth import street_truth
@@ -61,7 +61,8 @@ def run_inserts(
         start, end = _span(other, name)
         own = [view for view in views if start <= view.time <= end and _is_free(street, world, actor, view.time)]
         shown = (partial(shown_by, street.stored), partial(shown_by, scene))
-        record = compared("inserted", name, actor, shown, own, (truth, with_it))
+        covers = covered_by(actor, world, street.settings, street.street_from_world)
+        record = compared("inserted", name, actor, shown, own, (truth, with_it), covers)
         if record is not None:
             file.write("insert", record)
             say(in_words(record))

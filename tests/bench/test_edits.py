@@ -7,15 +7,16 @@ import pytest
 import torch
 
 from sparsestreet.bench import edits
-from sparsestreet.bench.edits import Beside
+from sparsestreet.bench.edits import Beside, covered_by, in_words
 from sparsestreet.bench.edits_insert import TracedStreet, _is_free, _way, run_inserts
 from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.data.synthetic.models.car import STYLES, Car
 from sparsestreet.data.synthetic.motion import Path
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.world import Actor, build_world
+from sparsestreet.geometry.transforms import inverse
 from sparsestreet.records.provenance import this_machine, this_source
-from sparsestreet.types import Frame
+from sparsestreet.types import Camera, Frame, View
 from tests.export.street import stored_street, street_views
 
 CAR = Actor("car", Car(STYLES[0], (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)), Path(start=0.0, y=1.0, speed=4.0), 0.0)
@@ -64,6 +65,47 @@ def test_views_that_an_edit_hardly_changes_do_not_count(monkeypatch):
         raise AssertionError("nothing is rendered")
 
     assert edits.compared("removed", "car", CAR, (show, show), views, (traced(140), traced(40))) is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "inside", "outline"),
+    # Rows of the region that are 10 levels off: within the object's rows 12 .. 19, on its outline, above it.
+    [(slice(13, 19), 1.0, 0.0), (slice(12, 13), 0.0, 1.0), (slice(11, 12), 0.0, 1.0), (slice(8, 10), 0.0, 0.0)],
+)
+def test_the_error_is_split_by_where_the_object_is(wrong, inside, outline, monkeypatch):
+    monkeypatch.setattr(edits, "LEAST", 24 * 16)
+    before, after, views = traced(140), traced(40), street_views()[:3]
+
+    def show(view):
+        image = after(view).image.double().numpy() / 255
+        image[wrong, 14:34] += 10 / 255
+        return image
+
+    def covers(view):
+        covered = np.zeros((32, 48), bool)
+        covered[12:20, 12:36] = True
+        return covered
+
+    record = edits.compared("moved", "car", CAR, (show, show), views, (before, after), covers)
+    assert record is not None
+    assert (record.inside, record.outline) == (pytest.approx(inside), pytest.approx(outline))
+    assert f"{inside:.0%} inside, {outline:.0%} outline, {1 - inside - outline:.0%} elsewhere" in in_words(record)
+
+
+def test_an_actor_covers_the_pixels_that_it_hides_the_sky_in():
+    """A camera 10 m behind a saloon of 1.82 x 1.45 m, at half of its height."""
+    settings = StreetSettings(num_frames=11, supersampling=1)
+    world_from_camera = torch.eye(4)
+    world_from_camera[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    world_from_camera[:3, 3] = torch.tensor([-10.0 - 2.3, 1.0, 1.45 / 2])
+    intrinsics = torch.tensor([[160.0, 0.0, 24.0], [0.0, 160.0, 16.0], [0.0, 0.0, 1.0]])
+    camera = Camera(inverse(world_from_camera), intrinsics, width=48, height=32)
+    covers = covered_by(CAR, build_world(settings), settings, torch.eye(4, dtype=torch.float64))
+    covered = covers(View(camera, 0.0))
+    rows, columns = np.flatnonzero(covered.any(1)), np.flatnonzero(covered.any(0))
+    # 16 pixels a meter at the near end; the roof begins farther away.
+    assert columns[-1] - columns[0] + 1 == pytest.approx(1.82 * 16, abs=2)
+    assert 0.6 * 1.45 * 16 < rows[-1] - rows[0] + 1 <= 1.45 * 16 + 1
 
 
 def test_an_actor_beside_its_way_keeps_heading_and_steps():
