@@ -1,6 +1,5 @@
 """The public signatures of the op: it takes Gaussians and a camera, and returns a differentiable Rendering."""
 
-from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from types import ModuleType
 
@@ -75,7 +74,7 @@ def splat(
     chosen = resolve_backend(backend, gaussians.means.device)
     if gates is not None:
         check_gates(gates, gaussians.means, chosen)
-    with _without_autocast(gaussians.means.device.type):
+    with torch.autocast(gaussians.means.device.type, enabled=False):
         offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
         if chosen == "triton":
             return _module(chosen).render(gaussians, offsets, background, camera, settings)
@@ -142,11 +141,6 @@ def leave_one_out(
             check_pixel_weights(pixel_weights, camera, gaussians.means)
         behind = None if background is None else background.expand(camera.height, camera.width, 3)
         return _module(chosen).leave_one_out(gaussians, behind, pixel_weights, camera, settings)
-
-
-def _without_autocast(device: str) -> AbstractContextManager:
-    # To enter it takes the host as long as a launch, also where it is off.
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
 
 
 def _module(backend: str) -> ModuleType:

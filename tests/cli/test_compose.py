@@ -42,7 +42,10 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["data.log.min_lens_shift=0.5"], "no key 'data.log.min_lens_shift': it is 'effects.lens.min_shift' now"),
         (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
         (["nod.background.num_points=5"], "did you mean 'node.background.num_points'"),
-        (["sparsify=papr"], "no option 'papr' in conf/sparsify: choose one of capped, importance, masks, mcmc"),
+        (
+            ["sparsify=papr"],
+            "no option 'papr' in conf/sparsify: choose one of capped, importance, maskgaussian, masks, mcmc",
+        ),
         (["experimant=capped"], "did you mean 'experiment'"),
         (["data/lidar=hdl65"], "no option 'hdl65' in conf/data/lidar: choose one of hdl32, hdl64, ideal, waymo_top"),
         (["data/lidr=hdl64"], "did you mean 'data/lidar'"),
@@ -52,7 +55,10 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["+surprise=1"], "no key 'surprise'"),
         (["seed=x"], "seed"),
         (["out=runs/seed=1"], "'out=runs/seed=1' cannot be read"),
-        (["node.background.mask.sparsity_weight=1e-3"], "has no effect with sparsify=none: choose sparsify=masks"),
+        (
+            ["node.background.mask.sparsity_weight=1e-3"],
+            "has no effect with sparsify=none: choose sparsify=maskgaussian, masks",
+        ),
         (["schedule.lambda_m=3"], "has no effect with sparsify=none"),
         (["effects=none"], "no option 'none' in conf/effects: choose one of affine, box_poses, camera_poses, "),
         (["image_points=null"], "choose one of none, sift"),
@@ -67,7 +73,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["pruning@callback.pruning.rule=removal"], "with these choices: leave it out, or choose the option that has"),
         (["density@node.background.density=foo"], "no option 'foo' in conf/density: choose one of gradient, mcmc"),
         (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
-        (["mask@node.rigd.mask=temporal"], "mask@node.rigid.mask? Its options are static, temporal"),
+        (["mask@node.rigd.mask=temporal"], "mask@node.rigid.mask? Its options are sampled, static, temporal"),
         (["render=fast"], "set one of render.backend, render.preset, render.settings"),
         (
             ["optimizer=visible_adam"],

@@ -24,7 +24,7 @@ _OPTIONS = {"enable_fp_fusion": False}
 LEAST = constant(LEAST_ALPHA)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Composed:
     """What backward needs of a composed image."""
 
@@ -34,7 +34,7 @@ class Composed:
     """[3] or [h, w, 3]."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Split:
     """Tiles whose pixels are still in parts."""
 

@@ -39,7 +39,7 @@ GIANT = constant(32)
 """Splats that cover at least this many tiles get a warp each."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Visible:
     """Visible rows in the order of the scene, and room behind them."""
 
@@ -49,7 +49,7 @@ class Visible:
     sizes: Sizes
 
 
-@dataclass
+@dataclass(frozen=True)
 class Lists:
     """The tiles' lists of splats: room for v visible rows and p (splat, tile) pairs, t tiles."""
 

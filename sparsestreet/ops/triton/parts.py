@@ -22,7 +22,7 @@ from sparsestreet.ops.triton.thin import thin_pairs
 from sparsestreet.ops.triton.tuning import tuning
 
 
-@dataclass
+@dataclass(frozen=True)
 class Parts:
     """The tile and the pairs of each part. Those after the last needed one are empty, of no tile, and never read."""
 
@@ -46,7 +46,7 @@ class Parts:
         return self.tiles.shape[0]
 
 
-@dataclass
+@dataclass(frozen=True)
 class PartLayers:
     """What each part adds to its tile's pixels (as in ``Raster``), and the light after it: p = 256 s pixels, one part
     after the other, c = 3 p."""

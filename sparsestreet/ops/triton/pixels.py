@@ -21,7 +21,7 @@ PARTS = {"PARTS": True, "TOGETHER": False}
 TOGETHER = {"PARTS": False, "TOGETHER": True}
 
 
-@dataclass
+@dataclass(frozen=True)
 class Ends:
     """Where backward begins."""
 
@@ -31,7 +31,7 @@ class Ends:
     parts: PartLayers | None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Layers:
     """A blended view: the images of a Rendering."""
 
@@ -41,7 +41,7 @@ class Layers:
     ends: Ends
 
 
-@dataclass
+@dataclass(frozen=True)
 class Cotangents:
     """Derivatives of the loss by what is blended, before it is composed; a missing one is 0."""
 

@@ -20,7 +20,7 @@ from sparsestreet.types import Gaussians
 Layers = TypeVar("Layers")
 
 
-@dataclass
+@dataclass(frozen=True)
 class Projection:
     """A scene projected to the screen of one view, and the running sum over what each program counted (rows.py)."""
 
@@ -31,7 +31,7 @@ class Projection:
     sums: Int[Tensor, " b"]
 
 
-@dataclass
+@dataclass(frozen=True)
 class Screen:
     """A scene projected to the screen of one view."""
 

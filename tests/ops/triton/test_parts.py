@@ -176,7 +176,7 @@ def test_parts_longer_than_a_look(staged):
     assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=25)
 @given(
     st.lists(st.integers(0, 40), min_size=1, max_size=9),
     st.integers(1, 7),
