@@ -89,6 +89,7 @@ def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, stopped_early):
     goes_on_to_the_same_end(stopped_early, whole)
 
 
+@pytest.mark.slow
 def test_sampled_masks_go_on_bit_for_bit(tiny_street, tmp_path):
     """What they draw follows from seed and step; rows go before and after the stop."""
     whole = tmp_path / "whole"
