@@ -59,6 +59,7 @@ STAND_INS = {
     "data.log.first_frame=100": "data.log.first_frame=0",
     "data.log.last_frame=200": "data.log.last_frame=5",
     "data.log.width=960": "data.log.width=16",
+    "split.offset=50": "split.offset=5",
 }
 """A word of the pages, and what stands in for it."""
 

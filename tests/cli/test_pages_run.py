@@ -84,7 +84,7 @@ def tiny(words: list[str], tiny_street: list[str]) -> list[str]:
         street += ["split.stride=0"] if reader_of(words) in WRITERS else []  # four frames
     elif any(word.startswith(("data.log.settings.", "seed=")) for word in words):
         street = ["data.log.parent=streets", *(word for word in street if not word.startswith("data.log.root="))]
-    if {"image_points=none", "preset=drivestudio"} & set(words):  # neither has points from images
+    if {"image_points=none", "preset=drivestudio", "preset=drivestudio_legacy"} & set(words):  # no points from images
         street = [word for word in street if not word.startswith("image_points.")]
     return [*street, *TINY_NODES.get(method_of(words), [])]
 
@@ -142,6 +142,8 @@ def test_a_command_of_the_pages_runs(command, place, tiny_street, tmp_path, monk
     monkeypatch.chdir(place)
     measures_little(monkeypatch)
     name, *words = command
+    if name == "train" and not any(word.startswith(("out=", "-m", "+sweep=", "--")) for word in words):
+        words = [*words, f"out={tmp_path / 'run'}"]  # two runs in one second would share a folder
     words = ["to=" + str(tmp_path / "OUT") if word == "to=OUT" else word for word in words]
     if (reader := reader_of(words)) in WRITERS:
         WRITERS[reader](tmp_path / "DIR")
