@@ -5,7 +5,7 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -59,6 +59,7 @@ class TrainSchema:
     overwrite: bool = False
     reuse: bool = True
     checkpoint_every: Any = MISSING
+    branch_points: list[float] = field(default_factory=list)
     count_of: str | None = None
     data: Tree = MISSING
     schedule: Tree = MISSING

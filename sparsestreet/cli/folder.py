@@ -33,6 +33,7 @@ OF_A_RUN = (
     "curves",
     "pictures",
     "same_as.json",
+    "branch_of.json",
 )
 """What a training leaves in its folder, besides its configuration and its log."""
 

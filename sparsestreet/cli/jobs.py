@@ -1,6 +1,8 @@
 """``sparsestreet jobs +sweep=NAME,...``: what sweeps would train, before anybody starts them."""
 
+import math
 import sys
+from collections import defaultdict
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 
+from sparsestreet.cli.branch import first_pruning, identity_of_trunk, moments_to_keep
 from sparsestreet.cli.compose import configuration, override_problem, resolved
 from sparsestreet.cli.folder import identity_of_run
 from sparsestreet.cli.sweep import finished
@@ -25,22 +28,32 @@ sparsestreet jobs +sweep=NAME[,NAME ...] [key=value ...]
 What sweeps of conf/sweep would train, with the options that train would get; nothing is trained or written. A job
 repeats another where its options, seed and drive are those of a job before it, in its own sweep or in one that is named
 before: with reuse=true (conf/train.yaml) it is trained once. A job that stands finished in its folder is not trained
-again either. Drives need not be there: data.root=a,b,c counts three.
+again either. One that differs from a job before it only in what it prunes begins with a checkpoint of that job
+(branch_points), so the last column has what is trained in whole runs, one sweep after the other on one device. Drives
+need not be there: data.root=a,b,c counts three.
 """
 
 
 @dataclass(frozen=True)
 class SweepCount:
-    """Jobs of a sweep; those that repeat another, and of the others those that stand finished."""
+    """Jobs of a sweep; those that repeat another, and of the others those that stand finished.
+
+    ``shared``: what the rest need not train because it begins with a checkpoint of a job before it, in whole runs.
+    """
 
     name: str
     jobs: int
     repeated: int
     finished: int
+    shared: float = 0.0
 
     @property
     def trainings(self) -> int:
         return self.jobs - self.repeated - self.finished
+
+    @property
+    def whole_runs(self) -> float:
+        return self.trainings - self.shared
 
 
 def jobs(arguments: list[str]) -> int:
@@ -65,18 +78,40 @@ def jobs(arguments: list[str]) -> int:
 def count_jobs(names: Sequence[str], overrides: Sequence[str]) -> list[SweepCount]:
     """The counts of each sweep, in their order. Raises what Hydra raises for options that do not compose."""
     seen: set[Hashable] = set()
+    kept: defaultdict[Hashable, set[float]] = defaultdict(set)  # what runs have in common -> moments
     counts = []
     with configuration():
         for name in names:
             found = list(_jobs_of([f"+sweep={name}", *overrides]))
-            new = {identity: done for identity, done in found if identity not in seen}
+            new = {job.identity: job for job in found if job.identity not in seen}
             seen |= new.keys()
-            counts.append(SweepCount(name, len(found), len(found) - len(new), sum(new.values())))
+            shared = sum(0.0 if job.done else job.begins(kept[job.trunk]) for job in new.values())
+            done = sum(job.done for job in new.values())
+            counts.append(SweepCount(name, len(found), len(found) - len(new), done, shared))
     return counts
 
 
-def _jobs_of(overrides: Sequence[str]) -> Iterator[tuple[Hashable, bool]]:
-    """Of each job what it would train, and whether that stands finished in the job's folder."""
+@dataclass(frozen=True)
+class _Job:
+    identity: Hashable
+    """What it trains."""
+    trunk: Hashable
+    """What it trains before anything is pruned."""
+    first: float
+    """The fraction of it at which something is pruned first."""
+    keeps: tuple[float, ...]
+    """The moments before which it leaves a checkpoint."""
+    done: bool
+    """Whether it stands finished in its folder."""
+
+    def begins(self, kept: set[float]) -> float:
+        """The fraction of the run at which it begins; ``kept``: its trunk's moments, to which its own are added."""
+        begins = max((moment for moment in kept if moment <= self.first < math.inf), default=0.0)
+        kept |= set(self.keeps)
+        return begins
+
+
+def _jobs_of(overrides: Sequence[str]) -> Iterator[_Job]:
     given = [text for text in overrides if not _is_sweep(text)]
     params = compose("train", given, return_hydra_config=True).hydra.sweeper.params or {}
     asked = OverridesParser.create().parse_overrides([*(f"{key}={value}" for key, value in params.items()), *overrides])
@@ -87,14 +122,16 @@ def _jobs_of(overrides: Sequence[str]) -> Iterator[tuple[Hashable, bool]]:
             with open_dict(cfg):
                 del cfg["hydra"]
             cfg.folder = str(out)
-            yield _identity(cfg, out), out.is_dir() and finished(cfg, out) is not None
+            yield _job(cfg, out, done=out.is_dir() and finished(cfg, out) is not None)
 
 
-def _identity(cfg: DictConfig, out: Path) -> Hashable:
+def _job(cfg: DictConfig, out: Path, done: bool) -> _Job:
     try:
-        return identity_of_run(flat_config(resolved(cfg)))
+        config = flat_config(resolved(cfg))
     except (OmegaConfBaseException, ValueError):
-        return out  # what it trains follows from a run that is not there yet
+        return _Job(out, out, 0.0, (), done)  # what it trains follows from a run that is not there yet
+    first = first_pruning(config)
+    return _Job(identity_of_run(config), identity_of_trunk(config), first, moments_to_keep(cfg), done)
 
 
 def _is_sweep(text: str) -> bool:
@@ -103,9 +140,11 @@ def _is_sweep(text: str) -> bool:
 
 def _table(counts: Sequence[SweepCount]) -> Table:
     table = Table("sweep", box=None)
-    for heading in ("jobs", "repeat another", "finished", "to train"):
+    for heading in ("jobs", "repeat another", "finished", "to train", "in whole runs"):
         table.add_column(heading, justify="right")
-    total = SweepCount("sum", *(sum(getattr(one, part) for one in counts) for part in ("jobs", "repeated", "finished")))
+    parts = ("jobs", "repeated", "finished", "shared")
+    total = SweepCount("sum", *(sum(getattr(one, part) for one in counts) for part in parts))
     for one in [*counts, total] if len(counts) > 1 else counts:
-        table.add_row(one.name, *map(str, (one.jobs, one.repeated, one.finished, one.trainings)))
+        numbers = map(str, (one.jobs, one.repeated, one.finished, one.trainings))
+        table.add_row(one.name, *numbers, f"{one.whole_runs:.1f}")
     return table

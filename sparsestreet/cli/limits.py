@@ -26,6 +26,9 @@ def limit_problem(cfg: DictConfig) -> str | None:
         if not whole or value < least or (most is not None and value > most):
             limits = f"{least} or more" if most is None else f"{least} to {most}"
             return f"{key} must be a whole number, {limits}, got {value!r}"
+    for moment in cfg.get("branch_points") or ():
+        if not 0 < moment < 1:
+            return f"branch_points are fractions of the run, above 0 and below 1, got {moment!r}"
     return _two_lengths(cfg) or _missing_package(cfg)
 
 

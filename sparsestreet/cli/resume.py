@@ -1,19 +1,20 @@
 """Going on with a run: its own configuration, its own folder, exactly where it stopped."""
 
 from pathlib import Path
-from typing import Any
 
 import yaml
 
-from sparsestreet.cli.compose import load_run_config, resolved
-from sparsestreet.records.configuration import IDENTITY_KEYS, flat_config, without
+from sparsestreet.cli.compose import load_run_config
+from sparsestreet.records.branch_of import moment_of
 from sparsestreet.safe_yaml import read_yaml
 
 
 def resumed_overrides(arguments: list[str]) -> list[str]:
     """The overrides of the run that ``resume=RUN`` (or one of its checkpoints) names, then those that were given.
 
-    The run's folder is gone on in, unless ``out=`` names another. Without ``resume=`` they are as given.
+    An option that is given again counts as it is given now. The run's folder is gone on in, unless ``out=`` names
+    another, or the checkpoint is one that was kept before a moment: a branch has a folder of its own. Without
+    ``resume=`` they are as given.
     Raises FileNotFoundError where no run is at that place, ValueError in a sweep.
     """
     given = next((text.partition("=")[2] for text in arguments if text.startswith("resume=")), "null")
@@ -31,9 +32,15 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
     overrides = read_yaml(run / ".hydra" / "overrides.yaml", yaml.safe_load)
     if not isinstance(overrides, list):
         raise ValueError(f"{run}/.hydra/overrides.yaml is damaged: it holds no list of options")
-    kept = [text for text in map(str, overrides) if not text.startswith(("resume=", "out=", "overwrite="))]
-    folder = [] if any(text.startswith("out=") for text in arguments) else [f"out={run}"]
+    own = {"resume", "out", "overwrite", *(_key_of(text) for text in arguments)}
+    kept = [text for text in map(str, overrides) if _key_of(text) not in own]
+    branches = moment_of(Path(given)) is not None
+    folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={run}"]
     return [*kept, *arguments, *folder]
+
+
+def _key_of(override: str) -> str:
+    return override.partition("=")[0].lstrip("+~")
 
 
 def run_of(path: Path) -> Path:
@@ -46,16 +53,3 @@ def run_of(path: Path) -> Path:
 def has_checkpoint(run: Path) -> bool:
     """Whether a run has one that is whole."""
     return any((run / "checkpoints").glob("[!.]*.ckpt"))
-
-
-def check_resumed(config: dict[str, Any], run: Path) -> None:
-    """Raises ValueError, naming the options, where a run would go on with another configuration than its own."""
-    before = flat_config(resolved(load_run_config(run)))
-    now = flat_config(config)
-    old, new = (without(flat, (*IDENTITY_KEYS, "trainer.*")) for flat in (before, now))
-    changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
-    if before.get("seed") != now["seed"]:
-        changed.insert(0, "seed")
-    if changed:
-        said = ", ".join(f"{key} ({old.get(key, before.get(key))} before)" for key in changed[:3])
-        raise ValueError(f"a run goes on as it began, but {len(changed)} options differ: {said}; start a new run")

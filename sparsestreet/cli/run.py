@@ -5,15 +5,18 @@ import warnings
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of, with_views
+from sparsestreet.cli.branch import moments_to_keep, record_branch, trunk_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.device import devices_of_job
 from sparsestreet.cli.folder import start_of, take_folder
 from sparsestreet.cli.preset import preset_notes
 from sparsestreet.cli.process import follows_another, keep_freed_memory
+from sparsestreet.cli.resume import run_of
 from sparsestreet.evaluation.memory import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.run import train
@@ -48,9 +51,11 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
         recipe = recipe_of(known)
-        start = start_of(cfg, out)
+        own = start_of(cfg, out)
+        start = own or (trunk_of(cfg, out) if HydraConfig.get().mode == RunMode.MULTIRUN else None)
         if not follows_another(cfg.trainer):
-            take_folder(cfg, out, goes_on=start is not None)
+            take_folder(cfg, out, goes_on=own is not None and run_of(own).resolve() == out.resolve())
+            record_branch(out, start)
     with devices_of_job(cfg.trainer) as devices:
         summary = train(
             recipe,
@@ -64,6 +69,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
             extra=extra,
             resume=start,
             checkpoint_every=cfg.checkpoint_every,
+            checkpoints_before=moments_to_keep(cfg),
             stages=stages,
         )
     return 0.0 if summary is None else summary.mean("psnr_full")

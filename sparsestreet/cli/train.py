@@ -13,13 +13,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
+from sparsestreet.cli.branch import check_resumed
 from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.locks import sole_writer
 from sparsestreet.cli.process import follows_another, name_beside_first, speak_as
-from sparsestreet.cli.resume import check_resumed, resumed_overrides, run_of
+from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
@@ -80,7 +81,7 @@ def _problem_of_values(arguments: list[str]) -> str | None:
     problem = folder_problem(cfg, Path(cfg.out)) or config_problem(cfg)
     if problem is None and cfg.resume:
         # Before Hydra writes the configuration of this start over that of the run.
-        check_resumed(resolved(cfg), run_of(Path(cfg.resume)))
+        check_resumed(resolved(cfg), Path(cfg.resume))
     return problem
 
 

@@ -22,6 +22,7 @@ IDENTITY_KEYS = (
     "overwrite",
     "reuse",
     "checkpoint_every",
+    "branch_points",
     "out",
     "folder",
     "count_of",  # the run whose counts a control copies; the counts are options of their own

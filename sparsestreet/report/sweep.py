@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.records.branch_of import BRANCH_OF
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.same_as import SAME_AS
 from sparsestreet.records.strict_json import write_atomically
@@ -53,7 +54,15 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     said = verdict(found, protocol)
     folder = sweep / "report"
     figures, absent = _figures(found, protocol, folder / "figures")
-    notes = [*incomplete(found), *why_apart(found), *_caps(found), *_unfinished(records), *_taken(records), *absent]
+    notes = [
+        *incomplete(found),
+        *why_apart(found),
+        *_caps(found),
+        *_unfinished(records),
+        *_taken(records),
+        *_branches(records),
+        *absent,
+    ]
     write_atomically(folder / "tables.md", markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes))
     write_atomically(folder / "tables.tex", latex(grids))
     write_atomically(folder / "tables.csv", comma_separated(grids))
@@ -149,6 +158,12 @@ def _caps(found: Sequence[Arm]) -> list[str]:
 def _taken(records: Sequence[RunRecord]) -> list[str]:
     names = [record.folder.name for record in records if SAME_AS.exists(record.folder)]
     return [f"trained by another sweep, whose runs these are: {', '.join(names)}"] if names else []
+
+
+def _branches(records: Sequence[RunRecord]) -> list[str]:
+    names = [record.folder.name for record in records if BRANCH_OF.exists(record.folder)]
+    said = "begun with a checkpoint of another run, whose seconds until then count as theirs"
+    return [f"{said}: {', '.join(names)}"] if names else []
 
 
 def _unfinished(records: Sequence[RunRecord]) -> list[str]:

@@ -11,13 +11,15 @@ EARLIER = LoggedFile("curves/earlier.csv")
 
 
 @contextmanager
-def kept_curves(run: Path, resumed_at: int | None) -> Iterator[None]:
+def kept_curves(run: Path, resumed_at: int | None, of: Path | None = None) -> Iterator[None]:
     """While training goes on, keep what ``metrics.csv`` said of the steps before ``resumed_at``; None: a new run.
+
+    ``of``: the run whose checkpoint it goes on from; None: this one.
 
     Lightning's CSV logger begins its file anew. What an earlier part logged behind the checkpoint is left out: those
     steps are taken again.
     """
-    logged = [] if resumed_at is None else _joined(run)
+    logged = [] if resumed_at is None else _joined(of or run)
     earlier = [row for row in logged if resumed_at is not None and int(row["step"]) < resumed_at]
     if earlier:
         EARLIER.write(run, earlier)

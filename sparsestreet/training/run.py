@@ -75,6 +75,7 @@ def train(
     extra: ExtraMetrics | None = None,
     resume: Path | None = None,
     checkpoint_every: int = 1000,
+    checkpoints_before: Sequence[float] = (),
     stages: StageRecorder | None = None,
 ) -> RunSummary | None:
     """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
@@ -94,8 +95,9 @@ def train(
         logger: of Lightning, for the curves of the training; None: ``curves/metrics.csv``; False: none.
         identity: what the run is called in its records; None: as its folder.
         extra: what is measured beside the record of every run; None: nothing.
-        resume: a run's folder, or one of its checkpoints, to go on from.
+        resume: a run's folder, or one of its checkpoints, to go on from; of another run its curves are taken too.
         checkpoint_every: steps between two checkpoints, besides the one at the end.
+        checkpoints_before: fractions of the run; ``before_0.6.ckpt`` stays as it is before what happens at 60 %.
         stages: counts the seconds of the command that trains; None: they begin here.
 
     Returns:
@@ -125,7 +127,7 @@ def train(
             HeldOutCurve(out, clock),
             TrainingProgress(),
             RunFiles(out, identity.describe(recipe, data, max_steps, effects), clock),
-            Checkpoints(out / "checkpoints", checkpoint_every),
+            Checkpoints(out / "checkpoints", checkpoint_every, checkpoints_before),
             stop,  # the last: a signal ends training when the others are done with the step
         ]
         logger = CSVLogger(out, name="", version="curves") if logger is None else logger
@@ -213,7 +215,7 @@ def fit(
     step = step_of(start)
     if step >= max_steps:
         log.info("%s was finished: all %d steps are done, it is measured again", out, step)
-    with kept_curves(out, step if trainer.is_global_zero else None):
+    with kept_curves(out, step if trainer.is_global_zero else None, of=start.parents[1]):
         trainer.fit(system, datamodule=data, ckpt_path=start, weights_only=True)
     return trainer
 

@@ -14,8 +14,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from sparsestreet.cli.branch import check_resumed
 from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.resume import check_resumed, resumed_overrides
+from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.train import train
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.summary import SUMMARY

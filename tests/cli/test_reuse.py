@@ -1,5 +1,6 @@
 """Jobs that sweeps share are trained once; the folder of each sweep is whole."""
 
+import math
 import os
 import shutil
 from dataclasses import replace
@@ -11,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from sparsestreet.cli import folder, reuse
 from sparsestreet.cli.assemble import with_images
 from sparsestreet.cli.compose import resolved
-from sparsestreet.cli.jobs import SweepCount, count_jobs, jobs
+from sparsestreet.cli.jobs import SweepCount, _Job, count_jobs, jobs
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.sweep import finished
 from sparsestreet.records.configuration import flat_config
@@ -168,10 +169,19 @@ def test_files_are_copied_where_no_link_can_be(sweeps, monkeypatch):
 
 @pytest.mark.lengthy
 def test_trainings_are_counted_with_and_without_those_that_repeat(capsys):
-    """Tables 3 and 5 share the paper's score."""
+    """Tables 3 and 5 share the paper's score; what prunes late begins with what another job has trained."""
     counts = count_jobs(["table5_ablation", "table3_pruning"], ["data.root=/drives/023", "seed=0"])
-    assert counts == [SweepCount("table5_ablation", 3, 0, 0), SweepCount("table3_pruning", 2, 1, 0)]
+    late = 0.93334
+    assert counts == [SweepCount("table5_ablation", 3, 0, 0, late), SweepCount("table3_pruning", 2, 1, 0, late)]
     assert [count.trainings for count in counts] == [3, 1]
+    assert counts[1].whole_runs == pytest.approx(1 - late)
+
+
+def test_a_job_begins_with_the_latest_moment_before_its_own_pruning():
+    kept: set[float] = set()
+    moments = [0.93334, 0.93334, 0.6, 0.4, math.inf]
+    begun = [_Job(0, 0, first, (0.4, 0.6) if first > 0.6 else (0.4,), False).begins(kept) for first in moments]
+    assert begun == [0.0, 0.6, 0.6, 0.4, 0.0]
 
 
 def test_jobs_that_cannot_be_counted_are_said(capsys):
@@ -183,9 +193,13 @@ def test_jobs_that_cannot_be_counted_are_said(capsys):
 
 
 def test_jobs_prints_a_line_a_sweep_and_their_sum(monkeypatch, capsys):
-    counts = [SweepCount("one", 9, 0, 2), SweepCount("two", 6, 3, 0)]
+    counts = [SweepCount("one", 9, 0, 2, 1.5), SweepCount("two", 6, 3, 0)]
     monkeypatch.setattr("sparsestreet.cli.jobs.override_problem", lambda words: None)
     monkeypatch.setattr("sparsestreet.cli.jobs.count_jobs", lambda names, rest: counts if rest == ["seed=0"] else [])
     assert jobs(["+sweep=one,two", "seed=0"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert lines[1:] == [["one", "9", "0", "2", "7"], ["two", "6", "3", "0", "3"], ["sum", "15", "3", "2", "10"]]
+    assert lines[1:] == [
+        ["one", "9", "0", "2", "7", "5.5"],
+        ["two", "6", "3", "0", "3", "3.0"],
+        ["sum", "15", "3", "2", "10", "8.5"],
+    ]

@@ -1,8 +1,9 @@
-"""What training leaves to go on from: a checkpoint now and then, at the end, and when it is interrupted."""
+"""What training leaves to go on from: a checkpoint now and then, at chosen moments, at the end, when interrupted."""
 
 import logging
 import pickle
 import zipfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -11,9 +12,12 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.atomic import atomic_file
 from sparsestreet.phases import stage
 from sparsestreet.ranks import LostProcessError
+from sparsestreet.records.branch_of import kept_before
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.finite import check_parameters
 from sparsestreet.training.lightning import ends_step, ranks_of, validates_now
+from sparsestreet.training.schedule import milestone
+from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +30,9 @@ _BROKEN = (pickle.UnpicklingError, zipfile.BadZipFile, RuntimeError, EOFError, K
 class Checkpoints(Callback):
     """Writes ``last.ckpt`` every ``every`` steps and at the end, ``interrupted.ckpt`` on an exception or a signal.
 
+    ``before`` holds fractions of the run: ``before_0.6.ckpt`` has the last step before what happens after 60 % of it,
+    and stays. Runs that differ only from there on can begin with it (``cli/branch.py``).
+
     Each is written beside its place and renamed: whole or not at all, also on a full disk. Where a periodic one cannot
     be written, training goes on; where the last one cannot, the error is raised. It stands behind the callbacks that
     change rows, so that a checkpoint holds the rows as they left them. It waits for the validation of its step, which
@@ -37,10 +44,12 @@ class Checkpoints(Callback):
     opening one runs no code (``weights_only``).
     """
 
-    def __init__(self, folder: str | Path, every: int = 1000) -> None:
+    def __init__(self, folder: str | Path, every: int = 1000, before: Sequence[float] = ()) -> None:
         self.folder = Path(folder)
         self.every = every
-        self._due = False
+        self.before = tuple(before)
+        self._due: list[str] = []
+        """Names of what is to be written after this step."""
         self._inside = False
         """Whether a step has begun and not ended."""
 
@@ -53,20 +62,16 @@ class Checkpoints(Callback):
             half_written.unlink(missing_ok=True)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
     ) -> None:
         self._inside = False
-        self._due = (
-            ends_step(trainer, batch_idx)
-            and trainer.global_step % self.every == 0
-            and trainer.global_step < trainer.max_steps
-        )
-        if self._due and not validates_now(trainer):
-            self._try_to_save(trainer, pl_module, LAST)
+        self._due = list(self._names(trainer, pl_module)) if ends_step(trainer, batch_idx) else []
+        if not validates_now(trainer):
+            self._save_due(trainer, pl_module)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self._due and not trainer.sanity_checking:
-            self._try_to_save(trainer, pl_module, LAST)
+        if not trainer.sanity_checking:
+            self._save_due(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.interrupted:
@@ -81,6 +86,19 @@ class Checkpoints(Callback):
             log.warning("stopped inside step %d: go on from the checkpoint before it", trainer.global_step + 1)
         elif trainer.global_step > 0 and self._try_to_save(trainer, pl_module, INTERRUPTED):
             log.warning("stopped after step %d; go on with resume=%s", trainer.global_step, self.folder.parent)
+
+    def _names(self, trainer: Trainer, system: StreetSystem) -> Iterator[str]:
+        step = trainer.global_step
+        if step % self.every == 0 and step < trainer.max_steps:
+            yield LAST
+        for fraction in self.before:
+            if step == milestone(fraction, system.course) - 1:
+                yield kept_before(fraction)
+
+    def _save_due(self, trainer: Trainer, system: LightningModule) -> None:
+        for name in self._due:
+            self._try_to_save(trainer, system, name)
+        self._due = []
 
     def _try_to_save(self, trainer: Trainer, system: LightningModule, name: str) -> bool:
         try:
@@ -126,7 +144,7 @@ def _check_sums(checkpoint: Path) -> None:
 
 def newest_checkpoint(run: Path) -> Path:
     """The checkpoint of a run's folder that was written last. Raises FileNotFoundError where there is none."""
-    found = [path for name in (LAST, INTERRUPTED) if (path := run / "checkpoints" / name).is_file()]
+    found = list((run / "checkpoints").glob("[!.]*.ckpt"))
     if not found:
         raise FileNotFoundError(f"{run} has no checkpoint to go on from: give the folder of a run that was trained")
     return max(found, key=lambda path: path.stat().st_mtime_ns)

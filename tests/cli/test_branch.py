@@ -1,0 +1,117 @@
+"""A run that begins with another's checkpoint ends with the bits of one that began at step 0."""
+
+from pathlib import Path
+
+import pytest
+
+from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep
+from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.train import train
+from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
+from sparsestreet.records.configuration import Configuration, flat_config
+from sparsestreet.records.run import RUN
+from tests.cli import configurations
+from tests.cli.conftest import TINY_RIGID
+from tests.cli.test_resume import assert_equal, curve
+from tests.typed import there
+
+
+def flat(*words: str) -> Configuration:
+    return flat_config(resolved(configurations.composed(*words)))
+
+
+PAPER = ("schedule=paper", "preset=drivestudio_legacy", "capacity=paper", "method=omnire")
+RULES = "schedule.removal_at=[0.4,0.6]"
+
+
+@pytest.mark.parametrize(
+    ("run", "trunk", "moment", "shared"),
+    [
+        ((*PAPER, "sparsify=importance"), PAPER, 0.93334, True),
+        ((*PAPER, "sparsify=importance"), PAPER, 0.94, False),
+        ((*PAPER, "sparsify=paper"), (*PAPER, "sparsify=masks"), 0.93334, True),
+        ((*PAPER, "sparsify=paper"), PAPER, 0.1, False),
+        # K_min is a matter of masks, where there are any.
+        ((*PAPER, "experiment=table/global_pruning"), PAPER, 0.93334, True),
+        ((*PAPER, "sparsify=masks", "node.background.min_gaussians=0"), (*PAPER, "sparsify=masks"), 0.5, False),
+        (("experiment=rule/random", RULES), ("experiment=rule/opacity", "schedule.removal_at=[0.93334]"), 0.4, True),
+        (("experiment=rule/random", RULES), ("experiment=rule/opacity", "schedule.removal_at=[0.93334]"), 0.6, False),
+        (("experiment=rule/random", "schedule.removal_at=[0.93334]"), ("experiment=rule/opacity", RULES), 0.6, False),
+        (("seed=1", "sparsify=importance"), (), 0.5, False),
+        (("sparsify=importance", "schedule.max_steps=900"), (), 0.5, False),
+        (("sparsify=importance", "node.rigid.max_gaussians=900"), (), 0.5, False),
+        (("sparsify=importance", "branch_points=[0.2]", "checkpoint_every=7", "reuse=false"), (), 0.5, True),
+    ],
+)
+def test_what_runs_have_in_common(run, trunk, moment, shared):
+    assert is_branch(flat(*run), flat(*trunk), moment) is shared
+    assert is_branch(flat(*trunk), flat(*run), moment) is shared
+
+
+@pytest.mark.parametrize(
+    ("words", "first", "kept"),
+    [
+        ((), float("inf"), (0.3, 0.6)),
+        (("sparsify=importance",), 0.93334, (0.3, 0.6)),
+        (("sparsify=removal", "schedule.removal_at=[0.6,0.7]"), 0.6, (0.3, 0.6)),
+        (("sparsify=removal", "schedule.removal_at=[0.7,0.4]"), 0.4, (0.3,)),
+        (("budget.minutes=3",), float("inf"), ()),
+    ],
+)
+def test_a_run_keeps_what_its_own_pruning_has_not_touched(words, first, kept):
+    cfg = configurations.composed(*words, "branch_points=[0.3,0.6]")
+    assert first_pruning(flat_config(resolved(cfg))) == first
+    assert moments_to_keep(cfg) == kept
+
+
+SHORT = [*TINY_RIGID, "schedule.max_steps=20", "schedule.mask_in.every=5", "trainer.val_check_interval=7"]
+LATE = ["sparsify=importance", "callback.pruning.at=[0.6,0.8]"]
+
+
+@pytest.fixture(scope="module")
+def sweep(tiny_street, tmp_path_factory) -> Path:
+    """A plain run, then one that prunes."""
+    folder = tmp_path_factory.mktemp("branches") / "sweep"
+    places = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${sparsify.name}", "branch_points=[0.6]"]
+    for words in (["sparsify=none"], LATE):
+        assert train(["-m", *tiny_street, *SHORT, *words, *places]) == 0
+    return folder
+
+
+def test_a_job_begins_with_the_checkpoint_of_its_trunk_and_ends_as_if_it_had_not(sweep, tiny_street, tmp_path, capsys):
+    assert BRANCH_OF.read(sweep / "importance") == BranchOf(run="../none", label="streetgs", moment=0.6)
+    assert not BRANCH_OF.exists(sweep / "none")
+    whole = tmp_path / "whole"
+    assert train([*tiny_street, *SHORT, *LATE, f"out={whole}"]) == 0
+    assert_equal(whole, sweep / "importance")
+    assert curve(whole) == curve(sweep / "importance")
+    for name in ("records/counts.csv", "scene.safetensors"):
+        assert (whole / name).read_bytes() == (sweep / "importance" / name).read_bytes(), name
+    counts = (whole / "records/counts.csv").read_text()
+    assert "\n12,background" in counts  # the pruning of the very step behind the checkpoint
+    branch, trunk = RUN.read(sweep / "importance"), RUN.read(sweep / "none")
+    assert branch.config_hash == RUN.read(whole).config_hash
+    # What the trunk took until then is part of what the branch took.
+    assert there(branch.training_seconds) > 0.3 * there(trunk.training_seconds)
+
+
+def test_a_branch_that_is_none_is_refused_and_touches_nothing(sweep, tmp_path, capsys):
+    checkpoint = sweep / "none" / "checkpoints" / "before_0.6.ckpt"
+    before = {path: path.stat().st_mtime_ns for path in sweep.rglob("*")}
+    for words, said in (
+        ([*LATE, f"out={sweep / 'none'}"], "a run goes on as it began, but"),
+        (["sparsify=importance", "callback.pruning.at=[0.5]", f"out={tmp_path / 'early'}"], "callback.pruning"),
+        (["sparsify=masks", f"out={tmp_path / 'masks'}"], "a run goes on as it began, but"),
+    ):
+        assert train([f"resume={checkpoint}", *words]) == 2
+        assert said in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in sweep.rglob("*")} == before
+
+
+@pytest.mark.slow
+def test_a_branch_may_be_named(sweep, tmp_path):
+    checkpoint, out = sweep / "none" / "checkpoints" / "before_0.6.ckpt", tmp_path / "named"
+    assert train([f"resume={checkpoint}", *LATE, f"out={out}"]) == 0
+    assert_equal(sweep / "importance", out)
+    assert curve(out) == curve(sweep / "importance")
+    assert (out / BRANCH_OF.read(out).run).resolve() == sweep / "none"
