@@ -96,7 +96,8 @@ def trunk_of(cfg: DictConfig, out: Path) -> Path | None:
     begins at step 0; ``resume=CHECKPOINT`` names one for all.
     """
     first = first_pruning(config := flat_config(resolved(cfg)))
-    if not cfg.reuse or math.isinf(first) or cfg.budget.minutes or _is_shared(config):
+    wanted = cfg.reuse and not cfg.overwrite and not cfg.budget.minutes
+    if not wanted or math.isinf(first) or _is_shared(config):
         return None
     sweeps = Path(HydraConfig.get().sweep.dir).absolute().parent
     for moment, checkpoint in sorted(_kept(sweeps), key=lambda kept: (-kept[0], kept[1])):

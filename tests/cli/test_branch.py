@@ -1,14 +1,18 @@
 """A run that begins with another's checkpoint ends with the bits of one that began at step 0."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
-from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep
+from sparsestreet.cli import branch
+from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep, trunk_of
 from sparsestreet.cli.compose import resolved
 from sparsestreet.cli.train import train
 from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
 from sparsestreet.records.configuration import Configuration, flat_config
+from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
 from tests.cli import configurations
 from tests.cli.conftest import TINY_RIGID
@@ -64,6 +68,61 @@ def test_a_run_keeps_what_its_own_pruning_has_not_touched(words, first, kept):
     assert moments_to_keep(cfg) == kept
 
 
+ARM = ("sparsify=random", "callback.pruning.at=[0.7]")
+
+
+def kept(out: Path, *words: str, moments: Sequence[str] = ("0.6",), ended: bool = True) -> list[Path]:
+    """What a job of a sweep left: its configuration, checkpoints, and what it took."""
+    cfg = configurations.composed(*words).copy()
+    (out / ".hydra").mkdir(parents=True)
+    OmegaConf.save(cfg, out / ".hydra" / "config.yaml")
+    update_costs(out, wall_seconds=9.0 if ended else None, phases={"train": 9.0})
+    (out / "checkpoints").mkdir()
+    for name in ("last.ckpt", *(f"before_{moment}.ckpt" for moment in moments)):
+        (out / "checkpoints" / name).touch()
+    return [out / "checkpoints" / f"before_{moment}.ckpt" for moment in moments]
+
+
+@pytest.fixture
+def sweeps(tmp_path, monkeypatch) -> Path:
+    """The folder of sweeps, with ``two`` under way."""
+    asked = OmegaConf.create({"sweep": {"dir": str(tmp_path / "two")}})
+    monkeypatch.setattr(branch.HydraConfig, "get", lambda: asked)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("trunk", "run", "found"),
+    [
+        ({}, (), True),
+        ({"ended": False}, (), False),
+        ({"moments": ["0.8"]}, (), False),
+        ({}, ("reuse=false",), False),
+        ({}, ("overwrite=true",), False),
+        ({}, ("seed=1",), False),
+        ({}, ("budget.minutes=3",), False),
+        ({}, ("trainer=ddp",), False),
+        ({}, ("sparsify=none",), False),
+    ],
+    ids=["", "unfinished", "too late", "reuse=false", "overwrite", "seed", "minutes", "ddp", "plain"],
+)
+def test_the_trunk_of_a_job_is_found(sweeps, trunk, run, found):
+    (left,) = kept(sweeps / "one" / "job", **trunk)
+    words = run if "sparsify=none" in run else (*ARM, *run)
+    assert trunk_of(configurations.composed(*words), sweeps / "two" / "job") == (left if found else None)
+
+
+def test_the_latest_moment_comes_first_and_ones_own_folder_is_none(sweeps):
+    (early,) = kept(sweeps / "one" / "early", moments=["0.5"])
+    late = kept(sweeps / "two" / "late", moments=["0.65", "0.9"])
+    out = sweeps / "two" / "job"
+    kept(out, *ARM, moments=["0.7"])
+    cfg = configurations.composed(*ARM)
+    assert trunk_of(cfg, out) == late[0]
+    (sweeps / "two" / "late" / ".hydra" / "config.yaml").write_text("a: [")
+    assert trunk_of(cfg, out) == early
+
+
 SHORT = [*TINY_RIGID, "schedule.max_steps=20", "schedule.mask_in.every=5", "trainer.val_check_interval=7"]
 LATE = ["sparsify=importance", "callback.pruning.at=[0.6,0.8]"]
 
@@ -89,10 +148,10 @@ def test_a_job_begins_with_the_checkpoint_of_its_trunk_and_ends_as_if_it_had_not
         assert (whole / name).read_bytes() == (sweep / "importance" / name).read_bytes(), name
     counts = (whole / "records/counts.csv").read_text()
     assert "\n12,background" in counts  # the pruning of the very step behind the checkpoint
-    branch, trunk = RUN.read(sweep / "importance"), RUN.read(sweep / "none")
-    assert branch.config_hash == RUN.read(whole).config_hash
+    arm, trunk = RUN.read(sweep / "importance"), RUN.read(sweep / "none")
+    assert arm.config_hash == RUN.read(whole).config_hash
     # What the trunk took until then is part of what the branch took.
-    assert there(branch.training_seconds) > 0.3 * there(trunk.training_seconds)
+    assert there(arm.training_seconds) > 0.3 * there(trunk.training_seconds)
 
 
 def test_a_branch_that_is_none_is_refused_and_touches_nothing(sweep, tmp_path, capsys):
