@@ -52,8 +52,8 @@ def splat(
             None: 1, at no cost. Rows are culled and listed as if all gates were 1. So a row whose gate is 0 changes no
             pixel and no other field's gradient, but is visible and its gate gets one: in each pixel
             dL/dM = alpha T (<dL/dC, c - b>), T the light that reaches it and b what is seen behind it. The stop rule
-            sees gated alphas: rows behind the splat that finishes a pixel get none from there. On a GPU their values
-            are not checked, as those of a background.
+            sees gated alphas: rows behind the splat that finishes a pixel get none from there. On a GPU the values of
+            gates are not checked, as those of a background.
 
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is not a rigid motion, or whose size or lens is

@@ -116,13 +116,16 @@ def test_sizes(size, fractions, poisoned):
     assert_all_say_the_same(random_gaussians(12, view, seed=7), view, gates, SplatSettings(), 1e-5, 1e-4)
 
 
-def test_open_gates_change_no_bit(poisoned):
+@pytest.mark.parametrize(
+    "choices", first_interpreted(Tuning(), replace(ALL_CHOICES, shortest_part=1)), ids=["whole tiles", "all choices"]
+)
+def test_open_gates_change_no_bit(choices, poisoned):
     """On a device the compiler may contract other products."""
-    gaussians = stack(6, 0.9)
-    with tuned(replace(ALL_CHOICES, shortest_part=2)):
+    gaussians = stack(5, 0.9)
+    with tuned(choices):
         plain, opened = (
             gated(gaussians, VIEW, gates, "triton", torch.float32, EXCLUSIVE, BACKGROUND)
-            for gates in (None, torch.ones(7))
+            for gates in (None, torch.ones(6))
         )
     for without, given in zip(plain, opened, strict=True):
         for name, value in without.items():
@@ -130,9 +133,12 @@ def test_open_gates_change_no_bit(poisoned):
             torch.testing.assert_close(given[name], value, rtol=0.0, atol=rounding, msg=name)
 
 
-def test_closed_gates_show_the_background_and_still_learn(poisoned):
-    gaussians, gates = stack(6, 0.9), torch.zeros(7)
-    with tuned(Tuning(shortest_part=2)):
+@pytest.mark.parametrize(
+    "choices", first_interpreted(Tuning(), replace(ALL_CHOICES, shortest_part=1)), ids=["whole tiles", "all choices"]
+)
+def test_closed_gates_show_the_background_and_still_learn(choices, poisoned):
+    gaussians, gates = stack(5, 0.9), torch.zeros(6)
+    with tuned(choices):
         images, gradients = gated(gaussians, VIEW, gates, "triton", torch.float32, background=BACKGROUND)
     assert torch.equal(images["rgb"], BACKGROUND.float().double().expand(9, 19, 3))
     assert not images["alpha"].any()

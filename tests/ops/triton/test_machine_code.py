@@ -164,12 +164,13 @@ def test_every_kernel_is_compiled(compiled, request):
 
 
 def test_nothing_spills(compiled, request):
-    """But for staged records, outside of the loop, and for sm_120, where registers were not tuned."""
-    newest = "sm_120" in request.node.name
-    spilled = [launch for launch, found in compiled if found["spilled"] and not (newest or _is_staged(launch))]
-    assert spilled == []
+    """But outside of the loop for staged records, and 8 bytes for gates on sm_80; and on sm_120, where registers were
+    not tuned, once in the loop of both."""
+    newest, oldest = "sm_120" in request.node.name, "sm_80" in request.node.name
     for launch, found in compiled:
-        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and _is_staged(launch)), launch
+        gated = launch.name == "blend_tiles" and launch.constants["GATED"]
+        assert found["spilled"] <= 8 * (oldest and gated) or newest or _is_staged(launch), launch
+        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and (gated or _is_staged(launch))), launch
 
 
 def _is_staged(launch: Launch) -> bool:
@@ -219,10 +220,10 @@ BACKWARD = {
     "ABSOLUTE DEPTH TOGETHER": (104, 61.0),
     "ABSOLUTE DEPTH PARTS": (104, 61.0),
     "ABSOLUTE DEPTH MARKED TOGETHER": (104, 62.0),
-    "ABSOLUTE DEPTH GATED": (112, 66.0),
-    "ABSOLUTE DEPTH GATED TOGETHER": (112, 66.0),
-    "ABSOLUTE DEPTH GATED PARTS": (112, 66.0),
-    "ABSOLUTE DEPTH GATED MARKED TOGETHER": (112, 66.5),
+    "ABSOLUTE DEPTH GATED": (112, 66.5),
+    "ABSOLUTE DEPTH GATED TOGETHER": (112, 66.5),
+    "ABSOLUTE DEPTH GATED PARTS": (112, 66.5),
+    "ABSOLUTE DEPTH GATED MARKED TOGETHER": (112, 67.5),
 }
 OF_TRAINING = {
     "blend_tiles": (
