@@ -1,6 +1,7 @@
 """One small rendering with its gradients, for a tool that watches memory: python scripts/gpu_race_case.py CASE.
 
-CASE: "plain" (a pinhole), "lens", "shutter", "both". Without a CUDA device it needs TRITON_INTERPRET=1.
+CASE: "plain" (a pinhole), "lens", "shutter", "both", "gates" (a pinhole, rows with gates). Without a CUDA device
+it needs TRITON_INTERPRET=1.
 """
 
 import sys
@@ -11,7 +12,7 @@ import torch
 from sparsestreet.ops import splat
 from sparsestreet.types import Camera, Gaussians, Shutter
 
-CASES = ("plain", "lens", "shutter", "both")
+CASES = ("plain", "lens", "shutter", "both", "gates")
 ROWS = 140
 """More than a program of either kind of camera has, and no multiple of its rows."""
 
@@ -40,9 +41,11 @@ def main(case: str) -> None:
     fields = (means.to(device).requires_grad_(), numbers(ROWS, 4), numbers(ROWS, 3), numbers(ROWS), numbers(ROWS, 4, 3))
     # Splats that do not cover the whole image.
     scaled = replace(Gaussians(*fields), scales=0.05 * fields[2])
-    rendering = splat(scaled, camera_of(case), backend="triton")
+    gates = numbers(ROWS) if case == "gates" else None
+    rendering = splat(scaled, camera_of(case), backend="triton", gates=gates)
     (rendering.rgb.sum() + rendering.depth.sum()).backward()
-    finite = all(bool(field.grad is not None and field.grad.isfinite().all()) for field in fields)
+    learned = fields if gates is None else (*fields, gates)
+    finite = all(bool(field.grad is not None and field.grad.isfinite().all()) for field in learned)
     print(f"{case}: {int(rendering.visible.sum())} of {ROWS} rows drawn, gradients finite: {finite}")
 
 

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Racecheck of a pinhole, a lens, a shutter and both, each in a process of its own, so that reports can be told apart.
+# Racecheck of a pinhole, a lens, a shutter, both, and gates, each in a process of its own, so that reports can be told
+# apart.
 #
 #   scripts/gpu_racecheck.sh            with compute-sanitizer of the CUDA toolkit
 #   scripts/gpu_racecheck.sh --dry-run  the same renderings in Triton's interpreter, on the CPU
@@ -29,7 +30,7 @@ esac
 }
 
 mkdir -p "$OUT"
-for name in plain lens shutter both; do
+for name in plain lens shutter both gates; do
   log="$OUT/$name.log"
   # Kernels are compiled first, so that the tool watches no compiler.
   if "$PYTHON" scripts/gpu_race_case.py "$name" >"$log" 2>&1 &&

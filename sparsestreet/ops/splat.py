@@ -52,7 +52,8 @@ def splat(
             None: 1, at no cost. Rows are culled and listed as if all gates were 1. So a row whose gate is 0 changes no
             pixel and no other field's gradient, but is visible and its gate gets one: in each pixel
             dL/dM = alpha T (<dL/dC, c - b>), T the light that reaches it and b what is seen behind it. The stop rule
-            sees gated alphas: rows behind the splat that finishes a pixel get none from there. Not in "triton".
+            sees gated alphas: rows behind the splat that finishes a pixel get none from there. On a GPU the values of
+            gates are not checked, as those of a background.
 
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is not a rigid motion, or whose size or lens is
@@ -73,11 +74,11 @@ def splat(
     check_structure(gaussians, camera, background)
     chosen = resolve_backend(backend, gaussians.means.device)
     if gates is not None:
-        check_gates(gates, gaussians.means, chosen)
+        check_gates(gates, gaussians.means)
     with torch.autocast(gaussians.means.device.type, enabled=False):
         offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
         if chosen == "triton":
-            return _module(chosen).render(gaussians, offsets, background, camera, settings)
+            return _module(chosen).render(gaussians, offsets, background, camera, settings, gates)
         raster = _module(chosen).rasterize(gaussians, offsets, camera, settings, gates=gates)
         return _compose(raster, offsets, background)
 

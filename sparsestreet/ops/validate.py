@@ -74,16 +74,10 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
     _raise_in_image("pixel_weights", weights, (weights >= 0) & (weights < math.inf), "must be finite and >= 0")
 
 
-def check_gates(gates: Tensor, means: Tensor, backend: str) -> None:
-    """Checks for a backend with gates, and for one in [0, 1] per row, of the means' dtype and device; raises
-    ValueError.
+def check_gates(gates: Tensor, means: Tensor) -> None:
+    """Checks for one gate in [0, 1] per row, of the means' dtype and device; raises ValueError.
 
     As those of a background, values on a GPU are not checked, which would wait for it."""
-    if backend == "triton":
-        raise ValueError(
-            "gates need backend 'cpu' or 'reference', got 'triton', which has none: name one of them, or train masks "
-            "without sampling"
-        )
     if gates.shape != means.shape[:1] or gates.dtype != means.dtype or gates.device != means.device:
         raise ValueError(
             f"gates must be [{means.shape[0]}] {means.dtype} on {means.device} like the means, got "

@@ -33,7 +33,13 @@ from sparsestreet.scene.effects import (
 )
 from sparsestreet.scene.effects.recorded_poses import RecordedPoses
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import StaticMaskSettings, TemporalMaskSettings
+from sparsestreet.scene.masks import (
+    MaskSettings,
+    SampledMask,
+    SampledMaskSettings,
+    StaticMaskSettings,
+    TemporalMaskSettings,
+)
 from sparsestreet.scene.nodes import Node
 from sparsestreet.training import losses
 from sparsestreet.training.callbacks import DensityControl
@@ -54,13 +60,14 @@ from tests.training.waiting import META, SPLAT, Waits, pretended, waits
 
 SIZE = (16, 32)
 RATE = LearningRate(0.01)
+STATIC = StaticMaskSettings(1.0)
 ALL_LOSSES = {name: getattr(losses, name)() for name in losses.__all__ if name != "Loss"}
 
 __all__ = ["pretended"]  # a fixture
 
 
-def masked(weight: float = 1.0) -> dict[str, Node]:
-    mask = {"mask": StaticMaskSettings(weight), "min_gaussians": 8}
+def masked(settings: MaskSettings = STATIC) -> dict[str, Node]:
+    mask = {"mask": settings, "min_gaussians": 8}
     return {"background": background(20, **mask), "rigid": rigid(10, **mask)}
 
 
@@ -154,6 +161,13 @@ def test_cameras_and_masks_of_the_car_wait_for_nothing(case: str, pretended: Non
         frame = replace(frame, camera=replace(frame.camera, shutter=shutter))
     system = make_system(nodes(), effects={"sky": Sky(SkySettings(resolution=4))})
     assert places_of_a_step(system, frame, monkeypatch) == [SPLAT]
+
+
+def test_a_sampled_mask_does_not_wait(pretended: None, monkeypatch: pytest.MonkeyPatch):
+    # A GPU has a generator that a seed starts; this device has none.
+    monkeypatch.setattr(SampledMask, "_uniform", lambda mask, rows, purpose: torch.rand_like(rows.mask_logits))
+    system = make_system(masked(SampledMaskSettings(1.0)), {"sparsity": MaskSparsity()})
+    assert places_of_a_step(system, frame_with(), monkeypatch) == [SPLAT]
 
 
 def test_a_mask_over_time_does_not_wait(pretended: None, monkeypatch: pytest.MonkeyPatch):

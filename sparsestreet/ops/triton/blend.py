@@ -25,16 +25,16 @@ from sparsestreet.ops.triton.quadrants import (
     row_of,
     touches,
 )
-from sparsestreet.ops.triton.thin import LOOK, open_light, thin_pairs
+from sparsestreet.ops.triton.thin import LOOK, alpha_of, open_light, thin_pairs
 from sparsestreet.ops.triton.view import TILE
 
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
 
 
-def registers(exclusive: bool, staged: bool) -> int:
+def registers(exclusive: bool, staged: bool, gated: bool) -> int:
     """Fewest registers of a lane without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
-    return 96 if staged else 88 if exclusive else 80
+    return 96 + 8 * gated if staged else 88 if exclusive else 80
 
 
 @jit
@@ -59,14 +59,12 @@ def whitened(s, px, py):
 
 
 @jit
-def blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr):
-    """Blend weight of a splat, the light that passes it, and which pixels were open to it.
+def blend_one(alpha, drawn, passed, transmittance_min, EXCLUSIVE: tl.constexpr):
+    """Blend weight of a splat, the light that passes it, and which pixels were open to it, drawn there or not.
 
     A pixel is finished for good when ``passed`` is at most ``transmittance_min``. The exclusive stop drops the splat
     that would cross that limit, and marks the pixel by the sign, because the light itself stays above.
     """
-    alpha = tl.minimum(tl.exp2(exponent), alpha_max)
-    drawn = exponent >= cutoff
     if EXCLUSIVE:
         weight = tl.where(drawn, alpha, 0.0) * passed
         rest = passed - weight
@@ -102,7 +100,9 @@ def blend_quadrant(
     if touched:
         geometry, ends, light = splat
         _, a = across(x, geometry, line, RIGHT)
-        weight, passed, still = blend_one(line[3] - a * a, ends[1], passed, alpha_max, transmittance_min, EXCLUSIVE)
+        exponent = line[3] - a * a
+        alpha = alpha_of(exponent, ends, alpha_max)
+        weight, passed, still = blend_one(alpha, exponent >= ends[1], passed, transmittance_min, EXCLUSIVE)
         red += weight * light[0]
         green += weight * light[1]
         blue += weight * light[2]
@@ -167,13 +167,15 @@ def blend_tiles(
     rgb, transmittance, depth_sum, lasts, part_rgb, part_transmittance, part_depth, part_lasts,
     width, height, tiles_x, part_count, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
-    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, STAGED: tl.constexpr, BLOCK: tl.constexpr,
+    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, STAGED: tl.constexpr, GATED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes every pixel of one tile; with PARTS those of one part, if needed, into the layers of parts (parts.py).
 
     ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins. TOGETHER:
     whole tiles and parts. Of parts the first ones of tiles are then blended, and of the others it is computed what they
-    let through. REST: parts but the first ones. STAGED: each lane fetches the record of one of the next pairs.
+    let through. REST: parts but the first ones. STAGED: each lane fetches the record of one of the next pairs. GATED:
+    a row's gate multiplies its alpha.
     """
     tl.static_assert(BLOCK == 1)
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
@@ -185,7 +187,8 @@ def blend_tiles(
         later = is_part & (first < part)
         if later & (part + 1 < tl.load(nexts + part)):
             thin_pairs(
-                records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, limit
+                records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, limit,
+                GATED,
             )  # fmt: skip
         first, end = part, tl.where(later, k, end)
     if REST:
@@ -201,10 +204,10 @@ def blend_tiles(
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         if STAGED:
-            held = hold_splats(records, pair_rows, k, end)
+            held = hold_splats(records, pair_rows, k, end, GATED)
         for i in range(k, stop):
             touched = pair
-            splat = held_splat(held, i - k) if STAGED else load_splat(records, row_of(pair))
+            splat = held_splat(held, i - k, GATED) if STAGED else load_splat(records, row_of(pair), GATED)
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(y, splat[0], splat[1][0], 0)

@@ -7,6 +7,10 @@ prefix would carry the rounding of the total to the faintest splat.) Each pair w
 
 A slot holds, with s = dLoss/d(ln alpha), d = (dx, dy), (a, b) = L d and w the blend weight, the sums over pixels of
 s, s a, s b; s a dx, s a dy, s b dy (towards l11, l21, l22); |s a|, |s (l21 a + l22 b)|; w times the cotangents.
+
+With gates alpha_k = M_k A_k, A_k being the splat's own, and dLoss/dM_k = A_k (T_k f_k - (light from behind k) /
+(1 - alpha_k)), T_k the light before k. This is there where M_k is 0. A slot then has four numbers more, each of them
+the sum of this: 64 bytes, two sectors of memory.
 """
 
 from functools import partial
@@ -30,15 +34,21 @@ from sparsestreet.ops.triton.quadrants import (
 )
 from sparsestreet.ops.triton.view import TILE
 
-SLOT_LENGTH = 12
-SLOT = constant(SLOT_LENGTH)
+SLOT_LENGTH, GATED_SLOT_LENGTH = 12, 16
+SLOT, GATED_SLOT = constant(SLOT_LENGTH), constant(GATED_SLOT_LENGTH)
+GATE_PLACE = 12
 ZEROED = constant(16)
 
 
-def registers(depth: bool) -> int:
+def registers(depth: bool, gated: bool) -> int:
     """Fewest registers of a lane without spills. A multiprocessor runs 20 warps with up to 96 registers, 16 with
     128."""
-    return 104 if depth else 96
+    return (104 if depth else 96) + 8 * gated
+
+
+def slot_length(gated: bool) -> int:
+    """Numbers of a slot, and of a row's sums."""
+    return GATED_SLOT_LENGTH if gated else SLOT_LENGTH
 
 
 @jit
@@ -49,23 +59,30 @@ def halved(low, high, lane, BIT: tl.constexpr):
 
 
 @jit
-def store_sums(to, s):
-    """Stores the sums over the warp of each lane's twelve numbers, added in a fixed order.
+def store_sums(to, s, GATED: tl.constexpr):
+    """Stores the sums over the warp of each lane's twelve numbers, added in a fixed order; GATED: and of a thirteenth.
 
-    Every exchange between lanes halves how many numbers a lane still holds. This takes 13 exchanges; summing each
-    number
-    alone would take 60."""
+    Every exchange between lanes halves how many numbers a lane still holds. This takes 13 exchanges, or 15; summing
+    each number alone would take 60."""
     lane = tl.arange(0, WARP)
     s0, s1, s2 = halved(s[0], s[6], lane, 16), halved(s[1], s[7], lane, 16), halved(s[2], s[8], lane, 16)
     s3, s4, s5 = halved(s[3], s[9], lane, 16), halved(s[4], s[10], lane, 16), halved(s[5], s[11], lane, 16)
     s0, s1, s2 = halved(s0, s3, lane, 8), halved(s1, s4, lane, 8), halved(s2, s5, lane, 8)
     s0 = halved(s0, s1, lane, 4)
-    s2 += tl.gather(s2, lane ^ 4, 0)
+    if GATED:
+        gate = s[12] + tl.gather(s[12], lane ^ 16, 0)
+        s2 = halved(s2, gate + tl.gather(gate, lane ^ 8, 0), lane, 4)
+    else:
+        s2 += tl.gather(s2, lane ^ 4, 0)
     s0 = halved(s0, s2, lane, 2)
     s0 += tl.gather(s0, lane ^ 1, 0)
     third = (lane & 2) != 0
     field = 6 * (lane // 16) + 3 * (lane // 8 % 2) + tl.where(third, 2, lane // 4 % 2)
-    tl.store(to + field, s0, ((lane & 1) == 0) & ((lane & 6) != 6))
+    fourth = (lane & 6) == 6
+    if GATED:
+        tl.store(to + tl.where(fourth, 12 + lane // 8, field), s0, (lane & 1) == 0)
+    else:
+        tl.store(to + field, s0, ((lane & 1) == 0) & (fourth == 0))
 
 
 @jit
@@ -80,16 +97,21 @@ def zero_slots(slots, pair_slots, begin, end, COUNT: tl.constexpr):
 
 
 @jit
-def alpha_behind(exponent, cutoff, k, last, alpha_max):
-    """Alpha, 0 where the splat was not drawn or the pixel had finished, and 1 / (1 - alpha)."""
+def drawn_alpha(exponent, cutoff, k, last, alpha_max):
+    """Alpha before and after the clamp; then 0 where the splat was not drawn or the pixel had finished."""
     raw = tl.exp2(exponent)
     drawn = (exponent >= cutoff) & (k < last)
-    alpha = tl.where(drawn, tl.minimum(raw, alpha_max), 0.0)
+    return raw, tl.where(drawn, tl.minimum(raw, alpha_max), 0.0)
+
+
+@jit
+def inverse_rest(alpha):
+    """1 / (1 - alpha)."""
     # The device's reciprocal root is exact to 2^-22.9. One Newton step keeps errors from adding up over a stack.
     rest = 1.0 - alpha
     root = tl.rsqrt(rest)
     inverse = root * root
-    return raw, alpha, tl.fma(tl.fma(-rest, inverse, 1.0), inverse, inverse)
+    return tl.fma(tl.fma(-rest, inverse, 1.0), inverse, inverse)
 
 
 @jit
@@ -137,18 +159,20 @@ def last_quadrant(
 @jit
 def differentiate_quadrant(
     touched, quadrant, v, last, sums, x, line, RIGHT: tl.constexpr, splat, k, alpha_max,
-    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr,
+    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, GATED: tl.constexpr,
 ):  # fmt: skip
     """The quadrant before a splat, and the splat's sums with this quadrant's added.
 
     Within a lane, whose pixels share y, the sums cover everything that depends on x."""
     passed, behind = quadrant
-    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11 = sums
+    s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12 = sums
     if touched:
         geometry, ends, light = splat
         dy, _, b, base = line
         dx, a = across(x, geometry, line, RIGHT)
-        raw, alpha, inverse = alpha_behind(base - a * a, ends[1], k, last, alpha_max)
+        raw, own = drawn_alpha(base - a * a, ends[1], k, last, alpha_max)
+        alpha = own * ends[2] if GATED else own
+        inverse = inverse_rest(alpha)
         passed *= inverse
         weight = alpha * passed
         shown = light[0] * v[0] + light[1] * v[1] + light[2] * v[2]
@@ -157,6 +181,8 @@ def differentiate_quadrant(
         blended = weight * shown
         # A clamped alpha has no derivative.
         g = tl.where(raw <= alpha_max, blended - alpha * inverse * behind, 0.0)
+        if GATED:
+            s12 += lane_sum(own * (passed * shown - inverse * behind))
         behind += blended
         ga = g * a
         lane_g, lane_ga, lane_dy = lane_sum(g), lane_sum(ga), of_lane(dy)
@@ -170,7 +196,7 @@ def differentiate_quadrant(
         s10 += lane_sum(weight * v[2])
         if DEPTH:
             s11 += lane_sum(weight * v[3])
-    return (passed, behind), (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11)
+    return (passed, behind), (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12)
 
 
 @partial(jit, do_not_specialize=["width", "height", "tiles_x", "part_count"])
@@ -179,14 +205,16 @@ def blend_tiles_backward(
     transmittance, lasts, part_rgb, part_depth, part_transmittance, part_lasts,
     v_rgb, v_transmittance, v_depth_sum, slots, walked, width, height, tiles_x, part_count, alpha_max,
     DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr, MARKED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes the slots of all pairs of one tile, or (PARTS; TOGETHER: both) of one part of a tile.
 
     ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given; MARKED: sets ``walked`` of each slot that it
-    writes, and leaves the slots behind the last pair that a pixel was open to.
+    writes, and leaves the slots behind the last pair that a pixel was open to. GATED: rows have gates, slots also the
+    sums for these.
     """
     tl.static_assert(BLOCK == 1)
+    length: tl.constexpr = GATED_SLOT if GATED else SLOT
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
     tile, part, begin, end, is_part = work_of(*tables, PARTS, TOGETHER)
     following = part
@@ -205,24 +233,24 @@ def blend_tiles_backward(
     # needed has written nothing.
     latest = tl.maximum(tl.minimum(latest, end), begin)
     if not MARKED:
-        zero_slots(slots, pair_slots, latest, end, SLOT)
+        zero_slots(slots, pair_slots, latest, end, length)
     pair = tl.load(pair_rows + latest - 1, latest > begin, 0)
     k = latest - 1
     while k >= begin:
-        splat, touched = load_splat(records, row_of(pair)), pair
+        splat, touched = load_splat(records, row_of(pair), GATED), pair
         pair = tl.load(pair_rows + k - 1, k > begin, 0)
         nothing = tl.zeros((WARP,), tl.float32)
         s = (nothing, nothing, nothing, nothing, nothing, nothing)
-        s = s + s
+        s = s + s + (nothing,)
         more = (splat, k, alpha_max, DEPTH, ABSOLUTE)
         line = of_lines(y, splat[0], splat[1][0], 0)
-        q0, s = differentiate_quadrant(touches(touched, 0), q0, v0, last0, s, x, line, 0, *more)
-        q1, s = differentiate_quadrant(touches(touched, 1), q1, v1, last1, s, x, line, 1, *more)
+        q0, s = differentiate_quadrant(touches(touched, 0), q0, v0, last0, s, x, line, 0, *more, GATED)
+        q1, s = differentiate_quadrant(touches(touched, 1), q1, v1, last1, s, x, line, 1, *more, GATED)
         line = of_lines(y, splat[0], splat[1][0], 1)
-        q2, s = differentiate_quadrant(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more)
-        q3, s = differentiate_quadrant(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more)
+        q2, s = differentiate_quadrant(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more, GATED)
+        q3, s = differentiate_quadrant(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more, GATED)
         slot = tl.load(pair_slots + k)
-        store_sums(slots + slot * SLOT, s)
+        store_sums(slots + slot * length, s, GATED)
         if MARKED:
             tl.store(walked + slot, 1)
         k -= 1

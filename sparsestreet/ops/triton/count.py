@@ -37,7 +37,8 @@ def count_tiles_pixels(
             s = record.record_of(records, row_of(tl.load(pair_rows + i)))
             _, _, _, _, exponent = whitened(s, px, py)
             cutoff = tl.load(s + record.CUTOFF)
-            weight, passed, _ = blend_one(exponent, cutoff, passed, alpha_max, transmittance_min, EXCLUSIVE)
+            alpha = tl.minimum(tl.exp2(exponent), alpha_max)
+            weight, passed, _ = blend_one(alpha, exponent >= cutoff, passed, transmittance_min, EXCLUSIVE)
             # Strictly more, so that of equal weights the nearer splat keeps the pixel.
             more = weight > best
             best, best_pair = tl.where(more, weight, best), tl.where(more, i, best_pair)

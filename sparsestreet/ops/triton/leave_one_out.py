@@ -8,7 +8,7 @@ import triton.language as tl
 
 from sparsestreet.ops.triton import records as record
 from sparsestreet.ops.triton.blend import pixels_of, whitened
-from sparsestreet.ops.triton.blend_backward import alpha_behind, zero_slots
+from sparsestreet.ops.triton.blend_backward import drawn_alpha, inverse_rest, zero_slots
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.quadrants import row_of
 
@@ -56,7 +56,8 @@ def remove_from_tiles(
         k = latest - 1 - i
         s = record.record_of(records, row_of(tl.load(pair_rows + k)))
         _, _, _, _, exponent = whitened(s, px, py)
-        _, alpha, inverse = alpha_behind(exponent, tl.load(s + record.CUTOFF), k, last, alpha_max)
+        _, alpha = drawn_alpha(exponent, tl.load(s + record.CUTOFF), k, last, alpha_max)
+        inverse = inverse_rest(alpha)
         passed *= inverse
         weight, through = alpha * passed, alpha * inverse
         of_red, red = change_of(red, weight * tl.load(s + record.COLOR), through)

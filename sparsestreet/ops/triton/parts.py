@@ -112,7 +112,7 @@ def part_begin(begin, end, count, i):
 @jit
 def thin_parts(
     records, pair_rows, tiles, begins, ends, nexts, products, width, height, tiles_x, alpha_max, transmittance_min,
-    BLOCK: tl.constexpr,
+    GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes what each part lets through alone, but for the last parts of tiles, behind which nothing is blended."""
     tl.static_assert(BLOCK == 1)
@@ -120,7 +120,7 @@ def thin_parts(
     if part + 1 < tl.load(nexts + part):
         thin_pairs(
             records, pair_rows, tl.load(begins + part), tl.load(ends + part), tl.load(tiles + part), part, products,
-            width, height, tiles_x, alpha_max, transmittance_min,
+            width, height, tiles_x, alpha_max, transmittance_min, GATED,
         )  # fmt: skip
 
 

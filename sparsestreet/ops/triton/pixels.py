@@ -65,12 +65,13 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
     numbers = (*sizes(view, parts), view.settings.alpha_max, limit)
     tiles, part_count, choices = lists.order.shape[0], numbers[3], tuning()
     staged = tiles <= choices.staged_tiles
-    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged)}
+    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged, screen.gated)}
 
     def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
         launch(
             blend.blend_tiles, count, 1, *tables, *numbers,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, **work, options=options,
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, GATED=screen.gated, **work,
+            options=options,
         )  # fmt: skip
 
     if parts is None or part is None:
@@ -83,7 +84,7 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
         launch(
             thin_parts, part_count, 1,
             screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, parts.nexts, part.products,
-            *pixel_arguments(view), limit, options=ONE_WARP,
+            *pixel_arguments(view), limit, GATED=screen.gated, options=ONE_WARP,
         )  # fmt: skip
         blend_each(part_count, PARTS)
     alpha = compose(rgb, transmittance, depth_sum, background, last, split)
@@ -92,12 +93,12 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
 
 def differentiate_view(
     screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
-) -> tuple[Float[Tensor, "p 12"], UInt8[Tensor, " p"] | None]:
+) -> tuple[Float[Tensor, "p s"], UInt8[Tensor, " p"] | None]:
     """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means.
 
     Also which slots are written, as bytes; None: all."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
-    slots = passed.new_empty(lists.sizes.pairs, blend_backward.SLOT_LENGTH)
+    slots = passed.new_empty(lists.sizes.pairs, blend_backward.slot_length(screen.gated))
     walked = slots.new_zeros(len(slots), dtype=torch.uint8) if tuning().marked_slots else None
     parts, part = lists.parts, ends.parts
     nexts, part_layers = lists.order, (passed, passed, passed, lists.order)
@@ -110,8 +111,8 @@ def differentiate_view(
             screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
             v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, given_or(walked, lists.order),
             *sizes(view, parts), view.settings.alpha_max,
-            DEPTH=depth, ABSOLUTE=absolute, MARKED=walked is not None, **work,
-            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth)},
+            DEPTH=depth, ABSOLUTE=absolute, MARKED=walked is not None, GATED=screen.gated, **work,
+            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth, screen.gated)},
         )  # fmt: skip
 
     tiles = len(lists.order)

@@ -108,20 +108,23 @@ def of_lane(values):
 
 
 @jit
-def load_shape(records, row):
-    """Mean and factor of the row's splat; log2 of its opacity and the cutoff."""
+def load_shape(records, row, GATED: tl.constexpr):
+    """Mean and factor of the row's splat; log2 of its opacity, the cutoff, and its gate where rows have gates."""
     s = record.record_of(records, row)
     geometry = (
         tl.load(s + record.X), tl.load(s + record.Y),
         tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
     )  # fmt: skip
-    return geometry, (tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF))
+    ends = (tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF))
+    if GATED:
+        ends += (tl.load(s + record.GATE),)
+    return geometry, ends
 
 
 @jit
-def load_splat(records, row):
+def load_splat(records, row, GATED: tl.constexpr):
     """The shape of the row's splat (``load_shape``), its color and depth."""
-    geometry, ends = load_shape(records, row)
+    geometry, ends = load_shape(records, row, GATED)
     s = record.record_of(records, row)
     return geometry, ends, (
         tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
@@ -130,19 +133,21 @@ def load_splat(records, row):
 
 
 @jit
-def hold_splats(records, pair_rows, k, end):
-    """Of WARP pairs from ``k`` on one splat in each lane: the eleven numbers of ``load_splat`` and whatever behind
-    ``end``."""
+def hold_splats(records, pair_rows, k, end, GATED: tl.constexpr):
+    """Of WARP pairs from ``k`` on one splat in each lane: the numbers of ``load_splat`` and whatever behind ``end``."""
     pair = k + tl.arange(0, WARP)
     given = pair < end
     s = record.record_of(records, row_of(tl.load(pair_rows + pair, given, 0)))
-    return (
+    held = (
         tl.load(s + record.X, given, 0.0), tl.load(s + record.Y, given, 0.0),
         tl.load(s + record.L11, given, 0.0), tl.load(s + record.L21, given, 0.0), tl.load(s + record.L22, given, 0.0),
         tl.load(s + record.LOG2_OPACITY, given, 0.0), tl.load(s + record.CUTOFF, given, 0.0),
         tl.load(s + record.COLOR, given, 0.0), tl.load(s + record.COLOR + 1, given, 0.0),
         tl.load(s + record.COLOR + 2, given, 0.0), tl.load(s + record.DEPTH, given, 0.0),
     )  # fmt: skip
+    if GATED:
+        held += (tl.load(s + record.GATE, given, 0.0),)
+    return held
 
 
 @jit
@@ -153,12 +158,15 @@ def handed(values, lane):
 
 
 @jit
-def held_splat(held, lane):
+def held_splat(held, lane, GATED: tl.constexpr):
     """As ``load_splat``, of the splat that a lane holds."""
-    x, y, l11, l21, l22, log2_opacity, cutoff, red, green, blue, depth = held
+    x, y, l11, l21, l22, log2_opacity, cutoff, red, green, blue, depth = held[:11]
     geometry = (handed(x, lane), handed(y, lane), handed(l11, lane), handed(l21, lane), handed(l22, lane))
     color = (handed(red, lane), handed(green, lane), handed(blue, lane), handed(depth, lane))
-    return geometry, (handed(log2_opacity, lane), handed(cutoff, lane)), color
+    ends = (handed(log2_opacity, lane), handed(cutoff, lane))
+    if GATED:
+        ends += (handed(held[11], lane),)
+    return geometry, ends, color
 
 
 @jit

@@ -25,7 +25,7 @@ from sparsestreet.ops.triton.pixels import (
     pixel_arguments,
 )
 from sparsestreet.ops.triton.quadrants import MOST_ROWS
-from sparsestreet.ops.triton.screen import contiguous, draw, effects, fields_of, given_or, project
+from sparsestreet.ops.triton.screen import Screen, contiguous, draw, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
@@ -36,14 +36,16 @@ def render(
     background: Float[Tensor, "3"] | Float[Tensor, "h w 3"] | None,
     camera: Camera,
     settings: SplatSettings,
+    gates: Float[Tensor, " n"] | None = None,
 ) -> Rendering:
     """Projects, sorts by tile, blends and composes, in float32. Bitwise the same in every run on one device."""
     g = gaussians
     _check(g)
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
-    differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*fields, screen_offsets))
+    learned = fields if gates is None else (*fields, gates)
+    differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*learned, screen_offsets))
     view = KernelView.of(camera, settings)
-    images = _Blend.apply(*fields, screen_offsets, background, g.displacements, view, differentiated)
+    images = _Blend.apply(*fields, screen_offsets, gates, background, g.displacements, view, differentiated)
     return Rendering(*images, screen_offsets)
 
 
@@ -97,16 +99,19 @@ def leave_one_out(
 
 
 class _Blend(torch.autograd.Function):
-    """Maps five fields, the screen offsets and the background to the images of a Rendering, and the radii."""
+    """Maps five fields, the screen offsets, gates and the background to the images of a Rendering, and the radii."""
 
     @staticmethod
     def forward(
-        ctx, means, quaternions, scales, opacities, sh, screen_offsets, background, displacements, view, differentiated
+        ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, background, displacements, view,
+        differentiated,
     ):  # fmt: skip
         ctx.set_materialize_grads(False)
         gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
         background = contiguous(background)
-        screen, drawn = draw(gaussians, view, lambda screen: blend_view(screen, view, differentiated, background))
+        screen, drawn = draw(
+            gaussians, view, lambda screen: blend_view(screen, view, differentiated, background), gates
+        )  # fmt: skip
         ctx.mark_non_differentiable(screen.radii)
         ctx.save_for_backward(*fields_of(gaussians), drawn.ends.transmittance, drawn.depth, background)
         ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
@@ -121,15 +126,15 @@ class _Blend(torch.autograd.Function):
         v_rgb = transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous()
         composed = Composed(transmittance, depth, background)
         v_passed, v_depth_sum, v_background = decompose(
-            composed, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[6]
+            composed, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[7]
         )
-        if not any(ctx.needs_input_grad[:6]):
-            return *[None] * 6, v_background, None, None, None
+        if not any(ctx.needs_input_grad[:7]):
+            return *[None] * 7, v_background, None, None, None
         cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
         plain = view.settings.plain_gradients
         absolute = ctx.needs_input_grad[5] and not plain
         gradients, walked = differentiate_view(screen, view, ends, cotangents, absolute)
-        sums = transmittance.new_empty(len(fields[0]), blend_backward.SLOT_LENGTH)
+        sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])
         _sum_slots(gradients, lists, sums, 16, tl.float32, walked)
         outputs = [torch.empty_like(field) for field in fields]
         v_screen = transmittance.new_empty(len(fields[0]), 2)
@@ -137,10 +142,18 @@ class _Blend(torch.autograd.Function):
             rows_backward.project_rows_backward, len(fields[0]), rows_backward.block_of(view),
             *fields, given_or(ctx.displacements, fields[0]), screen.table, screen.records, screen.tile_counts, sums,
             *outputs, v_screen, len(fields[0]),
-            TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias, CLAMPED=view.settings.clamp_colors,
-            DETACHED=view.settings.detach_directions, PLAIN=plain, **effects(view, ctx.displacements),
+            SUMS=sums.shape[1], TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias,
+            CLAMPED=view.settings.clamp_colors, DETACHED=view.settings.detach_directions, PLAIN=plain,
+            **effects(view, ctx.displacements),
         )  # fmt: skip
-        return *outputs, v_screen, v_background, None, None, None
+        return *outputs, v_screen, _of_gates(screen, sums), v_background, None, None, None
+
+
+def _of_gates(screen: Screen, sums: Float[Tensor, "n s"]) -> Float[Tensor, " n"] | None:
+    """Gradients of the gates; 0 for rows that were not drawn, whose sums are not written."""
+    if not screen.gated:
+        return None
+    return torch.where(screen.tile_counts > 0, sums[:, blend_backward.GATE_PLACE], 0.0)
 
 
 def _sum_slots(

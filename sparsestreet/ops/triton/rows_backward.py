@@ -59,11 +59,13 @@ def screen_gradient(s, to, mask):
 def project_rows_backward(
     means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
     v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,
-    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr,
+    SUMS: tl.constexpr, TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr,
     PLAIN: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr,
     DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read."""
+    """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read.
+
+    SUMS: how many numbers a row has in ``sums``, of which the first twelve are read."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given = row < rows
     seen = given & (tl.load(tile_counts + row, given, 0) > 0)
@@ -71,7 +73,7 @@ def project_rows_backward(
     mean = in_camera(view, rotation, load_row(means, row, seen, 3))
     # Lanes of rows that were not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
-    s = load_columns(sums, row, seen, record.RECORD)
+    s = load_columns(sums, row, seen, SUMS)
     coefficients = load_columns(sh, row, seen, 3 * TERMS)
     # This comes first, so that nothing else holds registers meanwhile.
     v_colors = (s[8], s[9], s[10])

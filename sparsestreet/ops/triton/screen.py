@@ -29,6 +29,8 @@ class Projection:
     tile_counts: Int[Tensor, " n"]
     radii: Float[Tensor, " n"]
     sums: Int[Tensor, " b"]
+    gated: bool
+    """Whether records hold gates."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Screen:
     tile_counts: Int[Tensor, " n"]
     radii: Float[Tensor, " n"]
     lists: Lists
+    gated: bool
+    """Whether records hold gates."""
 
 
 def project(gaussians: Gaussians, view: KernelView) -> Screen:
@@ -50,13 +54,15 @@ def project(gaussians: Gaussians, view: KernelView) -> Screen:
     return list_exactly(gaussians, project_all(gaussians, view), view)
 
 
-def draw(gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers]) -> tuple[Screen, Layers]:
+def draw(
+    gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers], gates: Float[Tensor, " n"] | None = None
+) -> tuple[Screen, Layers]:
     """As ``project``, with what ``work`` makes of it, but the wait comes when all is queued, also the work.
 
     The room for the lists is a guess. If it is too small all that follows the projection is done again. Where views are
     known too little for a guess, it waits in between.
     """
-    projection, rows = project_all(gaussians, view), len(gaussians)
+    projection, rows = project_all(gaussians, view, gates), len(gaussians)
     place = capacity.like(rows, view, projection.records.device)
     room = capacity.predicted(place, rows, PAIR_LIMIT)
     if room is not None:
@@ -75,8 +81,8 @@ def draw(gaussians: Gaussians, view: KernelView, work: Callable[[Screen], Layers
     return screen, work(screen)
 
 
-def project_all(gaussians: Gaussians, view: KernelView) -> Projection:
-    """Projects all rows."""
+def project_all(gaussians: Gaussians, view: KernelView, gates: Float[Tensor, " n"] | None = None) -> Projection:
+    """Projects all rows, as if their gates were 1, and puts the gates into the records."""
     fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
     means, sh = fields[0], fields[4]
     n, settings, table = len(gaussians), view.settings, view.table(means.device)
@@ -91,8 +97,10 @@ def project_all(gaussians: Gaussians, view: KernelView) -> Projection:
         HALF_COLORS=settings.half_colors, BOUNDED=view.bounded, **effects(view, displacements),
         options={"enable_fp_fusion": False},
     )  # fmt: skip
+    if gates is not None:
+        splats[:, records.GATE_PLACE] = gates
     # Of one line, because torch sums the columns of a table one row after the other.
-    return Projection(table, splats, tile_counts, radii, numbers.cumsum(0))
+    return Projection(table, splats, tile_counts, radii, numbers.cumsum(0), gates is not None)
 
 
 def list_exactly(gaussians: Gaussians, projection: Projection, view: KernelView) -> Screen:
@@ -109,7 +117,7 @@ def list_visible_rows(projection: Projection, room: Room, view: KernelView) -> V
 
 def list_in(room: Room, projection: Projection, visible: Visible, view: KernelView) -> Screen:
     p = projection
-    return Screen(p.table, p.records, p.tile_counts, p.radii, list_tiles(p.records, visible, room, view))
+    return Screen(p.table, p.records, p.tile_counts, p.radii, list_tiles(p.records, visible, room, view), p.gated)
 
 
 def wait_for(numbers: OnItsWay) -> list[int]:

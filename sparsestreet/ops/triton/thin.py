@@ -27,20 +27,28 @@ def open_light(tile, width, height, tiles_x, QUADRANT: tl.constexpr):
 
 
 @jit
+def alpha_of(exponent, ends, alpha_max):
+    """Alpha after the clamp, times the gate where rows have gates (``load_shape``)."""
+    alpha = tl.minimum(tl.exp2(exponent), alpha_max)
+    return alpha * ends[2] if len(ends) > 2 else alpha
+
+
+@jit
 def thin_quadrant(touched, passed, x, line, RIGHT: tl.constexpr, shape, alpha_max):
     """A quadrant's light after a splat, which may touch it; rounded as in the blend."""
     if touched:
         geometry, ends = shape
         _, a = across(x, geometry, line, RIGHT)
         exponent = line[3] - a * a
-        alpha = tl.minimum(tl.exp2(exponent), alpha_max)
+        alpha = alpha_of(exponent, ends, alpha_max)
         passed -= tl.where(exponent >= ends[1], alpha, 0.0) * passed
     return passed
 
 
 @jit
 def thin_pairs(
-    records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, transmittance_min
+    records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, transmittance_min,
+    GATED: tl.constexpr,
 ):  # fmt: skip
     """Writes the product of 1 - alpha over the pairs of a part, or some value below the limit once it is below."""
     t0, t1 = open_light(tile, width, height, tiles_x, 0), open_light(tile, width, height, tiles_x, 1)
@@ -51,7 +59,7 @@ def thin_pairs(
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
         for i in range(k, stop):
-            shape, touched = load_shape(records, row_of(pair)), pair
+            shape, touched = load_shape(records, row_of(pair), GATED), pair
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             line = of_lines(y, shape[0], shape[1][0], 0)
             t0 = thin_quadrant(touches(touched, 0), t0, x, line, 0, shape, alpha_max)

@@ -1,13 +1,15 @@
 """Writes the machine code of every variant of the pixel kernels down, in numbers: benchmarks/pixel_kernels.jsonl.
 
-Nothing runs on a device: kernels are launched in the interpreter, and compiled for three architectures.
+Nothing runs on a device: kernels are launched in the interpreter, and compiled for three architectures. With the
+argument "gates" those of training whose rows have gates: benchmarks/pixel_kernels_gates.jsonl.
 
-    TRITON_INTERPRET=1 python -m tests.ops.triton.pixel_machine_code
+    TRITON_INTERPRET=1 python -m tests.ops.triton.pixel_machine_code [gates]
 """
 
 import dataclasses
 import itertools
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,7 +25,6 @@ from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
 ARCHITECTURES = (80, 90, 120)
 KERNELS = ("blend_tiles", "thin_parts", "compose_pixels", "blend_tiles_backward", "sum_slots")
-RECORD = Path("benchmarks") / "pixel_kernels.jsonl"
 COMMAND = "TRITON_INTERPRET=1 python -m tests.ops.triton.pixel_machine_code"
 
 
@@ -42,21 +43,29 @@ class KernelCode:
     from memory, exchanges between lanes, accesses to spilled registers."""
 
 
-def variants() -> list[Launch]:
-    """Each choice of each kernel: with either stop, before a backward pass and not, with depth and not."""
+STOPS = [SplatSettings(stop="inclusive"), SplatSettings(stop="exclusive")]
+# Split tiles in two launches and in four, and tiles that are not split.
+SPLITS = [{"shortest_part": 1}, {"shortest_part": 1, "two_launches": False}, {"shortest_part": 1000}]
+OTHERS = [{}, {"staged_tiles": 1, "marked_slots": True}]
+
+
+def variants(gated: bool) -> list[Launch]:
+    """Each choice of each kernel: with either stop, before a backward pass and not, with depth and not.
+
+    Of rows that have gates the defaults of all other choices, before a backward pass."""
     view, scene = camera(5, 4), random_gaussians(3, camera(5, 4), terms=1)
-    stops = [SplatSettings(stop="inclusive"), SplatSettings(stop="exclusive")]
-    # Split tiles in two launches and in four, and tiles that are not split.
-    splits = [{"shortest_part": 1}, {"shortest_part": 1, "two_launches": False}, {"shortest_part": 1000}]
-    others = [{}, {"staged_tiles": 1, "marked_slots": True}]
+    splits, others = (SPLITS[::2], OTHERS[:1]) if gated else (SPLITS, OTHERS)
+    gates = torch.ones(3) if gated else None
     with pytest.MonkeyPatch.context() as monkeypatch:
         launches = record_launches(monkeypatch)
-        for settings, split, other in itertools.product(stops, splits, others):
+        for settings, split, other in itertools.product(STOPS, splits, others):
             with tuned(Tuning(**split, **other)):
                 for output in ("rgb", "depth"):
                     leaves = cast(scene, torch.float32, requires_grad=True)
-                    getattr(splat(leaves, view, backend="triton", settings=settings), output).sum().backward()
-                splat(cast(scene, torch.float32), view, backend="triton", settings=settings)
+                    drawn = splat(leaves, view, backend="triton", settings=settings, gates=gates)
+                    getattr(drawn, output).sum().backward()
+                if not gated:
+                    splat(cast(scene, torch.float32), view, backend="triton", settings=settings)
     unique = {json.dumps(dataclasses.asdict(item), sort_keys=True): item for item in launches if item.name in KERNELS}
     return sorted(unique.values(), key=lambda item: (KERNELS.index(item.name), _switches(item)))
 
@@ -65,10 +74,11 @@ def _switches(launch: Launch) -> str:
     return " ".join(sorted(name for name, value in launch.constants.items() if value is True))
 
 
-def main() -> None:
-    """Writes one line for each kernel and architecture."""
-    file = RecordFile(RECORD, Provenance(COMMAND, 1, this_machine(), this_source()))
-    launches = variants()
+def main(*wanted: str) -> None:
+    """Writes one line for each kernel and architecture; ``wanted``: nothing or "gates"."""
+    path, command = Path("benchmarks") / "_".join(("pixel_kernels", *wanted)), " ".join((COMMAND, *wanted))
+    file = RecordFile(path.with_suffix(".jsonl"), Provenance(command, 1, this_machine(), this_source()))
+    launches = variants(gated="gates" in wanted)
     for architecture in ARCHITECTURES:
         for launch, found in compile_launches(launches, architecture):
             code = KernelCode(
@@ -79,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

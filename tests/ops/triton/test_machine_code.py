@@ -85,9 +85,9 @@ def launches_of(
         rasterizer.leave_one_out(scene, background, weights, STILL, SplatSettings())
     for stop in stops:
         contribution(scene, STILL, settings=SplatSettings(stop=stop), backend="triton")
-    for choice, stop in itertools.product(choices, stops):
+    for gates, choice, stop in itertools.product((None, torch.ones(3, device=DEVICE)), choices, stops):
         with tuned(choice):
-            splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop)).depth.sum().backward()
+            splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop), gates=gates).depth.sum().backward()
     unique = {json.dumps(dataclasses.asdict(launch), sort_keys=True): launch for launch in launches}
     return list(unique.values())
 
@@ -146,7 +146,9 @@ def _is_daily(launch: Launch) -> bool:
     """Of what is compiled elsewhere only what has a budget, and of rows the largest."""
     if launch.name in ROW_BUDGETS:
         return launch.constants["TERMS"] == 16
-    return launch.name in BUDGETS or launch.name not in (*FORWARD_PASS, *BACKWARD_PASS)
+    if launch.name in BUDGETS:
+        return _switches(launch.constants) in OF_TRAINING[launch.name]
+    return launch.name not in (*FORWARD_PASS, *BACKWARD_PASS)
 
 
 def test_every_kernel_is_compiled(compiled, request):
@@ -162,12 +164,13 @@ def test_every_kernel_is_compiled(compiled, request):
 
 
 def test_nothing_spills(compiled, request):
-    """But for staged records, outside of the loop, and for sm_120, where registers were not tuned."""
-    newest = "sm_120" in request.node.name
-    spilled = [launch for launch, found in compiled if found["spilled"] and not (newest or _is_staged(launch))]
-    assert spilled == []
+    """But outside of the loop for staged records, and 8 bytes for gates on sm_80; and on sm_120, where registers were
+    not tuned, once in the loop of both."""
+    newest, oldest = "sm_120" in request.node.name, "sm_80" in request.node.name
     for launch, found in compiled:
-        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and _is_staged(launch)), launch
+        gated = launch.name == "blend_tiles" and launch.constants["GATED"]
+        assert found["spilled"] <= 8 * (oldest and gated) or newest or _is_staged(launch), launch
+        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and (gated or _is_staged(launch))), launch
 
 
 def _is_staged(launch: Launch) -> bool:
@@ -196,6 +199,18 @@ FORWARD = {
     "DEPTH EXCLUSIVE LASTS PARTS": (88, 26.0),
     "DEPTH EXCLUSIVE LASTS STAGED TOGETHER": (96, 26.0),
     "DEPTH EXCLUSIVE LASTS PARTS REST STAGED": (96, 26.0),
+    "DEPTH GATED LASTS": (80, 24.5),
+    "DEPTH GATED LASTS TOGETHER": (80, 25.0),
+    "DEPTH GATED LASTS PARTS REST": (80, 24.5),
+    "DEPTH GATED LASTS PARTS": (80, 24.5),
+    "DEPTH GATED LASTS STAGED TOGETHER": (104, 25.5),
+    "DEPTH GATED LASTS PARTS REST STAGED": (104, 25.0),
+    "DEPTH EXCLUSIVE GATED LASTS": (88, 27.0),
+    "DEPTH EXCLUSIVE GATED LASTS TOGETHER": (88, 27.0),
+    "DEPTH EXCLUSIVE GATED LASTS PARTS REST": (88, 27.0),
+    "DEPTH EXCLUSIVE GATED LASTS PARTS": (88, 27.0),
+    "DEPTH EXCLUSIVE GATED LASTS STAGED TOGETHER": (104, 27.0),
+    "DEPTH EXCLUSIVE GATED LASTS PARTS REST STAGED": (104, 27.0),
 }
 BACKWARD = {
     "": (96, 53.0),
@@ -205,10 +220,25 @@ BACKWARD = {
     "ABSOLUTE DEPTH TOGETHER": (104, 61.0),
     "ABSOLUTE DEPTH PARTS": (104, 61.0),
     "ABSOLUTE DEPTH MARKED TOGETHER": (104, 62.0),
+    "ABSOLUTE DEPTH GATED": (112, 66.5),
+    "ABSOLUTE DEPTH GATED TOGETHER": (112, 66.5),
+    "ABSOLUTE DEPTH GATED PARTS": (112, 66.5),
+    "ABSOLUTE DEPTH GATED MARKED TOGETHER": (112, 67.5),
 }
 OF_TRAINING = {
-    "blend_tiles": ("DEPTH", "DEPTH LASTS", "DEPTH LASTS TOGETHER", "DEPTH LASTS PARTS REST"),
-    "blend_tiles_backward": ("ABSOLUTE", "ABSOLUTE DEPTH", "ABSOLUTE DEPTH TOGETHER"),
+    "blend_tiles": (
+        "DEPTH",
+        "DEPTH LASTS",
+        "DEPTH LASTS TOGETHER",
+        "DEPTH LASTS PARTS REST",
+        "DEPTH GATED LASTS TOGETHER",
+    ),
+    "blend_tiles_backward": (
+        "ABSOLUTE",
+        "ABSOLUTE DEPTH",
+        "ABSOLUTE DEPTH TOGETHER",
+        "ABSOLUTE DEPTH GATED TOGETHER",
+    ),
 }
 BUDGETS = {"blend_tiles": FORWARD, "blend_tiles_backward": BACKWARD}
 
@@ -224,10 +254,10 @@ def test_budget_of_the_pixel_loops(compiled):
         registers, instructions = BUDGETS[launch.name][switches]
         assert found["registers"] <= registers, (launch.name, switches)
         assert found["sample"] <= instructions, (launch.name, switches)
-        # Staged, only the next pair's row and quadrants are loaded, and eleven numbers change lanes.
+        # Staged, only the next pair's row and quadrants are loaded, and eleven numbers change lanes, or a gate too.
         loop = found["loops"][-1]
         if _is_staged(launch):
-            assert (loop["loads"], loop["exchanges"]) == (1, 11)
+            assert (loop["loads"], loop["exchanges"]) == (1, 11 + launch.constants["GATED"])
         # What a part lets through is a second, shorter loop.
         assert len(found["loops"]) == (2 if launch.name == "blend_tiles" and launch.constants["TOGETHER"] else 1)
 
@@ -265,10 +295,10 @@ def test_budget_of_the_row_kernels(compiled, name):
         assert each["registers"] <= ROW_BUDGETS[name][2]
 
 
-# Numbers in a row of the tables that are read and written as tiles, in the order of the kernels; None: harmonics.
+# Numbers in a row of the tables that are read and written as tiles, in the order of the kernels.
 TABLES = {
-    "project_rows": {"load": (None,), "store": (12,)},
-    "project_rows_backward": {"load": (12, None, 4), "store": (None, 4)},
+    "project_rows": {"load": ("TERMS",), "store": (12,)},
+    "project_rows_backward": {"load": ("SUMS", "TERMS", 4), "store": ("TERMS", 4)},
 }
 
 
@@ -281,7 +311,7 @@ def test_lanes_side_by_side_take_numbers_side_by_side(compiled, name):
             continue
         for kind, counts in TABLES[name].items():
             tiles = iter([tile for tile in found["tiles"] if tile["kind"] == kind])
-            for count in (number or 3 * launch.constants["TERMS"] for number in counts):
+            for count in (_length(launch, counted) for counted in counts):
                 asked, first = 0, 0
                 while first < count:
                     tile = next(tiles)
@@ -291,6 +321,13 @@ def test_lanes_side_by_side_take_numbers_side_by_side(compiled, name):
                 checked += 1
             assert not list(tiles)
     assert checked
+
+
+def _length(launch: Launch, counted: int | str) -> int:
+    """Numbers of a row: of colors by their terms, of others as they are."""
+    if isinstance(counted, int):
+        return counted
+    return launch.constants[counted] * (3 if counted == "TERMS" else 1)
 
 
 def _sectors(tile: dict, count: int, first: int) -> int:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.triton import pixels, rasterizer
-from sparsestreet.ops.triton.screen import Screen, project
+from sparsestreet.ops.triton.screen import Screen, list_exactly, project_all
 from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
@@ -37,6 +37,8 @@ VIEW = front_camera(27, 17, 22.0)
 CASES = [
     *((stop, "split", name) for stop in STOPS for name in VARIANTS),
     *(("exclusive", kind, "all") for kind in ("whole", "nothing")),
+    *(("exclusive", "gated", name) for name in VARIANTS),
+    ("inclusive", "gated", "all"),
 ]
 
 
@@ -50,9 +52,11 @@ def project_case(stop: str, kind: str) -> tuple[Screen, KernelView, Tuning]:
     if kind == "nothing":
         scene = one_gaussian(means=[[0.0, 0.0, -5.0]])
     view = KernelView(VIEW, STOPS[stop])
-    choices = ONE_BY_ONE if kind == "split" else replace(ONE_BY_ONE, shortest_part=100)
+    choices = ONE_BY_ONE if kind in ("split", "gated") else replace(ONE_BY_ONE, shortest_part=100)
+    single = cast(scene, torch.float32, device=DEVICE)
+    gates = torch.linspace(0, 1, len(scene), device=DEVICE) if kind == "gated" else None
     with tuned(choices):
-        return project(cast(scene, torch.float32, device=DEVICE), view), view, choices
+        return list_exactly(single, project_all(single, view, gates), view), view, choices
 
 
 def drawn(screen: Screen, view: KernelView, choices: Tuning, cotangents: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ import torch
 from scipy.integrate import quad
 from scipy.special import expit
 
-from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import Mask, MaskSettings, SampledMask, SampledMaskSettings
@@ -143,6 +143,28 @@ def test_a_training_step_hides_rows_that_other_views_show_and_tells_them_what_th
     node.finish_mask()
     assert torch.equal(render(scene, frame_at(), FINISHED, options).rgb, finished.rgb)
     assert render(scene, frame_at(), STEP_7, options).gates is None
+
+
+def test_triton_gets_the_samples(monkeypatch):
+    """Its kernels draw with them in tests/ops/triton/test_gates.py; here the reference draws what they are given."""
+    kernels = pytest.importorskip("sparsestreet.ops.triton.rasterizer")
+    given = []
+
+    def drawn(gaussians, offsets, background, camera, settings, gates):
+        given.append(gates)
+        return splat(gaussians, camera, background=background, settings=settings, backend="reference", gates=gates)
+
+    monkeypatch.setattr(kernels, "render", drawn)
+    node = background(12, mask=SETTINGS)
+    set_rows(node, "mask_logits", dict.fromkeys(range(12), 0.0))
+    scene, options = SceneGraph({"street": node}), RenderOptions(backend="triton")
+    rendering = render(scene, frame_at(), STEP_7, options)
+    assert given[0] is rendering.gates
+    assert 0 < int(rendering.gates.sum()) < 12
+    rendering.rgb.square().sum().backward()
+    assert node.rows.mask_logits.grad[rendering.gates == 0].any()
+    render(scene, frame_at(), FINISHED, options)
+    assert given[1:] == [None]
 
 
 def test_another_camera_of_the_same_step_sees_the_same_samples():
