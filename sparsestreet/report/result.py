@@ -3,9 +3,13 @@
 from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.records.held_out import HELD_OUT_CURVE
 from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.records.run import RunDescription
 from sparsestreet.records.summary import RunSummary
+
+FALL = 0.5
+"""dB by which a probe of held-out views may end below its best look without a word: looks vary by a few tenths."""
 
 _VIEWS = {HELD_OUT: "held-out views", TRAINING: "training views"}
 
@@ -26,6 +30,7 @@ def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDI
         *(_quality(summary, split, protocol) for split in (HELD_OUT, TRAINING) if split in summary.quality),
         ", ".join([*size, f"{latency.p50:.1f} ms a frame{steady}"]),
         *_warnings(run),
+        *_better_before(out),
         f"pictures: {out / 'pictures' / 'sheet.png'}; curves: {out / 'curves'}; numbers: {out / 'records'}",
     ]
 
@@ -36,6 +41,18 @@ def _warnings(run: RunDescription) -> list[str]:
         (run.rested, "rows that took no step because their gradient was not finite, counted at each step"),
     )
     return [f"{what}: {', '.join(f'{name} {n:,}' for name, n in counts.items())}" for counts, what in said if counts]
+
+
+def _better_before(out: Path) -> list[str]:
+    """What held-out views have lost since their best look: an average over the run would not show it."""
+    looks = HELD_OUT_CURVE.find(out) or ()
+    said = []
+    for name, column in (("PSNR", "psnr_full"), ("vehicles", "psnr_vehicle"), ("people", "psnr_human")):
+        seen = [(value, look.step) for look in looks if (value := getattr(look, column)) is not None]
+        if seen and max(seen)[0] > seen[-1][0] + FALL:
+            (best, step), (last, _) = max(seen), seen[-1]
+            said.append(f"{name} {best:.2f} dB at step {step:,}, {last:.2f} dB at the end")
+    return [f"held-out views were better before (curves/held_out.png): {'; '.join(said)}"] if said else []
 
 
 def _quality(summary: RunSummary, split: str, protocol: Protocol) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
 from tests.evaluation.frames import make_summary
@@ -28,6 +29,21 @@ def test_only_what_was_measured_is_said(psnr, training):
     assert len(lines) == 3
     assert lines[0].startswith("training views: PSNR 26.00" if psnr is None else "held-out views: PSNR 25.00")
     assert "people" not in lines[0]
+
+
+def test_what_held_out_views_have_lost_is_said(tmp_path):
+    """More than half a decibel; a column without numbers says nothing."""
+    (tmp_path / "curves").mkdir()
+    looks = [(20_000, 32.0, 30.7, None), (25_000, 32.4, 25.0, None), (30_000, 31.95, 21.9, None)]
+    HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(9.0, step, full, people, cars) for step, full, cars, people in looks])
+    (said,) = result_lines(make_summary("plain", 0, 24.35), tmp_path)[-2:-1]
+    assert said == (
+        "held-out views were better before (curves/held_out.png): vehicles 30.70 dB at step 20,000, 21.90 dB at the end"
+    )
+    HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(9.0, 1, 33.0, None, None), HeldOutLook(9.0, 2, 32.4, None, None)])
+    assert "PSNR 33.00 dB at step 1, 32.40 dB at the end" in result_lines(make_summary("plain", 0, 24.35), tmp_path)[-2]
+    HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(9.0, 1, 32.8, None, None), HeldOutLook(9.0, 2, 32.4, None, None)])
+    assert not any("better before" in line for line in result_lines(make_summary("plain", 0, 24.35), tmp_path))
 
 
 def test_what_was_held_back_and_what_rested_is_said_again():
