@@ -10,11 +10,15 @@ import jaxtyping
 import pytest
 import torch
 
+from tests import shapes
 from tests.cpu_limit import CpuLimit
+from tests.workers import CompiledOnce
 
 if not torch.cuda.is_available():
     # Before anything imports triton: its kernels are then interpreted, on CPU tensors.
     os.environ.setdefault("TRITON_INTERPRET", "1")
+
+shapes.speed_up()  # before anything imports the package
 
 # Modules and tests stay: the collector need not look at them again and again (7 % of all time).
 gc.disable()
@@ -32,6 +36,11 @@ def pytest_configure(config: pytest.Config) -> None:
     # On a GPU the first launch of a kernel compiles it.
     if not torch.cuda.is_available():
         config.pluginmanager.register(CpuLimit())
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        tests = Path(__file__).parent
+        config.pluginmanager.register(
+            CompiledOnce(tests / "viewing/__pycache__", tests.parent / ".cache/compiling.lock")
+        )
 
 
 @pytest.fixture(autouse=True)
