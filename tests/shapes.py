@@ -97,15 +97,25 @@ def _checks(fn: FunctionType, typechecker: Callable) -> tuple[Callable, Callable
 
 def _write(fn: FunctionType, typechecker: Callable) -> tuple[Callable, Callable | None]:
     signature = _hinted(fn)
-    names = fn.__name__, fn.__qualname__, fn.__module__
     taken = signature.replace(return_annotation=Any)
-    parameters = typechecker(_inner._make_fn_with_signature(*names, taken, output=False))
-    if signature.return_annotation is inspect.Signature.empty:
+    write = _inner._make_fn_with_signature
+    parameters = typechecker(write(fn.__name__, fn.__qualname__, fn.__module__, taken, output=False))
+    returned = signature.return_annotation
+    if returned is inspect.Signature.empty or returned is Any:
         return parameters, None
-    returned = signature.replace(parameters=())
-    result, name = _inner._make_fn_with_signature(*names, returned, output=True)
+    try:
+        return parameters, _result(returned, typechecker)
+    except TypeError:  # an annotation without a hash
+        return parameters, _result.__wrapped__(returned, typechecker)
+
+
+@functools.cache
+def _result(hint: Any, typechecker: Callable) -> Callable:
+    """Many functions return the same."""
+    signature = inspect.Signature(return_annotation=hint)
+    result, name = _inner._make_fn_with_signature("returns", "returns", __name__, signature, output=True)
     result = typechecker(result)
-    return parameters, lambda out: result(**{name: out})
+    return lambda out: result(**{name: out})
 
 
 def _hinted(fn: FunctionType) -> inspect.Signature:
