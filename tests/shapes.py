@@ -20,6 +20,7 @@ _inner: Any = _decorator
 _arrays: Any = _array_types
 _original = _inner.jaxtyped
 _is_array = _arrays._MetaAbstractArray.__instancecheck__
+_config = jaxtyping.config
 _missing = object()
 _written: dict[Any, tuple[Callable, Callable | None]] = {}
 
@@ -46,7 +47,7 @@ def _checked(fn: FunctionType, typechecker: Callable) -> Callable:
     def checked(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
         nonlocal checks
-        if jaxtyping.config.jaxtyping_disable:
+        if _config.jaxtyping_disable:
             return fn(*args, **kwargs)
         if checks is None:
             checks = _checks(fn, typechecker)
