@@ -3,7 +3,7 @@
 jaxtyping 0.3 writes two functions for each function of the package as it is imported, checks the parameters before a
 call and again behind it, and binds them to the signature for its messages. Here the checks of a function are written
 when it is first called, parameters are checked once, and what fails is checked again by jaxtyping itself, which has the
-last word. A hint in quotes that names a later class of its module is found so, where jaxtyping takes it for ``Any``.
+last word. Hints in quotes are looked up when jaxtyping does: a class that comes later in its module is ``Any``.
 """
 
 import functools
@@ -41,7 +41,13 @@ def _jaxtyped(fn: Any = _missing, *, typechecker: Any = _missing) -> Any:
 
 
 def _checked(fn: FunctionType, typechecker: Callable) -> Callable:
+    signature = _hinted(fn) if any(_is_quoted(hint) for hint in fn.__annotations__.values()) else None
     checks: tuple[Callable, Callable | None] | None = None
+
+    def by_jaxtyping(call: Callable) -> Callable:
+        told = functools.wraps(fn)(lambda *args, **kwargs: call(*args, **kwargs))
+        told.__signature__ = signature or inspect.signature(fn)
+        return _original(told, typechecker=typechecker)
 
     @functools.wraps(fn)
     def checked(*args: Any, **kwargs: Any) -> Any:
@@ -50,20 +56,31 @@ def _checked(fn: FunctionType, typechecker: Callable) -> Callable:
         if _config.jaxtyping_disable:
             return fn(*args, **kwargs)
         if checks is None:
-            checks = _checks(fn, typechecker)
+            checks = _checks(fn, signature or inspect.signature(fn), typechecker)
         parameters, result = checks
         push_shape_memo({})
         try:
             if _fails(parameters, *args, **kwargs):
-                return _original(fn, typechecker=typechecker)(*args, **kwargs)
+                return by_jaxtyping(fn)(*args, **kwargs)
             out = fn(*args, **kwargs)
             if result is not None and _fails(result, out):
-                return _original(_gives(fn, out), typechecker=typechecker)(*args, **kwargs)
+                return by_jaxtyping(lambda *args, **kwargs: out)(*args, **kwargs)  # without running again
             return out
         finally:
             pop_shape_memo()
 
     return checked
+
+
+def _is_quoted(hint: Any) -> bool:
+    return not isinstance(hint, type) and ("'" in repr(hint) or isinstance(hint, str))
+
+
+def _hinted(fn: FunctionType) -> inspect.Signature:
+    signature = inspect.signature(fn)
+    found = functools.partial(_inner._destring_annotation, ns=fn.__globals__)
+    parameters = [one.replace(annotation=found(one.annotation)) for one in signature.parameters.values()]
+    return signature.replace(parameters=parameters, return_annotation=found(signature.return_annotation))
 
 
 def _fails(check: Callable, /, *args: Any, **kwargs: Any) -> bool:
@@ -74,30 +91,18 @@ def _fails(check: Callable, /, *args: Any, **kwargs: Any) -> bool:
     return False
 
 
-def _gives(fn: FunctionType, out: Any) -> Callable:
-    """Of the same signature, without running again."""
-
-    @functools.wraps(fn)
-    def gives(*args: Any, **kwargs: Any) -> Any:
-        return out
-
-    gives.__signature__ = _hinted(fn)  # pyright: ignore[reportAttributeAccessIssue]
-    return gives
-
-
-def _checks(fn: FunctionType, typechecker: Callable) -> tuple[Callable, Callable | None]:
+def _checks(fn: FunctionType, signature: inspect.Signature, typechecker: Callable) -> tuple[Callable, Callable | None]:
     """Of the parameters and of the result; a function within another one is made anew at each call."""
-    key = fn.__code__, typechecker, *fn.__annotations__.items()
+    key = fn.__code__, fn.__module__, typechecker, *fn.__annotations__.items()
     try:
         if key not in _written:
-            _written[key] = _write(fn, typechecker)
+            _written[key] = _write(fn, signature, typechecker)
     except TypeError:  # an annotation without a hash
-        return _write(fn, typechecker)
+        return _write(fn, signature, typechecker)
     return _written[key]
 
 
-def _write(fn: FunctionType, typechecker: Callable) -> tuple[Callable, Callable | None]:
-    signature = _hinted(fn)
+def _write(fn: FunctionType, signature: inspect.Signature, typechecker: Callable) -> tuple[Callable, Callable | None]:
     taken = signature.replace(return_annotation=Any)
     write = _inner._make_fn_with_signature
     parameters = typechecker(write(fn.__name__, fn.__qualname__, fn.__module__, taken, output=False))
@@ -117,14 +122,6 @@ def _result(hint: Any, typechecker: Callable) -> Callable:
     result, name = _inner._make_fn_with_signature("returns", "returns", __name__, signature, output=True)
     result = typechecker(result)
     return lambda out: result(**{name: out})
-
-
-def _hinted(fn: FunctionType) -> inspect.Signature:
-    """With hints in quotes looked up."""
-    signature = inspect.signature(fn)
-    found = functools.partial(_inner._destring_annotation, ns=fn.__globals__)
-    parameters = [one.replace(annotation=found(one.annotation)) for one in signature.parameters.values()]
-    return signature.replace(parameters=parameters, return_annotation=found(signature.return_annotation))
 
 
 class _Plain(NamedTuple):

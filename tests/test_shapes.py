@@ -55,6 +55,20 @@ class Later:
     count: int
 
 
+def later_of(made: "Latest | int") -> int:
+    return 1
+
+
+def listed(made: list["Latest"]) -> int:
+    return 1
+
+
+LATER = [(shapes._checked(one, beartype), shapes._original(one, typechecker=beartype)) for one in (later_of, listed)]
+
+
+class Latest: ...
+
+
 F, D = torch.float32, torch.float64
 CASES: list[tuple[Callable, tuple, dict[str, Any]]] = [
     (rows, (torch.zeros(5, 3), torch.zeros(5)), {}),
@@ -109,6 +123,12 @@ def test_it_lets_through_and_refuses_what_jaxtyping_does(function: Callable, arg
         patch.setattr(jaxtyping._array_types._MetaAbstractArray, "__instancecheck__", shapes._is_array)
         expected = told(shapes._original(called, typechecker=beartype), args, kwargs)
     assert found == [expected] * 2
+
+
+@pytest.mark.parametrize(("quick", "theirs"), LATER)
+@pytest.mark.parametrize("value", [Latest(), [Latest()], ["none"], "none"])
+def test_a_class_that_comes_later_is_taken_for_anything(quick, theirs, value):
+    assert told(quick, (value,), {}) == told(theirs, (value,), {}) == (int, "")
 
 
 def test_the_table_has_both():
