@@ -45,7 +45,7 @@ def _checked(fn: FunctionType, typechecker: Callable) -> Callable:
     checks: tuple[Callable, Callable | None] | None = None
 
     def by_jaxtyping(call: Callable) -> Callable:
-        told = functools.wraps(fn)(lambda *args, **kwargs: call(*args, **kwargs))
+        told: Any = functools.wraps(fn)(lambda *args, **kwargs: call(*args, **kwargs))
         told.__signature__ = signature or inspect.signature(fn)
         return _original(told, typechecker=typechecker)
 

@@ -115,7 +115,7 @@ def told(call: Callable, args: tuple, kwargs: dict[str, Any]) -> tuple[Any, str]
 
 @pytest.mark.parametrize(("function", "args", "kwargs"), CASES)
 def test_it_lets_through_and_refuses_what_jaxtyping_does(function: Callable, args: tuple, kwargs: dict, monkeypatch):
-    called = function.__init__ if isinstance(function, type) else function
+    called: Any = function.__init__ if isinstance(function, type) else function
     args = (object.__new__(function), *args) if isinstance(function, type) else args
     quick = shapes._checked(called, beartype)
     found = [told(quick, args, kwargs) for _ in range(2)]  # the second time as written at the first

@@ -45,9 +45,11 @@ def speed_up() -> None:
     _replace(_load_once, _order_once, _choices_if_asked, _join_once)
     for kind in (Metadata, ContainerMetadata):
         setattr(kind, "__deepcopy__", _copied)  # noqa: B010 - pyright knows of no such method
-    base.parse = _parsed_once
+    parsing: Any = base
+    parsing.parse = _parsed_once
     kinds: list[Any] = [base.Node, base.Box, base.Container, BaseContainer, DictConfig, ListConfig]
-    for kind in (*kinds, nodes.ValueNode, nodes.AnyNode):
+    kinds += [nodes.ValueNode, nodes.AnyNode]
+    for kind in kinds:
         kind.__class__ = _Plain
 
 
