@@ -42,6 +42,10 @@ def named_alike(check: bool, fn: int, args: int, *, kwargs: Float[Tensor, " n"],
     return fn + args + out
 
 
+def quoted(count: "int", *, twice: "bool" = False) -> "int":
+    return count / 2 if twice else count  # pyright: ignore[reportReturnType]
+
+
 def lied(count: int) -> Float[Tensor, "3"]:
     return torch.zeros(count)
 
@@ -97,6 +101,9 @@ CASES: list[tuple[Callable, tuple, dict[str, Any]]] = [
     (scaled, (torch.zeros(2, 3), torch.zeros(4, 3)), {}),
     (named_alike, (), {"check": True, "fn": 1, "args": 2, "kwargs": torch.zeros(2), "out": 3}),
     (named_alike, (), {"check": 1, "fn": 1, "args": 2, "kwargs": torch.zeros(2)}),
+    (quoted, (1,), {}),
+    (quoted, ("one",), {}),
+    (quoted, (1,), {"twice": True}),
     (lied, (3,), {}),
     (lied, (4,), {}),
     (several, (2,), {}),
