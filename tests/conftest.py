@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.cpu_limit import CpuLimit
+from tests.workers import CompiledOnce
 
 if not torch.cuda.is_available():
     # Before anything imports triton: its kernels are then interpreted, on CPU tensors.
@@ -22,6 +23,7 @@ gc.disable()
 
 def pytest_collection_finish() -> None:
     gc.freeze()
+    gc.set_threshold(20_000)
     gc.enable()
 
 
@@ -32,6 +34,11 @@ def pytest_configure(config: pytest.Config) -> None:
     # On a GPU the first launch of a kernel compiles it.
     if not torch.cuda.is_available():
         config.pluginmanager.register(CpuLimit())
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        tests = Path(__file__).parent
+        config.pluginmanager.register(
+            CompiledOnce(tests / "viewing/__pycache__", tests.parent / ".cache/compiling.lock")
+        )
 
 
 @pytest.fixture(autouse=True)

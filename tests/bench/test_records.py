@@ -68,6 +68,6 @@ def test_committed_records_are_read(mode):
     assert all(record["provenance"]["command"].startswith(f"sparsestreet bench {mode}") for record in records)
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 def test_committed_records_are_drawn(tmp_path):
     assert len(draw_pareto(read_records(COMMITTED / "knobs.jsonl"), tmp_path)) == 4

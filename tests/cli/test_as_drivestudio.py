@@ -37,7 +37,7 @@ def test_each_is_an_option(override: str):
     assert override_problem([method, override]) is None
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 def test_they_train_together(run_train, tmp_path: Path):
     run = run_train(tmp_path / "run", *AS_DRIVESTUDIO, "schedule.max_steps=4")
     config = RUN.read(run).config

@@ -264,36 +264,41 @@ def test_settings_of_the_op_are_those_of_a_preset_unless_given():
 
 
 @pytest.mark.parametrize(
-    "override",
+    "overrides",
     [
-        "node.background.mask.threshold=0.1",
-        "node.background.mask.sparsity_weight=1e-3",
-        "node.rigid.density.grad_threshold=1e-4",
-        "node.background.learning_rates.means.initial=1e-4",
-        "node.rigid.learning_rates.mask_logits.initial=0.1",
-        "node.background.sources.lidar.initial_opacity=0.2",
-        "node.background.sources.images.order=random",
-        "node.rigid.initial_opacity=0.2",
-        "image_points.min_views=4",
-        "image_points=none",
-        "~node.background.sources.near",
-        "source@node.background.sources=[lidar,far]",
-        "render.settings.alpha_min=0.01",
-        "effects.sky.learning_rates.texels.initial=0.02",
-        "loss.depth.nearest=1.0",
-        "render.preset=fast",
-        "optimizer.visible_only=true",
-        "pruning@callback.pruning.rule=removal",
-        "density@node.background.density=gradient",
-        "effects.sky.when=off",
-        "effects=[sky]",
-        "effects=[]",
-        "logger=none",
+        [
+            "node.background.mask.threshold=0.1",
+            "node.background.mask.sparsity_weight=1e-3",
+            "node.rigid.density.grad_threshold=1e-4",
+            "node.background.learning_rates.means.initial=1e-4",
+            "node.rigid.learning_rates.mask_logits.initial=0.1",
+            "node.background.sources.lidar.initial_opacity=0.2",
+            "node.background.sources.images.order=random",
+            "node.rigid.initial_opacity=0.2",
+            "image_points.min_views=4",
+            "render.settings.alpha_min=0.01",
+            "effects.sky.learning_rates.texels.initial=0.02",
+            "loss.depth.nearest=1.0",
+            "optimizer.visible_only=true",
+        ],
+        [
+            "image_points=none",
+            "~node.background.sources.near",
+            "render.preset=fast",
+            "pruning@callback.pruning.rule=removal",
+            "density@node.background.density=gradient",
+            "effects.sky.when=off",
+            "logger=none",
+        ],
+        ["source@node.background.sources=[lidar,far]", "effects=[sky]"],
+        ["effects=[]"],
     ],
+    ids=["values", "choices", "some of several", "none of several"],
 )
-def test_every_option_can_be_set_without_plus_signs(override: str):
-    assert override_problem(["sparsify=paper", override]) is None
-    recipe_of(composed("sparsify=paper", override))
+def test_every_option_can_be_set_without_plus_signs(overrides: list[str]):
+    """What does not fit names its key."""
+    assert override_problem(["sparsify=paper", *overrides]) is None
+    recipe_of(composed("sparsify=paper", *overrides))
 
 
 @pytest.mark.parametrize(

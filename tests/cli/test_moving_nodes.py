@@ -76,6 +76,7 @@ def test_objects_deformed_by_a_network(tiny_street, tmp_path):
     assert len(node.instances().names) > 0
 
 
+@pytest.mark.slow
 def test_people_on_skeletons(tiny_street, tmp_path):
     """Its loss falls, poses and joints are learned, a mask over time takes rows, and the file brings all of it back."""
     scene, curves = trained(

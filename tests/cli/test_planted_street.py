@@ -69,6 +69,7 @@ def planted_in(tiny_street: list[str], out: Path, max_steps: int, max_gaussians:
     return out, data, rows, planted, visible
 
 
+@pytest.mark.slow
 def test_removal_finds_what_was_planted_and_spares_what_is_visible(planted_street):
     """One pass without a budget: rows that nobody sees. The judge renders every view without the row."""
     out, data, rows, planted, visible = planted_street

@@ -150,6 +150,7 @@ def _raises_at(step: int):
     return hook
 
 
+@pytest.mark.slow
 def test_a_signal_inside_a_step(tiny_street, tmp_path, monkeypatch):
     """In this process, which is told how it would have ended."""
 

@@ -307,6 +307,7 @@ def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
     assert "no lidar: Gaussians start from points in images" in said
 
 
+@pytest.mark.slow
 def test_adam_of_visible_gaussians_runs(run_train, tmp_path):
     run_train(tmp_path, "optimizer.visible_only=true", "trainer.fast_dev_run=2")
 
@@ -322,6 +323,7 @@ def test_bf16_mixed_changes_nothing_where_it_would_hurt(run_train, tmp_path):
         assert torch.equal(value, mixed["state_dict"][name]), name
 
 
+@pytest.mark.slow
 def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path):
     """A crushing lambda closes every mask; K_min Gaussians stay open, are kept, and the firing is logged."""
     out = run_train(

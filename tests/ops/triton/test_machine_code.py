@@ -226,20 +226,10 @@ BACKWARD = {
     "ABSOLUTE DEPTH GATED MARKED TOGETHER": (112, 67.5),
 }
 OF_TRAINING = {
-    "blend_tiles": (
-        "DEPTH",
-        "DEPTH LASTS",
-        "DEPTH LASTS TOGETHER",
-        "DEPTH LASTS PARTS REST",
-        "DEPTH GATED LASTS TOGETHER",
-    ),
-    "blend_tiles_backward": (
-        "ABSOLUTE",
-        "ABSOLUTE DEPTH",
-        "ABSOLUTE DEPTH TOGETHER",
-        "ABSOLUTE DEPTH GATED TOGETHER",
-    ),
+    "blend_tiles": ("DEPTH LASTS", "DEPTH LASTS TOGETHER", "DEPTH GATED LASTS TOGETHER"),
+    "blend_tiles_backward": ("ABSOLUTE DEPTH TOGETHER", "ABSOLUTE DEPTH GATED TOGETHER"),
 }
+"""Of a kernel's variants those with the most loops and registers. The others are compiled by ``make test-all``."""
 BUDGETS = {"blend_tiles": FORWARD, "blend_tiles_backward": BACKWARD}
 
 
