@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -92,12 +93,12 @@ def check_resumed(config: dict[str, Any], start: Path) -> None:
 def trunk_of(cfg: DictConfig, out: Path) -> Path | None:
     """The latest checkpoint that this job of a sweep can begin with, of a finished run in a sweep beside it or its own.
 
-    None: there is none, or none is wanted. Of several processes each would look for itself, so a run that they share
-    begins at step 0; ``resume=CHECKPOINT`` names one for all.
+    None: there is none, none is wanted, or this is no job of a sweep. Of several processes each would look for itself,
+    so a run that they share begins at step 0; ``resume=CHECKPOINT`` names one for all.
     """
     first = first_pruning(config := flat_config(resolved(cfg)))
     wanted = cfg.reuse and not cfg.overwrite and not cfg.budget.minutes
-    if not wanted or math.isinf(first) or _is_shared(config):
+    if not wanted or math.isinf(first) or _is_shared(config) or HydraConfig.get().mode != RunMode.MULTIRUN:
         return None
     sweeps = Path(HydraConfig.get().sweep.dir).absolute().parent
     for moment, checkpoint in sorted(_kept(sweeps), key=lambda kept: (-kept[0], kept[1])):

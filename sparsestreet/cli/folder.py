@@ -79,6 +79,11 @@ def _is_resumed(cfg: DictConfig, out: Path) -> bool:
     return bool(cfg.get("resume")) and run_of(Path(cfg.resume)).resolve() == out.resolve()
 
 
+def lies_in(start: Path, out: Path) -> bool:
+    """Whether a run, or one of its checkpoints, is this folder's own."""
+    return start.resolve().is_relative_to(out.resolve())
+
+
 def holds_run(out: Path) -> bool:
     """Whether something of a training is there; the configuration and log of one that never began do not count."""
     return any((out / name).exists() for name in OF_A_RUN)

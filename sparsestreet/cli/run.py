@@ -5,7 +5,6 @@ import warnings
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
@@ -13,10 +12,9 @@ from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of
 from sparsestreet.cli.branch import moments_to_keep, record_branch, trunk_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.device import devices_of_job
-from sparsestreet.cli.folder import start_of, take_folder
+from sparsestreet.cli.folder import lies_in, start_of, take_folder
 from sparsestreet.cli.preset import preset_notes
 from sparsestreet.cli.process import follows_another, keep_freed_memory
-from sparsestreet.cli.resume import run_of
 from sparsestreet.evaluation.memory import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.run import train
@@ -51,10 +49,9 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
         recipe = recipe_of(known)
-        own = start_of(cfg, out)
-        start = own or (trunk_of(cfg, out) if HydraConfig.get().mode == RunMode.MULTIRUN else None)
+        start = start_of(cfg, out) or trunk_of(cfg, out)
         if not follows_another(cfg.trainer):
-            take_folder(cfg, out, goes_on=own is not None and run_of(own).resolve() == out.resolve())
+            take_folder(cfg, out, goes_on=start is not None and lies_in(start, out))
             record_branch(out, start)
     with devices_of_job(cfg.trainer) as devices:
         summary = train(
