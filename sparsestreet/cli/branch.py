@@ -14,11 +14,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from sparsestreet.cli.compose import load_run_config, resolved
-from sparsestreet.cli.folder import identity_of_run, is_whole
+from sparsestreet.cli.folder import configuration_of, identity_of_run, is_whole, lies_in
 from sparsestreet.cli.resume import run_of
 from sparsestreet.records.branch_of import BRANCH_OF, BranchOf, moment_of
 from sparsestreet.records.configuration import IDENTITY_KEYS, Configuration, flat_config, without
@@ -50,7 +48,7 @@ def moments_to_keep(cfg: DictConfig) -> tuple[float, ...]:
     A run of so many minutes has none: what a step is follows from the clock.
     """
     first = first_pruning(flat_config(resolved(cfg)))
-    return () if cfg.budget.minutes else tuple(moment for moment in cfg.branch_points if 0 < moment <= first)
+    return () if cfg.budget.minutes else tuple(moment for moment in cfg.branch_points if moment <= first)
 
 
 def first_pruning(config: Configuration) -> float:
@@ -105,7 +103,7 @@ def trunk_of(cfg: DictConfig, out: Path) -> Path | None:
         run = checkpoint.parents[1]
         if moment > first or run == out.absolute() or not is_whole(run):
             continue
-        trunk = _configuration(run)
+        trunk = configuration_of(run)
         if trunk is not None and is_branch(config, trunk, moment):
             return checkpoint
     return None
@@ -114,7 +112,7 @@ def trunk_of(cfg: DictConfig, out: Path) -> Path | None:
 def record_branch(out: Path, start: Path | None) -> None:
     """Write down which run's checkpoint a run began with, where that is another one's."""
     moment = None if start is None else moment_of(start)
-    if start is None or moment is None or run_of(start).resolve() == out.resolve():
+    if start is None or moment is None or lies_in(start, out):
         return
     trunk = run_of(start)
     log.info("begins with %s, with which it has all steps up to there in common", start)
@@ -126,13 +124,6 @@ def _kept(sweeps: Path) -> Iterator[tuple[float, Path]]:
         moment = moment_of(checkpoint)
         if moment is not None:
             yield moment, checkpoint
-
-
-def _configuration(run: Path) -> Configuration | None:
-    try:
-        return flat_config(resolved(load_run_config(run)))
-    except (FileNotFoundError, OmegaConfBaseException, ValueError, YAMLError):
-        return None  # of another version
 
 
 def _is_shared(config: Configuration) -> bool:

@@ -100,11 +100,16 @@ def is_whole(out: Path) -> bool:
 
 def holds_same_run(cfg: DictConfig, out: Path) -> bool:
     """Whether the run in a folder has this configuration, seed and drive."""
+    before = configuration_of(out)
+    return before is not None and same_run(before, flat_config(resolved(cfg)))
+
+
+def configuration_of(run: Path) -> Configuration | None:
+    """What a run's folder says of it; None: nothing that can be read today."""
     try:
-        before = flat_config(resolved(load_run_config(out)))
+        return flat_config(resolved(load_run_config(run)))
     except (FileNotFoundError, OmegaConfBaseException, ValueError, YAMLError):
-        return False
-    return same_run(before, flat_config(resolved(cfg)))
+        return None
 
 
 def same_run(config: Configuration, other: Configuration) -> bool:

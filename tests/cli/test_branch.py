@@ -9,12 +9,14 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli import branch
 from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep, trunk_of
-from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.compose import override_problem, resolved
 from sparsestreet.cli.train import train
 from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
 from sparsestreet.records.configuration import Configuration, flat_config
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
+from sparsestreet.report.collect import collect
+from sparsestreet.report.sweep import _branches
 from tests.cli import configurations
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.test_resume import assert_equal, curve
@@ -67,6 +69,12 @@ def test_a_run_keeps_what_its_own_pruning_has_not_touched(words, first, kept):
     cfg = configurations.composed(*words, "branch_points=[0.3,0.6]")
     assert first_pruning(flat_config(resolved(cfg))) == first
     assert moments_to_keep(cfg) == kept
+
+
+@pytest.mark.parametrize("moment", ["0.0", "1.0", "-0.5"])
+def test_a_moment_lies_inside_the_run(moment):
+    said = override_problem([f"branch_points=[0.5,{moment}]"])
+    assert said == f"branch_points are fractions of the run, above 0 and below 1, got {moment}"
 
 
 ARM = ("sparsify=random", "callback.pruning.at=[0.7]")
@@ -141,6 +149,8 @@ def sweep(tiny_street, tmp_path_factory) -> Path:
 def test_a_job_begins_with_the_checkpoint_of_its_trunk_and_ends_as_if_it_had_not(sweep, tiny_street, tmp_path, capsys):
     assert BRANCH_OF.read(sweep / "importance") == BranchOf(run="../none", label="streetgs", moment=0.6)
     assert not BRANCH_OF.exists(sweep / "none")
+    (note,) = _branches(collect([sweep]))
+    assert note.endswith(": importance")
     whole = tmp_path / "whole"
     assert train([*tiny_street, *SHORT, *LATE, f"out={whole}"]) == 0
     assert_equal(whole, sweep / "importance")
