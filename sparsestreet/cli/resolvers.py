@@ -64,13 +64,26 @@ def epoch_of_log(least: int, *, _root_: DictConfig) -> int:
     return least if images is None else max(least, 100 * round(images / 100))
 
 
+def _relative_images(root: DictConfig) -> float:
+    """The training images, relative to ``data.images_per_capacity`` (without such a key ``IMAGES_PER_CAPACITY``), and 1
+    at least; before the log is read, 1."""
+    enough = float(root.data.get("images_per_capacity", IMAGES_PER_CAPACITY))
+    return 1.0 if root.training_views.images is None else max(1.0, root.training_views.images / enough)
+
+
+def relative_length(*, _root_: DictConfig) -> float:
+    """Of conf/schedule: how many times as many training images the log has as ``data.images_per_capacity``, less in a
+    run of fewer steps than ``steps_of_log`` gives it, and 1 at least."""
+    steps, own = _root_.schedule.max_steps, steps_of_log(1, _root_=_root_)
+    whole = isinstance(steps, int) and steps > 0  # others are refused (cli/limits.py)
+    return max(1.0, _relative_images(_root_) * (min(1.0, steps / own) if whole else 1.0))
+
+
 def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:
     """Of conf/node: a number of Gaussians, in whole hundreds, that grows with the training images where these are more
     than ``data.images_per_capacity`` (without such a key ``IMAGES_PER_CAPACITY``); before the log is read, the least.
     """
-    images = _root_.training_views.images
-    enough = float(_root_.data.get("images_per_capacity", IMAGES_PER_CAPACITY))
-    return least if images is None else max(least, 100 * round(least * images / enough / 100))
+    return max(least, 100 * round(least * _relative_images(_root_) / 100))
 
 
 def of_pressure(weight: float, *, _root_: DictConfig) -> float:
@@ -148,6 +161,7 @@ _RESOLVERS = {
     "mul": mul,
     "steps_of_log": steps_of_log,
     "epoch_of_log": epoch_of_log,
+    "relative_length": relative_length,
     "gaussians_of_log": gaussians_of_log,
     "min": min,
     "of_30000": of_30000,

@@ -24,6 +24,13 @@ class OptimizerSettings:
     """Meters: rates that are scaled by the scene's radius count no more of it. Detail does not grow with the length of
     a drive. None: all of it (3DGS, DriveStudio)."""
 
+    relative_length: float = 1.0
+    """K: training images and steps, relative to those that the rates were set on. A Gaussian is seen as often in all,
+    but in 1/K of the steps. Adam divides by the root of a mean over all steps, also over those that do not see it. So
+    each time the Gaussian moves sqrt(K) times as far, and between two times its moments forget more. Rates / sqrt(K)
+    and betas to the power of 1/K undo both: the rule of several images, for 1/K images (docs/length.md). Not with
+    ``visible_only``, where moments rest with their Gaussian."""
+
     batch_rule: Literal["sqrt", "none"] = "sqrt"
     """Of steps that take n > 1 images. sqrt (Grendel-GS, Zhao et al. 2024): rates times sqrt(n) and Adam's betas to the
     power of n, so that moments remember as many images and n images move a parameter about as far as n steps of one;
@@ -32,6 +39,8 @@ class OptimizerSettings:
     def __post_init__(self) -> None:
         if self.largest_radius is not None and not self.largest_radius > 0:
             raise ValueError(f"largest_radius must be > 0 m, got {self.largest_radius}: null for no limit")
+        if not self.relative_length > 0:
+            raise ValueError(f"relative_length must be > 0, got {self.relative_length}: 1 for rates as they are")
 
     def build(self, scene: SceneGraph, radius: float, images: int = 1) -> torch.optim.Optimizer:
         """Adam with one group per rate, in which parameters of all nodes are stepped together.
@@ -41,8 +50,9 @@ class OptimizerSettings:
         Raises ValueError for a parameter without a rate.
         """
         rates, groups = scene.learning_rates(), {}
-        images = images if self.batch_rule == "sqrt" else 1
-        factor, betas = math.sqrt(images), (0.9**images, 0.999**images)
+        counted = images if self.batch_rule == "sqrt" else 1
+        counted = counted if self.visible_only else counted / self.relative_length
+        factor, betas = math.sqrt(counted), (0.9**counted, 0.999**counted)
         radius = radius if self.largest_radius is None else min(radius, self.largest_radius)
         for name, parameter in scene.named_parameters():
             rate = rates[name]

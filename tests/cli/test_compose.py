@@ -77,7 +77,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["render=fast"], "set one of render.backend, render.preset, render.settings"),
         (
             ["optimizer=visible_adam"],
-            "largest_radius, optimizer.batch_rule, optimizer.visible_only",
+            "largest_radius, optimizer.relative_length, optimizer.batch_rule, optimizer.visible_only",
         ),
         (["render=null"], "render is no choice but has keys of its own"),
         (["trainer.max_step=5"], "did you mean 'schedule.max_steps'?"),  # which that one follows

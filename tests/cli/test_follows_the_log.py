@@ -52,6 +52,28 @@ def test_a_short_run_counts_no_more_of_the_radius_than_a_street_has(words, large
     assert {node.density.steady_means for node in cfg.node.values()} == {"preset=drivestudio" not in words}
 
 
+@pytest.mark.parametrize(
+    ("words", "images", "length"),
+    [
+        ((), None, 1.0),
+        ((), 108, 1.0),
+        ((), 27, 1.0),
+        ((), 432, 4.0),
+        (DRIVE, 108, 2.0),
+        ((*DRIVE, "data.images_per_capacity=108"), 108, 1.0),
+        ((*DRIVE, "schedule.max_steps=2000"), 108, 1.0),  # a third of its steps: rates as they are
+        (("schedule.max_steps=4000",), 432, 2.0),
+        (("schedule.max_steps=40000",), 432, 4.0),
+        (("schedule=paper",), 432, 1.0),
+        (("preset=drivestudio",), 432, 1.0),
+    ],
+)
+def test_rates_are_lower_where_a_longer_log_is_trained_longer(words, images, length):
+    cfg = composed(*words)
+    recipe_of(cfg)
+    assert recipe_of(with_images(cfg, images)).optimizer.relative_length == pytest.approx(length, abs=0.01)
+
+
 @pytest.mark.parametrize("method", ["pvg", "deformgs", "omnire"])
 def test_gaussians_of_every_method_follow_the_training_images(method):
     few, many = (with_images(composed(f"method={method}"), images).node for images in (108, 216))

@@ -55,6 +55,7 @@ ALL = {
     "data.log.extent": "first_pose",
     "optimizer.eps": 1e-15,
     "optimizer.largest_radius": None,
+    "optimizer.relative_length": 1.0,
     "split.with_replacement": True,
     "render.settings.eps2d": 0.3,
     "render.settings.alpha_max": 0.999,  # of gsplat 1.3.0, as the next four

@@ -66,6 +66,47 @@ def test_the_rule_for_steps_of_several_images(rule, images, factor, betas, visib
         assert (one["betas"], other["betas"]) == ((0.9, 0.999), betas)
 
 
+@pytest.mark.parametrize(("images", "counted"), [(1, 0.25), (4, 1.0), (2, 0.5)])
+def test_a_step_of_a_long_log_counts_as_part_of_an_image(images, counted):
+    """Four times as long: rates of half, betas to the power of a quarter; four images a step make up for it."""
+    street = scene()
+    single = OptimizerSettings().build(street, 10.0)
+    long = OptimizerSettings(relative_length=4.0).build(street, 10.0, images)
+    for one, other in zip(single.param_groups, long.param_groups, strict=True):
+        assert other["lr"] == other["initial_lr"] == pytest.approx(one["lr"] * counted**0.5, rel=1e-15)
+        assert other["betas"] == (0.9**counted, 0.999**counted)
+    resting = OptimizerSettings(relative_length=4.0, visible_only=True).build(street, 10.0, images)
+    assert resting.param_groups[0]["betas"] == (0.9**images, 0.999**images)
+
+
+def distance_each_time(every: int, relative_length: float) -> float:
+    """Of rows with random gradients in one step of so many, from one time to the next: the mean of times 20 to 59."""
+    street, random = SceneGraph({"background": background(200)}), torch.Generator().manual_seed(3)
+    optimizer = OptimizerSettings(relative_length=relative_length).build(street, 1.0)
+    rows = street.nodes["background"].rows.get_parameter("sh_dc")
+    path = []
+    for _ in range(60):
+        before, rows.grad = rows.detach().clone(), torch.randn(rows.shape, generator=random)
+        optimizer.step()
+        rows.grad = torch.zeros_like(rows)
+        for _ in range(every - 1):
+            optimizer.step()
+        path.append(float((rows.detach() - before).abs().mean()))
+    return sum(path[20:]) / 40
+
+
+def test_a_gaussian_moves_as_far_each_time_it_is_seen_however_long_the_log_is():
+    """In one step of 5, or of 20 in a log of four times the length."""
+    short = distance_each_time(5, 1.0)
+    assert distance_each_time(20, 4.0) == pytest.approx(short, rel=0.02)
+    assert distance_each_time(20, 1.0) > 3 * short  # without it
+
+
+def test_a_relative_length_is_positive():
+    with pytest.raises(ValueError, match=r"relative_length must be > 0, got 0\.0: 1 for rates"):
+        OptimizerSettings(relative_length=0.0)
+
+
 def test_a_largest_radius_is_positive():
     with pytest.raises(ValueError, match=r"must be > 0 m, got 0\.0: null"):
         OptimizerSettings(largest_radius=0.0)
