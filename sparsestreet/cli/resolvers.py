@@ -73,10 +73,12 @@ def _relative_images(root: DictConfig) -> float:
 
 def relative_length(*, _root_: DictConfig) -> float:
     """Of conf/schedule: how many times as many training images the log has as ``data.images_per_capacity``, less in a
-    run of fewer steps than ``steps_of_log`` gives it, and 1 at least."""
+    run of fewer steps than ``steps_of_log`` gives it, and 1 at least. With a budget, where the clock decides the steps,
+    1."""
     steps, own = _root_.schedule.max_steps, steps_of_log(1, _root_=_root_)
-    whole = isinstance(steps, int) and steps > 0  # others are refused (cli/limits.py)
-    return max(1.0, _relative_images(_root_) * (min(1.0, steps / own) if whole else 1.0))
+    if _root_.budget.minutes is not None or not isinstance(steps, int):  # others are refused (cli/limits.py)
+        return 1.0
+    return max(1.0, _relative_images(_root_) * min(1.0, steps / own))
 
 
 def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:

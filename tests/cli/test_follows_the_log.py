@@ -64,6 +64,7 @@ def test_a_short_run_counts_no_more_of_the_radius_than_a_street_has(words, large
         ((*DRIVE, "schedule.max_steps=2000"), 108, 1.0),  # a third of its steps: rates as they are
         (("schedule.max_steps=4000",), 432, 2.0),
         (("schedule.max_steps=40000",), 432, 4.0),
+        (("budget.minutes=5",), 432, 1.0),
         (("schedule=paper",), 432, 1.0),
         (("preset=drivestudio",), 432, 1.0),
     ],
