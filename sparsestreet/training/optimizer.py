@@ -27,9 +27,9 @@ class OptimizerSettings:
     relative_length: float = 1.0
     """K: training images and steps, relative to those that the rates were set on. A Gaussian is seen as often in all,
     but in 1/K of the steps. Adam divides by the root of a mean over all steps, also over those that do not see it. So
-    each time the Gaussian moves sqrt(K) times as far, and between two times its moments forget more. Rates / sqrt(K)
-    and betas to the power of 1/K undo both: the rule of several images, for 1/K images (docs/length.md). Not with
-    ``visible_only``, where moments rest with their Gaussian."""
+    the Gaussian moves further each time, sqrt(K) times or more, and its moments forget more until the next. Rates /
+    sqrt(K) and betas to the power of 1/K undo both: the rule of several images, for 1/K images (docs/length.md). Not
+    with ``visible_only``, where moments rest with their Gaussian."""
 
     batch_rule: Literal["sqrt", "none"] = "sqrt"
     """Of steps that take n > 1 images. sqrt (Grendel-GS, Zhao et al. 2024): rates times sqrt(n) and Adam's betas to the
