@@ -64,14 +64,13 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
     tables = (screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers)
     numbers = (*sizes(view, parts), view.settings.alpha_max, limit)
     tiles, part_count, choices = lists.order.shape[0], numbers[3], tuning()
-    staged = tiles <= choices.staged_tiles
-    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, staged, screen.gated)}
+    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, choices.staged, screen.gated)}
 
     def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
         launch(
             blend.blend_tiles, count, 1, *tables, *numbers,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=staged, GATED=screen.gated, **work,
-            options=options,
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=choices.staged, GATED=screen.gated,
+            **work, options=options,
         )  # fmt: skip
 
     if parts is None or part is None:

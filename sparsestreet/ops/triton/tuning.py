@@ -1,7 +1,7 @@
 """What only a device can decide: where long tiles are split, and which variant of a pixel kernel runs.
 
-Every choice draws the same image and the same gradients, up to rounding where a field says so. The defaults come from a
-model of the device (tests/ops/triton/device_model.py) and from machine code. **No choice has been measured.**
+Every choice draws the same image and the same gradients, up to rounding where a field says so. The defaults are those
+that an H100 was fastest with (docs/gpu_variants.md). No other device has been asked.
 """
 
 from collections.abc import Iterator
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tuning:
-    """One choice of each. Gains are modelled for two trained streets at 960x640 (docs/gpu_variants.md)."""
+    """One choice of each. Times are of the pixel kernels of one view of a trained street, 1.2 M splats at 960x576."""
 
     most_parts: int = 6144
     """Most parts of a view, 7 kB each. A part has at least one of so many shares of all pairs; 1: no tile is split.
 
-    A street lasts as long as its longest tile: split, its pixels are modelled to take half the time and less. Moves
-    images by rounding, as the light before a part is a product of other parts' products."""
+    A street lasts as long as its longest tile. Measured: forward 3.4 ms without a split, 0.73 with; backward 5.2 and
+    0.78. Moves images by rounding, as the light before a part is a product of other parts' products."""
     shortest_part: int = 128
     """Least number of pairs of a part. It bounds what parts cost in small views."""
     fewest_parts: int = 3
@@ -26,18 +26,18 @@ class Tuning:
     """Forward in two launches and the sum: whole tiles, the first parts and what later ones let through; then those.
     Backward in one. Otherwise whole tiles, products and parts wait for each other.
 
-    Modelled: pixels of a street forward 0.9 to 0.8 ms, backward 1.3 to 0.9. The first kernel keeps the registers of the
-    blend also while it computes products. The same bits in the interpreter."""
+    Measured: forward 0.92 to 0.73 ms, backward 1.17 to 0.78. The first kernel keeps the registers of the blend also
+    while it computes products. The same bits in the interpreter."""
     marked_slots: bool = False
     """Backward marks the slots that it writes, a byte each, and writes no zeros into those behind closed pixels.
 
-    Modelled: nothing for a street, which closes few tiles early; perhaps 1.6 of 2.6 ms for 5 M random splats at
-    960x640. Costs 2 to 14 instructions a pair and a fill of the bytes. The same bits."""
-    staged_tiles: int = 0
-    """Forward fetches the records of 32 pairs at once, one a lane, in views of at most so many tiles; 0: in none.
+    Not measured. Modelled: nothing for a street, which closes few tiles early; perhaps 1.6 of 2.6 ms for 5 M random
+    splats at 960x640. Costs 2 to 14 instructions a pair and a fill of the bytes. The same bits."""
+    staged: bool = True
+    """Forward fetches the records of 32 pairs at once, one a lane.
 
-    A lone warp then waits for memory once in 32 pairs. Modelled: pixels of a street 0.8 to 0.6 ms. Where many warps
-    hide the wait it only costs registers and exchanges between lanes. The same bits."""
+    A warp then waits for memory once in 32 pairs. Measured: 0.73 to 0.58 ms, and 9 to 33 % less at 100,000
+    random splats and more. The same bits in the interpreter."""
 
     def __post_init__(self) -> None:
         if self.most_parts < 1 or self.shortest_part < 1 or self.fewest_parts < 2:

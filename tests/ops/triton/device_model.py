@@ -3,7 +3,8 @@
 132 multiprocessors have four schedulers each. A scheduler holds as many one-warp programs as their registers allow, and
 takes the next as soon as one ends. Of n that it holds, each takes ``wait + n * issue`` microseconds for a pair: what a
 lone warp waits for memory, and what the others' instructions take. Both were fitted to the H100's records of views
-without split tiles (benchmarks/gpu*.jsonl). They cannot be told apart well, so three fits stand beside each other.
+without split tiles (benchmarks/gpu.jsonl, gpu_960x640.jsonl). They cannot be told apart well, so three fits stand
+beside each other. Later the device confirmed what they say of a street (docs/gpu.md).
 
 Not modelled: caches, empty programs, the sums of part layers (some 20 us), and what closes early.
 """

@@ -46,7 +46,7 @@ class KernelCode:
 STOPS = [SplatSettings(stop="inclusive"), SplatSettings(stop="exclusive")]
 # Split tiles in two launches and in four, and tiles that are not split.
 SPLITS = [{"shortest_part": 1}, {"shortest_part": 1, "two_launches": False}, {"shortest_part": 1000}]
-OTHERS = [{}, {"staged_tiles": 1, "marked_slots": True}]
+OTHERS = [{}, {"staged": False, "marked_slots": True}]
 
 
 def variants(gated: bool) -> list[Launch]:

@@ -28,7 +28,7 @@ from tests.typed import there
 
 DEVICE = device_of("triton")
 PARTS = Tuning(shortest_part=3)
-ALL_CHOICES = Tuning(shortest_part=3, marked_slots=True, staged_tiles=4)
+ALL_CHOICES = Tuning(shortest_part=3, marked_slots=True, staged=True)
 FOUR_LAUNCHES = Tuning(shortest_part=3, two_launches=False)
 VIEW = front_camera(19, 9, 16.0)
 BACKGROUND = torch.tensor([0.3, 0.6, 0.1], dtype=torch.float64)

@@ -101,8 +101,8 @@ def bare(launch: Launch, registers: int, **constants: bool) -> Launch:
 SPLIT = Tuning(shortest_part=1, fewest_parts=2)
 TUNINGS = [
     SPLIT,
-    dataclasses.replace(SPLIT, two_launches=False),
-    dataclasses.replace(SPLIT, marked_slots=True, staged_tiles=1),
+    dataclasses.replace(SPLIT, two_launches=False, staged=False),
+    dataclasses.replace(SPLIT, marked_slots=True, staged=False),
 ]
 ALL = (TRAINED + OTHERS, ("inclusive", "exclusive"), TUNINGS)
 SCOPES = {
@@ -135,7 +135,8 @@ def compiled_in(scope: str) -> list[tuple[Launch, dict]]:
         return compile_launches([launch for launch in launches if _is_daily(launch)], arch)
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
     forward, backward = first["blend_tiles"], first["blend_tiles_backward"]
-    launches += [bare(forward, 72, LASTS=False), bare(forward, 80), bare(backward, 96, ABSOLUTE=False)]
+    launches += [bare(forward, 72, STAGED=False, LASTS=False), bare(forward, 80, STAGED=False)]
+    launches.append(bare(backward, 96, ABSOLUTE=False))
     launches.append(bare(backward, 104, ABSOLUTE=False, DEPTH=True))
     plain = [launch for launch in launches if launch.name in EFFECTS and _is_plain(launch)]
     launches += [dataclasses.replace(launch, without=EFFECTS[launch.name]) for launch in plain]
@@ -186,14 +187,16 @@ def test_no_tensor_cores_and_no_atomics(compiled):
 FORWARD = {
     "": (72, 21.0),
     "LASTS": (80, 22.0),
-    "DEPTH": (80, 22.0),
+    "DEPTH STAGED": (96, 22.0),
     "DEPTH LASTS": (80, 23.5),
+    "DEPTH LASTS STAGED": (96, 23.5),
     "DEPTH LASTS TOGETHER": (80, 24.0),
     "DEPTH LASTS PARTS REST": (80, 23.5),
     "DEPTH LASTS PARTS": (80, 23.5),
     "DEPTH LASTS STAGED TOGETHER": (96, 24.0),
     "DEPTH LASTS PARTS REST STAGED": (96, 23.5),
     "DEPTH EXCLUSIVE LASTS": (88, 26.0),
+    "DEPTH EXCLUSIVE LASTS STAGED": (96, 26.0),
     "DEPTH EXCLUSIVE LASTS TOGETHER": (88, 26.0),
     "DEPTH EXCLUSIVE LASTS PARTS REST": (88, 26.0),
     "DEPTH EXCLUSIVE LASTS PARTS": (88, 26.0),
@@ -226,7 +229,7 @@ BACKWARD = {
     "ABSOLUTE DEPTH GATED MARKED TOGETHER": (112, 67.5),
 }
 OF_TRAINING = {
-    "blend_tiles": ("DEPTH LASTS", "DEPTH LASTS TOGETHER", "DEPTH GATED LASTS TOGETHER"),
+    "blend_tiles": ("DEPTH LASTS STAGED", "DEPTH LASTS STAGED TOGETHER", "DEPTH GATED LASTS STAGED TOGETHER"),
     "blend_tiles_backward": ("ABSOLUTE DEPTH TOGETHER", "ABSOLUTE DEPTH GATED TOGETHER"),
 }
 """Of a kernel's variants those with the most loops and registers. The others are compiled by ``make test-all``."""

@@ -162,7 +162,7 @@ def test_counting_and_removal_walk_whole_tiles(short_parts):
     torch.testing.assert_close(split.max_abs_change, whole.max_abs_change, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("staged", first_interpreted(1, 0))
+@pytest.mark.parametrize("staged", first_interpreted(True, False))
 def test_parts_longer_than_a_look(staged):
     # Both parts hold 35 splats and are looked at after 32, when half the light still passes.
     layers = [
@@ -170,7 +170,7 @@ def test_parts_longer_than_a_look(staged):
         for k in range(70)
     ]
     scene, view = Gaussians.concatenate(layers), front_camera(3, 2, 20.0)
-    with tuned(Tuning(shortest_part=33, fewest_parts=2, staged_tiles=staged)):
+    with tuned(Tuning(shortest_part=33, fewest_parts=2, staged=staged)):
         drawn = splat(cast(scene, torch.float32, device=DEVICE), view, backend="triton")
     truth = splat(scene, view, backend="reference")
     assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6

@@ -19,13 +19,13 @@ from tests.ops.scenes import cast, device_of, first_interpreted, front_camera, o
 from tests.ops.triton.test_parts import stack
 
 DEVICE = device_of("triton")
-ONE_BY_ONE = Tuning(shortest_part=3, two_launches=False)
-"""Whole tiles, products and parts after each other."""
+ONE_BY_ONE = Tuning(shortest_part=3, two_launches=False, staged=False)
+"""Whole tiles, products and parts after each other; each pair's record is fetched alone."""
 VARIANTS = {
-    "all": {"two_launches": True, "marked_slots": True, "staged_tiles": 4},
+    "all": {"two_launches": True, "marked_slots": True, "staged": True},
     "two launches": {"two_launches": True},
     "marked slots": {"marked_slots": True},
-    "staged": {"staged_tiles": 4},
+    "staged": {"staged": True},
 }
 STOPS = {
     "exclusive": SplatSettings(stop="exclusive", transmittance_min=0.02),
@@ -95,5 +95,5 @@ def test_every_choice_draws_the_same_bits(case, poisoned):
     found = drawn(screen, view, replace(choices, **VARIANTS[variant]), cotangents)
     for image, values in expected.items():
         # On a device the compiler contracts other products in other kernels.
-        rounding = 0.0 if DEVICE.type == "cpu" else 1e-6 * float(values.abs().max())
+        rounding = 0.0 if DEVICE.type == "cpu" or not values.numel() else 1e-6 * float(values.abs().max())
         torch.testing.assert_close(found[image], values, rtol=0.0, atol=rounding, msg=image)
