@@ -1,7 +1,7 @@
 """What only a device can decide: where long tiles are split, and which variant of a pixel kernel runs.
 
-Every choice draws the same image and the same gradients, up to rounding where a field says so. The defaults are those
-that an H100 was fastest with (docs/gpu_variants.md). No other device has been asked.
+Every choice draws the same image and the same gradients, up to rounding where a field says so. On an H100 the defaults
+were the fastest that was tried, or within 0.06 ms of it (docs/gpu_variants.md). No other device has been asked.
 """
 
 from collections.abc import Iterator
@@ -36,8 +36,8 @@ class Tuning:
     staged: bool = True
     """Forward fetches the records of 32 pairs at once, one a lane.
 
-    A warp then waits for memory once in 32 pairs. Measured: 0.73 to 0.58 ms, and 9 to 33 % less at 100,000
-    random splats and more. The same bits in the interpreter."""
+    A warp then waits for memory once in 32 pairs. Measured: 0.73 to 0.58 ms, and 9 to 33 % less with 100,000 random
+    splats and more. The same bits in the interpreter."""
 
     def __post_init__(self) -> None:
         if self.most_parts < 1 or self.shortest_part < 1 or self.fewest_parts < 2:

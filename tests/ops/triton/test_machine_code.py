@@ -165,12 +165,12 @@ def test_every_kernel_is_compiled(compiled, request):
 
 
 def test_nothing_spills(compiled, request):
-    """But outside of the loop for staged records, and 8 bytes for gates on sm_80; and on sm_120, where registers were
+    """But 8 bytes outside of the loop for staged records, and for gates on sm_80; and on sm_120, where registers were
     not tuned, once in the loop of both."""
     newest, oldest = "sm_120" in request.node.name, "sm_80" in request.node.name
     for launch, found in compiled:
         gated = launch.name == "blend_tiles" and launch.constants["GATED"]
-        assert found["spilled"] <= 8 * (oldest and gated) or newest or _is_staged(launch), launch
+        assert found["spilled"] <= 8 * (_is_staged(launch) or (oldest and gated)) or newest, launch
         assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and (gated or _is_staged(launch))), launch
 
 
