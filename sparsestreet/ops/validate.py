@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from sparsestreet.finite import check_finite, check_rows
 from sparsestreet.geometry.cameras import numbers_of
 from sparsestreet.types import Camera, Gaussians, Side
 
@@ -86,7 +87,7 @@ def check_gates(gates: Tensor, means: Tensor) -> None:
     if gates.device.type == "cpu":
         values = gates.detach()
         inside = (values >= 0) & (values <= 1)
-        _raise_at("gates", values, inside, torch.zeros_like(inside), "must lie in [0, 1]", "sample or clamp them")
+        check_rows("gates", values, inside, "must lie in [0, 1]", "sample or clamp them")
 
 
 def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) -> None:
@@ -101,18 +102,10 @@ def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) 
         field, unread = getattr(gaussians, name).detach(), masked
         if name == "sh" and drawn is not None:
             unread = ~drawn
-        _raise_at(name, field, torch.isfinite(field), unread, "must be finite", "check what computed it")
+        check_finite({name: field}, "check what computed it", unread=unread)
     inside = (opacities >= 0) & (opacities <= 1)
-    _raise_at("opacities", opacities, inside, masked, "must lie in [0, 1]", "apply the sigmoid")
-    _raise_at("scales", scales, scales >= 0, masked, "must be >= 0 meters", "apply the exponential")
-
-
-def _raise_at(name: str, field: Tensor, holds: Tensor, masked: Tensor, invariant: str, remedy: str) -> None:
-    if bool(holds.all()):
-        return
-    index = (~holds & ~masked.reshape(-1, *[1] * (field.dim() - 1))).nonzero()[:1].flatten().tolist()
-    if index:
-        raise ValueError(f"{name} {invariant}, but row {index[0]} has {field[tuple(index)].item()}: {remedy}")
+    check_rows("opacities", opacities, inside, "must lie in [0, 1]", "apply the sigmoid", unread=masked)
+    check_rows("scales", scales, scales >= 0, "must be >= 0 meters", "apply the exponential", unread=masked)
 
 
 def _raise_in_image(name: str, image: Tensor, holds: Tensor, invariant: str) -> None:
