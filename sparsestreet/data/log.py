@@ -16,6 +16,8 @@ from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.types import Frame, SparsePoints, Track, View
 
 _QUANTILES = (0.02, 0.98)
+_FLATTEST = 0.01
+"""Shortest side of the scene's box over its longest one: a log of one height would divide by zero."""
 _MARGIN = 1.1
 _SEEN_AHEAD = 50.0
 """Meters a camera is taken to see where no lidar says so."""
@@ -174,6 +176,18 @@ class DrivingLog:
         low, high = self._bounds
         middle = torch.from_numpy((low + high) / 2)
         return (middle if self.first_axes is None else self.first_axes @ middle).float()
+
+    @property
+    def box_from_world(self) -> Float[Tensor, "3 4"]:
+        """Affine map of the world, meters, that takes the scene's box to [-1, 1] along its own axes.
+
+        A flat box counts as a hundredth as high as it is long.
+        """
+        low, high = self._bounds
+        half = torch.from_numpy(np.maximum(high - low, _FLATTEST * float((high - low).max())) / 2)
+        turned = torch.eye(3, dtype=torch.float64) if self.first_axes is None else self.first_axes.T
+        middle = torch.from_numpy((low + high) / 2)
+        return torch.cat((turned, -middle[:, None]), 1).div(half[:, None]).float()
 
     @property
     def radius(self) -> float:

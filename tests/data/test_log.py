@@ -110,8 +110,20 @@ def test_along_the_first_pose_the_size_is_the_same_wherever_the_street_leads():
         along = replace(log, first_axes=turn)
         assert along.radius == pytest.approx(1.1 * (high[0] - low[0]) / 2, rel=1e-6)
         assert torch.allclose(along.center, (turn @ middle).float(), atol=1e-4)
+        # Its corners are the corners of [-1, 1], each side by its own length.
+        corners = torch.from_numpy(np.stack((low, (*high[:2], 20.0)))) @ turn.T
+        box = along.box_from_world.double()
+        assert torch.allclose(corners @ box[:, :3].T + box[:, 3], torch.tensor([[-1.0], [1.0]]).double(), atol=1e-5)
         # Around 300 m of cameras.
         assert log.radius > 150
+
+
+def test_a_log_of_one_height_has_a_box_all_the_same():
+    flat = torch.tensor([[0.0, 0, 5], [100, 0, 5], [0, 10, 5], [100, 10, 5]]).repeat(50, 1)
+    log = make_log(num_frames=2, num_cameras=1, sweeps=(sweep(flat, torch.ones(200, dtype=torch.bool)),))
+    box = replace(log, first_axes=torch.eye(3, dtype=torch.float64)[[0, 2, 1]]).box_from_world
+    assert box.isfinite().all()
+    assert float(box[1, :3].norm()) == pytest.approx(2 / (0.01 * 100))  # the flat axis counts as 1 m
 
 
 def test_along_the_first_pose_without_lidar():

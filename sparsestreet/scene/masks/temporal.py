@@ -35,6 +35,10 @@ class TemporalMaskSettings:
     initial_logit: float = 1.0
     features: int = 8
     """d of the paper: number of learned features of each Gaussian."""
+    feature_times: int = 1
+    """Times at which a Gaussian has features of its own, spread evenly over the log and interpolated between. 1: one
+    vector f_k for all times, as for the network's t is enough to tell times apart; the number of frames: the paper's
+    f_k^t to the letter."""
     frames: int = 4
     """T of the paper: number of training frames in the loss of a step, in addition to the current one."""
     width: int = 64
@@ -53,10 +57,10 @@ class TemporalMaskSettings:
             raise ValueError(f"a mask's sparsity_weight must be >= 0, got {self.sparsity_weight}")
         if not 0 <= self.threshold < 1:
             raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
-        if min(self.features, self.width) < 1 or min(self.frames, self.octaves) < 0:
+        if min(self.features, self.feature_times, self.width) < 1 or min(self.frames, self.octaves) < 0:
             raise ValueError(
-                "a mask over time needs features and width >= 1, frames and octaves >= 0, got "
-                f"{self.features}, {self.width}, {self.frames} and {self.octaves}"
+                "a mask over time needs features, feature_times and width >= 1, frames and octaves >= 0, got "
+                f"{self.features}, {self.feature_times}, {self.width}, {self.frames} and {self.octaves}"
             )
 
     def build(self, min_gaussians: int, scope: MaskScope) -> "TemporalMask":
@@ -64,7 +68,7 @@ class TemporalMaskSettings:
 
 
 class TemporalMask(Mask):
-    """sigma(MLP(f_k, t, p_k)) > epsilon, with the features f as the column ``mask_features``.
+    """sigma(MLP(f_k^t, t, p_k)) > epsilon, with the features f as the column ``mask_features``.
 
     p is the mean in units of its instance's half size, without gradient; t and p are encoded by sines and cosines. The
     network returns a logit. The paper's formula ends the network with a sigmoid; a second sigmoid after it would keep
@@ -104,17 +108,37 @@ class TemporalMask(Mask):
         self.draws.fill_(number)
 
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
-        """Returns random features of standard deviation 0.01, so that rows in one place can learn different masks."""
+        """Returns random features of standard deviation 0.01, so that rows in one place can learn different masks.
+
+        They start equal at all times.
+        """
         generator = torch.Generator().manual_seed(num_rows)
-        return {FEATURES: 0.01 * torch.randn(num_rows, self.settings.features, generator=generator)}
+        features = 0.01 * torch.randn(num_rows, self.settings.features, generator=generator)
+        return {FEATURES: features.repeat(1, self.settings.feature_times)}
 
     def scores(self, rows: Rows, times: Float[Tensor, "#n t"]) -> Float[Tensor, "n t"]:
         """Returns sigma of every row at its times, float32 under any precision."""
         with torch.autocast(rows.mask_features.device.type, enabled=False):
-            of_row = self.of_row(torch.cat((rows.mask_features, self._encoded(self._places(rows))), dim=1))
+            features = self._features_at(rows.mask_features, times)
+            places = self._encoded(self._places(rows))[:, None].expand(-1, features.shape[1], -1)
+            of_row = self.of_row(torch.cat((features, places), dim=-1))
             of_time = self.of_time(self._encoded(times[..., None]))
-            hidden = torch.relu(self.hidden(torch.relu(of_row[:, None] + of_time)))
+            hidden = torch.relu(self.hidden(torch.relu(of_row + of_time)))
             return torch.sigmoid(self.last(hidden).squeeze(-1))
+
+    def _features_at(
+        self, features: Float[Tensor, "n s"], times: Float[Tensor, "#n t"]
+    ) -> Float[Tensor, "n t d"] | Float[Tensor, "n 1 d"]:
+        """Returns f_k^t, linear between the times at which features stand; one for all times if that is one."""
+        count = self.settings.feature_times
+        stored = features.reshape(len(features), count, self.settings.features)
+        if count == 1:
+            return stored
+        places = times.clamp(0, 1).expand(len(features), -1) * (count - 1)
+        before = places.long().clamp(max=count - 2)
+        share = (places - before)[..., None]
+        lower, upper = (stored.take_along_dim(place[..., None], 1) for place in (before, before + 1))
+        return torch.lerp(lower, upper, share)
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
         scores = self.scores(rows, self.times.new_full((1, 1), time)).squeeze(1)

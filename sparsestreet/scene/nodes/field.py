@@ -55,8 +55,7 @@ class FieldSettings(BackgroundSettings):
         return Field(
             self,
             rows,
-            center=log.center,
-            radius=log.radius,
+            box_from_world=log.box_from_world,
             frame_periods=log.frame_periods,
             seed=generator.initial_seed(),
             mask=mask,
@@ -64,36 +63,38 @@ class FieldSettings(BackgroundSettings):
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Field":
         check_stored(self.network, tensors)
+        if "box_from_world" not in tensors:
+            raise ValueError(
+                "the scene's network was trained in a ball, as until version 0.2.0, and positions are now those of the "
+                "scene's box: train it again"
+            )
         periods = stored_frame_periods(header)
-        return Field(
-            self, rows, center=tensors["center"], radius=header["radius"], frame_periods=periods, seed=header["seed"]
-        )
+        box = tensors["box_from_world"]
+        return Field(self, rows, box_from_world=box, frame_periods=periods, seed=header["seed"])
 
 
 class Field(Node):
     """Canonical rows in the world frame, and the network that moves, turns and scales them."""
 
     settings: FieldSettings
-    center: Tensor
+    box_from_world: Tensor
 
     def __init__(
         self,
         settings: FieldSettings,
         rows: Rows,
         *,
-        center: Float[Tensor, "3"],
-        radius: float,
+        box_from_world: Float[Tensor, "3 4"],
         frame_periods: float,
         seed: int = 0,
         mask: Mask | None = None,
     ) -> None:
-        """``center`` and ``radius``, meters, are the ball of the scene in which the network's positions are linear;
+        """``box_from_world`` maps the box of the scene, in which the network's positions are linear, to [-1, 1];
         ``frame_periods`` are the log's, ``seed`` is the seed of weights and noise."""
         super().__init__(settings, rows, mask)
-        self.radius = radius
         self.frame_periods = frame_periods
         self.seed = seed
-        self.register_buffer("center", center)
+        self.register_buffer("box_from_world", box_from_world)
         self.network = DeformationNetwork(settings.network, seed=seed)
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
@@ -119,7 +120,7 @@ class Field(Node):
         )
 
     def header(self) -> dict[str, Any]:
-        return {"radius": self.radius, "frame_periods": self.frame_periods, "seed": self.seed}
+        return {"frame_periods": self.frame_periods, "seed": self.seed}
 
     def pose_bytes(self) -> int:
         """float32 bytes of the network."""
@@ -135,8 +136,11 @@ class Field(Node):
         return torch.nonzero(distances < sizes + self.settings.reach).squeeze(1)
 
     def _contracted(self, positions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Maps the ball of the scene to [0.25, 0.75] in each direction, and everything beyond it into [0, 1]."""
-        scaled = (positions - self.center) / self.radius
+        """Maps the scene's box into [0.25, 0.75], each side by its own length, and everything beyond into [0, 1].
+
+        As DriveStudio's DeformGS does: a street is long and low, and its height keeps its detail (docs/baselines.md).
+        """
+        scaled = positions @ self.box_from_world[:, :3].T + self.box_from_world[:, 3]
         lengths = scaled.norm(dim=1, keepdim=True).clamp(min=1.0)
         return scaled * (2 - 1 / lengths) / lengths / 4 + 0.5
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -66,3 +66,20 @@ def test_forcing_what_the_data_cannot_support_says_what_is_missing():
     missing = replace(NOT, reason="no image has a stamp", missing="give a clock")
     with pytest.raises(ValueError, match=r"^effects\.stub is on, but no image has a stamp: give a clock, or say auto$"):
         plan_effects({"stub": Stub(found=missing, when="on")}, training_data())
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffByDefault(Stub):
+    found_when_off: ClassVar[bool] = True
+
+    def detect(self, data) -> Finding:
+        return self.found
+
+
+def test_what_is_off_by_default_says_what_the_log_shows_and_stays_off():
+    data, settings = training_data(), OffByDefault(when="off")
+    (decision,) = plan_effects({"stub": settings}, data).decisions(data, rows=1000)
+    assert (decision.on, decision.value, decision.threshold) == (False, 3.0, 1.0)
+    assert decision.reason == "found, not simulated (effects.stub=auto simulates it): it is seen"
+    (decision,) = plan_effects({"stub": replace(settings, found=NOT)}, data).decisions(data, rows=1000)
+    assert (decision.on, decision.reason) == (False, "it is seen")

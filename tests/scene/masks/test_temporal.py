@@ -76,6 +76,30 @@ def test_scores_are_those_of_the_formula_with_one_sigmoid():
     assert float(scores.detach().min()) < 0.4
 
 
+def test_features_of_several_times_are_those_of_the_moment():
+    """Three times, 0, 0.5 and 1; at 0.3 three fifths of the second and two of the first, at 1 the last alone."""
+    mask = mask_of(feature_times=3)
+    rows = random_rows(6, 1, mask=mask)
+    assert rows.mask_features.shape == (6, 9)
+    assert torch.equal(rows.mask_features[:, :3], rows.mask_features[:, 6:])  # equal at first
+    with torch.no_grad():
+        rows.mask_features.copy_(torch.randn(6, 9, generator=torch.Generator().manual_seed(5)))
+    times = torch.tensor([[0.3, 1.0, 0.8]])
+    scores = mask.scores(rows, times)
+    weights = ((0.4, 0.6, 0.0), (0.0, 0.0, 1.0), (0.0, 0.4, 0.6))
+    for row in range(6):
+        place = rows.means[row].detach().double().numpy() / 2
+        stored = rows.mask_features[row].detach().double().numpy().reshape(3, 3)
+        for column, (time, weight) in enumerate(zip((0.3, 1.0, 0.8), weights, strict=True)):
+            expected = by_hand(mask, np.array(weight) @ stored, place, time)
+            # float32 rounds 0.3 by 1e-8 and logits of size 10 by 1e-6.
+            assert scores[row, column].item() == pytest.approx(expected, abs=4e-6)
+    scores[:, 1].sum().backward()
+    assert not rows.mask_features.grad[:, :6].any()
+    with pytest.raises(ValueError, match="feature_times and width >= 1"):
+        replace(SETTINGS, feature_times=0)
+
+
 def test_a_new_mask_shows_everything_at_the_logit_it_is_given():
     mask = SETTINGS.build(0, scope())
     rows = random_rows(30, 1, mask=mask)

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 
+from sparsestreet.geometry import quaternions
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
@@ -16,7 +17,10 @@ from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import RATES, background_settings, camera_at, random_rows, street_log, training_data, view_at
 from tests.typed import as_a, there
 
-CENTER, RADIUS, NUM_FRAMES = torch.tensor([1.0, -2.0, 0.5]), 4.0, 21
+CENTER, HALF, NUM_FRAMES = torch.tensor([1.0, -2.0, 0.5]), torch.tensor([4.0, 2.0, 0.5]), 21
+AXES = quaternions.to_matrix(normalized(torch.tensor([0.9, 0.1, -0.3, 0.2])))
+"""Of the box, as columns in the world."""
+BOX = torch.cat((AXES.T, -(AXES.T @ CENTER)[:, None]), 1) / HALF[:, None]
 NETWORK = NetworkSettings(width=16, depth=3, skip=1, position_octaves=4, time_octaves=3)
 
 
@@ -30,8 +34,7 @@ def street(count: int = 30, *, awake: bool = True, **changes) -> Field:
     node = Field(
         field_settings(**changes),
         random_rows(count, 0),
-        center=CENTER,
-        radius=RADIUS,
+        box_from_world=BOX,
         frame_periods=NUM_FRAMES - 1.0,
         seed=5,
     )
@@ -48,7 +51,7 @@ def state(progress: float, training: bool = False) -> SceneState:
 
 
 def contracted(points: torch.Tensor) -> torch.Tensor:
-    scaled = (points.double() - CENTER) / RADIUS
+    scaled = (points.double() - CENTER) @ AXES.double() / HALF
     length = scaled.norm(dim=1, keepdim=True)
     return torch.where(length <= 1, scaled, (2 - 1 / length) * scaled / length) / 4 + 0.5
 
@@ -67,10 +70,12 @@ def test_all_rows_are_deformed_by_what_the_network_says_of_their_place(reach: fl
     assert (raw.means - stored.means).abs().max() > 0.1
 
 
-def test_the_ball_of_the_scene_is_the_middle_half_and_all_else_lies_around_it():
+def test_the_box_of_the_scene_is_the_middle_half_and_all_else_lies_around_it():
+    """Each side by its own length, so half a meter of height is worth four meters along the street."""
     node = street()
     directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    inside, border, far = (node._contracted(CENTER + r * RADIUS * directions) - 0.5 for r in (0.5, 1.0, 1e6))
+    ellipsoid = directions * HALF @ AXES.T
+    inside, border, far = (node._contracted(CENTER + r * ellipsoid) - 0.5 for r in (0.5, 1.0, 1e6))
     torch.testing.assert_close(inside, 0.125 * directions)
     torch.testing.assert_close(border, 0.25 * directions)
     torch.testing.assert_close(far, 0.5 * directions)
@@ -154,8 +159,8 @@ def test_it_starts_as_the_background_and_knows_its_log():
     still = background_settings(lidar=40, near=20).build(data, torch.Generator().manual_seed(3))
     assert torch.equal(node.rows.means, still.rows.means)
     log = street_log()
-    assert torch.equal(node.center, log.center)
-    assert (node.radius, node.frame_periods) == (log.radius, 4)
+    assert torch.equal(node.box_from_world, log.box_from_world)
+    assert node.frame_periods == 4
     again = settings.build(data, torch.Generator().manual_seed(3))
     assert torch.equal(again.network.first.of_row.weight, node.network.first.of_row.weight)
     assert again.seed == node.seed
@@ -175,7 +180,8 @@ def test_a_scene_file_keeps_it(tmp_path):
     save_scene(tmp_path / "scene.safetensors", stored)
     loaded = load_scene(tmp_path)
     again = as_a(Field, loaded.scene.nodes["street"])
-    assert (again.radius, again.frame_periods, again.seed) == (RADIUS, NUM_FRAMES - 1, 5)
+    assert torch.equal(again.box_from_world, BOX)
+    assert (again.frame_periods, again.seed) == (NUM_FRAMES - 1, 5)
     assert again.settings.network == NETWORK
     for time in (0.0, 0.4, 1.0):
         assert torch.equal(loaded.render(view_at(time, camera_at(-6.0))).rgb,
@@ -187,3 +193,10 @@ def test_a_scene_file_keeps_it(tmp_path):
 def test_a_reach_that_cannot_be():
     with pytest.raises(ValueError, match=r"reach is a distance in meters and must be >= 0, got -1\.0"):
         field_settings(reach=-1.0)
+
+
+def test_a_scene_of_the_time_of_the_ball_says_so():
+    node = street()
+    tensors = {name: values for name, values in node.state_dict().items() if name != "box_from_world"}
+    with pytest.raises(ValueError, match="trained in a ball, .*: train it again"):
+        node.settings.restore(node.rows, tensors, node.header())
