@@ -102,11 +102,16 @@ def _plan(cfg: DictConfig, out: Path | None) -> Iterator[str]:
 
 
 def plan_lines(decisions: Sequence[EffectDecision]) -> Iterator[str]:
-    """A paragraph for each effect: its state, its number beside the threshold, the reason, the predicted cost."""
+    """A paragraph for each effect: its state, its number beside the threshold, the reason, the predicted cost.
+
+    Without a number nothing was measured; what has no cost (it is found and never simulated) has no line of it.
+    """
     for decision in decisions:
-        yield f"\n{decision.name:<14}{'on' if decision.on else 'off':<5}{decision.source:<10}{_number(decision)}"
+        source = "" if decision.source == "measured" and decision.value is None else decision.source
+        yield f"\n{decision.name:<14}{'on' if decision.on else 'off':<5}{source:<10}{_number(decision)}".rstrip()
         yield from textwrap.wrap(decision.reason, WIDTH, initial_indent=" " * 14, subsequent_indent=" " * 14)
-        yield f"{'':<14}{_cost(decision)}"
+        if decision.numbers or decision.ms:
+            yield f"{'':<14}{_cost(decision)}"
 
 
 def _number(decision: EffectDecision) -> str:

@@ -117,6 +117,30 @@ def test_02_an_overflowing_row_is_culled(backend, case):
     assert guards(both, view, settings=settings).alarms == {}
 
 
+@every_backend
+def test_02_a_row_too_far_to_square_is_culled_and_not_drawn_in_another_color(backend):
+    """Beyond 1.8e19 m the length of the direction is infinite in float32, and its harmonics would count as those of no
+    direction. float64 draws it, in a color that depends on where it stands."""
+    view, settings = front_camera(21, 13, 20.0), SplatSettings()
+    far = one_gaussian(
+        means=[[3e18, -2e18, 3e19]], scales=[[4e18] * 3], sh=[[[0.3, 0.1, 0.2], *[[0.5, -0.4, 0.6]] * 3]]
+    )
+    both = Gaussians.concatenate([random_gaussians(10, view), far])
+    alone, together = (
+        render(rows, view, backend, torch.float32, settings) for rows in (random_gaussians(10, view), both)
+    )
+    for name, image in alone.images.items():
+        assert torch.equal(image, together.images[name]), name
+    assert together.radii[-1] == 0
+    assert not any(gradient[-1].any() for gradient in together.gradients.values())
+    assert guards(cast(both, torch.float32), view, settings=settings).alarms == {"overflowed": 1}
+    assert guards(both, view, settings=settings).alarms == {}
+    near = dataclasses.replace(far, means=1e-18 * far.means, scales=1e-18 * far.scales)
+    if backend != "triton":  # float32 alone
+        images = [render(rows, view, backend, torch.float64, settings).images["rgb"] for rows in (far, near)]
+        torch.testing.assert_close(*images, rtol=0, atol=1e-12)
+
+
 @every_precision
 def test_05_zero_quaternion_is_the_identity(backend, dtype):
     view = front_camera(21, 13, 20.0)

@@ -100,7 +100,9 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
         colors = _rounded_to_half(colors)
     reaches = _reaches(opacities.detach(), settings)
     half_boxes = (reaches[:, None] * variances.detach()).sqrt()
-    refusals |= {Reason.VANISHED: determinant < DETERMINANT_MIN, Reason.OVERFLOWED: ~torch.isfinite(determinant)}
+    # The direction of a color is divided by its length, whose square float32 holds up to 1.8e19 m.
+    overflowed = ~torch.isfinite(determinant) | ~torch.isfinite(in_camera.square().sum(-1))
+    refusals |= {Reason.VANISHED: determinant < DETERMINANT_MIN, Reason.OVERFLOWED: overflowed}
     return Splats(means, cholesky, opacities, colors, in_camera[:, 2], reaches, half_boxes, ratio, refusals)
 
 

@@ -22,7 +22,7 @@ class Reason(IntEnum):
     VANISHED = 5
     """Thinner than the dtype can invert, which happens only without blur."""
     OVERFLOWED = 6
-    """Larger on the screen than the dtype can hold."""
+    """Larger on the screen, or farther away, than the dtype can square."""
     FAINT = 7
     """Peak alpha below the cut-off."""
     OUTSIDE = 8

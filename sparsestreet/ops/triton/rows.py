@@ -25,7 +25,7 @@ from sparsestreet.ops.triton.shape import (
 from sparsestreet.ops.triton.shutter import ROLL_LEAST, roll, velocity
 from sparsestreet.ops.triton.tiles import BOX_MARGIN, count_tiles
 from sparsestreet.ops.triton.unscented import unscented, within_fold
-from sparsestreet.ops.triton.vectors import load_row, times
+from sparsestreet.ops.triton.vectors import dot, load_row, times
 from sparsestreet.ops.triton.view import (
     ALPHA_MIN,
     NEAR,
@@ -137,7 +137,7 @@ def project_rows(
     unit, _ = unit_quaternion(q)
     shape, sees = on_screen(view, mean, camera_axes(rotation, unit, size), moved, DISTORTED, ROLLING, COLUMNS)
     variance_x, variance_y, determinant = blurred(view, shape[2], shape[3], shape[5])
-    seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST)
+    seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST) & (dot(mean, mean) <= LARGEST)
     effective = opacity * compensation(shape[5], determinant, ANTIALIAS)
     seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective >= LEAST_OPACITY)
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -31,6 +31,7 @@ class AffineSettings(EffectSettings):
     decay: float = 1e-6
     """Of half the squared numbers of A - I and b: Adam's weight decay of this rate, which is a term of the loss."""
     learning_rates: Rates = field(default_factory=lambda: {"deltas": LearningRate(1e-5)})
+    found_when_off: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -7,7 +7,7 @@ log calls for, by name; one that it does not have is not built and costs nothing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -94,6 +94,8 @@ class EffectSettings(ABC):
 
     when: Literal["auto", "on", "off"] = "auto"
     """auto: the scene has the effect if its log calls for it; on: in any case; off: never, whatever the log says."""
+    found_when_off: ClassVar[bool] = False
+    """Whether the plan says what the log shows also where the effect is off: for those that are off by default."""
     learning_rates: Rates = field(default_factory=dict)
     """Parameter or module of the effect -> its rate, or the fields of one; the longest name that matches wins."""
 
@@ -106,7 +108,7 @@ class EffectSettings(ABC):
     def detect(self, data: TrainingData) -> Finding:
         """Whether the log calls for the effect: from its files, its training views and their sweeps, in seconds.
 
-        Not asked where ``when`` is off.
+        Not asked where ``when`` is off, unless ``found_when_off``.
         """
 
     def cost(self, data: TrainingData) -> Cost:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ class MotionBlurSettings(EffectSettings):
     """Called for where what stands still moves far enough during the declared exposure. Nothing is learned."""
 
     when: Literal["auto", "on", "off"] = "off"
+    found_when_off: ClassVar[bool] = True
     min_blur: float = 3.0
     """Pixels, of the images as they are read, that a tenth of the static points move during the exposure, or more."""
 
@@ -68,8 +69,7 @@ class MotionBlurSettings(EffectSettings):
 
     def cost(self, data: TrainingData) -> Cost:
         """Each moment beside the first is a frame once more."""
-        found = None if self.when == "off" else self.detect(data).value
-        more = num_moments(found or 0.0) - 1
+        more = num_moments(self.detect(data).value or 0.0) - 1
         return Cost(ns_per_row=more * _NS_PER_ROW, ns_per_pixel=more * _NS_PER_PIXEL)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "MotionBlur":

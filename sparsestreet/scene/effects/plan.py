@@ -22,6 +22,12 @@ class PlannedEffect:
         """Whether the log calls for it, and something is missing for a scene to have it."""
         return self.finding.called_for and not self.on
 
+    def _reason(self) -> str:
+        if not self.only_found:
+            return self.finding.reason
+        switched = f" (effects.{self.name}=auto simulates it)" if self.settings.when == "off" else ""
+        return f"found, not simulated{switched}: {self.finding.reason}"
+
     def decision(self, data: TrainingData, rows: int) -> EffectDecision:
         """The effect as records have it, for a scene of ``rows`` Gaussians."""
         finding, cost = self.finding, self.settings.cost(data)
@@ -29,7 +35,7 @@ class PlannedEffect:
             name=self.name,
             on=self.on,
             source="forced" if self.settings.when != "auto" else "declared" if finding.declared else "measured",
-            reason=f"found, not simulated: {finding.reason}" if self.only_found else finding.reason,
+            reason=self._reason(),
             value=finding.value,
             unit=finding.unit,
             threshold=finding.threshold,
@@ -60,14 +66,16 @@ def plan_effects(effects: Mapping[str, EffectSettings], data: TrainingData) -> E
 
 
 _OFF = Finding(called_for=False, reason="the configuration says so")
-"""What is off is not looked for."""
+"""What is off is not looked for, unless it is off by default."""
 
 
 def _planned(name: str, settings: EffectSettings, data: TrainingData) -> PlannedEffect:
-    finding = _OFF if settings.when == "off" else settings.detect(data)
-    if settings.when == "on" and finding.missing is not None:
+    when = settings.when
+    finding = _OFF if when == "off" and not settings.found_when_off else settings.detect(data)
+    if when == "on" and finding.missing is not None:
         raise ValueError(f"effects.{name} is on, but {finding.reason}: {finding.missing}, or say auto")
-    return PlannedEffect(name, settings, finding, settings.when == "on" or (finding.called_for and not finding.missing))
+    on = when == "on" or (when == "auto" and finding.called_for and not finding.missing)
+    return PlannedEffect(name, settings, finding, on)
 
 
 def _pixels(data: TrainingData) -> int:

@@ -139,8 +139,10 @@ inline Index<V> project(const Camera<T>& camera, const RowValues<V>& row, const 
   s.l21 = -scale * c.xy / (deviation_y * root(c.determinant));
   s.l22 = scale / deviation_y;
   return p.seen && opacity >= T(LEAST_OPACITY) && c.determinant >= T(DETERMINANT_MIN) &&
-         c.determinant <= std::numeric_limits<T>::max() && opacity >= camera.alpha_min && s.x + box_x >= T(0.5) &&
-         s.x - box_x <= camera.width - T(0.5) && s.y + box_y >= T(0.5) && s.y - box_y <= camera.height - T(0.5);
+         c.determinant <= std::numeric_limits<T>::max() &&
+         dot(p.placement.mean, p.placement.mean) <= std::numeric_limits<T>::max() && opacity >= camera.alpha_min &&
+         s.x + box_x >= T(0.5) && s.x - box_x <= camera.width - T(0.5) && s.y + box_y >= T(0.5) &&
+         s.y - box_y <= camera.height - T(0.5);
 }
 
 }  // namespace SPLAT_VARIANT
