@@ -198,5 +198,5 @@ def test_a_reach_that_cannot_be():
 def test_a_scene_of_the_time_of_the_ball_says_so():
     node = street()
     tensors = {name: values for name, values in node.state_dict().items() if name != "box_from_world"}
-    with pytest.raises(ValueError, match="trained in a ball, .*: train it again"):
+    with pytest.raises(ValueError, match=r"trained in a ball, .*: train it again"):
         node.settings.restore(node.rows, tensors, node.header())
