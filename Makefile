@@ -11,7 +11,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help quick test test-all stress lint style types docs demo bench tables claims figure clean FORCE
+.PHONY: help quick elsewhere test test-all stress lint style types docs demo bench tables claims figure clean FORCE
 
 help: ## this list
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -46,6 +46,10 @@ endef
 
 quick: style ## the loop of daily work, under a minute: style and unit tests without trainings and Triton's interpreter
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'
+
+elsewhere: $(VENV)/.ok ## the fast tests as on another processor, in another time zone, locale and order of hashes
+	ATEN_CPU_CAPABILITY=default PYTHONHASHSEED=7 TZ=Asia/Kolkata LC_ALL=C $(PYTEST) --ignore=tests/cli \
+	  -m 'not slow and not lengthy and not interpreted'
 
 test: style ## what a change must pass: lint and all tests but those marked slow
 	$(call beside_types,$(PYTEST) -m "not slow" --durations=20)
