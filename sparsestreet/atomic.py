@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,16 @@ from pathlib import Path
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SAID = ("os error 28", "os error 27", "os error 122", "iostream error", "unexpected pos", "file write failed")
 """What safetensors (numbers of the system) and torch say, whose errors are none of the system's."""
+
+
+def check_regular(path: Path) -> None:
+    """Raises OSError for a pipe, a socket or a device, by a link too: who opens one may wait for ever.
+
+    What is not there is no matter of this check.
+    """
+    mode = path.stat().st_mode if path.exists() else stat.S_IFREG
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(f"{path} is a pipe, a socket or a device, and no file: put the file itself in its place")
 
 
 @contextmanager

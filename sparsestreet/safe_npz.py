@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.lib import format as npy
 
+from sparsestreet.atomic import check_regular
+
 LARGEST = 1 << 30
 """Bytes of all arrays beyond the size of the file: what is compressed may grow so much."""
 
@@ -28,6 +30,7 @@ def read_npz(path: Path, names: Iterable[str] | None = None) -> dict[str, np.nda
     {'count': array([0, 1, 2])}
     """
     try:
+        check_regular(path)
         with zipfile.ZipFile(path) as archive:
             sizes = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             chosen = list(sizes) if names is None else list(names)

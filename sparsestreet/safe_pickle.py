@@ -19,6 +19,8 @@ from typing import Any, BinaryIO, ClassVar
 import numpy as np
 import torch
 
+from sparsestreet.atomic import check_regular
+
 
 def read_pickled(path: Path) -> Any:
     """Reads dicts, lists, numbers, text and arrays of numbers from a pickle, or from joblib's without compression.
@@ -33,6 +35,7 @@ def read_pickled(path: Path) -> Any:
     ...     read_pickled(path)
     {'means': array([0, 1, 2])}
     """
+    check_regular(path)
     with path.open("rb") as file:
         try:
             return _worked_out(_Reader(file, _KNOWN).load())

@@ -6,6 +6,8 @@ from typing import TypeVar
 
 import yaml
 
+from sparsestreet.atomic import check_regular
+
 Value = TypeVar("Value")
 
 LARGEST = 2_000_000
@@ -27,6 +29,7 @@ def read_yaml(path: Path, parse: Callable[[str], Value]) -> Value:
     ...     read_yaml(path, yaml.safe_load)
     {'remove': ['car_3']}
     """
+    check_regular(path)
     if (size := path.stat().st_size) > LARGEST:
         raise ValueError(f"{path} has {size:,} bytes, more than the {LARGEST:,} that are read: shorten it")
     try:
@@ -38,6 +41,8 @@ def read_yaml(path: Path, parse: Callable[[str], Value]) -> Value:
         raise ValueError(f"{path} is no YAML: it is no text ({error})") from error
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is no YAML: {' '.join(str(error).split())}") from error
+    except ValueError as error:  # a number of more digits than Python reads
+        raise ValueError(f"{path} is no YAML that can be read: {error}") from error
     except RecursionError as error:
         raise ValueError(f"{path} is no YAML that can be read: brackets in brackets without end") from error
     raise ValueError(f"{path} holds aliases (*name), which are not read: write out what they stand for")

@@ -1,8 +1,18 @@
+import contextlib
 import os
+import socket
 
 import pytest
 
-from sparsestreet.atomic import atomic_file, atomic_folder
+from sparsestreet.atomic import atomic_file, atomic_folder, check_regular
+from sparsestreet.data.colmap import binary, text
+from sparsestreet.data.images import check_pixels, image_size, read_image
+from sparsestreet.data.nuscenes.tables import all_rows
+from sparsestreet.data.ply import read_ply
+from sparsestreet.records.strict_json import read_text
+from sparsestreet.safe_npz import read_npz
+from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.safe_yaml import read_yaml
 
 
 def names(folder) -> list[str]:
@@ -96,3 +106,42 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     with pytest.raises(OSError, match="no empty folder"), atomic_folder(tmp_path / "out"):
         pytest.fail("the block must not run")
     assert names(tmp_path / "out") == ["mine"]
+
+
+READERS = {
+    "image": lambda path: read_image(path, (4, 4)),
+    "image size": image_size,
+    "image end": lambda path: check_pixels(path, decode=False),
+    "yaml": lambda path: read_yaml(path, str),
+    "npz": read_npz,
+    "pickle": read_pickled,
+    "ply": read_ply,
+    "record": read_text,
+    "table": all_rows,
+    "colmap": lambda path: [*binary.camera_rows(path)],
+    "colmap text": lambda path: [*text.camera_rows(path)],
+}
+"""Some of those that open files of others."""
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("kind", ["pipe", "device", "socket"])
+def test_nobody_waits_for_a_pipe_or_reads_a_device_without_end(name, kind, tmp_path):
+    path = tmp_path / "000.png"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        with socket.socket(socket.AF_UNIX) as one, contextlib.chdir(tmp_path):
+            one.bind(path.name)
+    with pytest.raises(
+        (OSError, ValueError), match="is a pipe, a socket or a device, and no file: put"
+    ):
+        READERS[name](path)
+
+
+def test_files_folders_links_to_them_and_nothing_at_all_pass(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path)
+    for path in (tmp_path / "link", tmp_path / "nothing", tmp_path):
+        check_regular(path)

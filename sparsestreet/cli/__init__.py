@@ -70,9 +70,9 @@ def _run(command: str, rest: list[str]) -> int:
         # Each command is the function of its name in the module of its name, and imported only when it is called:
         # lightning alone takes seconds to import, and a report needs none of it.
         return getattr(importlib.import_module(f"sparsestreet.cli.{command}"), command)(rest)
-    import difflib
+    from sparsestreet.naming import nearest
 
-    close = difflib.get_close_matches(command, COMMANDS, n=1)
+    close = nearest(command, COMMANDS)
     meant = f"; did you mean {close[0]!r}?" if close else ""
     print(f"sparsestreet: no command {command!r}{meant}\n\n{USAGE}", file=sys.stderr)
     return 2

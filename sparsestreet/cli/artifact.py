@@ -13,6 +13,7 @@ def export_artifact(
     car: tuple[float, ...] | None,
     mount: tuple[float, ...] | None,
     names: tuple[str, ...] | None,
+    parts: tuple[str, ...] = (),
 ) -> None:
     """Write the file and say what is in it. Raises what ``open_scene`` and ``write_artifact`` do."""
     try:
@@ -21,7 +22,7 @@ def export_artifact(
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"a .usdz needs {error.name}: pip install 'sparsestreet[serve]'") from error
     (name,) = named_runs([run])
-    served = open_run(run, name, lambda path: open_scene(path, "cpu"), RigOptions(mount, names))
+    served = open_run(run, name, lambda path: open_scene(path, "cpu", parts), RigOptions(mount, names))
     described = RUN.find(run)
     provenance = Provenance(
         "" if described is None else described.source.commit or "",

@@ -10,6 +10,7 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
 from sparsestreet.cli.compose import check_moved, resolved
+from sparsestreet.cli.named_log import reader_of
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
@@ -46,7 +47,7 @@ def _render_options(cfg: DictConfig) -> RenderOptions:
 def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out. Raises ValueError for a key that has moved."""
     check_moved(cfg)
-    log = instantiate(cfg.data.log, _convert_="all").read()
+    log = reader_of(cfg).read()
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
     return StreetData(log, **cfg.split, seed=cfg.seed, hood=_masked_from(cfg, "hood"), dirt=_masked_from(cfg, "dirt"))
 
@@ -86,7 +87,7 @@ def identity_of(cfg: DictConfig, command: str) -> RunIdentity:
         method=cfg.method.name,
         sparsify=cfg.sparsify.name,
         config=flat_config(resolved(cfg)),
-        data_hash=instantiate(cfg.data.log, _convert_="all").data_hash(),
+        data_hash=reader_of(cfg).data_hash(),
         command=command,
     )
 

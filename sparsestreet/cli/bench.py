@@ -217,16 +217,19 @@ def _edits(options: argparse.Namespace) -> bool:
 
 def _traced(run: Path, quick: bool) -> "tuple[list[View], StreetSettings, Tensor] | None":
     """Held-out views of a run, and how its street can be traced with other actors; None for a recorded drive."""
-    from hydra.utils import instantiate
-
-    from sparsestreet.cli.compose import check_moved, load_run_config
+    from sparsestreet.cli.compose import check_moved
+    from sparsestreet.cli.named_log import reader_of
+    from sparsestreet.cli.targets import open_run_config
     from sparsestreet.data.lazy import spread
     from sparsestreet.data.synthetic import StreetReader
     from sparsestreet.scene.views import FILE_NAME, read_views
 
-    config = load_run_config(run)
-    check_moved(config)
-    reader = instantiate(config.data.log)
+    try:
+        config = open_run_config(run)
+        check_moved(config)
+        reader = reader_of(config)
+    except (OSError, ValueError) as error:
+        raise SystemExit(f"sparsestreet bench: {error}") from error
     if not isinstance(reader, StreetReader):
         return None
     views = read_views(run / FILE_NAME).held_out

@@ -11,13 +11,13 @@ from dataclasses import is_dataclass
 
 from beartype.door import is_bearable
 from beartype.roar import BeartypeException
-from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from sparsestreet.cli.device import device_problem
 from sparsestreet.cli.limits import limit_problem
 from sparsestreet.cli.preset import preset_problem
+from sparsestreet.cli.targets import located
 
 Tree = typing.Any
 
@@ -30,7 +30,10 @@ def config_problem(cfg: DictConfig) -> str | None:
         tree = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         return _in_one_line(error)
-    problem = limit_problem(cfg) or next(_parts_without_keys(tree), None) or type_problem(tree)
+    try:
+        problem = limit_problem(cfg) or next(_parts_without_keys(tree), None) or type_problem(tree)
+    except ValueError as error:  # a class that cannot be imported
+        return str(error)
     return problem or device_problem(cfg.trainer)
 
 
@@ -72,7 +75,7 @@ def _wrong_types(tree: Tree, path: str = "", kind: typing.Any = None) -> Iterato
     """Values that the classes and functions they are handed to do not take; ``kind`` is what the tree shall become."""
     if not isinstance(tree, dict):
         return
-    hints = _hints(tree, kind)
+    hints = _hints(tree, kind, path)
     for name, value in tree.items():
         key = f"{path}.{name}" if path else name
         if isinstance(kind, type) and is_dataclass(kind) and "_target_" not in tree and name not in hints:
@@ -82,12 +85,12 @@ def _wrong_types(tree: Tree, path: str = "", kind: typing.Any = None) -> Iterato
         yield from _wrong_types(value, key, hints.get(name))
 
 
-def _hints(tree: Mapping[str, Tree], kind: typing.Any) -> dict[str, typing.Any]:
+def _hints(tree: Mapping[str, Tree], kind: typing.Any, path: str) -> dict[str, typing.Any]:
     """Key -> annotation of its value, by what ``_target_`` names or by the kind; nothing where neither can be read."""
     if typing.get_origin(kind) is Mapping and "_target_" not in tree:
         item = _from_mapping(typing.get_args(kind)[1])
         return {name: item for name, value in tree.items() if isinstance(value, dict)}
-    found = get_object(tree["_target_"]) if "_target_" in tree else kind
+    found = located(tree["_target_"], f"{path}._target_") if "_target_" in tree else kind
     if not (callable(found) and ("_target_" in tree or is_dataclass(found))):
         return {}
     try:

@@ -1,6 +1,5 @@
 """Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
 
-import difflib
 import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
 from sparsestreet.cli.limits import limit_problem
+from sparsestreet.naming import nearest
 from sparsestreet.safe_yaml import read_yaml
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -233,7 +233,7 @@ def _meant(key: str) -> list[str]:
     known, leaders = _known()
     alike = 0.5 if len(key) >= SHORT else 0.8
     found = [] if "." in key else _by_last_name(key, known)
-    found = found or difflib.get_close_matches(key, known, n=1, cutoff=alike)
+    found = found or nearest(key, known, cutoff=alike)
     return list(dict.fromkeys(leaders.get(one, one) for one in found))
 
 
@@ -242,7 +242,7 @@ def _by_last_name(word: str, known: Sequence[str]) -> list[str]:
     last: dict[str, list[str]] = {}
     for key in known:
         last.setdefault(key.rpartition(".")[2], []).append(key)
-    like = difflib.get_close_matches(word, last, n=1, cutoff=0.6 if len(word) >= SHORT else 1.0)
+    like = nearest(word, last, cutoff=0.6 if len(word) >= SHORT else 1.0)
     found = last[like[0]] if like else []
     return found if len(found) <= FEW_PLACES else []
 
@@ -305,7 +305,10 @@ def load_run_config(run: Path) -> DictConfig:
     cfg = load_config(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
-    _find_log(cfg, run / ".hydra" / "hydra.yaml")
+    try:
+        _find_log(cfg, run / ".hydra" / "hydra.yaml")
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{path} is damaged ({str(error).splitlines()[0]})") from error
     return cfg
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from sparsestreet.naming import one_line
 from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
 from sparsestreet.scene.edits.file import Open
@@ -42,7 +43,7 @@ def log_seconds(views: RecordedViews) -> float:
 
 
 def _notes(edits: Edits) -> list[str]:
-    gone = [name for name, change in edits.changes.items() if change.hidden or change.path is not None]
+    gone = [one_line(name) for name, change in edits.changes.items() if change.hidden or change.path is not None]
     notes = []
     if gone:
         notes.append(
@@ -50,5 +51,5 @@ def _notes(edits: Edits) -> list[str]:
             "there at other times; what never was is a guess, and shadows stay"
         )
     if foreign := [name for name, one in edits.added.items() if one.scene is not None]:
-        notes.append(f"{', '.join(foreign)}: lit as in the scene it comes from, without a shadow here")
+        notes.append(f"{', '.join(map(one_line, foreign))}: lit as in the scene it comes from, without a shadow here")
     return notes

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from hydra.utils import instantiate
 
 from sparsestreet.cli.assemble import data_of, this_command
-from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.device import device_of
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
+from sparsestreet.cli.targets import made, open_run_config
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.records.provenance import this_machine
 from sparsestreet.records.run import RUN, RunDescription
@@ -32,6 +31,8 @@ records/novel.json holds what was found.
 With presets (names of render.preset), the same views are also rendered in these ways, whatever training did: what it
 costs and saves is in records/presets.json, and in the report of the run's sweep.
 
+A run with parts from outside (docs/extending.md) opens with parts=[MODULE], if their code is trusted.
+
 Training measures both by itself where evaluation.novel, ramp and presets ask for it; then so does this command.
 """
 
@@ -45,6 +46,7 @@ class Options:
     novel: tuple[float, ...] | None = None
     ramp: bool | None = None
     presets: tuple[str, ...] | None = None
+    parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self.extra(ExtraMetrics())
@@ -66,13 +68,13 @@ def measure(options: Options) -> None:
     Raises ValueError, OSError or ImportError where something is missing or malformed.
     """
     run = options.run
-    cfg, description = load_run_config(run), RUN.read(run)
+    cfg, description = open_run_config(run, options.parts), RUN.read(run)
     if "evaluation" not in cfg:
         raise ValueError(f"{run} is of an earlier version, its configuration lacks 'evaluation': train it again")
     # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
     torch.set_num_threads(min(description.threads, this_machine().cores))
-    extra = options.extra(instantiate(cfg.evaluation, _convert_="all"))
-    stored = open_scene(run, "cpu")
+    extra = options.extra(made(cfg.evaluation))
+    stored = open_scene(run, "cpu", options.parts)
     summary = evaluate_run(
         stored.scene,
         stored.options,

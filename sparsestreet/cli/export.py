@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.naming import one_line
 
 if TYPE_CHECKING:
     from sparsestreet.scene.storage import StoredScene
@@ -31,6 +32,7 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
              docs/shipping.md says what each keeps
   edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   views      the views.json that holds the cameras (default: the one beside the scene, or in it)
+  parts      [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
 
 of a .ply, .spz, .sog or .compressed.ply:
   time       0 to 1: first to last frame of the log (default: 0)
@@ -81,6 +83,7 @@ class ExportRequest:
     names: tuple[str, ...] | None = None
     sky: bool | None = None
     check: bool | None = None
+    parts: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -111,12 +114,12 @@ def _export(request: ExportRequest) -> None:
     if request.out.suffix == ".usdz":
         from sparsestreet.cli.artifact import export_artifact
 
-        export_artifact(request.scene, request.out, request.car, request.mount, request.names)
+        export_artifact(request.scene, request.out, request.car, request.mount, request.names, request.parts)
         return
     from sparsestreet.cli.edits import with_edits
     from sparsestreet.cli.scene import open_scene, recorded_views
 
-    stored = open_scene(request.scene, "cpu")
+    stored = open_scene(request.scene, "cpu", request.parts)
     if request.kind == ".street":
         return _export_street(request, stored)
     if request.kind in (".html", "") or request.edits is not None:
@@ -157,7 +160,7 @@ def _export_objects(request: ExportRequest, stored: "StoredScene", views: "Recor
     from sparsestreet.export.object_files import POSES, write_objects
 
     names = write_objects(request.out, stored, views.all)
-    print(f"{request.out}: {len(names)} objects and {POSES}: {', '.join(names)}")
+    print(f"{request.out}: {len(names)} objects and {POSES}: {', '.join(map(one_line, names))}")
 
 
 def _export_ply(request: ExportRequest, stored: "StoredScene") -> None:

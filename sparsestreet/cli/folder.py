@@ -16,6 +16,7 @@ from sparsestreet.cli.compose import load_run_config, resolved
 from sparsestreet.cli.resume import has_checkpoint, run_of
 from sparsestreet.records.configuration import Configuration, config_hash, flat_config, only
 from sparsestreet.records.costs import COSTS
+from sparsestreet.records.file import check_links
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.records.strict_json import RecordError
 
@@ -45,10 +46,15 @@ _ALIKE = ("seed", "data.root", "data.log.root")
 
 
 def folder_problem(cfg: DictConfig, out: Path) -> str | None:
-    """One line where ``out`` cannot be written, or holds a run that nobody asked to replace or to go on with."""
+    """One line where ``out`` cannot be written, has links out of it, or holds a run that nobody asked to replace or
+    to go on with."""
     there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
         return f"{out} cannot be written: name another place with out=..."
+    try:
+        check_links(out)
+    except OSError as error:
+        return str(error)
     if _is_resumed(cfg, out) or cfg.get("overwrite") or not holds_run(out):
         return None
     run = _description(out)
@@ -129,7 +135,10 @@ def take_folder(cfg: DictConfig, out: Path, goes_on: bool) -> None:
 
     Hydra would write it before the run is known to be one. What a kill left of files that were being written goes:
     nobody else writes here (``locks.sole_writer``).
+
+    Raises OSError for a link that leads out of the folder.
     """
+    check_links(out)
     for half_written in [path for path in out.rglob(".*.tmp*") if _TEMPORARY.fullmatch(path.name) and path.is_file()]:
         half_written.unlink()
     if not goes_on:
@@ -149,7 +158,7 @@ def leave_folder(out: Path, log: str) -> None:
 
     What another process is at has its lock there.
     """
-    if out.is_dir() and {path.name for path in out.iterdir()} <= {CONFIGURATION, log}:
+    if out.is_dir() and not out.is_symlink() and {path.name for path in out.iterdir()} <= {CONFIGURATION, log}:
         shutil.rmtree(out)
 
 

@@ -4,12 +4,11 @@ import copy
 from collections.abc import Sequence
 from pathlib import Path
 
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.auto import AUTO, with_found_data
 from sparsestreet.cli.compose import composed, override_problem
+from sparsestreet.cli.targets import made
 from sparsestreet.data.reader import LogReader
 
 
@@ -58,9 +57,5 @@ def compose_data(overrides: Sequence[str]) -> DictConfig:
 
 
 def reader_of(cfg: DictConfig) -> LogReader:
-    """Raises what the reader's class raises for its values."""
-    try:
-        return instantiate(cfg.data.log, _convert_="all")
-    except InstantiationException as error:
-        # Hydra's own words name the target; the cause says what to do.
-        raise error.__cause__ or error from None
+    """Raises what the reader's class raises for its values, as ``made`` does."""
+    return made(cfg.data.log)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.naming import one_line
 
 if TYPE_CHECKING:
     from sparsestreet.export.objects import SceneObject
@@ -19,6 +20,7 @@ sparsestreet objects RUN [key=value ...]     the objects of a trained street, th
   scene     a run's folder; the first word without a key
   out       the sheet, a .png (default: pictures/objects.png in the run's folder)
   device    cpu or cuda (default: a GPU if there is one)
+  parts     [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
 """
 
 COLUMNS, TILE_WIDTH = 6, 180
@@ -31,6 +33,7 @@ class ObjectsRequest:
     scene: Path
     out: Path | None = None
     device: str | None = None
+    parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.out is not None and self.out.suffix != ".png":
@@ -46,8 +49,11 @@ def _objects(request: ObjectsRequest) -> None:
     from sparsestreet.cli.edits import log_seconds
     from sparsestreet.cli.scene import folder_of, open_scene, recorded_views
     from sparsestreet.export.objects import scene_objects
+    from sparsestreet.records.file import check_links
 
-    stored = open_scene(request.scene, request.device)
+    if request.out is None:
+        check_links(folder_of(request.scene))
+    stored = open_scene(request.scene, request.device, request.parts)
     folder = folder_of(request.scene)
     views = recorded_views(request.scene)
     found = scene_objects(stored, views.all)
@@ -61,8 +67,8 @@ def _objects(request: ObjectsRequest) -> None:
         start, end = (seconds * time for time in one.span)
         seen = "never" if one.view is None else "frame {} camera {}".format(*one.view.indices)
         print(
-            f"{one.name:24} {one.class_name or '-':12} {one.node:11} {size:>16} {one.gaussians:9,} {start:6.1f} "
-            f"{end:6.1f}  {seen}"
+            f"{one_line(one.name):24} {one_line(one.class_name or '-'):12} {one.node:11} {size:>16} "
+            f"{one.gaussians:9,} {start:6.1f} {end:6.1f}  {seen}"
         )
     out = request.out or folder / "pictures" / "objects.png"
     _write_sheet(stored, found, out)
@@ -76,7 +82,7 @@ def _write_sheet(stored: "StoredScene", found: "list[SceneObject]", out: Path) -
     from sparsestreet.pictures.sheets import Tile, tile_sheet
 
     pictures = [(one.name, portrait(stored, one)) for one in shown(found, len(found), "pictures")]
-    tiles = [Tile(name, picture) for name, picture in pictures if picture is not None]
+    tiles = [Tile(one_line(name), picture) for name, picture in pictures if picture is not None]
     if not tiles:
         raise ValueError("no view shows any of the objects: there is nothing to draw")
     out.parent.mkdir(parents=True, exist_ok=True)

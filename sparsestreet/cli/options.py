@@ -1,6 +1,5 @@
 """``key=value`` words of a command as a frozen dataclass: strict in keys and types, one line where one is wrong."""
 
-import difflib
 import math
 import sys
 import types
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from sparsestreet.cli.process import nobody_reads
+from sparsestreet.naming import nearest, printable
 
 Options = TypeVar("Options")
 
@@ -44,12 +44,12 @@ def run_command(
     try:
         action(parse_options(words, kind, positional))
     except OptionError as error:
-        print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        print(printable(f"sparsestreet {name}: {error}"), file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and nobody_reads():
             raise  # ``main`` ends quietly; a program of ours that broke, such as ffmpeg, is told
-        print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        print(printable(f"sparsestreet {name}: {error}"), file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"sparsestreet {name}: stopped, nothing was written", file=sys.stderr)
@@ -109,7 +109,7 @@ def unknown_key(key: str, known: Iterable[str], about: Callable[[str], str] = la
     ``about`` adds what is to be said of the one that was meant.
     """
     known = list(known)
-    close = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    close = nearest(key, known, cutoff=0.5)
     if close:
         return f"no key {key!r}; did you mean {close[0]!r}?{about(close[0])}"
     return f"no key {key!r}" + (f"; there are {', '.join(known)}" if len(known) <= FEW else "")

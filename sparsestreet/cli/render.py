@@ -34,6 +34,7 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
   edits     edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   device    cpu or cuda (default: a GPU if there is one)
+  parts     [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
 
 the way:
   path      recorded (as the log was driven), shifted (beside it), lane_change (from there to beside it), or a .json:
@@ -83,6 +84,7 @@ class RenderRequest:
     views: Path | None = None
     edits: Path | None = None
     device: str | None = None
+    parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.path not in PATHS and not self.path.endswith(".json"):
@@ -128,7 +130,7 @@ def _render(request: RenderRequest) -> None:
 
     started = time.perf_counter()
     check_destination(request.out)
-    stored = open_scene(request.scene, request.device)
+    stored = open_scene(request.scene, request.device, request.parts)
     views = recorded_views(request.scene, request.views)
     if "seen" in request.layers:
         count_images(stored, shown(views.training, len(views.training), "images looked at"))
@@ -137,7 +139,7 @@ def _render(request: RenderRequest) -> None:
     if log_fps is None:
         log_fps = DEFAULT_FRAME_RATE
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
-    returns = returns_of(folder_of(request.scene), views) if "lidar" in request.layers else None
+    returns = returns_of(folder_of(request.scene), views, request.parts) if "lidar" in request.layers else None
     path, fps, what = _path(request, views, log_fps)
     count = _write(request, stored, _seen_by(request, path), fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"

@@ -1,21 +1,23 @@
 """The lidar of the log that a run was trained on."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from sparsestreet.cli.compose import check_moved, load_run_config
+from sparsestreet.cli.compose import check_moved
 from sparsestreet.cli.named_log import reader_of
+from sparsestreet.cli.targets import open_run_config
 from sparsestreet.export.lidar import LidarReturns
 from sparsestreet.records.run import RUN
 from sparsestreet.scene.views import RecordedViews
 
 
-def returns_of(run: Path, views: RecordedViews) -> LidarReturns:
-    """Returns the sweeps at the times of their frames, in the world of the scene.
+def returns_of(run: Path, views: RecordedViews, parts: Sequence[str] = ()) -> LidarReturns:
+    """Returns the sweeps at the times of their frames, in the world of the scene; ``parts`` as for ``open_scene``.
 
     Raises ValueError in one sentence where the log is not there, is another one, or has no lidar.
     """
     try:
-        config = load_run_config(run)
+        config = open_run_config(run, parts)
         check_moved(config)
         reader = reader_of(config)
         log, data_hash = reader.read(), reader.data_hash()

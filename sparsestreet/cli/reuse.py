@@ -11,11 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.compose import resolved
 from sparsestreet.cli.folder import is_whole, same_run, take_folder
 from sparsestreet.cli.resume import has_checkpoint
+from sparsestreet.cli.targets import targets_of
 from sparsestreet.records.configuration import Configuration, flat_config, only
 from sparsestreet.records.costs import COSTS, update_costs
 from sparsestreet.records.run import RUN, RunDescription
@@ -107,7 +108,8 @@ def _measure(cfg: DictConfig, out: Path) -> None:
     with devices_of_job(cfg.trainer) as devices:
         if isinstance(devices, list):
             torch.cuda.set_device(devices[0])
-        measure(Options(run=out))
+        # Whatever it names is named by the words of this very sweep.
+        measure(Options(run=out, parts=tuple({one for one in targets_of(OmegaConf.to_container(cfg)) if "." in one})))
 
 
 def _copy(source: Path, to: Path, link: Callable[[str, str], object]) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.naming import one_line
 
 USAGE = """\
 sparsestreet serve RUN[,RUN] [key=value ...]     pictures for simulators over gRPC (docs/serving.md)
@@ -25,6 +26,7 @@ sparsestreet serve RUN[,RUN] [key=value ...]     pictures for simulators over gR
   names     [front,left]: of the cameras, in the order of their numbers (default: as the log calls them)
   log_fps   frames a second of a log without a clock (default: 10)
   device    cpu or cuda (default: a GPU if there is one)
+  parts     [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
 """
 
 GRACE = 5
@@ -44,6 +46,7 @@ class ServeRequest:
     names: tuple[str, ...] | None = None
     log_fps: float | None = None
     device: str | None = None
+    parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
@@ -71,13 +74,13 @@ def _serve(request: ServeRequest) -> None:
     options = RigOptions(request.mount, request.names, request.log_fps)
     scenes = Scenes(
         named_runs(request.scene),
-        lambda run: open_scene(run, request.device),
+        lambda run: open_scene(run, request.device, request.parts),
         memory=int(1e9 * request.memory),
         options=options,
     )
     for name in scenes.names:
-        cameras = ", ".join(one.name for one in scenes.rig(name).cameras)
-        print(f"{name}: cameras {cameras}")
+        cameras = ", ".join(one_line(one.name) for one in scenes.rig(name).cameras)
+        print(f"{one_line(name)}: cameras {cameras}")
     scenes.get(scenes.names[0])  # what is wrong with it is said now, and the first request need not wait
     server, port = start(scenes, request.host, request.port, request.workers)
     print(f"serving {len(scenes.names)} scenes at {request.host}:{port}; Ctrl-C ends it", flush=True)

@@ -38,9 +38,10 @@ def train(arguments: list[str]) -> int:
     _started = time.perf_counter()
     if "--help" not in arguments:
         try:
+            parts, arguments = _without_parts(arguments)
             problem = flag_problem(arguments)
             if problem is None:
-                arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments)))
+                arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments), parts))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
                 arguments = as_sweep(arguments)
@@ -58,6 +59,15 @@ def train(arguments: list[str]) -> int:
     with handlers_put_back():
         app()
     return sweep_status()
+
+
+def _without_parts(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """The modules of ``parts=[...]``, and the other arguments. Raises ValueError where no run is opened."""
+    said = [text.partition("=")[2].strip("[]") for text in arguments if text.startswith("parts=")]
+    if said and not any(text.startswith("resume=") for text in arguments):
+        raise ValueError("parts=[...] says which modules of resume=RUN are trusted: training takes your own without it")
+    parts = [part.strip() for words in said for part in words.split(",")]
+    return parts, [text for text in arguments if not text.startswith("parts=")]
 
 
 def _shown(arguments: list[str]) -> list[str]:

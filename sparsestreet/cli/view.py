@@ -18,6 +18,7 @@ sparsestreet view RUN [key=value ...]     a trained street in the browser: fly, 
   fps       pictures a second that it aims at while something moves (default: 15); at rest they have full size
   views     the views.json that holds the cameras (default: the one beside the scene, or in it)
   device    cpu or cuda (default: a GPU if there is one)
+  parts     [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
   host      whom it answers (default: 127.0.0.1, this machine alone); anybody who reaches it can use it
   port      default: 8080, or the next that is free
 """
@@ -35,6 +36,7 @@ class ViewRequest:
     device: str | None = None
     host: str = "127.0.0.1"
     port: int = 8080
+    parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= 60:
@@ -57,7 +59,7 @@ def _view(request: ViewRequest) -> None:
     from sparsestreet.viewing.server import Viewer
     from sparsestreet.viewing.stage import Stage
 
-    stored = open_scene(request.scene, request.device)
+    stored = open_scene(request.scene, request.device, request.parts)
     folder = folder_of(request.scene)
     views = recorded_views(request.scene, request.views)
     file, open_other = request.edits or folder / "edits.yaml", opener(stored)

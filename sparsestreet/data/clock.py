@@ -6,6 +6,7 @@ from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import fault
 from sparsestreet.types import Camera, View
 
@@ -81,6 +82,7 @@ def read_stamps(path: Path, num_frames: int) -> tuple[int, ...]:
     Raises LogError for another number of lines, a line that is no number, or stamps that do not increase.
     """
     try:
+        check_regular(path)
         lines = [line.strip() for line in path.read_text().splitlines() if line.strip()]
     except (OSError, UnicodeDecodeError) as error:
         raise fault(path, f"the file cannot be read ({error})", _REMEDY) from error

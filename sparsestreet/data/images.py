@@ -12,6 +12,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.undistortion import Undistortion
 
@@ -23,6 +24,7 @@ _REMEDY = "write the file again from its source"
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) from the file's header; raises LogError where that cannot be read."""
     try:
+        check_regular(path)
         with Image.open(path) as image:
             return image.size
     except (OSError, Image.DecompressionBombError) as error:
@@ -31,7 +33,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def check_pixels(path: Path, *, decode: bool) -> None:
     """Raises LogError where the file cannot be decoded; without ``decode`` only what looks cut short is tried."""
-    if decode or not _ends_well(path):
+    if decode or not path.is_file() or not _ends_well(path):
         _decode(path, "RGB", None, Image.Resampling.NEAREST)
 
 
@@ -107,6 +109,7 @@ def read_mask(
 
 def _decode(path: Path, mode: str, size: tuple[int, int] | None, resampling: Image.Resampling) -> np.ndarray:
     try:
+        check_regular(path)
         with Image.open(path) as image:
             pixels = image.convert(mode)
         return np.array(pixels if size in (None, pixels.size) else pixels.resize(size, resampling))

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import LogError, fault
 
 _TYPES = {
@@ -34,6 +35,7 @@ def read_ply(path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     No memory is taken that the file's own size does not justify.
     """
     try:
+        check_regular(path)
         with path.open("rb") as file:
             order, count, columns = _header(file, path)
             size = path.stat().st_size - file.tell()

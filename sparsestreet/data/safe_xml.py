@@ -5,6 +5,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import LogError, fault
 
 _CHUNK = 1 << 16
@@ -29,6 +30,7 @@ def elements(path: Path, depth: int, *, largest: int, remedy: str) -> Iterator[E
     Raises LogError for a file that is missing, too large, or no such document.
     """
     try:
+        check_regular(path)
         size = path.stat().st_size
         if size > largest:
             raise fault(path, f"the file has {size} bytes, more than the {largest} that are read", remedy)

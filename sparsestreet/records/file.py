@@ -2,15 +2,42 @@
 
 import csv
 import io
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.records.strict_json import RecordError, read_json, write_atomically, write_json
+
+FOLDERS = (".hydra", "checkpoints", "records", "predictions", "curves", "pictures")
+"""Those in the folder of a run."""
 
 Record = TypeVar("Record")
 Row = TypeVar("Row")
+
+
+def check_links(run: Path) -> None:
+    """Raises OSError, naming it, for a link in a run's folder that leads out of it: nothing is written through one.
+
+    A run may come from anybody. The folder itself may be a link, which its user made.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     Path(folder, "records").symlink_to("/somewhere")
+    ...     check_links(Path(folder))  # doctest: +IGNORE_EXCEPTION_DETAIL
+    Traceback (most recent call last):
+    OSError: records is a link out of the run's folder, to /somewhere: nothing was written, put a copy in its place
+    """
+    inside = os.path.realpath(run)
+    places = [run, *(Path(at) for name in FOLDERS if not (run / name).is_symlink() for at, *_ in os.walk(run / name))]
+    for path in sorted(entry for place in places if place.is_dir() for entry in place.iterdir()):
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(inside):
+            raise OSError(
+                f"{path} is a link out of the run's folder, to {os.path.realpath(path)}: nothing was written, put a "
+                "copy in its place"
+            )
 
 
 @dataclass(frozen=True)
@@ -128,6 +155,7 @@ class CsvFile(RunFile, Generic[Row]):
 
 def csv_lines(path: Path, remedy: str) -> list[list[str]]:
     """Cells of each line. Raises RecordError, naming the file and how to make it, for what is no text."""
+    check_regular(path)
     try:
         # As bytes, because a cell may hold ends of lines.
         return list(csv.reader(io.StringIO(path.read_bytes().decode("utf-8"), newline="")))

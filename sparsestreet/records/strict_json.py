@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
 from pathlib import Path
 
-from sparsestreet.atomic import atomic_file
+from sparsestreet.atomic import atomic_file, check_regular
 
 Json = None | bool | int | float | str | list | dict
 Record = typing.TypeVar("Record")
@@ -61,6 +61,7 @@ def read_json(path: Path, kind: type[Record]) -> Record:
 
 def read_text(path: Path) -> str:
     """The text of a record. Raises RecordError, naming the file, where it is missing or no text."""
+    check_regular(path)
     try:
         return path.read_text(encoding="utf-8")
     except (FileNotFoundError, UnicodeDecodeError) as error:

@@ -5,8 +5,9 @@ the threads of other requests encode. No request ends the server.
 """
 
 import logging
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,8 @@ LARGEST_MESSAGE = 64 * 2**20
 """Bytes: that of AlpaSim's channel to its renderer."""
 MOST_WAITING = 256
 """Requests at the same time; further ones get RESOURCE_EXHAUSTED."""
+WHOLE_MESSAGE = 60.0
+"""Seconds within which the message of a call must have come; a call without one holds a place of all."""
 _MOST_CAMERAS = 64
 """Of a batch."""
 _LONGEST_DETAILS = 1000
@@ -194,11 +197,25 @@ Call = Callable[[Any, grpc.ServicerContext], Any]
 
 
 def _handler(call: Call, request: str, answer: str) -> grpc.RpcMethodHandler:
-    return grpc.unary_unary_rpc_method_handler(
-        partial(_answered, call),
+    # One message a call, as a stream of one: so the wait for it has an end.
+    return grpc.stream_unary_rpc_method_handler(
+        partial(_awaited, call),
         request_deserializer=wire.kind(request).FromString,
         response_serializer=wire.kind(answer).SerializeToString,
     )
+
+
+def _awaited(call: Call, requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
+    """The answer to the one message of a call, which ends where its sender keeps all waiting."""
+    late = threading.Timer(WHOLE_MESSAGE, context.cancel)
+    late.start()
+    try:
+        request = next(requests)
+    except StopIteration:
+        _refuse(context, grpc.StatusCode.INVALID_ARGUMENT, "the call has no message: send one")
+    finally:
+        late.cancel()
+    return _answered(call, request, context)
 
 
 def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:

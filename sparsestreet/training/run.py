@@ -23,6 +23,7 @@ from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.effects import draw_effects
 from sparsestreet.pictures.history import draw_history
 from sparsestreet.ranks import ALONE, Ranks
+from sparsestreet.records.file import check_links
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.result import result_lines
@@ -109,6 +110,7 @@ def train(
         OSError: for files that cannot be written.
         SystemExit: with the status of the signal that ended training, after a checkpoint was written.
     """
+    check_links(out)
     identity, extra = identity or RunIdentity(label=out.name), extra or ExtraMetrics()
     checkpoint = resume if resume is None or resume.is_file() else newest_checkpoint(resume)
     with stages or StageRecorder() as stages:
@@ -236,8 +238,9 @@ def evaluate(
 
     ``ranks``: as in ``evaluate_scene``.
 
-    Raises ValueError for renders that are not finite.
+    Raises ValueError for renders that are not finite, OSError for a link that leads out of ``out``.
     """
+    check_links(out)
     with stage("evaluate"):
         summary = evaluate_scene(
             scene,

@@ -183,7 +183,7 @@ def test_an_evaluation_hands_on_what_it_is_told(log, monkeypatch, tmp_path, caps
     scene, options = object(), object()
     opened, asked, numbers = [], [], []
     cfg = OmegaConf.merge(composed(*WORDS), {})
-    monkeypatch.setattr(evaluate_module, "load_run_config", lambda run: opened.append(run) or cfg)
+    monkeypatch.setattr(evaluate_module, "open_run_config", lambda run, parts: opened.append(run) or cfg)
     stored = SimpleNamespace(scene=scene, options=options)
     monkeypatch.setattr(evaluate_module, "open_scene", lambda *place: opened.append(place) or stored)
     monkeypatch.setattr(torch, "set_num_threads", numbers.append)
@@ -197,7 +197,7 @@ def test_an_evaluation_hands_on_what_it_is_told(log, monkeypatch, tmp_path, caps
     extra = ExtraMetrics(novel=[1.5], presets=("fast", "fine"), timing=Timing(20, 50, 3))
     command = f"sparsestreet evaluate run={tmp_path} novel=1.5 presets=fast,fine"
     assert how == {"device": torch.device("cpu"), "command": command, "extra": extra, "say": print}
-    assert opened == [tmp_path, (tmp_path, "cpu")]
+    assert opened == [tmp_path, (tmp_path, "cpu", ())]
     assert numbers == [min(threads, 6)]
     assert capsys.readouterr().out.splitlines() == [
         "held-out views: PSNR 21.50 dB, vehicles 22.00 dB, SSIM 0.800",

@@ -2,9 +2,12 @@
 
 import math
 import os
+import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli import folder
@@ -14,9 +17,14 @@ from sparsestreet.cli.locks import sole_writer
 from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.sweep import run_job
 from sparsestreet.cli.train import train
+from sparsestreet.data.datamodule import StreetData
+from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.training.run import evaluate
 from tests.evaluation.frames import make_summary
 from tests.typed import there
 
@@ -227,6 +235,29 @@ def test_nothing_of_a_replaced_run_stays_beside_the_new_one(tmp_path):
     assert "out: outputs/${now:" in (out / ".hydra/config.yaml").read_text()  # as it was composed
     assert hydra.hydra.runtime.cwd == "/here"
     assert overrides == ["seed=1"]
+
+
+@pytest.mark.usefixtures("within_hydra")
+@pytest.mark.parametrize("name", ["predictions", ".hydra", "train.log"])
+def test_nothing_is_written_or_removed_through_a_link(name, tmp_path, capsys):
+    """By training, going on and evaluation: a run may come from anybody."""
+    out, victim = a_run(tmp_path / "run", steps=23), tmp_path / "victim"
+    victim.mkdir()
+    (victim / "config.yaml").write_text((out / ".hydra/config.yaml").read_text())
+    (victim / "001_0.png").touch()
+    before = contents(victim)
+    if name == ".hydra":
+        shutil.rmtree(out / name)
+    (out / name).symlink_to(victim)
+    said = f"{out / name} is a link out of the run's folder"
+    assert said in there(folder_problem(composed(["overwrite=true"]), out))
+    with pytest.raises(OSError, match=f"{name} is a link out of the run's folder"):
+        take_folder(composed(["overwrite=true", "seed=1"]), out, goes_on=False)
+    with pytest.raises(OSError, match=f"{name} is a link out of the run's folder"):
+        scene, options, data = Mock(spec=SceneGraph), Mock(spec=RenderOptions), Mock(spec=StreetData)
+        evaluate(scene, options, data, out, device=torch.device("cpu"), command="", extra=ExtraMetrics())
+    assert contents(victim) == before
+    assert (out / "checkpoints/last.ckpt").is_file()
 
 
 @pytest.mark.usefixtures("within_hydra")

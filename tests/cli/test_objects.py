@@ -9,6 +9,7 @@ from PIL import Image
 from sparsestreet.cli.objects import objects
 from sparsestreet.cli.render import render
 from sparsestreet.export.objects import scene_objects
+from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
 from tests.export.street import CAR_ROWS, stored_street, street_views
@@ -32,6 +33,25 @@ def test_objects_are_listed_with_a_sheet_of_pictures(run, capsys):
     sheet = np.asarray(Image.open(run / "pictures" / "objects.png"))
     assert sheet.shape[1] == 2 * 180 + 6 + 20
     assert sheet.std() > 5
+
+
+def test_names_that_a_terminal_would_obey_are_written_out(tmp_path, capsys):
+    """A received scene may call its objects anything."""
+    stored = stored_street()
+    for node in stored.scene.nodes.values():
+        if isinstance(node, Tracked):
+            node.names = tuple(f"\x1b]0;owned\x07\n{name}\u202e" for name in node.names)
+    save_scene(tmp_path / "scene.safetensors", stored)
+    write_views(tmp_path / "views.json", street_views(), [], frame_rate=4.0)
+    assert objects([str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert r"\x1b]0;owned\x07\ncar\u202e" in said
+    assert len(said.splitlines()) == 4  # the heading, two objects, the sheet
+    (tmp_path / "edits.yaml").write_text("remove: ['\\e[2J']\n".replace("'", '"'))
+    assert render([str(tmp_path), str(tmp_path / "a.mp4"), f"edits={tmp_path / 'edits.yaml'}"]) == 1
+    captured = capsys.readouterr()
+    assert "the scene has no object" in captured.err
+    assert not {"\x1b", "\x07", "\u202e"} & {*said, *captured.out, *captured.err}
 
 
 def test_the_view_that_shows_an_object_largest_is_chosen():

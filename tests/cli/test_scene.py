@@ -1,41 +1,20 @@
 """What a command imports before it opens the scene of a run."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from sparsestreet.cli import scene
-from sparsestreet.cli.scene import import_parts, open_scene
+from sparsestreet.cli.scene import open_scene
 from tests.export.street import stored_street
-
-
-@pytest.mark.parametrize(
-    "where",
-    ["node.kite", "node.background.density", "node.background.sources.kites", "node.background.mask", "effects.haze"],
-)
-def test_every_part_from_outside_is_imported(where: str, tmp_path: Path, monkeypatch):
-    """A scene file holds the settings of nodes and effects, and what is set within them."""
-    name = f"outside_{where.rpartition('.')[2]}"
-    (tmp_path / f"{name}.py").write_text("class Settings: ...\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    config = OmegaConf.create({"node": {"background": {"_target_": "sparsestreet.scene.nodes.BackgroundSettings"}}})
-    OmegaConf.update(config, f"{where}._target_", f"{name}.Settings")
-    (tmp_path / ".hydra").mkdir()
-    OmegaConf.save(config, tmp_path / ".hydra" / "config.yaml")
-    import_parts(tmp_path)
-    assert sys.modules.pop(name).Settings
 
 
 @pytest.mark.parametrize("gpu", [False, True])
 @pytest.mark.parametrize("asked", [None, "cpu", "cuda"])
 def test_a_scene_opens_where_it_is_asked_for(tmp_path, monkeypatch, gpu, asked):
-    """Of a run its parts are imported first; a file alone says nothing of them."""
+    """Of a run its configuration is looked at first; a file alone says nothing of them."""
     done: list[object] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
-    monkeypatch.setattr(scene, "import_parts", lambda run: done.append(run))
+    monkeypatch.setattr(scene, "open_run_config", lambda run, parts: done.append((run, *parts)))
     stored = stored_street()
     monkeypatch.setattr(scene, "load_scene", lambda *given: done.append(given) or stored)
     (tmp_path / "run" / ".hydra").mkdir(parents=True)
@@ -44,7 +23,7 @@ def test_a_scene_opens_where_it_is_asked_for(tmp_path, monkeypatch, gpu, asked):
         with pytest.raises(ValueError, match="device=cuda needs a CUDA device and torch sees none: say device=cpu"):
             open_scene(tmp_path / "run", asked)
         return
-    assert open_scene(tmp_path / "run", asked) is stored
+    assert open_scene(tmp_path / "run", asked, ["mine"]) is stored
     assert open_scene(tmp_path / "run" / "scene.safetensors", asked) is stored
     run, file = tmp_path / "run", tmp_path / "run" / "scene.safetensors"
-    assert done == [run, (run, torch.device(device)), (file, torch.device(device))]
+    assert done == [(run, "mine"), (run, torch.device(device)), (file, torch.device(device))]

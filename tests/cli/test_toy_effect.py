@@ -1,12 +1,15 @@
 """An effect from outside the package: it is called for, trained, stored, opened, timed, reported and left out."""
 
 import csv
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
 from sparsestreet import load_scene
+from sparsestreet.cli.evaluate import evaluate
+from sparsestreet.cli.render import render
 from sparsestreet.cli.report import report
 from sparsestreet.cli.train import train
 from sparsestreet.records.costs import COSTS
@@ -63,3 +66,19 @@ def test_it_is_timed_counted_and_reported(toy_run, capsys):
     assert RUN.read(toy_run).config["effects.gain.evenness"] == 0.1
     assert report([str(toy_run)]) == 0
     assert "streetgs+removal" in capsys.readouterr().out
+
+
+def test_commands_open_it_where_its_module_is_trusted(toy_run, tmp_path, capsys):
+    """A run may come from anybody; the user's own command says whose code may run."""
+    run = shutil.copytree(toy_run, tmp_path / "run")
+    commands = [
+        (evaluate, [str(run)], 1),
+        (render, [str(run), str(tmp_path / "still"), "frames=0:1", "device=cpu"], 1),
+        (train, [f"resume={run}", f"hydra.searchpath=[file://{CONF}]"], 2),
+    ]
+    for command, words, status in commands:
+        assert command(words) == status
+        said = "effects.gain._target_ names 'tests.cli.toy.gain.GainSettings', which conf/ does not: say parts=[tests"
+        assert said in capsys.readouterr().err
+    for command, words, _ in commands:
+        assert command([*words, "parts=[tests.cli.toy]"]) == 0

@@ -18,6 +18,11 @@ from sparsestreet.cli.train import train
         (["data=drivestudio"], "data.root has no value"),
         (["schedule.max_steps=abc"], "must be a whole number, 1 or more, got 'abc'"),
         (["resume=/nowhere/at/all"], "there is nothing"),
+        (
+            ["++loss.mine._target_=mypaper.Loss"],
+            "loss.mine._target_: there is no module mypaper; is its folder in PYTHONPATH?",
+        ),
+        (["++loss.mine._target_=tests.cli.toy.Kite"], "loss.mine._target_ names tests.cli.toy.Kite, which cannot be"),
     ],
 )
 def test_a_slip_is_one_line_before_hydra_sees_it(overrides, said, tmp_path, capsys):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.records.file import CsvFile, JsonFile, csv_text
+from sparsestreet.records.file import CsvFile, JsonFile, check_links, csv_text
 from sparsestreet.records.strict_json import RecordError, significant
 
 
@@ -98,3 +98,24 @@ def test_a_malformed_table_names_file_line_and_remedy(tmp_path, text, message):
     PIXELS.path(tmp_path).write_text(text)
     with pytest.raises(RecordError, match=rf"pixels\.csv(,|:) {message}"):
         PIXELS.read(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["records", "predictions/held_out", "records/summary.json", "train.log", "curves/a/b"])
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_out_of_a_run_is_refused(name, there, tmp_path):
+    """Whether or not something is where it leads; what leads to another place of the run is its own matter."""
+    run, other = tmp_path / "run", tmp_path / "run_of_others"
+    (run / name).parent.mkdir(parents=True)
+    if there:
+        other.mkdir()
+    (run / name).symlink_to(other)
+    (tmp_path / "link").symlink_to(run)
+    for folder in (run, tmp_path / "link"):
+        with pytest.raises(OSError, match=rf"{name} is a link out of the run's folder, to {other}: nothing was"):
+            check_links(folder)
+    (run / name).unlink()
+    (run / "checkpoints").mkdir()
+    (run / "checkpoints" / "last.ckpt").symlink_to("before_0.6.ckpt")
+    (run / "checkpoints" / "loop").symlink_to("loop")
+    check_links(tmp_path / "link")
+    check_links(tmp_path / "not_there")

@@ -185,6 +185,24 @@ def test_bytes_that_are_no_message_get_a_status(client):
     assert picture(client, timed_views()[0])
 
 
+def test_a_call_that_never_ends_its_message_gives_its_place_back(tmp_path, monkeypatch):
+    """Four take all workers and all places; one that is closed without a message is told so."""
+    monkeypatch.setattr("sparsestreet.serving.server.WHOLE_MESSAGE", 0.5)
+    monkeypatch.setattr("sparsestreet.serving.server.MOST_WAITING", 4)
+    runs = named_runs([write_run(tmp_path / "street")])
+    server, port = start(Scenes(runs, load_scene, memory=10**9), "127.0.0.1", 0, workers=4)
+    client, end = Client(port), threading.Event()
+    call = client.channel.stream_unary("/nre.grpc.protos.sensorsim.SensorsimService/get_version")
+    held = [call.future((b"" for _ in range(1) if end.wait(60) and False), timeout=60) for _ in range(4)]
+    assert {one.code() for one in held} == {grpc.StatusCode.CANCELLED}
+    assert client.get_version()
+    with pytest.raises(grpc.RpcError, match="the call has no message: send one"):
+        call(iter(()), timeout=60)
+    end.set()
+    client.channel.close()
+    server.stop(None).wait()
+
+
 def test_an_error_of_our_own_is_internal_and_the_server_goes_on(client, monkeypatch, caplog):
     with monkeypatch.context() as patch:
         patch.setattr("sparsestreet.serving.server.view_of", lambda *_: 1 / 0)

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.colmap.lenses import MODELS
 from sparsestreet.data.colmap.rows import CameraRow, ImageRow
 from sparsestreet.data.problems import fault
@@ -74,6 +75,7 @@ class _OpenFile:
 
 
 def camera_rows(path: Path) -> Iterator[CameraRow]:
+    check_regular(path)
     with path.open("rb") as file:
         table = _OpenFile(file, path, path.stat().st_size)
         for _ in range(table.count(_CAMERA.size, "cameras")):
@@ -87,6 +89,7 @@ def camera_rows(path: Path) -> Iterator[CameraRow]:
 
 
 def image_rows(path: Path) -> Iterator[ImageRow]:
+    check_regular(path)
     with path.open("rb") as file:
         table = _OpenFile(file, path, path.stat().st_size)
         for _ in range(table.count(_IMAGE.size + 1 + _COUNT.size, "images")):
@@ -100,6 +103,7 @@ def image_rows(path: Path) -> Iterator[ImageRow]:
 
 def points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions n x 3 in float64 and RGB n x 3 in uint8."""
+    check_regular(path)
     with path.open("rb") as file:
         table = _OpenFile(file, path, path.stat().st_size)
         count = table.count(_POINT.size, "points")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.colmap.lenses import MODELS
 from sparsestreet.data.colmap.rows import CameraRow, ImageRow
 from sparsestreet.data.problems import LogError, fault
@@ -73,6 +74,7 @@ def _entries(path: Path) -> Iterator[tuple[int, str]]:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Lines and their numbers, counted from 1."""
     try:
+        check_regular(path)
         with path.open(encoding="utf-8") as file:
             number = 0
             while line := file.readline(_LONGEST_LINE):

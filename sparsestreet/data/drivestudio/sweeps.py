@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.drivestudio.flavors import NAME_IT
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import read_pose
@@ -40,6 +41,7 @@ def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None =
     """
     check_sweep_size(layout, frame)
     path = layout.sweep(frame)
+    check_regular(path)
     rows = np.fromfile(path, dtype="<f4").reshape(-1, layout.flavor.columns)
     first = layout.flavor.x_column
     points = torch.from_numpy(rows[:, first : first + 3].astype(np.float64))

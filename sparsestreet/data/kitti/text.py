@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import fault
 
 _LARGEST = 1 << 26
@@ -23,6 +24,7 @@ def read_lines(path: Path, largest: int = _LARGEST) -> list[str]:
         if path.stat().st_size > largest:
             message = f"the file has {path.stat().st_size} bytes, more than the {largest} that such a file can have"
             raise fault(path, message, _REMEDY)
+        check_regular(path)
         return [line.strip() for line in path.read_text("utf-8").splitlines()]
     except FileNotFoundError as error:
         raise fault(path, "the file is missing", _REMEDY) from error

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.problems import fault
 
@@ -25,6 +26,7 @@ def read_points(path: Path) -> Float64[Tensor, "n 3"]:
         if size % _ROW or size > _LARGEST:
             message = f"{size} bytes are no whole number of rows of 4 float32, or more than {_LARGEST}"
             raise fault(path, message, _REMEDY)
+        check_regular(path)
         rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
     except OSError as error:
         raise fault(path, f"the file cannot be read ({error})", _REMEDY) from error

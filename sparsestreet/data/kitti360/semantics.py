@@ -8,6 +8,7 @@ from jaxtyping import Bool
 from PIL import Image
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.kitti.contents import check_size
 from sparsestreet.data.problems import fault
 
@@ -20,6 +21,7 @@ def read_semantics(path: Path, recorded_size: tuple[int, int], size: tuple[int, 
     """Kind -> mask at (width, height) ``size``, of the nearest pixels; raises LogError for a broken label image."""
     check_size(path, recorded_size)
     try:
+        check_regular(path)
         with Image.open(path) as image:
             if image.mode not in ("L", "P"):
                 message = f"a label image has one number of 8 bits a pixel, this has the mode {image.mode}"

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.problems import fault
 from sparsestreet.geometry.transforms import transform_points
@@ -38,6 +39,7 @@ def read_sweep(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[
     """
     check_sweep_size(path)
     try:
+        check_regular(path)
         rows = np.fromfile(path, dtype="<f4").reshape(-1, COLUMNS)
     except OSError as error:
         raise fault(path, f"the sweep cannot be read ({error})", _REMEDY) from error

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import LogError, fault
 
 _CHUNK = 1 << 22
@@ -83,6 +84,7 @@ def all_rows(path: Path) -> list[Row]:
     if path.is_file() and path.stat().st_size > _LARGEST_WHOLE:
         raise fault(path, f"the table has {path.stat().st_size} bytes, more than {_LARGEST_WHOLE}", REMEDY)
     try:
+        check_regular(path)
         rows = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         raise _unreadable(path, error) from error
@@ -125,6 +127,7 @@ def _pieces(path: Path) -> Iterator[bytes]:
     """A JSON list of flat objects in pieces that end behind one. Raises LogError if it is none, or is cut short."""
     rest, first = b"", True
     try:
+        check_regular(path)
         with path.open("rb") as file:
             while part := file.read(_CHUNK):
                 if first and not part.lstrip().startswith(b"["):

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.pandaset.frames import read_columns
 from sparsestreet.data.pandaset.layout import OWN_CAR
@@ -152,6 +153,7 @@ def _json(path: Path, parse_float: Callable[[str], Any] = float) -> Any:
     if path.stat().st_size > _LARGEST_JSON:
         raise fault(path, f"it has {path.stat().st_size} bytes, as no file of its kind has", _REMEDY)
     try:
+        check_regular(path)
         return json.loads(path.read_text(), parse_float=parse_float)
     except (OSError, ValueError, RecursionError, ArithmeticError) as error:
         raise fault(path, f"it is no JSON ({type(error).__name__}: {error})"[:300], _REMEDY) from error

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.ply import read_ply
@@ -80,6 +81,7 @@ def _binary(path: Path, columns: tuple[str, ...]) -> np.ndarray:
     if path.stat().st_size % (4 * len(columns)):
         message = f"{path.stat().st_size} bytes are no whole number of rows of {len(columns)} float32"
         raise fault(path, message, f"write rows of {', '.join(columns)}, or name the columns in lidar.columns")
+    check_regular(path)
     return np.fromfile(path, dtype="<f4").reshape(-1, len(columns))
 
 

@@ -1,9 +1,9 @@
 """Edits of a scene as values: what is hidden, goes another way, or is there once more. Its file stays as it is."""
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from sparsestreet.naming import nearest, one_line
 from sparsestreet.scene.edits.nodes import ALWAYS, AddedObject, Change, EditedNode, recorded_frames
 from sparsestreet.scene.edits.paths import AsRecorded, Frame, Held, Moved, Recorded
 from sparsestreet.scene.graph import SceneGraph
@@ -84,9 +84,9 @@ def objects_of(scene: SceneGraph) -> dict[str, Object]:
 def found(objects: Mapping[str, Object], name: str) -> Object:
     """The object of a name. Raises ValueError, with the nearest names, where there is none."""
     if name not in objects:
-        near = difflib.get_close_matches(name, objects, n=3, cutoff=0.3) or list(objects)[:3]
+        near = map(one_line, nearest(name, objects, most=3, cutoff=0.3) or list(objects)[:3])
         said = f"the nearest names are {', '.join(near)}" if objects else "it has no objects that move at all"
-        raise ValueError(f"the scene has no object {name!r}: {said} (sparsestreet objects RUN lists all)")
+        raise ValueError(f"the scene has no object {one_line(name)!r}: {said} (sparsestreet objects RUN lists all)")
     return objects[name]
 
 

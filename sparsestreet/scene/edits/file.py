@@ -1,6 +1,5 @@
 """``edits.yaml``: edits as text, in seconds since the first frame, meters and degrees."""
 
-import difflib
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path as FilePath
@@ -8,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from sparsestreet.naming import nearest, one_line
 from sparsestreet.safe_yaml import read_yaml
 from sparsestreet.scene.edits.edits import REMOVED, Added, Edits
 from sparsestreet.scene.edits.nodes import Change
@@ -165,8 +165,8 @@ def _mapping(value: Any, where: str) -> None:
 def _known(entry: Mapping[str, Any], keys: Any, where: str) -> None:
     for key in entry:
         if key not in keys:
-            near = difflib.get_close_matches(str(key), keys, n=1) or [", ".join(keys)]
-            raise ValueError(f"{where} has no key {key!r}; did you mean {near[0]}?")
+            near = nearest(str(key), keys) or [", ".join(keys)]
+            raise ValueError(f"{where} has no key {one_line(str(key))!r}; did you mean {near[0]}?")
 
 
 def _new(changes: Mapping[str, Change], name: str) -> None:

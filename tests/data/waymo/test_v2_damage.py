@@ -222,3 +222,22 @@ def test_types_names_and_orders_of_genuine_files(components, tmp_path, roots):
         assert np.array_equal(one.read_image(shot), other.read_image(same))
     for frame in (2, 0, 3):
         np.testing.assert_allclose(one.sweeps[frame].read(), other.sweeps[frame].read(), atol=1e-3)
+
+
+@pytest.mark.parametrize("bomb", ["equal rows", "long texts", "long lists"])
+def test_rows_that_few_bytes_code_are_counted_as_memory_holds_them(bomb, tmp_path, monkeypatch):
+    """Dictionaries and runs code any number of equal cells in some bytes; a tenth of the limit shows it as well."""
+    from pyarrow import parquet
+
+    monkeypatch.setattr("sparsestreet.data.waymo.v2.tables._LARGEST_TABLE", 25_600_000)
+    count, size = {"equal rows": (2_000_000, 40), "long texts": (30_000, 10_000), "long lists": (3, 40)}[bomb]
+    cells = pyarrow.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["a" * size])
+    if bomb == "long lists":
+        flat = pyarrow.DictionaryArray.from_arrays(np.zeros(3_000_000, np.int8), ["a" * size])
+        cells = pyarrow.ListArray.from_arrays([0, 1_000_000, 2_000_000, 3_000_000], flat.cast(pyarrow.string()))
+    path = tmp_path / "bomb.parquet"
+    parquet.write_table(pyarrow.table({SEGMENT: cells}), path, store_schema=False)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(LogError, match=r"the columns key\.segment_context_name \.\.\. take \d+ bytes"):
+        Table(path, "CameraImageComponent").rows([SEGMENT], [])
+    assert pyarrow.total_allocated_bytes() < 30_000_000

@@ -104,6 +104,7 @@ def test_other_scenes_are_looked_for_beside_the_file(tmp_path, other):
         ("copy: {a: {right: 2}}", "copy: a: of: is missing"),
         ("{remove: [a], hide: {a: [0, 1]}}", "a is edited twice"),
         ("remove: [a", "is no YAML"),
+        (f"remove: [{'9' * 5000}]", r"is no YAML that can be read: Exceeds the limit"),
     ],
 )
 def test_a_wrong_file_gets_one_sentence_that_names_it(text, said, tmp_path, other):

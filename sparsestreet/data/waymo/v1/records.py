@@ -5,6 +5,7 @@ import mmap
 import struct
 from pathlib import Path
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import Problem, fault
 from sparsestreet.data.waymo.segment import REMEDY
 from sparsestreet.data.waymo.v1.crc32c import masked_crc32c
@@ -22,6 +23,7 @@ class Records:
         """Raises LogError for a file that is no sequence of whole records."""
         self.path = path
         try:
+            check_regular(path)
             with path.open("rb") as file:
                 mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
                 # Fields are far apart: what lies behind one is not read ahead.

@@ -6,6 +6,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.lock import Lock
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.waymo.segment import REMEDY
@@ -15,6 +16,8 @@ SEGMENT, FRAME = "key.segment_context_name", "key.frame_timestamp_micros"
 CAMERA, LASER, OBJECT = "key.camera_name", "key.laser_name", "key.laser_object_id"
 _LARGEST_TABLE = 256_000_000
 """Bytes of small columns that are held at once; those of a segment take a few million."""
+_BYTES_OF_A_ROW, _BYTES_OF_A_CELL = 256, 64
+"""What Python takes for either at least, however few bytes code them: sixty million equal cells fit into 400 kB."""
 _ROWS_AT_ONCE = 4
 _READ_AHEAD = 1 << 20
 """Bytes of a column that are read from the file at a time."""
@@ -40,12 +43,7 @@ class Table:
         wanted = [*keys, *columns]
         names = [self.column(name) for name in wanted]
         self._require(names)
-        size = self._explained(lambda: self._size(names))
-        if size > _LARGEST_TABLE:
-            message = f"the columns {', '.join(names[:3])} ... take {size} bytes, a segment's take a few million"
-            raise fault(self.path, message, REMEDY)
-        table = self._explained(lambda: self._file.read(columns=names, use_threads=False))
-        cells = self._explained(lambda: [table.column(name).to_pylist() for name in names])
+        cells = self._explained(lambda: self._cells(names, *self._sizes(names)))
         return [dict(zip(wanted, row, strict=True)) for row in zip(*cells, strict=True)]
 
     def spooled(
@@ -96,18 +94,39 @@ class Table:
         if missing:
             raise fault(self.path, f"the columns {missing[:4]} are missing", REMEDY)
 
-    def _size(self, names: Sequence[str]) -> int:
-        metadata, size = self._file.metadata, 0
+    def _cells(self, names: Sequence[str], coded: int, decoded: int) -> list[list[Any]]:
+        """The cells of columns, read so few rows at a time that none of the steps takes more than the largest table."""
+        self._check_size(names, decoded)
+        columns: list[list[Any]] = [[] for _ in names]
+        # No cell is larger than the bytes that code all of them.
+        rows = max(1, min(_LARGEST_TABLE // max(coded, 1), 65536))
+        for batch in self._file.iter_batches(rows, columns=names, use_threads=False):
+            decoded += batch.nbytes
+            self._check_size(names, decoded)
+            for cells, name in zip(columns, names, strict=True):
+                cells += batch.column(name).to_pylist()
+        return columns
+
+    def _check_size(self, names: Sequence[str], size: int) -> None:
+        if size > _LARGEST_TABLE:
+            message = f"the columns {', '.join(names[:3])} ... take {size} bytes, a segment's take a few million"
+            raise fault(self.path, message, REMEDY)
+
+    def _sizes(self, names: Sequence[str]) -> tuple[int, int]:
+        """Bytes that code the columns, and the least that they take in memory."""
+        metadata, size, values = self._file.metadata, 0, 0
         for number in range(metadata.num_row_groups):
             group = metadata.row_group(number)
             chunks = [group.column(place) for place in range(group.num_columns)]
             # A list's column is told by its path: NAME.list.element.
-            size += sum(
-                chunk.total_uncompressed_size
+            wanted = [
+                chunk
                 for chunk in chunks
                 if chunk.path_in_schema.removesuffix(".list.element").removesuffix(".list.item") in names
-            )
-        return size
+            ]
+            size += sum(chunk.total_uncompressed_size for chunk in wanted)
+            values += sum(chunk.num_values for chunk in wanted)
+        return size, size + _BYTES_OF_A_ROW * metadata.num_rows + _BYTES_OF_A_CELL * values
 
     def _explained(self, read: Callable[[], Any]) -> Any:
         """What ``read`` returns; errors of Arrow as those of the file."""
@@ -137,6 +156,7 @@ def _opened(path: Path) -> Any:
         message = "tables in parquet files need pyarrow, which is not installed"
         raise fault(path, message, "pip install 'sparsestreet[parquet]'") from error
     try:
+        check_regular(path)
         return pyarrow.parquet.ParquetFile(path, buffer_size=_READ_AHEAD, pre_buffer=False)
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise _unreadable(path, error) from error

@@ -1,0 +1,289 @@
+"""A run's folder may come from anybody: whatever it names, only what conf/ names is made, or what the user trusts."""
+
+import itertools
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from sparsestreet.cli import COMMANDS, targets
+from sparsestreet.cli.bench import bench
+from sparsestreet.cli.compose import CONF, TrainSchema
+from sparsestreet.cli.evaluate import evaluate
+from sparsestreet.cli.export import export
+from sparsestreet.cli.objects import objects
+from sparsestreet.cli.render import render
+from sparsestreet.cli.resume import resumed_overrides
+from sparsestreet.cli.serve import serve
+from sparsestreet.cli.targets import check_received, leaves, made, named_by_conf, open_run_config
+from sparsestreet.cli.train import train
+from sparsestreet.cli.view import view
+from tests.cli.configurations import composed
+
+
+def attacks(mark: str) -> list[dict[str, Any]]:
+    """Callables that leave a file where somebody makes them, of the standard library, others and our own."""
+    touch = ["touch", mark]
+    code = f"open({mark!r}, 'w')"
+    path = {"_target_": "pathlib.Path", "_args_": [mark]}
+    return [
+        {"_target_": "os.system", "command": f"touch {mark}"},
+        {"_target_": "posix.system", "_args_": [f"touch {mark}"]},
+        {"_target_": "os.mkdir", "path": mark},
+        {"_target_": "subprocess.run", "args": touch},
+        {"_target_": "subprocess.Popen", "args": touch},
+        {"_target_": "setuptools._distutils.spawn.spawn", "cmd": touch},
+        {"_target_": "builtins.eval", "_args_": [code]},
+        {
+            "_target_": "code.InteractiveInterpreter.runsource",
+            "_args_": [{"_target_": "code.InteractiveInterpreter"}, code],
+        },
+        {"_target_": "timeit.timeit", "stmt": code, "number": 1},
+        {"_target_": "cProfile.run", "statement": code},
+        {"_target_": "logging.FileHandler", "filename": mark},
+        {"_target_": "logging.config.dictConfig", "config": {"handlers": {"a": {"()": "os.system", "command": mark}}}},
+        {"_target_": "pathlib.Path.write_text", "_args_": [path, "x"]},
+        {"_target_": "functools.partial", "_args_": [{"_target_": "pathlib.Path.touch", "_args_": [path]}]},
+        {"_target_": "builtins.list", "_args_": [[{"_target_": "os.mkdir", "path": mark}]]},
+        {"_target_": "numpy.testing.measure", "code_str": code},
+        {"_target_": "numpy.save", "file": mark, "arr": [1]},
+        {"_target_": "torch.save", "obj": 1, "f": mark},
+        {"_target_": "torch.serialization.load", "f": mark, "weights_only": False},
+        {"_target_": "torch.distributed.run.main", "args": [mark]},
+        {"_target_": "lightning.pytorch.loggers.CSVLogger", "save_dir": mark},
+        {"_target_": "lightning.Trainer", "default_root_dir": mark},
+        {"_target_": "hydra.utils.instantiate", "config": {"_target_": "os.mkdir", "path": mark}},
+        {"_target_": "hydra.utils.get_object", "path": "this"},
+        {"_target_": "omegaconf.OmegaConf.save", "config": {}, "f": mark},
+        {"_target_": "sparsestreet.cli.main", "arguments": ["bench", "--out", mark]},
+        {"_target_": "sparsestreet.records.strict_json.write_json", "path": path, "value": 1},
+        {"_target_": "sparsestreet.cli.sweep.SweepFolder"},
+        {"_target_": "antigravity.geohash", "_args_": [0, 0, mark]},
+    ]
+
+
+WRAPPED: list[Callable[[dict[str, Any]], Any]] = [
+    lambda part: part,
+    lambda part: part | {"_partial_": True},
+    lambda part: [[{"deep": part}]],
+    lambda part: {"_target_": "sparsestreet.evaluation.extra.ExtraMetrics", "novel": [1, part]},
+    lambda part: {**part, "_target_": "${name}"},
+    lambda part: {**part, "_target_": ["os", "system"]},
+    lambda part: "${by_capacity:{small: {_target_: os.mkdir, path: " + "x" + "}}}",
+    lambda part: "${oc.create:'{_target_: os.mkdir}'}",
+    lambda part: "${oc.env:HOME}",
+    lambda part: "${${name}:HOME}",
+]
+PLACES = ("evaluation", "data.log", "data.log.classes", "node.background", "effects.sky", "loss.sky", "anything.else")
+
+
+def run_with(folder: Path, place: str, part: Any) -> Path:
+    config = OmegaConf.create({"name": "os.mkdir", "capacity": "small", "folder": "x", "seed": 0})
+    OmegaConf.update(config, place, OmegaConf.create(part) if isinstance(part, dict | list) else part)
+    (folder / ".hydra").mkdir(parents=True, exist_ok=True)
+    for name in ("scene.safetensors", "views.json"):
+        (folder / name).touch()
+    (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(OmegaConf.to_container(config)))
+    return folder
+
+
+def opened_by(run: Path, out: Path) -> list[Callable[[], int]]:
+    """Every command that opens a run."""
+    return [
+        lambda: evaluate([str(run)]),
+        lambda: render([str(run), str(out / "a.mp4"), "device=cpu"]),
+        lambda: objects([str(run), "device=cpu"]),
+        lambda: export([str(run), str(out / "a.ply")]),
+        lambda: export([str(run), str(out / "a.usdz")]),
+        lambda: view([str(run), "device=cpu", "port=0"]),
+        lambda: serve([str(run), "device=cpu", "port=0"]),
+        lambda: bench(["edits", "--street", str(run), "--quick", "--out", str(out)]),
+    ]
+
+
+def test_nothing_that_a_received_run_names_is_made_by_any_command(tmp_path, monkeypatch, capfd):
+    """Each callable by some command, each command with several; the check comes before anything is made or imported."""
+    for name in ("instantiate", "_locate"):
+        monkeypatch.setattr(targets, name, lambda *given, **_: pytest.fail(f"{given} was made"))
+    monkeypatch.setattr("sparsestreet.scene.storage.load_scene", lambda *given: pytest.fail("it was opened"))
+    monkeypatch.setattr("sparsestreet.serving.scenes.Scenes.rig", lambda *given: SimpleNamespace(cameras=()))
+    mark = tmp_path / "it_ran"
+    cases = itertools.product(attacks(str(mark)), WRAPPED)
+    for number, (part, wrap) in enumerate(cases):
+        run = run_with(tmp_path / "run", PLACES[number % len(PLACES)], wrap(part))
+        commands = opened_by(run, tmp_path)
+        try:
+            status: object = commands[number % len(commands)]()
+        except SystemExit as error:  # of bench
+            status = str(error)
+        said = capfd.readouterr().err + str(status)
+        assert status not in (0, 2), (part, wrap, said)
+        assert f"{run}/.hydra/config.yaml" in said, (part, said)
+        assert said.count("\n") <= 1
+        assert not mark.exists()
+    assert "this" not in sys.modules
+
+
+def test_every_command_is_among_those_that_are_tried():
+    """Those that open no run: they compose, read records, or read a log."""
+    others = {"demo", "jobs", "report", "data", "effects", "presets", "check"}
+    tried = {"evaluate", "render", "objects", "export", "view", "serve", "bench", "train"}
+    assert others | tried == set(COMMANDS)
+
+
+def test_nobody_makes_parts_of_a_configuration_that_was_not_looked_at():
+    """Who reads a run's configuration by ``load_run_config`` compares it; who makes its parts opens it here."""
+    sources = {path.name: path.read_text() for path in Path(targets.__file__).parent.glob("*.py")}
+    reads = {name for name, text in sources.items() if "load_run_config" in text}
+    assert reads == {"compose.py", "targets.py", "branch.py", "folder.py", "resume.py"}
+    makers = r"instantiate\(|_locate\(|get_object\(|located\(|get_class\(|import_module\(|reader_of\(|made\("
+    assert {name for name in reads if re.search(makers, sources[name])} == {"targets.py"}
+
+
+def test_the_closed_list_has_what_conf_names():
+    """Found once more, by the letters; what stands under hydra is no part of a run."""
+    found = {name for path in CONF.rglob("*.yaml") for name in re.findall(r"_target_: ([\w.]+)", path.read_text())}
+    assert found - {"sparsestreet.cli.sweep.SweepFolder"} == set(named_by_conf().targets)
+    assert len(found) > 80
+    assert "sparsestreet.scene.body.SmplFile" in found  # a comment offers it
+    texts = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
+    assert texts.count("_target_") == len(re.findall(r"_target_: [\w.]+", texts))  # none is hidden in a text
+    outside = {name: roots for name, roots in named_by_conf().targets.items() if not name.startswith("sparsestreet.")}
+    assert outside == {
+        "lightning.Trainer": {"trainer"},
+        **{f"lightning.pytorch.loggers.{name}Logger": {"logger"} for name in ("CSV", "TensorBoard", "Wandb")},
+    }
+
+
+@pytest.mark.parametrize("words", [(), ("sparsify=removal", "method=omnire", "trainer=ddp", "logger=wandb")])
+def test_what_conf_composes_is_fine(words, tmp_path):
+    check_received(OmegaConf.to_container(composed(*words)), tmp_path)
+
+
+def test_a_class_that_conf_gains_is_known_at_once(tmp_path, monkeypatch):
+    (tmp_path / "node").mkdir()
+    (tmp_path / "node" / "kite.yaml").write_text("kite: {parts: [{_target_: sparsestreet.scene.Kite}]}\n")
+    monkeypatch.setattr(targets, "CONF", tmp_path)
+    named_by_conf.cache_clear()
+    try:
+        assert named_by_conf().targets == {"sparsestreet.scene.Kite": {"node"}}
+    finally:
+        named_by_conf.cache_clear()
+    assert "node" in TrainSchema.__dataclass_fields__
+
+
+@pytest.mark.parametrize(
+    "where", ["node.kite", "node.background.sources.kites", "node.background.mask", "effects.haze"]
+)
+def test_a_part_from_outside_is_imported_where_the_user_trusts_its_module(where, tmp_path, monkeypatch):
+    name = f"outside_{where.rpartition('.')[2]}"
+    (tmp_path / f"{name}.py").write_text("class Settings: ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    run = run_with(tmp_path / "run", f"{where}._target_", f"{name}.Settings")
+    said = (
+        rf"config\.yaml: {where}\._target_ names '{name}\.Settings', which conf/ does not: say parts=\[{name}\] if its"
+    )
+    for parts in ((), (f"{name}s",), (name[:-1],)):
+        with pytest.raises(ValueError, match=said):
+            open_run_config(run, parts)
+    assert name not in sys.modules
+    open_run_config(run, (name,))
+    assert sys.modules.pop(name).Settings
+    with pytest.raises(ValueError, match=r"parts=\[\.\.\.\] names modules, such as parts=\[mypaper\], got '\.\.'"):
+        open_run_config(run, ("..",))
+
+
+def test_a_part_that_cannot_be_made_is_one_line():
+    part = OmegaConf.create({"log": {"_target_": "sparsestreet.evaluation.extra.ExtraMetrics", "kites": 1}})
+    with pytest.raises(ValueError, match=r"^log cannot be made: .* unexpected keyword argument 'kites'") as told:
+        made(part.log)
+    assert "\n" not in str(told.value)
+
+
+def received(folder: Path, *words: str) -> Path:
+    """A run with a checkpoint, whose words are these."""
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / "last.ckpt").touch()
+    (folder / ".hydra").mkdir()
+    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(words)))
+    (folder / ".hydra" / "config.yaml").write_text("{seed: 0}")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("++node.background.zzz={_target_:numpy.testing.measure,code_str:x}", "names 'numpy.testing.measure', which"),
+        ("++loss.mine=[{_target_:mypaper.Mine}]", r"names 'mypaper.Mine', which conf/ does not: say parts=\[mypaper\]"),
+        ("++evaluation.timing._target_=os.system", "evaluation.timing._target_ names 'os.system'"),
+        ("hydra.searchpath=[pkg://this]", "nothing of Hydra's"),
+        ("hydra/launcher=joblib", "nothing of Hydra's"),
+        ("++hydra.job_logging.handlers.file.class=os.system", "nothing of Hydra's"),
+        ("++node/rigid@hydra.callbacks.x=rigid", "nothing of Hydra's"),
+        ("--config-dir=/tmp", "no flag"),
+        ("-m", "no flag"),
+        ("++folder=/tmp", "no folder"),
+        ("++data.root=${oc.env:HOME}", "data.root is .*asks for what conf/ never asks for: write its value"),
+        ("++seed='${oc.decode:\"1\"}'", "asks for what"),
+        ("++data.log.x='${by_capacity:{small: {_target_: os.system}}}'", "asks for what"),
+        ("logger.save_dir=/tmp/elsewhere", "does not choose where it writes or whom it calls"),
+        ("++logger.project=theirs", "does not choose where it writes or whom it calls"),
+        ("callback.row_ledger.path=/tmp/elsewhere.csv", "does not choose where it writes"),
+        ("callback={row_ledger:{path:/tmp/elsewhere.csv}}", "does not choose where it writes"),
+        ("++trainer.profiler=advanced", "trainer.profiler is 'advanced'"),
+        ("++trainer.callbacks=[{_target_:sparsestreet.training.callbacks.RowLedger}]", "names below callback alone"),
+        ("++callback.row_ledger._args_=[/tmp/x]", "Hydra's _args_"),
+    ],
+)
+def test_words_of_a_received_run_choose_no_code_and_no_place(word, said, tmp_path):
+    run = received(tmp_path / "run", "seed=3", word)
+    with pytest.raises(ValueError, match=said) as told:
+        resumed_overrides([f"resume={run}"])
+    assert str(told.value).startswith(f"{run}/.hydra/overrides.yaml")
+    assert "\n" not in str(told.value)
+
+
+def test_a_file_outside_of_conf_reaches_hydra_no_more_than_a_word(tmp_path):
+    """A group's option may lead out of conf/."""
+    (tmp_path / "evil.yaml").write_text(
+        "# @package hydra.job_logging.handlers.file\nclass: os.system\ncommand: 'touch here'\n"
+    )
+    up = "../" * len(CONF.parts)
+    run = received(tmp_path / "run", f"experiment={up}{tmp_path.relative_to('/')}/evil")
+    with pytest.raises(ValueError, match=r"overrides\.yaml changes hydra\.job_logging"):
+        resumed_overrides([f"resume={run}"])
+
+
+def test_what_the_user_says_now_is_the_users(tmp_path, capsys):
+    part = "++loss.mine={_target_:tests.cli.toy.loss.MeanColor,weight:0.1}"
+    run = received(tmp_path / "run", "seed=3", part, "logger=wandb", "++trainer.accumulate_grad_batches=2")
+    asked = [f"resume={run}"]
+    own = ["seed=3", part, "logger=wandb", "++trainer.accumulate_grad_batches=2", *asked, f"out={run}"]
+    assert resumed_overrides(asked, ["tests.cli.toy"]) == own
+    assert part in resumed_overrides([*asked, part])
+    with pytest.raises(ValueError, match=r"say parts=\[tests\.cli\.toy\.loss\] if its code is trusted"):
+        resumed_overrides(asked, ["tests.cli.toys"])
+
+
+def test_a_folder_of_the_users_own_options_is_named_again(tmp_path, capsys):
+    outside = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
+    run = received(tmp_path / "other", "loss=[photometric,sky,mean_color]")
+    with pytest.raises(ValueError, match=r"loss\.mean_color\._target_ names 'tests\.cli\.toy\.loss\.MeanColor'"):
+        resumed_overrides([f"resume={run}", outside])
+    assert resumed_overrides([f"resume={run}", outside, "logger.save_dir=/tmp/mine"], ["tests.cli.toy"])
+    assert train(["parts=[tests.cli.toy]"]) == 2
+    assert "parts=[...] says which modules of resume=RUN are trusted" in capsys.readouterr().err
+
+
+def test_lists_in_lists_have_their_places():
+    assert [*leaves({"a": [{"_target_": {"b": 1}}, []], "c": {}})] == [
+        (("a", "0", "_target_"), {"b": 1}),
+        (("a", "1"), []),
+        (("c",), {}),
+    ]
