@@ -129,19 +129,42 @@ def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> An
     return DictConfig(gaussians) if node is None else gaussians[node]
 
 
-def by_drive(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
-    """Of conf/sweep: the entry of the drive whose folder is ``data.root``, by the number that is its name."""
+_NO_OTHER = object()
+_SAY_FRAMES = "say data.log.first_frame=N data.log.last_frame=N (0 and -1: all frames)"
+
+
+def by_drive(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: DictConfig) -> Any:
+    """Of conf/sweep: the entry of the drive whose folder is ``data.root``, by the number that is its name.
+
+    Raises ValueError for a folder without an entry, where there is nothing else: it would be read whole, unsaid.
+    """
     name = Path(_root_.data.root).name
-    return values.get(int(name), otherwise) if name.isdigit() else otherwise
+    found = values.get(int(name), otherwise) if name.isdigit() else otherwise
+    if found is _NO_OTHER:
+        raise ValueError(
+            f"this table's windows of frames are those of drives {', '.join(map(str, values))}, by the names of their "
+            f"folders, and none is {name!r}: rename the folder to the drive's number, or {_SAY_FRAMES}"
+        )
+    return found
 
 
-def by_scene(values: Mapping[Any, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
+def by_scene(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: DictConfig) -> Any:
     """Of conf/protocol: the entry of the scene, drive or sequence that is read. Names are compared without underscores,
-    because Hydra reads digits with underscores as a number."""
+    because Hydra reads digits with underscores as a number.
+
+    Raises ValueError for a scene without an entry, and where none is named, if there is nothing else.
+    """
     log = _root_.data.log
-    scene = next((log[key] for key in ("scene", "drive", "sequence") if log.get(key) is not None), None)
+    key = next((key for key in ("scene", "drive", "sequence") if log.get(key) is not None), None)
     named = {str(name).replace("_", ""): value for name, value in values.items()}
-    return named.get(str(scene).replace("_", ""), otherwise)
+    found = otherwise if key is None else named.get(str(log[key]).replace("_", ""), otherwise)
+    if found is _NO_OTHER:
+        what = "none is named (data.log.scene or data.log.drive)" if key is None else f"{log[key]} is none of them"
+        raise ValueError(
+            f"this protocol's windows of frames are those of {', '.join(map(str, values))}, and {what}: name one, or "
+            f"{_SAY_FRAMES}"
+        )
+    return found
 
 
 def dashed(values: Iterable[Any]) -> str:

@@ -41,6 +41,7 @@ class Conversion:
     """Those that an interrupted conversion had left."""
     bytes: int
     losses: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
 
 def partial_folder(folder: Path) -> Path:
@@ -69,9 +70,9 @@ def convert(
     folder = folder.resolve()
     check_free(folder)
     files = checked(list(writer.files(log)))
-    losses = writer.losses(log)
+    losses, doubts = writer.losses(log), writer.doubts(log)
     partial = partial_folder(folder)
-    _take(partial, _description(log, source, writer, losses), files)
+    _take(partial, _description(log, source, writer, losses, doubts), files)
     wanted = [file for file in files if not (partial / file.path).exists()]
     done = len(files) - len(wanted)
     try:
@@ -85,7 +86,7 @@ def convert(
         raise OSError(message + "give the same command to go on") from error
     size = sum((partial / file.path).stat().st_size for file in files)
     os.replace(partial, folder)
-    return Conversion(folder, len(files), len(files) - len(wanted), size, losses)
+    return Conversion(folder, len(files), len(files) - len(wanted), size, losses, doubts)
 
 
 def check_free(folder: Path) -> None:
@@ -108,7 +109,9 @@ def checked(files: Sequence[LogFile]) -> Sequence[LogFile]:
     return files
 
 
-def _description(log: DrivingLog, source: Source, writer: LogWriter, losses: tuple[str, ...]) -> bytes:
+def _description(
+    log: DrivingLog, source: Source, writer: LogWriter, losses: tuple[str, ...], doubts: tuple[str, ...]
+) -> bytes:
     content = {
         "format": FORMAT,
         "version": version("sparsestreet"),
@@ -118,6 +121,7 @@ def _description(log: DrivingLog, source: Source, writer: LogWriter, losses: tup
         "frames": log.num_frames,
         "cameras": log.camera_names or tuple(map(str, range(log.num_cameras))),
         "losses": losses,
+        "doubts": doubts,
     }
     return json.dumps(content, indent=1, default=str).encode() + b"\n"
 

@@ -30,3 +30,7 @@ class LogWriter(ABC):
     @abstractmethod
     def losses(self, log: DrivingLog) -> tuple[str, ...]:
         """What of this log the layout cannot hold, one sentence each, with numbers."""
+
+    def doubts(self, log: DrivingLog) -> tuple[str, ...]:
+        """Return what programs made for the layout will not take as it is written, one sentence each."""
+        return ()

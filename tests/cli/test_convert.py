@@ -28,8 +28,11 @@ def test_the_short_form_finds_the_reader_and_writes_drivestudios_layout(tmp_path
     assert converted(f"from={log}", f"to={out}") == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"data=drivestudio, as {log}/images/000_0.jpg tells"
-    assert "47 of 47 files" in lines[-2]
-    assert lines[-1] == f"{out}: 47 files, 0.0 MB, 3 frames of 2 cameras"
+    place = lines.index(f"{out}: 43 files, 0.0 MB, 3 frames of 2 cameras")
+    assert "43 of 43 files" in lines[place - 1]
+    assert lines[place + 1] == "  lost or changed: images become JPEG of quality 95"
+    assert lines[place + 2].startswith("  doubt: DriveStudio takes sizes of images from datasets/dataset_meta.py")
+    assert (out / "ego_pose/002.txt").is_file()  # as the log, Waymo's flavor
     assert DriveStudioReader(out).check() == []
 
 
@@ -38,15 +41,19 @@ def test_the_part_the_layout_and_its_settings_are_chosen_by_keys(tmp_path, capsy
     part = ["data.log.cameras=[1]", "data.log.last_frame=1", "data.log.width=20"]
     words = ["data=drivestudio", f"data.root={log}", *part, "layout=drivestudio", "layout.jpeg_quality=null"]
     assert converted(*words, f"to={out}") == 0
-    assert {path.name for path in (out / "images").iterdir()} == {"000_0.jpg", "001_0.jpg"}
-    assert (out / "images/000_0.jpg").read_bytes().startswith(b"\x89PNG")
+    assert {path.name for path in (out / "images").iterdir()} == {"000_1.jpg", "001_1.jpg"}
+    assert (out / "images/000_1.jpg").read_bytes().startswith(b"\x89PNG")
     said = json.loads((out / "conversion.json").read_text())
     assert said["source"]["data_hash"] == DriveStudioReader(log, cameras=[1], last_frame=1).data_hash()
     assert said["source"]["reader"]["width"] == 20
     assert not {"root", "cache_mb"} & set(said["source"]["reader"])
-    assert said["settings"] == {"jpeg_quality": None}
-    assert said["losses"] == ["names of cameras are lost (1): 1 become 0"]
-    assert "  lost or changed: names of cameras are lost (1): 1 become 0" in capsys.readouterr().out
+    assert said["settings"] == {"jpeg_quality": None, "flavor": "auto"}
+    (line,) = said["losses"]
+    assert line.endswith("knows in its flavor nuscenes (objects): Vehicle is vehicle.car (1)")
+    printed = capsys.readouterr().out
+    assert f"  lost or changed: {line}\n" in printed
+    assert all(f"  doubt: {doubt}\n" in printed for doubt in said["doubts"])
+    assert said["doubts"][-1].startswith("DriveStudio reads poses of cameras 0 too, which the log lacks")
 
 
 def test_a_street_is_made_and_converted(tmp_path, capsys):
@@ -73,7 +80,7 @@ def test_after_ctrl_c_the_same_command_goes_on(tmp_path, capsys, monkeypatch):
         "remove the folder\n"
     )
     assert converted(*words, "data.log.width=20") == 1
-    assert "differs in source: remove it, or name another place" in capsys.readouterr().err
+    assert "differs in source, doubts: remove it, or name another place" in capsys.readouterr().err
     assert converted(*words, "data.log.cache_mb=9") == 0
     assert "files, 10 of them there already, " in capsys.readouterr().out
     assert not partial.exists()

@@ -1,6 +1,7 @@
 """conf/protocol: scene lists that papers use, with their windows, cameras and splits."""
 
 import copy
+import re
 
 import pytest
 from hydra import compose
@@ -59,6 +60,28 @@ def test_a_name_that_hydra_takes_for_a_number_has_its_window_too():
 
 def test_drives_of_kitti_are_told_by_their_names():
     assert [last for _, last in windows("drivestudio_kitti").values()] == [-1, 200, 200, 200]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["protocol=omnire"], "none is named (data.log.scene or data.log.drive): name one"),
+        (["protocol=omnire", "data.log.scene=123_456"], "and 123456 is none of them: name one, or say"),
+        (["protocol=streetgs", "data.log.scene=7"], "those of 6, 26, 90, 105, 108, 134, 150, 181, and 7 is none"),
+        (["protocol=drivestudio_kitti", "data.log.drive=2011_09_26_drive_0002"], "drive_0002 is none of them"),
+        (
+            ["+sweep=table5_ablation"],
+            "and none is 'x': rename the folder to the drive's number, or say data.log.first",
+        ),
+        (["+sweep=table5_ablation", "data.root=a/39"], "and none is '39': rename the folder"),
+    ],
+)
+def test_a_drive_without_a_window_is_an_error_and_not_read_whole(words, said):
+    words = ["data.root=x", *words]
+    with pytest.raises(ValueError, match=re.escape(said)):
+        str(composed(words).data.log.last_frame)
+    log = composed([*words, "data.log.first_frame=3", "data.log.last_frame=9"]).data.log
+    assert (log.first_frame, log.last_frame) == (3, 9)
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)

@@ -1,14 +1,18 @@
 """Body poses of people in humanpose/smpl.pkl: read, and written."""
 
+import copyreg
+import io
 import pickle
+from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
+from torch._utils import _rebuild_tensor_v2
 
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import world_from_camera
@@ -125,5 +129,31 @@ def set_pose(person: dict[str, Any], frame: int, joints: np.ndarray, camera: int
 
 
 def pickled_people(people: dict[int, dict[str, Any]]) -> bytes:
-    """The file of people by their ids. It holds NumPy arrays; DriveStudio's own files hold torch tensors."""
-    return pickle.dumps(people, protocol=4)
+    """The file of people by their ids, of tensors, as DriveStudio's loaders need them; equal for equal people.
+
+    PyTorch's own pickles of tensors differ from call to call, and NumPy's arrays need the reader's NumPy to be as new.
+    """
+    file = io.BytesIO()
+    pickler = pickle.Pickler(file, protocol=4)
+    pickler.dispatch_table = {**copyreg.dispatch_table, np.ndarray: _as_tensor}
+    pickler.dump(people)
+    return file.getvalue()
+
+
+def _as_tensor(array: np.ndarray) -> tuple[Any, ...]:
+    """How ``torch.load`` of any version makes the tensor with an array's numbers."""
+    kept, tensor = io.BytesIO(), torch.from_numpy(array).clone()
+    torch.save(tensor._typed_storage(), kept)
+    storage = _Storage(kept.getvalue())
+    arguments = (storage, 0, tuple(tensor.shape), tensor.stride(), False, OrderedDict())
+    return _rebuild_tensor_v2, arguments
+
+
+@dataclass(frozen=True)
+class _Storage:
+    """The numbers of a tensor, which are pickled as PyTorch pickles them."""
+
+    content: bytes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return torch.storage._load_from_bytes, (self.content,)

@@ -120,7 +120,12 @@ class DriveStudioReader(LogReader):
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
             carried_without=folder.holding_out,
-            notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
+            notes=(
+                *_notes(layout),
+                *self._without_effect(layout),
+                *(camera.note for camera in rig if camera.note is not None),
+                *people,
+            ),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
             vehicle=VehiclePath(recentered(read_vehicle(layout), origin)) if layout.flavor.mounted else None,
         )
@@ -128,6 +133,13 @@ class DriveStudioReader(LogReader):
     def files(self) -> LogFiles:
         """Those of the chosen frames and cameras, of every kind that the folder has."""
         return hashed_files(self._layout())
+
+    def _without_effect(self, layout: Layout) -> list[str]:
+        """Options that were asked for, and change nothing of this folder."""
+        if self.lidar_ahead is None or (layout.has_lidar and layout.flavor.name == "waymo"):
+            return []
+        why = f"returns of the flavor {layout.flavor.name} are not cut" if layout.has_lidar else "no lidar is read"
+        return [f"lidar_ahead={list(self.lidar_ahead)} has no effect: {why}"]
 
     def _layout(self) -> Layout:
         return find_layout(

@@ -3,71 +3,95 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.drivestudio.annotations import frame_instances, instances_info, people
-from sparsestreet.data.drivestudio.flavors import FLAVORS
+from sparsestreet.data.drivestudio.annotations import frame_instances, instances_info, people, written_tracks
 from sparsestreet.data.drivestudio.layout import EGO_MASKS, FINE_MASKS, SKY_MASKS, Layout
-from sparsestreet.data.drivestudio.losses import losses_of
+from sparsestreet.data.drivestudio.losses import losses_of, unread_by_drivestudio
+from sparsestreet.data.drivestudio.placement import CAMERAS, Placement, WrittenFlavor, placed
+from sparsestreet.data.drivestudio.poses import WAYMO_FROM_OPENCV
 from sparsestreet.data.encoded import jpeg, mask_png, number_lines, png
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.mask_kinds import find_masks
 from sparsestreet.data.stamps import frame_stamps, seconds_lines
 from sparsestreet.data.writer import LogFile, LogWriter
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import View
+
+_FLOW_CLASS = 9
+"""Column of a row of Waymo's."""
 
 
 @dataclass(frozen=True)
 class DriveStudioWriter(LogWriter):
-    """The nuScenes flavor, which has a pose for each image, with ``timestamps_C.txt`` of cameras with own instants.
+    """What DriveStudio's own loaders and ours read: its flavor of Waymo, or that of nuScenes.
 
-    Poses are as the log has them, float32 around its origin. Points are in a frame with the world's axes at the first
-    camera of their instant, because a log does not know where its lidars are.
+    Waymo's has rigid cameras on a vehicle. nuScenes' has a pose for each image, and ``timestamps_C.txt`` of cameras
+    with own instants. Poses are as the log has them, float32 around its origin.
     """
 
     jpeg_quality: int | None = 95
     """1 to 100, at full resolution of color. None: PNGs, under the names in .jpg that the layout has; whoever opens
     images by their content reads them."""
+    flavor: WrittenFlavor = "auto"
+    """"auto": waymo for Waymo's logs (``placement.placed``), nuscenes for others."""
 
     def __post_init__(self) -> None:
         if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality lies in 1 to 100, got {self.jpeg_quality}: say 95, or null for PNGs")
+        if self.flavor not in get_args(WrittenFlavor):
+            raise ValueError(f"flavor must be one of {', '.join(get_args(WrittenFlavor))}, got {self.flavor!r}")
 
     def files(self, log: DrivingLog) -> Iterator[LogFile]:
         check_cameras(log)
-        layout = _layout(log)
-        for camera in layout.cameras:
-            yield _file(layout.intrinsics(camera), _intrinsics, log, camera)
-        yield from _clock(log, layout)
-        if log.tracks:
-            yield _file(layout.instances, instances_info, log)
-            yield _file(layout.frame_instances, frame_instances, log)
+        where = placed(log, self.flavor)
+        layout = _layout(log, where)
+        for index, camera in enumerate(where.cameras):
+            yield _file(layout.intrinsics(camera), _intrinsics, log, index)
+        yield from _clock(log, layout, where)
+        if written_tracks(log, where.flavor.name):
+            yield _file(layout.instances, instances_info, log, where.flavor.name)
+            yield _file(layout.frame_instances, frame_instances, log, where.flavor.name)
         if layout.has_bodies:
-            yield _file(layout.bodies, people, log)
-        for camera, frame in find_masks(log.frames).ego.items():
+            yield _file(layout.bodies, people, log, where)
+        for index, frame in find_masks(log.frames).ego.items():
             assert frame.ego is not None  # as find_masks says
-            yield _file(Path(EGO_MASKS, f"{camera}.png"), mask_png, frame.ego.numpy())
+            yield _file(Path(EGO_MASKS, f"{where.cameras[index]}.png"), mask_png, frame.ego.numpy())
+        yield from _poses(log, layout, where)
         for place, view in enumerate(log.views):
-            frame, camera = view.indices
-            yield _file(layout.extrinsics(frame, camera), _pose, world_from_camera(log, view))
+            frame, index = view.indices
+            camera = where.cameras[index]
             yield _file(layout.image(frame, camera), self._image, log, place)
-            yield from _masks(log, place)
-            if layout.has_lidar and camera == layout.cameras[-1]:  # its points are in memory for the depth of images
-                yield _file(layout.sweep_pose(frame), _pose, _dataset_from_lidar(log, frame))
-                yield _file(layout.sweep(frame), _points, log, frame)
+            yield from _masks(log, place, camera)
+            if layout.has_lidar and index == log.num_cameras - 1:  # its points are in memory for the depth of images
+                yield _file(layout.sweep(frame), _points, log, where, frame)
 
     def losses(self, log: DrivingLog) -> tuple[str, ...]:
-        return losses_of(log)
+        pixels = () if self.jpeg_quality is None else (f"images become JPEG of quality {self.jpeg_quality}",)
+        return (*losses_of(log, placed(log, self.flavor)), *pixels)
+
+    def doubts(self, log: DrivingLog) -> tuple[str, ...]:
+        where = placed(log, self.flavor)
+        return unread_by_drivestudio(log, where, stand_ins(log, where))
 
     def _image(self, log: DrivingLog, place: int) -> bytes:
         pixels = log.frames[place].image.numpy()
         return png(pixels) if self.jpeg_quality is None else jpeg(pixels, self.jpeg_quality)
+
+
+def stand_ins(log: DrivingLog, where: Placement) -> tuple[int, ...]:
+    """Cameras that the log lacks, and whose poses DriveStudio's loaders read nonetheless.
+
+    Where there are bodies they read those of all cameras of their data set, and of nuScenes those of camera 0 always.
+    """
+    bodies = any(track.body is not None for track in written_tracks(log, where.flavor.name))
+    read = range(len(CAMERAS[where.flavor.name])) if bodies else range(where.mounts is None)
+    return tuple(camera for camera in read if camera not in where.cameras)
 
 
 def check_cameras(log: DrivingLog) -> None:
@@ -92,23 +116,33 @@ def check_cameras(log: DrivingLog) -> None:
             )
 
 
-def world_from_camera(log: DrivingLog, view: View) -> Float64[Tensor, "4 4"]:
-    """Pose of a view in the data set's own world."""
-    return log.dataset_from_world @ inverse(view.camera.camera_from_world.double())
-
-
-def _layout(log: DrivingLog) -> Layout:
+def _layout(log: DrivingLog, where: Placement) -> Layout:
     """The layout's own names, below no folder."""
     return Layout(
         root=Path(),
-        flavor=FLAVORS["nuscenes"],
+        flavor=where.flavor,
         frames=range(log.num_frames),
-        cameras=tuple(range(log.num_cameras)),
-        front=0,
+        cameras=where.cameras,
+        front=min(where.cameras),
         num_frames_on_disk=log.num_frames,
         has_lidar=len(log.sweeps) > 0,
-        has_bodies=any(track.body is not None for track in log.tracks),
+        has_bodies=any(track.body is not None for track in written_tracks(log, where.flavor.name)),
     )
+
+
+def _poses(log: DrivingLog, layout: Layout, where: Placement) -> Iterator[LogFile]:
+    """Of cameras, those that the log lacks as its first one, and of vehicle or lidar."""
+    numbers = [*enumerate(where.cameras), *((0, camera) for camera in stand_ins(log, where))]
+    if where.mounts is not None:
+        for index, camera in numbers:
+            yield _file(layout.extrinsics(0, camera), _pose, where.mounts[index] @ inverse(WAYMO_FROM_OPENCV))
+    else:
+        place = {view.indices: place for place, view in enumerate(log.views)}
+        for frame in range(log.num_frames):
+            for index, camera in numbers:
+                yield _file(layout.extrinsics(frame, camera), _pose, where.world_from_camera[place[frame, index]])
+    for frame in range(log.num_frames if layout.has_lidar or where.mounts is not None else 0):
+        yield _file(layout.sweep_pose(frame), _pose, where.world_from_sweep[frame])
 
 
 def _file(path: Path, make: Callable[..., bytes], *arguments: Any) -> LogFile:
@@ -130,21 +164,21 @@ def _pose(pose: Float64[Tensor, "4 4"]) -> bytes:
     return number_lines(pose.numpy())
 
 
-def _clock(log: DrivingLog, layout: Layout) -> Iterator[LogFile]:
+def _clock(log: DrivingLog, layout: Layout, where: Placement) -> Iterator[LogFile]:
+    """Stamps of frames, and of images where they have poses of their own."""
     stamps = frame_stamps(log)
     if stamps is None:
         return
     yield _file(layout.timestamps, seconds_lines, stamps)
-    for camera in layout.cameras:
-        own = [view.stamp for view in log.views if view.camera_index == camera and view.stamp is not None]
+    for index, camera in enumerate(where.cameras if where.mounts is None else ()):
+        own = [view.stamp for view in log.views if view.camera_index == index and view.stamp is not None]
         if own != list(stamps):
             yield _file(layout.image_timestamps(camera), seconds_lines, own)
 
 
-def _masks(log: DrivingLog, place: int) -> Iterator[LogFile]:
+def _masks(log: DrivingLog, place: int, camera: int) -> Iterator[LogFile]:
     kinds = find_masks(log.frames).everywhere
-    frame, camera = log.views[place].indices
-    name = f"{frame:03d}_{camera}.png"
+    name = f"{log.views[place].indices[0]:03d}_{camera}.png"
     moving = [kind for kind in kinds if kind != "sky"]
     if "sky" in kinds:
         yield _file(Path(SKY_MASKS, name), _mask, log, place, ["sky"])
@@ -160,21 +194,17 @@ def _mask(log: DrivingLog, place: int, kinds: list[str]) -> bytes:
     return mask_png(torch.stack([getattr(frame, kind) for kind in kinds]).any(0).numpy())
 
 
-def _dataset_from_lidar(log: DrivingLog, frame: int) -> Float64[Tensor, "4 4"]:
-    world_from_lidar = torch.eye(4, dtype=torch.float64)
-    world_from_lidar[:3, 3] = _first_position(log, frame)
-    return log.dataset_from_world @ world_from_lidar
+def _points(log: DrivingLog, where: Placement, frame: int) -> bytes:
+    """Rows of the flavor. What a log does not have is 0, and the class of flow -1, none.
 
-
-def _first_position(log: DrivingLog, frame: int) -> Float64[Tensor, "3"]:
-    first = next(view for view in log.views if view.frame_index == frame)
-    return inverse(first.camera.camera_from_world.double())[:3, 3]
-
-
-def _points(log: DrivingLog, frame: int) -> bytes:
-    """Rows of x, y, z and an intensity, which a log does not have."""
-    rows = np.zeros((0, 4), np.float32)
+    All rays of Waymo's flavor start at the first camera, and are those of the lidar TOP, which alone DriveStudio reads.
+    """
+    rows = np.zeros((0, where.flavor.columns), np.float32)
     for sweep in log.sweeps.where(lambda index: index == frame).gray():
-        rows = np.zeros((len(sweep.points), 4), np.float32)
-        rows[:, :3] = (sweep.points.double() - _first_position(log, frame)).numpy()
+        rows = np.zeros((len(sweep.points), where.flavor.columns), np.float32)
+        sweep_from_world = inverse(where.world_from_sweep[frame]) @ log.dataset_from_world
+        first = where.flavor.x_column
+        rows[:, first : first + 3] = transform_points(sweep_from_world, sweep.points.double()).numpy()
+        if where.mounts is not None:
+            rows[:, :3], rows[:, _FLOW_CLASS] = where.mounts[0, :3, 3].numpy(), -1
     return rows.astype("<f4").tobytes()

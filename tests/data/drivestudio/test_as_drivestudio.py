@@ -110,7 +110,13 @@ def test_returns_ahead_of_the_vehicle(tmp_path):
         assert torch.equal(sweep.points, everything.points[kept])
     # nuScenes' points lie in the frame of the sensor.
     flavor = make_nuscenes(tmp_path / "nuscenes")
-    assert len(DriveStudioReader(flavor, lidar_ahead=(1.0, 8.0)).read().sweeps[1].points) == len(POINTS_IN_WORLD)
+    log = DriveStudioReader(flavor, lidar_ahead=(1.0, 8.0)).read()
+    assert len(log.sweeps[1].points) == len(POINTS_IN_WORLD)
+    assert "lidar_ahead=[1.0, 8.0] has no effect: returns of the flavor nuscenes are not cut" in log.notes
+    without = DriveStudioReader(root, lidar_ahead=(1.0, 8.0), lidar=False).read()
+    assert "lidar_ahead=[1.0, 8.0] has no effect: no lidar is read" in without.notes
+    for quiet in (DriveStudioReader(root, lidar_ahead=(1.0, 8.0)), DriveStudioReader(flavor)):
+        assert "lidar_ahead" not in " ".join(quiet.read().notes)
 
 
 def test_the_axes_of_the_first_pose(tmp_path):

@@ -14,11 +14,12 @@ from PIL import Image
 from sparsestreet.cli.compose import CONF
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
-from sparsestreet.data.drivestudio.classes import CLASS_NAMES
+from sparsestreet.data.drivestudio.classes import KNOWN, class_in
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from sparsestreet.types import Frame, Shutter, SparsePoints
+from tests.conftest import unchecked
 from tests.data.drivestudio.folders import (
     FIRST_STAMP,
     STEP,
@@ -54,7 +55,8 @@ def everything(tmp_path) -> DrivingLog:
     write_image(root / "ego_masks/0.png", hood)
     write_stamps(root, [FIRST_STAMP + frame * STEP + 20_000_000 for frame in range(4)], "timestamps_1.txt")
     write_people(root, {0: person()})
-    return DriveStudioReader(root).read()
+    log = DriveStudioReader(root).read()
+    return replace(log, tracks=(replace(log.tracks[0], class_name="vehicle.truck"),))
 
 
 def test_everything_comes_back(everything, tmp_path):
@@ -74,12 +76,83 @@ def test_everything_comes_back(everything, tmp_path):
     assert LOSSLESS.losses(everything) == ()
 
 
-def test_mounted_cameras_come_back_with_a_pose_for_each_image(tmp_path):
+@pytest.mark.parametrize("flavor", ["auto", "waymo", "nuscenes"])
+def test_mounted_cameras_come_back(flavor, tmp_path):
     log = DriveStudioReader(make_waymo(tmp_path / "from", offset=MAP)).read()
-    found = written(log, tmp_path / "out")
+    writer = replace(LOSSLESS, flavor=flavor)
+    found = written(log, tmp_path / "out", writer)
+    assert (tmp_path / "out/ego_pose").is_dir() == (flavor != "nuscenes")
     check_same_views(found, log)
     check_same_sweeps(found, log)
     check_same_track(found, found.tracks[0], log, log.tracks[0])
+    if flavor == "nuscenes":
+        assert found.tracks[0].class_name == "vehicle.car"
+        assert [line.split(":")[0] for line in writer.losses(log)] == [
+            "the path of the vehicle is lost",
+            "classes get names that DriveStudio knows in its flavor nuscenes (objects)",
+        ]
+        return
+    assert (writer.losses(log), found.tracks[0].class_name) == ((), "Vehicle")
+    assert found.vehicle is not None
+    assert log.vehicle is not None
+    poses = (of.dataset_from_world @ of.vehicle.poses for of in (found, log))
+    torch.testing.assert_close(*poses, atol=1e-9, rtol=0)  # float64, as text with all digits
+    # A part of its cameras keeps their numbers.
+    part = DriveStudioReader(tmp_path / "from", cameras=[1], last_frame=1).read()
+    assert written(part, tmp_path / "part", writer).camera_names == ("1",)
+
+
+def moving_mount(log: DrivingLog) -> DrivingLog:
+    def change(frame: Frame) -> Frame:
+        pose = frame.camera.camera_from_world.clone()
+        pose[0, 3] += 0.1 * (frame.indices == (2, 1))
+        return replace(frame, camera=replace(frame.camera, camera_from_world=pose))
+
+    return changed(log, change)
+
+
+def named(log: DrivingLog, class_name: str) -> DrivingLog:
+    return replace(log, tracks=(replace(log.tracks[0], class_name=class_name),))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda log: replace(log, vehicle=None), "the log does not tell where its vehicle was"),
+        (moving_mount, r"camera 1 moves by up to 0.1 \(meters or radians\) in its own"),
+        (lambda log: replace(log, camera_names=("left", "right")), None),
+        (lambda log: named(log, "Car"), None),
+    ],
+)
+def test_what_is_not_of_waymo_gets_a_pose_for_each_image(change, said, tmp_path):
+    log = change(DriveStudioReader(make_waymo(tmp_path / "from")).read())
+    paths = {file.path for file in LOSSLESS.files(log)}
+    assert "ego_pose/000.txt" not in paths
+    assert "extrinsics/000_0.txt" in paths
+    forced = replace(LOSSLESS, flavor="waymo")
+    if said is None:
+        assert "ego_pose/000.txt" in {file.path for file in forced.files(log)}
+        return
+    with pytest.raises(ValueError, match=said + ": say layout.flavor=nuscenes"):
+        list(forced.files(log))
+
+
+def test_a_flavor_is_one_of_those_that_are_written():
+    with unchecked(), pytest.raises(ValueError, match="flavor must be one of auto, waymo, nuscenes, got 'kitti'"):
+        DriveStudioWriter(flavor="kitti")  # pyright: ignore[reportArgumentType]
+
+
+def test_what_drivestudio_itself_needs_a_change_for_is_said(everything):
+    sizes, hood, stand_ins = LOSSLESS.doubts(everything)
+    assert sizes.endswith("camera 0 has 40x24, not 1600x900, 1 has 40x24, not 1600x900; write these sizes there")
+    assert hood.endswith("in data/ego_masks/nuscenes: copy those of ego_masks")
+    assert "cameras 2, 3, 4, 5 too" in stand_ins
+    bare = replace(make_log(), tracks=())
+    (_, absent) = LOSSLESS.doubts(bare)
+    assert absent == (
+        "DriveStudio asks for what is not there, unless data.pixel_source says so: lidar, without which it does not "
+        "start, boxes (load_objects=false), bodies (load_smpl=false), human and vehicle masks (load_dynamic_mask=false)"
+    )
 
 
 def test_what_a_log_lacks_is_not_written(tmp_path):
@@ -182,7 +255,7 @@ LOST = {
     ),
     "class": (
         lambda log: replace(log, tracks=(replace(log.tracks[0], class_name="BOX_TRUCK"),)),
-        "the class BOX_TRUCK becomes Vehicle, which data=drivestudio knows (objects: 1)",
+        "classes get names that DriveStudio knows in its flavor nuscenes (objects): BOX_TRUCK is vehicle.car (1)",
     ),
     "name": (
         lambda log: replace(log, tracks=(replace(log.tracks[0], name="car-1"),)),
@@ -210,7 +283,7 @@ def test_masks_that_a_log_never_had_are_no_loss(tmp_path):
     bare = replace(
         changed(log, lambda frame: replace(frame, sky=None)), notes=("no sky masks: nothing but the images",)
     )
-    assert LOSSLESS.losses(bare) == ()
+    assert LOSSLESS.losses(named(bare, "animal")) == ()
 
 
 def test_a_calibration_that_changes_cannot_be_written(everything):
@@ -227,12 +300,12 @@ def test_names_of_classes_keep_what_other_readers_take_them_for():
     classes = {path.stem: OmegaConf.load(path).classes for path in (CONF / "data").glob("*.yaml")}
     role = {name: which for which, names in classes["drivestudio"].items() for name in names}
     given = {
-        name: which
-        for reader in classes.keys() - {"synthetic", "drivestudio"}
-        for which, names in classes[reader].items()
-        for name in names
-    }
-    assert len(given) > 50
-    # These two say nothing of what an object is.
-    unlike = {name for name, which in given.items() if role.get(CLASS_NAMES.get(name, name)) != which}
-    assert unlike == {"Misc", "other"}
+        name: which for of in classes for which, names in classes[of].items() for name in names
+    }  # fmt: skip
+    assert len(given) > 70
+    for flavor, known in KNOWN.items():
+        found = {name: class_in(flavor, name) for name in given}
+        assert set(found.values()) <= set(known)
+        unlike = {given[name] for name, written in found.items() if role[written] != given[name]}
+        # Waymo has a name for nothing else.
+        assert unlike == ({"other"} if flavor == "waymo" else set())
