@@ -24,6 +24,10 @@ class OptionError(ValueError):
     """Words that do not fit a command; says in one line which, and what would."""
 
 
+class MissingOptionError(OptionError):
+    """A word that a command needs."""
+
+
 def run_command(
     name: str,
     usage: str,
@@ -44,7 +48,8 @@ def run_command(
     try:
         action(parse_options(words, kind, positional))
     except OptionError as error:
-        print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        form = f": {' '.join(usage.partition(chr(10))[0].split())}" if isinstance(error, MissingOptionError) else ""
+        print(f"sparsestreet {name}: {error}{form}", file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and nobody_reads():
@@ -96,7 +101,7 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | S
         given |= {name: _value(name, word, hints[name]) for name, word in zip(places, loose, strict=False)}
     for field in declared:
         if field.default is MISSING and field.name not in given:
-            raise OptionError(f"{field.name}=... is missing")
+            raise MissingOptionError(f"{field.name}=... is missing")
     try:
         return kind(**given)
     except ValueError as error:

@@ -91,9 +91,12 @@ def read_plain_ply(path: Path) -> Gaussians:
 def _read_by(program: str, path: Path) -> Gaussians:
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder, "plain.ply")
-        done = subprocess.run(
-            [program, "-q", "-w", str(path.resolve()), str(plain)], capture_output=True, text=True, timeout=_SECONDS
-        )
+        try:
+            done = subprocess.run(
+                [program, "-q", "-w", str(path.resolve()), str(plain)], capture_output=True, text=True, timeout=_SECONDS
+            )
+        except subprocess.TimeoutExpired as error:
+            raise ValueError(f"{PROGRAM} did not read {path} within {_SECONDS} s: look at it there") from error
         if done.returncode or not plain.is_file():
             said = " ".join((done.stderr or done.stdout).split())[-300:]
             raise ValueError(f"{PROGRAM} cannot read {path}: {said}")
