@@ -39,8 +39,8 @@ def run_command(
     """Parse the words of ``sparsestreet NAME`` and act on them.
 
     Returns 0, or 2 for words that do not fit, 1 where the action finds something missing or malformed (OSError,
-    ValueError, ImportError: its sentence is printed), 130 after Ctrl-C. Without words, and for --help, the usage is
-    printed.
+    ValueError, ImportError: its sentence is printed) or memory does not do (``types.as_demand``), 130 after Ctrl-C.
+    Without words, and for --help, the usage is printed.
     """
     if not words or "--help" in words or "-h" in words:
         print(usage)
@@ -55,6 +55,14 @@ def run_command(
         if isinstance(error, BrokenPipeError) and nobody_reads():
             raise  # ``main`` ends quietly; a program of ours that broke, such as ffmpeg, is told
         print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        return 1
+    except Exception as error:
+        from sparsestreet.types import as_demand  # torch, which whatever failed has imported
+
+        demand = as_demand(error)
+        if demand is None:
+            raise
+        print(f"sparsestreet {name}: {demand}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"sparsestreet {name}: stopped, nothing was written", file=sys.stderr)

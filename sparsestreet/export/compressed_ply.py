@@ -13,6 +13,7 @@ from jaxtyping import Float, Float64, Integer, UInt32
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.codec.positions import curve_order
+from sparsestreet.export.ply import check_gaussians
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Gaussians
 
@@ -36,13 +37,12 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
     Rounding is that of 256 neighbors along a curve: positions and log scales 1 / 2046 (y) or 1 / 4094 of their extent,
     colors 1 / 510 of theirs; opacities 1 / 510, parts of quaternions 0.0007, harmonics 1 / 64 in -4 to 4.
     """
+    check_gaussians(gaussians)
     order = curve_order(gaussians.means.double().numpy())
     means = gaussians.means.double().numpy()[order]
     logs = np.log(np.maximum(gaussians.scales.double().numpy()[order], 1e-30)).clip(-20, 20)
     sh = gaussians.sh.double().numpy()[order]
     colors = sh[:, 0] * _FIRST + 0.5
-    if not all(np.isfinite(values).all() for values in (means, sh)):
-        raise ValueError("all values of a .compressed.ply must be finite: the scene is damaged, train it again")
     tables = [_bounded(values) for values in (means, logs, colors)]
     bounds = np.concatenate([edge for low, high, _ in tables for edge in (low, high)], axis=1)
     red, green, blue = (np.rint(255 * column).astype(np.uint32) for column in tables[2][2].T)

@@ -9,11 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
+from sparsestreet.finite import check_finite
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.graph import SceneGaussians
 from sparsestreet.scene.nodes.node import Instances, Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
+from sparsestreet.scene.stored import DAMAGED, check_numbers
 from sparsestreet.types import Camera, Gaussians, View
 
 _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
@@ -38,19 +40,23 @@ def write_ply(path: Path | str, gaussians: Gaussians) -> int:
     then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). Raises ValueError for
     values that are not finite or if no Gaussian is left, OSError if the file cannot be written.
     """
+    check_gaussians(gaussians)
     table = _vertices(gaussians)
     if not len(table):
         raise ValueError("a ply needs a Gaussian with an opacity above 0, got none: choose more, or another time")
-    broken = np.flatnonzero(~np.isfinite(table).all(1))
-    if len(broken):
-        raise ValueError(
-            f"all values of a ply must be finite, but {len(broken)} Gaussians have others, the first of them in row "
-            f"{broken[0]} of those with an opacity: the scene is damaged, train it again"
-        )
     with atomic_file(Path(path)) as temporary, temporary.open("wb") as file:
         file.write(_header(len(table), gaussians.sh.shape[1]).encode("ascii"))
         file.write(table.tobytes())
     return len(table)
+
+
+def check_gaussians(gaussians: Gaussians, of: str = "", rows: slice = slice(None)) -> None:
+    """Raise ValueError where a number is NaN or infinite, also of a row that is not seen; names field, row and value.
+
+    Every writer asks before it leaves rows out: a comparison of opacities drops those that are NaN. ``of``: what is
+    said behind a field's name.
+    """
+    check_finite({f"{name}{of}": getattr(gaussians, name).detach()[rows] for name in _FIELDS}, DAMAGED)
 
 
 @torch.no_grad()
@@ -69,13 +75,17 @@ def scene_gaussians(
         nodes: names of the nodes to return (``["background"]``: nothing that moves); None: all.
         instances: names of tracks; only their Gaussians are returned. Not together with ``nodes``.
 
-    Raises ValueError, naming the available ones, for an unknown node or instance, or one absent at that time.
+    Raises ValueError, naming the available ones, for an unknown node or instance, or one absent at that time; and for
+    a scene with a number that is NaN, infinite, or becomes so (``log_scales`` of 100).
     """
     if not 0 <= time <= 1:
         raise ValueError(f"time runs from 0 (first frame of the log) to 1 (its last), got {time}")
     if nodes is not None and instances is not None:
         raise ValueError("Gaussians are chosen by nodes or by instances, got both: leave one out")
+    check_numbers(stored.scene)
     placed = stored.scene.gaussians_at(View(_ANYWHERE, time))
+    for name, rows in placed.spans.items():
+        check_gaussians(placed.gaussians, f" of node {name}", rows)
     if instances is not None:
         keep = _rows_of_instances(stored, placed, instances, time)
     else:

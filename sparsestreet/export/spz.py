@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.export.frame import turned
+from sparsestreet.export.ply import check_gaussians
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Gaussians
 
@@ -38,14 +39,13 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     [-10, 5.9], opacities 1 / 510, parts of quaternions 0.0007, the first harmonic 1 / 77 in [-3.3, 3.3], the others
     1 / 256 in [-1, 1). Raises ValueError for more than ``LARGEST_COUNT`` Gaussians or numbers that are not finite.
     """
+    check_gaussians(gaussians)
     found = turned(gaussians, _RIGHT_UP_BACK)
     if len(found) > LARGEST_COUNT:
         raise ValueError(
             f"a .spz holds at most {LARGEST_COUNT:,} Gaussians, got {len(found):,}: prune, or choose nodes"
         )
     means, sh = found.means.double().numpy(), found.sh.double().numpy()
-    if not (np.isfinite(means).all() and np.isfinite(sh).all()):
-        raise ValueError("all values of a .spz must be finite: the scene is damaged, train it again")
     bits = _fraction_bits(float(np.abs(means).max(initial=0)))
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
     logs = np.log(np.maximum(found.scales.double().numpy(), 1e-30))

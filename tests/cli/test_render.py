@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hydra.utils import instantiate
 from PIL import Image
 
@@ -21,6 +22,7 @@ from sparsestreet.export.layers import LAYERS, layer_values
 from sparsestreet.export.path import recorded, resized, shifted
 from sparsestreet.export.seen import count_images
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.edits import REMOVED, Edits, edited
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import read_views, write_views
@@ -156,6 +158,30 @@ def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, sa
     assert said in error
     assert len(error.strip().splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [None, MemoryError(), RuntimeError("CUDA out of memory.\nTried to"), torch.OutOfMemoryError("out of memory")],
+)
+def test_where_memory_does_not_do_it_is_one_line(run, tmp_path, error, capsys, monkeypatch):
+    def out_of_memory(*told):
+        raise error
+
+    if error is None:
+        monkeypatch.setattr(rasterizer, "PAIR_LIMIT", 5)
+    else:
+        monkeypatch.setattr(video, "side_by_side", out_of_memory)
+    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 1
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert ("more than the 5 that may be held" if error is None else "render: memory is out") in said
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_error_of_our_own_keeps_its_trace(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "side_by_side", lambda images: {}["of our own"])
+    with pytest.raises(KeyError, match="of our own"):
+        render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"])
 
 
 def test_without_a_file_the_usage_is_said(run, capsys):
