@@ -150,6 +150,8 @@ def _render(request: RenderRequest) -> None:
     if "seen" in request.layers:
         count_images(stored, shown(views.training, len(views.training), "images looked at"))
     stored = with_edits(stored, views, request.edits)
+    if stored.scene.exposed(views.all[0]) is not None:
+        print("the pictures are sharp: what blurred those of the log is left out")
     returns = returns_of(folder_of(request.scene), views) if "lidar" in request.layers else None
     count = _write(request, stored, path, fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"

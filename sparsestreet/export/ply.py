@@ -29,15 +29,19 @@ _LARGEST_OPACITY = 1 - 2.0**-25
 _TOLD_APART = 1000
 """Times that are said with three decimals, however many frames a scene file claims."""
 
+ANTIALIASED = "comment SplatRenderMode: mip"
+"""In the header: what gsplat and Brush go by. Others add the blur of plain 3DGS."""
+
 _SMALLEST_SCALE = 1e-30
 """Smallest scale that is written, meters; a scale of 0 has no logarithm."""
 
 
-def write_ply(path: Path | str, gaussians: Gaussians) -> int:
+def write_ply(path: Path | str, gaussians: Gaussians, *, antialiased: bool = False) -> int:
     """Writes the Gaussians whose opacity is above 0 and returns their number; writes the whole file or nothing.
 
     Binary, little endian, float32, one vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (all of red,
-    then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). Raises ValueError for
+    then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). ``antialiased`` is said
+    in a comment. Raises ValueError for
     values that are not finite or if no Gaussian is left, OSError if the file cannot be written.
     """
     check_gaussians(gaussians)
@@ -45,7 +49,7 @@ def write_ply(path: Path | str, gaussians: Gaussians) -> int:
     if not len(table):
         raise ValueError("a ply needs a Gaussian with an opacity above 0, got none: choose more, or another time")
     with atomic_file(Path(path)) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(table), gaussians.sh.shape[1]).encode("ascii"))
+        file.write(_header(len(table), gaussians.sh.shape[1], antialiased).encode("ascii"))
         file.write(table.tobytes())
     return len(table)
 
@@ -166,11 +170,12 @@ def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
     return torch.cat([column.float() for column in columns], dim=1).numpy().astype("<f4")
 
 
-def _header(rows: int, terms: int) -> str:
+def _header(rows: int, terms: int, antialiased: bool) -> str:
     properties = ["x", "y", "z", "nx", "ny", "nz"]
     properties += [f"f_dc_{index}" for index in range(3)]
     properties += [f"f_rest_{index}" for index in range(3 * (terms - 1))]
     properties += ["opacity", *(f"scale_{index}" for index in range(3)), *(f"rot_{index}" for index in range(4))]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}"]
+    comments = [ANTIALIASED] if antialiased else []
+    lines = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {rows}"]
     lines += [f"property float {name}" for name in properties]
     return "\n".join([*lines, "end_header", ""])
