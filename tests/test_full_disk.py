@@ -13,6 +13,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from sparsestreet.atomic import atomic_file, atomic_folder
+from sparsestreet.export.video import write_pictures
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.ledger import LEDGER, CountChange
 from sparsestreet.training.callbacks import Checkpoints
@@ -54,7 +55,19 @@ def ledger(path: Path) -> None:
     LEDGER.write_to(path, [CountChange(step, "background", 1, 2, "densify") for step in range(100)])
 
 
-WRITERS = {"c.ckpt": by_torch, "s.safetensors": by_safetensors, "p.png": picture, "h.csv": curve, "l.csv": ledger}
+def video(path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (2, 64, 64, 3), dtype=np.uint8)
+    write_pictures(path, list(noise), fps=10.0)
+
+
+WRITERS = {
+    "c.ckpt": by_torch,
+    "s.safetensors": by_safetensors,
+    "p.png": picture,
+    "h.csv": curve,
+    "l.csv": ledger,
+    "v.mp4": video,
+}
 
 
 @pytest.mark.parametrize(("name", "write"), WRITERS.items())

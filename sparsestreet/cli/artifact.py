@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sparsestreet.cli.scene import open_scene
 from sparsestreet.records.run import RUN
-from sparsestreet.scene.views import FILE_NAME, read_views
+from sparsestreet.scene.beside import views_of
 
 
 def export_artifact(
@@ -29,6 +29,6 @@ def export_artifact(
         "" if described is None else described.data_hash,
         0 if described is None else described.seed,
     )
-    counts = write_artifact(out, served, read_views(run / FILE_NAME), provenance, car or DEFAULT_CAR)
+    counts = write_artifact(out, served, views_of(run), provenance, car or DEFAULT_CAR)
     said = ", ".join(f"{count} {what}" for what, count in counts.items())
     print(f"{out}: scene {name!r} with {said}; sparsestreet serve {run} gives its pictures")

@@ -301,6 +301,10 @@ def load_run_config(run: Path) -> DictConfig:
     """
     path = run / ".hydra" / "config.yaml"
     if not path.is_file():
+        if run.is_file():
+            from sparsestreet.scene.storage import scene_path  # torch
+
+            scene_path(run)  # says what it is
         raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
     cfg = load_config(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.

@@ -44,8 +44,10 @@ def demo(arguments: list[str]) -> int:
         overrides = [*chosen, f"out={_quoted(out / sparsify)}", *arguments]
         # A process each: what one training leaves in memory does not slow the next.
         status = subprocess.run([sys.executable, "-m", "sparsestreet", "train", *overrides], check=False).returncode
+        if status < 0:
+            print(f"sparsestreet demo: signal {-status} ended the training of {out / sparsify}", file=sys.stderr)
         if status:
-            return status
+            return status if status > 0 else 128 - status
     runs = [out / sparsify for sparsify in SPARSIFY]
     plain = SUMMARY.read(runs[0])
     compare_runs(runs, out / "comparison.png", legend=node_legend(plain.gaussians))

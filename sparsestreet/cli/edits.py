@@ -1,5 +1,6 @@
 """``edits=FILE``: a trained scene as a file of edits leaves it, and what its user should know of that."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -8,8 +9,13 @@ from sparsestreet.naming import one_line
 from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
 from sparsestreet.scene.edits.file import Open
+from sparsestreet.scene.edits.nodes import ALWAYS
+from sparsestreet.scene.edits.paths import Driven, Held, Moved
 from sparsestreet.scene.storage import StoredScene, load_scene
 from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of
+
+_SAME = 1e-6
+"""Of normalized time."""
 
 
 def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> StoredScene:
@@ -22,7 +28,7 @@ def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> 
 
     edits = read_edits(file, log_seconds(views), opener(stored))
     scene = edited(stored.scene, edits)
-    for note in _notes(edits):
+    for note in [*_notes(edits), *_late(edits, log_seconds(views))]:
         print(note)
     return replace(stored, scene=scene)
 
@@ -42,8 +48,33 @@ def log_seconds(views: RecordedViews) -> float:
     return seconds_of(views, views.frame_rate or DEFAULT_FRAME_RATE)
 
 
+def _late(edits: Edits, seconds: float) -> Iterator[str]:
+    """Yield a line for each time of the edits that the log, of so many seconds, does not reach."""
+    changes = {**edits.changes, **{name: one.change for name, one in edits.added.items()}}
+    for name, change in changes.items():
+        path = change.path
+        spans = [("hide", span) for span in change.hidden if span != ALWAYS]
+        if isinstance(path, Moved) and path.during is not None:
+            spans.append(("during", path.during))
+        if isinstance(path, Held):
+            spans.append(("hold", (path.at, path.at)))
+        if isinstance(path, Driven):
+            spans.append(("path", (min(path.times), max(path.times))))
+        for what, (start, end) in spans:
+            if start < -_SAME or end > 1 + _SAME:
+                times = f"{seconds * start:g} s" if start == end else f"{seconds * start:g} to {seconds * end:g} s"
+                ends = f"ends at {seconds:.4g} s" if end > 1 + _SAME else "begins at 0 s"
+                unseen = start > 1 + _SAME or end < -_SAME
+                meant = "nothing of that is seen" if unseen and what != "hold" else "it is as it is there"
+                yield f"{name}: {what} {times}: the log {ends}, {meant}"
+
+
 def _notes(edits: Edits) -> list[str]:
-    gone = [one_line(name) for name, change in edits.changes.items() if change.hidden or change.path is not None]
+    gone = [
+        one_line(name)
+        for name, change in edits.changes.items()
+        if change.path is not None or any(start <= 1 and end >= 0 for start, end in change.hidden)
+    ]
     notes = []
     if gone:
         notes.append(

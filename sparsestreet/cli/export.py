@@ -129,8 +129,6 @@ def _export(request: ExportRequest) -> None:
             return _export_page(request, stored, views)
         if request.kind == "":
             return _export_objects(request, stored, views)
-    if request.kind == ".ply":
-        return _export_ply(request, stored)
     from sparsestreet.cli.shipping import FrameExport, export_frame
 
     wanted = FrameExport(
@@ -157,24 +155,23 @@ def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
 
 
 def _export_objects(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
+    from sparsestreet.cli.shipping import ANTIALIAS_LOST, lost_of_scene
     from sparsestreet.export.object_files import POSES, write_objects
+    from sparsestreet.export.ply import instance_names
 
     names = write_objects(request.out, stored, views.all)
     print(f"{request.out}: {len(names)} objects and {POSES}: {', '.join(map(one_line, names))}")
-
-
-def _export_ply(request: ExportRequest, stored: "StoredScene") -> None:
-    from sparsestreet.export.ply import scene_gaussians, write_ply
-
-    time = request.time or 0.0
-    instances = None if request.instance is None else [request.instance]
-    gaussians = scene_gaussians(stored, time, nodes=request.nodes, instances=instances)
-    count = write_ply(request.out, gaussians)
-    print(f"{request.out}: {count:,} Gaussians at time {time:g}, {request.out.stat().st_size / 1e6:.1f} MB")
+    absent = sorted(set(instance_names(stored)) - set(names))
+    if absent:
+        print(f"left out, as no recorded frame shows them: {', '.join(map(one_line, absent))}")
+    if stored.options.settings.antialias:
+        print(ANTIALIAS_LOST)
+    print(f"lost: {'; '.join(['the sky', 'how shapes change', *lost_of_scene(stored)])}")
 
 
 def _export_page(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
     from sparsestreet.cli.edits import log_seconds
+    from sparsestreet.cli.shipping import ANTIALIAS_LOST, lost_of_scene
     from sparsestreet.export.page import viser_module, write_page
     from sparsestreet.export.path import recorded
     from sparsestreet.export.recording import recorded_parts
@@ -193,3 +190,6 @@ def _export_page(request: ExportRequest, stored: "StoredScene", views: "Recorded
         f"{request.out}: {sum(map(len, parts)):,} Gaussians, {len(moving)} objects, {seconds[-1]:.1f} s, "
         f"{request.out.stat().st_size / 1e6:.1f} MB; open it in a browser"
     )
+    if stored.options.settings.antialias:
+        print(ANTIALIAS_LOST)
+    print(f"lost: {'; '.join(['colors that change with the direction', *lost_of_scene(stored)])}")

@@ -24,6 +24,10 @@ class OptionError(ValueError):
     """Words that do not fit a command; says in one line which, and what would."""
 
 
+class MissingOptionError(OptionError):
+    """A word that a command needs."""
+
+
 def run_command(
     name: str,
     usage: str,
@@ -35,8 +39,8 @@ def run_command(
     """Parse the words of ``sparsestreet NAME`` and act on them.
 
     Returns 0, or 2 for words that do not fit, 1 where the action finds something missing or malformed (OSError,
-    ValueError, ImportError: its sentence is printed), 130 after Ctrl-C. Without words, and for --help, the usage is
-    printed.
+    ValueError, ImportError: its sentence is printed) or memory does not do (``types.as_demand``), 130 after Ctrl-C.
+    Without words, and for --help, the usage is printed.
     """
     if not words or "--help" in words or "-h" in words:
         print(usage)
@@ -44,12 +48,21 @@ def run_command(
     try:
         action(parse_options(words, kind, positional))
     except OptionError as error:
-        print(printable(f"sparsestreet {name}: {error}"), file=sys.stderr)
+        form = f": {' '.join(usage.partition(chr(10))[0].split())}" if isinstance(error, MissingOptionError) else ""
+        print(printable(f"sparsestreet {name}: {error}{form}"), file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and nobody_reads():
             raise  # ``main`` ends quietly; a program of ours that broke, such as ffmpeg, is told
         print(printable(f"sparsestreet {name}: {error}"), file=sys.stderr)
+        return 1
+    except Exception as error:
+        from sparsestreet.types import as_demand  # torch, which whatever failed has imported
+
+        demand = as_demand(error)
+        if demand is None:
+            raise
+        print(printable(f"sparsestreet {name}: {demand}"), file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"sparsestreet {name}: stopped, nothing was written", file=sys.stderr)
@@ -96,7 +109,7 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | S
         given |= {name: _value(name, word, hints[name]) for name, word in zip(places, loose, strict=False)}
     for field in declared:
         if field.default is MISSING and field.name not in given:
-            raise OptionError(f"{field.name}=... is missing")
+            raise MissingOptionError(f"{field.name}=... is missing")
     try:
         return kind(**given)
     except ValueError as error:

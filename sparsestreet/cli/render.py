@@ -54,12 +54,15 @@ the pictures:
   layers    [rgb,depth,alpha,nodes,instances,seen,lidar]: in a .mp4 one below the other, in colors; in a folder one
             folder each, exact: depth in millimeters, ids of nodes and objects with tables (default: rgb). seen: how
             many recorded images showed it; 0 is a guess. lidar needs the log: its returns, drawn on the picture
-  fps       frames a second of the video; poses between the recorded ones are interpolated (default: as the log)
+  fps       frames a second of the video, 0.001 to 1000; poses between the recorded ones are interpolated (default: as
+            the log)
   log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
 """
 
 PATHS = ("recorded", "shifted", "lane_change")
+SLOWEST, FASTEST = 0.001, 1000.0
+"""Frames a second of a video."""
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "seen", "lidar")
 
 
@@ -101,6 +104,12 @@ class RenderRequest:
                 raise ValueError(f"{name} must be above 0, got {value:g}")
         if self.fov is not None and not 0 < self.fov < 180:
             raise ValueError(f"fov lies between 0 and 180 degrees, got {self.fov:g}")
+        if self.out.suffix not in (".mp4", ""):
+            raise ValueError(f"a video ends in .mp4, a folder of PNGs has no ending, got {self.out.name!r}")
+        for name in ("fps", "log_fps"):
+            value = getattr(self, name)
+            if value is not None and not SLOWEST <= value <= FASTEST:
+                raise ValueError(f"{name} lies in {SLOWEST:g} to {FASTEST:g}, got {value:g}")
         if not 1 <= self.quality <= 10:
             raise ValueError(f"quality lies in 1 to 10, got {self.quality:g}")
         for layer in self.layers:
@@ -125,23 +134,28 @@ def _render(request: RenderRequest) -> None:
     from sparsestreet.cli.returns import returns_of
     from sparsestreet.cli.scene import folder_of, open_scene, recorded_views
     from sparsestreet.export.seen import count_images
-    from sparsestreet.export.video import check_destination
+    from sparsestreet.export.video import check_destination, check_size, picture_size
     from sparsestreet.scene.views import DEFAULT_FRAME_RATE
 
     started = time.perf_counter()
     check_destination(request.out)
     stored = open_scene(request.scene, request.device, request.parts)
     views = recorded_views(request.scene, request.views)
-    if "seen" in request.layers:
-        count_images(stored, shown(views.training, len(views.training), "images looked at"))
-    stored = with_edits(stored, views, request.edits)
     log_fps = request.log_fps or views.frame_rate
     if log_fps is None:
         log_fps = DEFAULT_FRAME_RATE
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
-    returns = returns_of(folder_of(request.scene), views, request.parts) if "lidar" in request.layers else None
     path, fps, what = _path(request, views, log_fps)
-    count = _write(request, stored, _seen_by(request, path), fps, returns)
+    path = _seen_by(request, path)
+    if request.out.suffix:
+        check_size(*picture_size(path, rows=len(request.layers)))
+    if "seen" in request.layers:
+        count_images(stored, shown(views.training, len(views.training), "images looked at"))
+    stored = with_edits(stored, views, request.edits)
+    if stored.scene.exposed(views.all[0]) is not None:
+        print("the pictures are sharp: what blurred those of the log is left out")
+    returns = returns_of(folder_of(request.scene), views, request.parts) if "lidar" in request.layers else None
+    count = _write(request, stored, path, fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"
     print(f"{request.out}: {count} frames of {what} at {fps:g} a second{_speed(request, log_fps)}, {made}")
 
@@ -156,6 +170,8 @@ def _path(request: RenderRequest, views: "RecordedViews", log_fps: float) -> "tu
         fps = request.fps or log_fps
         like = views.all[0]
         read = read_path(request.path_file, like, seconds_of(views, log_fps), fps)
+        if read.note is not None:
+            print(read.note)
         return read.path, request.fps or read.fps or fps, request.path
     fps = request.fps or log_fps
     path = _along_the_log(request, views.all, step=log_fps / fps / frame_periods(views.all))

@@ -1,17 +1,21 @@
-"""``sparsestreet export RUN street.spz``: one frame for viewers, and what it keeps."""
+"""``sparsestreet export RUN street.spz``: one frame for viewers, what it keeps and what it loses."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.cli.scene import recorded_views
 from sparsestreet.export.check import check_file, turned_camera
-from sparsestreet.export.compressed_ply import read_compressed_ply, write_compressed_ply
-from sparsestreet.export.frame import VIEWER_FROM_WORLD, frame_gaussians
+from sparsestreet.export.compressed_ply import compressed_ply_notes, read_compressed_ply, write_compressed_ply
+from sparsestreet.export.frame import UNSEEN, VIEWER_FROM_WORLD, frame_gaussians
+from sparsestreet.export.ply import scene_gaussians, write_ply
 from sparsestreet.export.sog import read_sog, write_sog
-from sparsestreet.export.spz import read_spz, write_spz
+from sparsestreet.export.spz import read_spz, spz_notes, write_spz
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians
 
+ANTIALIAS_LOST = "trained with antialias: plain viewers show small Gaussians brighter"
+_WRITERS = {".ply": write_ply, ".spz": write_spz, ".sog": write_sog, ".compressed.ply": write_compressed_ply}
+_NOTES = {".spz": spz_notes, ".compressed.ply": compressed_ply_notes}
 _READERS = {".spz": read_spz, ".sog": read_sog, ".compressed.ply": read_compressed_ply}
 
 
@@ -23,7 +27,7 @@ class FrameExport:
     views: Path | None
     out: Path
     kind: str
-    """``.spz``, ``.sog`` or ``.compressed.ply``."""
+    """``.ply``, ``.spz``, ``.sog`` or ``.compressed.ply``."""
     time: float
     nodes: tuple[str, ...] | None
     instance: str | None
@@ -32,17 +36,25 @@ class FrameExport:
 
 
 def export_frame(request: FrameExport, stored: StoredScene) -> None:
-    """Write the file and say what is in it; with ``check``, what it lost. Raises ValueError where nothing is left."""
-    time = request.time
-    instances = None if request.instance is None else [request.instance]
-    gaussians = frame_gaussians(stored, time, nodes=request.nodes, instances=instances, sky=request.sky)
-    if request.kind == ".compressed.ply":
-        count = write_compressed_ply(request.out, gaussians)
+    """Write the file and say what is in it and what it lost; with ``check``, measured. Raises ValueError if empty."""
+    time, mip = request.time, stored.options.settings.antialias
+    chosen = {"nodes": request.nodes, "instances": None if request.instance is None else [request.instance]}
+    gaussians = scene_gaussians(stored, time, **chosen)
+    if request.kind == ".ply":
+        left_out, why = int((gaussians.opacities == 0).sum()), "are not there"
     else:
-        write = write_spz if request.kind == ".spz" else write_sog
-        count = write(request.out, gaussians, antialiased=stored.options.settings.antialias)
+        left_out, why = int((gaussians.opacities < UNSEEN).sum()), "have an opacity below 1 / 255"
+        gaussians = frame_gaussians(stored, time, **chosen, sky=request.sky)
+    count = _WRITERS[request.kind](request.out, gaussians, antialiased=mip)
     size = request.out.stat().st_size
     print(f"{request.out}: {count:,} Gaussians at time {time:g}, {size / 1e6:.2f} MB, {size / count:.1f} bytes each")
+    if left_out:
+        print(f"left out: {left_out:,} Gaussians that {why} at this time")
+    if mip and request.kind.endswith("ply"):
+        print(ANTIALIAS_LOST)
+    for note in _NOTES.get(request.kind, lambda _: [])(gaussians):
+        print(note)
+    print(f"lost: {'; '.join(_lost(request, stored))}")
     if request.check:
         _check(request, stored, gaussians)
 
@@ -52,7 +64,6 @@ def _check(request: FrameExport, stored: StoredScene, gaussians: Gaussians) -> N
     found = check_file(request.out, gaussians, camera, _READERS[request.kind], stored.options.settings)
     quality = "no camera is known" if found.psnr is None else f"{found.psnr:.1f} dB beside what was written"
     print(f"read by {found.reader}: {found.gaussians:,} Gaussians, {quality}, {found.bytes_each:.1f} bytes each")
-    print(f"lost: {'; '.join(_lost(request, stored))}")
 
 
 def _camera(request: FrameExport) -> Camera | None:
@@ -67,10 +78,16 @@ def _camera(request: FrameExport) -> Camera | None:
 
 def _lost(request: FrameExport, stored: StoredScene) -> list[str]:
     lost = [f"time, as this is the moment {request.time:g}"]
-    if not request.sky or request.nodes is not None or request.instance is not None:
+    if request.kind == ".ply" or not request.sky or request.nodes is not None or request.instance is not None:
         lost.append("the sky")
     else:
         lost.append("the sky's infinite distance, as it is a dome")
+    return [*lost, *lost_of_scene(stored)]
+
+
+def lost_of_scene(stored: StoredScene) -> list[str]:
+    """Return what no file for viewers holds of a scene: masks over time, effects of the cameras."""
+    lost = []
     if any(node.mask is not None for node in stored.scene.nodes.values()):
         lost.append("masks, but for what they show now")
     effects = [name for name in stored.scene.effects if name != "sky"]

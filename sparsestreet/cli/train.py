@@ -122,6 +122,14 @@ def app(cfg: DictConfig) -> float | None:
         name = name_beside_first(cfg.trainer)
         print(f"sparsestreet train{f', {name}' if name else ''}: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
+    except Exception as error:
+        from sparsestreet.types import as_demand
+
+        demand = as_demand(error)
+        if demand is None or "HYDRA_FULL_ERROR" in os.environ:
+            raise
+        print(f"sparsestreet train: {demand}", file=sys.stderr)
+        sys.exit(1)
     finally:
         leave_folder(out, f"{HydraConfig.get().job.name}.log")
 

@@ -1,6 +1,7 @@
 """What a file for viewers keeps of a frame: read again, and rendered beside what was written."""
 
 import math
+import re
 import shutil
 import subprocess
 import tempfile
@@ -70,17 +71,23 @@ def read_plain_ply(path: Path) -> Gaussians:
     content = path.read_bytes()
     head, _, body = content.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    names = [line[2] for line in lines if line[:2] == ["property", "float"]]
-    counts = [int(line[2]) for line in lines if line[:2] == ["element", "vertex"] and line[2].isdigit()]
-    others = [line for line in lines if line[:1] == ["property"] and line[1] != "float"]
-    if len(counts) != 1 or others or len(body) != 4 * len(names) * counts[0]:
+    names = [line[2] for line in lines if line[:2] == ["property", "float"] and len(line) == 3]
+    counts = [int(line[2]) for line in lines if re.fullmatch("element vertex [0-9]{1,9}", " ".join(line))]
+    plain = all(len(line) == 3 and line[1] == "float" for line in lines if line[:1] == ["property"])
+    binary = b"format binary_little_endian 1.0\n" in head
+    if len(counts) != 1 or not plain or not binary or len(body) != 4 * len(names) * counts[0]:
         raise ValueError(f"{path} is no .ply of floats in the layout of 3DGS")
+    terms = sum(name.startswith("f_rest_") for name in names) // 3
+    needed = ["x", "y", "z", "opacity", *_numbered("f_dc", 3), *_numbered("rot", 4), *_numbered("scale", 3)]
+    missing = {*needed, *_numbered("f_rest", 3 * terms)} - set(names)
+    if missing or len(set(names)) < len(names) or terms not in (0, 3, 8, 15):
+        what = f"it lacks {', '.join(sorted(missing))}" if missing else f"{terms} harmonics or a name twice"
+        raise ValueError(f"{path} is no .ply in the layout of 3DGS: {what}")
     columns = dict(zip(names, np.frombuffer(body, "<f4").reshape(counts[0], len(names)).T, strict=True))
 
     def table(pattern: str, count: int) -> torch.Tensor:
         return torch.from_numpy(np.stack([columns[pattern.format(index)] for index in range(count)], axis=1))
 
-    terms = sum(name.startswith("f_rest_") for name in names) // 3
     first = table("f_dc_{}", 3)[:, None]
     rest = table("f_rest_{}", 3 * terms).unflatten(1, (3, terms)).mT if terms else first[:, :0]
     means = torch.from_numpy(np.stack([columns[axis] for axis in "xyz"], axis=1))
@@ -88,12 +95,19 @@ def read_plain_ply(path: Path) -> Gaussians:
     return Gaussians(means, table("rot_{}", 4), table("scale_{}", 3).exp(), opacities, torch.cat([first, rest], 1))
 
 
+def _numbered(name: str, count: int) -> list[str]:
+    return [f"{name}_{index}" for index in range(count)]
+
+
 def _read_by(program: str, path: Path) -> Gaussians:
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder, "plain.ply")
-        done = subprocess.run(
-            [program, "-q", "-w", str(path.resolve()), str(plain)], capture_output=True, text=True, timeout=_SECONDS
-        )
+        try:
+            done = subprocess.run(
+                [program, "-q", "-w", str(path.resolve()), str(plain)], capture_output=True, text=True, timeout=_SECONDS
+            )
+        except subprocess.TimeoutExpired as error:
+            raise ValueError(f"{PROGRAM} did not read {path} within {_SECONDS} s: look at it there") from error
         if done.returncode or not plain.is_file():
             said = " ".join((done.stderr or done.stdout).split())[-300:]
             raise ValueError(f"{PROGRAM} cannot read {path}: {said}")

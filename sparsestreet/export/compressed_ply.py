@@ -13,6 +13,8 @@ from jaxtyping import Float, Float64, Integer, UInt32
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.codec.positions import curve_order
+from sparsestreet.export.ply import ANTIALIASED, check_gaussians
+from sparsestreet.export.spz import NOTED
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Gaussians
 
@@ -30,19 +32,34 @@ _SH_SPAN = 8.0
 """Harmonics lie in -4 to 4."""
 
 
-def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
+def compressed_ply_notes(gaussians: Gaussians) -> list[str]:
+    """Return, in a line each, what the format keeps less of than one expects."""
+    means = gaussians.means.double().numpy()
+    order = curve_order(means)
+    low, high, _ = _bounded(means[order])
+    steps = ((high - low) / [most for _, most in _XYZ]).max(1) / 2
+    if not len(steps) or steps.max() <= NOTED:
+        return []
+    rows = order[CHUNK * int(steps.argmax()) :][:CHUNK]
+    away = np.linalg.norm(means[rows] - np.median(means[rows], 0), axis=1)
+    return [
+        f"positions are kept to {1000 * np.median(steps):,.3g} mm, near row {rows[away.argmax()]} to "
+        f"{1000 * steps.max():,.3g} mm, because it lies {away.max():,.4g} m from its neighbors"
+    ]
+
+
+def write_compressed_ply(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
     """Writes Gaussians with x right, y down, z ahead; returns their number; the whole file or nothing.
 
     Rounding is that of 256 neighbors along a curve: positions and log scales 1 / 2046 (y) or 1 / 4094 of their extent,
     colors 1 / 510 of theirs; opacities 1 / 510, parts of quaternions 0.0007, harmonics 1 / 64 in -4 to 4.
     """
+    check_gaussians(gaussians)
     order = curve_order(gaussians.means.double().numpy())
     means = gaussians.means.double().numpy()[order]
     logs = np.log(np.maximum(gaussians.scales.double().numpy()[order], 1e-30)).clip(-20, 20)
     sh = gaussians.sh.double().numpy()[order]
     colors = sh[:, 0] * _FIRST + 0.5
-    if not all(np.isfinite(values).all() for values in (means, sh)):
-        raise ValueError("all values of a .compressed.ply must be finite: the scene is damaged, train it again")
     tables = [_bounded(values) for values in (means, logs, colors)]
     bounds = np.concatenate([edge for low, high, _ in tables for edge in (low, high)], axis=1)
     red, green, blue = (np.rint(255 * column).astype(np.uint32) for column in tables[2][2].T)
@@ -56,7 +73,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> int:
     # All of red come first, as in a plain .ply.
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), 3 * (sh.shape[1] - 1))
     with atomic_file(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(bounds), len(sh), rest.shape[1]))
+        file.write(_header(len(bounds), len(sh), rest.shape[1], antialiased))
         file.write(bounds.astype("<f4").tobytes())
         file.write(np.stack(words, axis=1).astype("<u4").tobytes())
         file.write(np.clip(np.floor((rest / _SH_SPAN + 0.5) * 256), 0, 255).astype(np.uint8).tobytes())
@@ -71,7 +88,10 @@ def read_compressed_ply(path: Path) -> Gaussians:
     named = re.search(rb"^element vertex (\d{1,9})$", head, re.MULTILINE)
     count, rest = int(named[1]) if named else 0, head.count(b"property uchar f_rest_")
     chunks = -(-count // CHUNK)
-    if head + found != _header(chunks, count, rest) or len(content) != start + 72 * chunks + (16 + rest) * count:
+    if (
+        head + found not in [_header(chunks, count, rest, mip) for mip in (False, True)]
+        or len(content) != start + 72 * chunks + (16 + rest) * count
+    ):
         raise ValueError(f"{path} is no .compressed.ply of this program or is damaged")
     bounds = np.frombuffer(content, "<f4", 18 * chunks, start).reshape(chunks, 6, 3).astype(float)
     bounds = np.repeat(bounds, CHUNK, axis=0)[:count]
@@ -87,8 +107,9 @@ def read_compressed_ply(path: Path) -> Gaussians:
     return Gaussians(*(torch.from_numpy(value).float() for value in values))
 
 
-def _header(chunks: int, count: int, rest: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment x right, y down, z ahead", f"element chunk {chunks}"]
+def _header(chunks: int, count: int, rest: int, antialiased: bool) -> bytes:
+    comments = ["comment x right, y down, z ahead", *([ANTIALIASED] if antialiased else [])]
+    lines = ["ply", "format binary_little_endian 1.0", *comments, f"element chunk {chunks}"]
     lines += [f"property float {name}" for name in _CHUNK_FIELDS]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _WORDS)]
     if rest:

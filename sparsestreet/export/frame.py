@@ -24,7 +24,7 @@ from sparsestreet.types import Gaussians
 VIEWER_FROM_WORLD = torch.tensor([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """x ahead, y left, z up to x right, y down, z ahead."""
 
-_UNSEEN = 1 / 255
+UNSEEN = 1 / 255
 """Opacity below which no viewer draws anything."""
 _NEAREST, _FARTHEST = 500.0, 2000.0
 """Meters of the dome; within 2,048 a .spz keeps a fourth of a millimeter."""
@@ -47,7 +47,7 @@ def frame_gaussians(
     left.
     """
     found = scene_gaussians(stored, time, nodes=nodes, instances=instances)
-    found = selected(found, found.opacities >= _UNSEEN)
+    found = selected(found, found.opacities >= UNSEEN)
     if not len(found):
         raise ValueError("no Gaussian has an opacity of 1 / 255 or more: choose more, or another time")
     skies = [effect for effect in stored.scene.effects.values() if isinstance(effect, Sky)]

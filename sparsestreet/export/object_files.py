@@ -24,11 +24,13 @@ POSES = "poses.json"
 def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> list[str]:
     """Writes a .ply for each object and one for all that stands still, and ``poses.json``; returns the objects' names.
 
+    An object that no recorded instant shows is left out.
+
     A .ply has x ahead, y left, z up from the middle of the object's box, meters; of a body, as it stands in the middle
     of its time. Poses are those of the recorded instants at which the object is there. The whole folder is written, or
     nothing. Raises ValueError for a scene without objects, OSError where the folder is there and not empty.
     """
-    instants = _instants(views)
+    instants, antialiased = _instants(views), stored.options.settings.antialias
     objects = []
     with atomic_folder(folder) as temporary:
         for name, node in stored.scene.nodes.items():
@@ -39,7 +41,8 @@ def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> l
             raise ValueError("the scene has no objects of their own: export it as one .ply")
         still = [name for name, node in stored.scene.nodes.items() if not isinstance(node, Tracked)]
         if still:
-            write_ply(temporary / "still.ply", scene_gaussians(stored, instants[0].time, nodes=still))
+            found = scene_gaussians(stored, instants[0].time, nodes=still)
+            write_ply(temporary / "still.ply", found, antialiased=antialiased)
         described = {
             "axes": "x ahead, y left, z up; meters; quaternions wxyz",
             "still": "still.ply" if still else None,
@@ -71,7 +74,8 @@ def _object(
     turn = torch.from_numpy(world_from_object[:3, :3]).to(own.means)
     shift = torch.from_numpy(world_from_object[:3, 3]).to(own.means)
     file = f"{place:03d}.ply"
-    count = write_ply(folder / file, turned(replace(own, means=own.means - shift), turn.T))
+    moved = turned(replace(own, means=own.means - shift), turn.T)
+    count = write_ply(folder / file, moved, antialiased=stored.options.settings.antialias)
     return [
         {
             "name": node.names[number],

@@ -19,11 +19,11 @@ from sparsestreet.export.rig import intrinsics
 from sparsestreet.geometry.transforms import inverse, rigidity_error
 from sparsestreet.types import Camera, View
 
-KINDS = ("poses", "keyframes", "camera_path")
-"""The key of a file's list, which says what it is."""
+KINDS = ("camera_path", "poses", "keyframes")
+"""The key of a file's list, which says what it is. nerfstudio's files have keyframes of their own beside theirs."""
 _KEYS = {"seconds", "world_from_camera", "intrinsics", "width", "height"}
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_LARGEST = 16384
+_LARGEST, _FASTEST = 16384, 1000
 _RIGID = 1e-3
 """What numbers of a file may lack to a rotation; it is then made one."""
 
@@ -34,6 +34,8 @@ class PathFile:
 
     path: CameraPath
     fps: float | None
+    note: str | None = None
+    """What is in the file and has no effect."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +150,8 @@ def _nerfstudio(said: Mapping[str, Any], last: float, time_of: Callable[[float],
         raise ValueError(f"camera_type is {kind!r}, and only perspective cameras are rendered")
     width, height = _size(said.get("render_width"), said.get("render_height"), "render_")
     fps = float(_numbers(said.get("fps", 24), (), "fps"))
-    if fps <= 0:
-        raise ValueError(f"fps is above 0, got {fps:g}")
+    if not 0 < fps <= _FASTEST:
+        raise ValueError(f"fps is above 0 and at most {_FASTEST}, got {fps:g}")
     rigs = []
     for index, entry in enumerate(said["camera_path"]):
         where = f"camera_path[{index}]"
@@ -158,20 +160,25 @@ def _nerfstudio(said: Mapping[str, Any], last: float, time_of: Callable[[float],
         fov = float(_numbers(entry["fov"], (), f"{where}: fov"))
         if not 0 < fov < 180:
             raise ValueError(f"{where}: fov lies between 0 and 180 degrees, got {fov:g}")
-        pose = _rigid(np.reshape(_numbers(entry["camera_to_world"], (16,), f"{where}: camera_to_world"), (4, 4)), where)
+        rows = entry["camera_to_world"]
+        nested = isinstance(rows, list) and len(rows) == 4  # nerfstudio writes them one behind the other, others do not
+        table = _numbers(rows, (4, 4) if nested else (16,), f"{where}: camera_to_world")
+        pose = _rigid(np.reshape(table, (4, 4)), where)
         at = min(index / fps, last)
         if entry.get("render_time") is not None:
             at = last * float(_numbers(entry["render_time"], (), f"{where}: render_time"))
         focal = height / 2 / math.tan(math.radians(fov) / 2)
         lens = (focal, focal, width / 2, height / 2)
         rigs.append((_Pose(at, pose @ _OPENCV_FROM_OPENGL, lens, width, height).view(time_of),))
-    return PathFile(tuple(rigs), fps)
+    return PathFile(tuple(rigs), fps, "the crop of the path's file has no effect" if said.get("crop") else None)
 
 
 def _size(width: Any, height: Any, where: str) -> tuple[int, int]:
-    if not all(isinstance(side, int) and 0 < side <= _LARGEST for side in (width, height)):
-        raise ValueError(f"{where}width and height are pixels, 1 to {_LARGEST}, got {width!r} and {height!r}")
-    return width, height
+    for side in (width, height):
+        whole = isinstance(side, int | float) and not isinstance(side, bool) and side == side // 1
+        if not whole or not 0 < side <= _LARGEST:
+            raise ValueError(f"{where}width and height are pixels, 1 to {_LARGEST}, got {width!r} and {height!r}")
+    return int(width), int(height)
 
 
 def _numbers(value: Any, shape: tuple[int, ...], where: str) -> Float64[np.ndarray, "..."]:

@@ -9,11 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
+from sparsestreet.finite import check_finite
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.graph import SceneGaussians
 from sparsestreet.scene.nodes.node import Instances, Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
+from sparsestreet.scene.stored import DAMAGED, check_numbers
 from sparsestreet.types import Camera, Gaussians, View
 
 _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
@@ -27,30 +29,38 @@ _LARGEST_OPACITY = 1 - 2.0**-25
 _TOLD_APART = 1000
 """Times that are said with three decimals, however many frames a scene file claims."""
 
+ANTIALIASED = "comment SplatRenderMode: mip"
+"""In the header: what gsplat and Brush go by. Others add the blur of plain 3DGS."""
+
 _SMALLEST_SCALE = 1e-30
 """Smallest scale that is written, meters; a scale of 0 has no logarithm."""
 
 
-def write_ply(path: Path | str, gaussians: Gaussians) -> int:
+def write_ply(path: Path | str, gaussians: Gaussians, *, antialiased: bool = False) -> int:
     """Writes the Gaussians whose opacity is above 0 and returns their number; writes the whole file or nothing.
 
     Binary, little endian, float32, one vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (all of red,
-    then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). Raises ValueError for
+    then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). ``antialiased`` is said
+    in a comment. Raises ValueError for
     values that are not finite or if no Gaussian is left, OSError if the file cannot be written.
     """
+    check_gaussians(gaussians)
     table = _vertices(gaussians)
     if not len(table):
         raise ValueError("a ply needs a Gaussian with an opacity above 0, got none: choose more, or another time")
-    broken = np.flatnonzero(~np.isfinite(table).all(1))
-    if len(broken):
-        raise ValueError(
-            f"all values of a ply must be finite, but {len(broken)} Gaussians have others, the first of them in row "
-            f"{broken[0]} of those with an opacity: the scene is damaged, train it again"
-        )
     with atomic_file(Path(path)) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(table), gaussians.sh.shape[1]).encode("ascii"))
+        file.write(_header(len(table), gaussians.sh.shape[1], antialiased).encode("ascii"))
         file.write(table.tobytes())
     return len(table)
+
+
+def check_gaussians(gaussians: Gaussians, of: str = "", rows: slice = slice(None)) -> None:
+    """Raise ValueError where a number is NaN or infinite, also of a row that is not seen; names field, row and value.
+
+    Every writer asks before it leaves rows out: a comparison of opacities drops those that are NaN. ``of``: what is
+    said behind a field's name.
+    """
+    check_finite({f"{name}{of}": getattr(gaussians, name).detach()[rows] for name in _FIELDS}, DAMAGED)
 
 
 @torch.no_grad()
@@ -69,13 +79,17 @@ def scene_gaussians(
         nodes: names of the nodes to return (``["background"]``: nothing that moves); None: all.
         instances: names of tracks; only their Gaussians are returned. Not together with ``nodes``.
 
-    Raises ValueError, naming the available ones, for an unknown node or instance, or one absent at that time.
+    Raises ValueError, naming the available ones, for an unknown node or instance, or one absent at that time; and for
+    a scene with a number that is NaN, infinite, or becomes so (``log_scales`` of 100).
     """
     if not 0 <= time <= 1:
         raise ValueError(f"time runs from 0 (first frame of the log) to 1 (its last), got {time}")
     if nodes is not None and instances is not None:
         raise ValueError("Gaussians are chosen by nodes or by instances, got both: leave one out")
+    check_numbers(stored.scene)
     placed = stored.scene.gaussians_at(View(_ANYWHERE, time))
+    for name, rows in placed.spans.items():
+        check_gaussians(placed.gaussians, f" of node {name}", rows)
     if instances is not None:
         keep = _rows_of_instances(stored, placed, instances, time)
     else:
@@ -156,11 +170,12 @@ def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
     return torch.cat([column.float() for column in columns], dim=1).numpy().astype("<f4")
 
 
-def _header(rows: int, terms: int) -> str:
+def _header(rows: int, terms: int, antialiased: bool) -> str:
     properties = ["x", "y", "z", "nx", "ny", "nz"]
     properties += [f"f_dc_{index}" for index in range(3)]
     properties += [f"f_rest_{index}" for index in range(3 * (terms - 1))]
     properties += ["opacity", *(f"scale_{index}" for index in range(3)), *(f"rot_{index}" for index in range(4))]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}"]
+    comments = [ANTIALIASED] if antialiased else []
+    lines = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {rows}"]
     lines += [f"property float {name}" for name in properties]
     return "\n".join([*lines, "end_header", ""])

@@ -13,6 +13,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from sparsestreet.export.path import CameraPath, Rig
+from sparsestreet.export.ply import check_gaussians
+from sparsestreet.finite import check_finite
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import project
 from sparsestreet.ops.activate import activate
@@ -21,6 +23,7 @@ from sparsestreet.ops.spherical_harmonics import view_colors
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
+from sparsestreet.scene.stored import DAMAGED, check_numbers
 from sparsestreet.types import Gaussians
 
 LOOKS = 12
@@ -68,7 +71,10 @@ def recorded_parts(stored: StoredScene, path: CameraPath, every: int) -> list[Pa
 
     What changes its shape (bodies, networks, masks over time) gets a shape every so many instants, as it is at that
     instant. A field is deformed where the first camera of the instant sees it.
+
+    Raises ValueError for a scene with a number that is NaN, infinite, or becomes so.
     """
+    check_numbers(stored.scene)
     smallest = stored.options.settings.alpha_min
     nodes = stored.scene.nodes.items()
     return [part for name, node in nodes for part in _parts(name, node, path, every, smallest)]
@@ -82,12 +88,12 @@ def _parts(name: str, node: Node, path: CameraPath, every: int, smallest: float)
     )
     if all(same):
         looks = np.unique(np.linspace(0, len(path) - 1, LOOKS).round().astype(int)).tolist()
-        wholes = [_whole(first, [(_raw(node, path[look]), path[look]) for look in looks])]
+        wholes = [_whole(name, first, [(_raw(node, path[look]), path[look]) for look in looks])]
     else:
         # A shape is that of an instant in the middle of those that show it.
         keys = [min(start + every // 2, len(path) - 1) for start in range(0, len(path), every)]
         raws = ((_raw(node, path[key]), path[key]) for key in keys)
-        wholes = [_whole(raw, [(raw, rig)]) for raw, rig in raws]
+        wholes = [_whole(name, raw, [(raw, rig)]) for raw, rig in raws]
     shape_at = [0 if all(same) else index // every for index in range(len(path))]
     # A slash would make a folder of a viewer's list.
     objects = [name] if instances is None else [f"{name}/{one.replace('/', '_')}" for one in instances.names]
@@ -105,8 +111,10 @@ class _Whole:
     colors: Float[Tensor, "n 3"]
 
 
-def _whole(raw: RawGaussians, looks: Sequence[tuple[RawGaussians, Rig]]) -> _Whole:
-    return _Whole(activate([replace(raw, placement=None)], sh_degree=FINISHED.sh_degree), _seen_colors(looks))
+def _whole(name: str, raw: RawGaussians, looks: Sequence[tuple[RawGaussians, Rig]]) -> _Whole:
+    own = activate([replace(raw, placement=None)], sh_degree=FINISHED.sh_degree)
+    check_gaussians(own, f" of node {name}")
+    return _Whole(own, _seen_colors(looks))
 
 
 def _part(
@@ -141,7 +149,9 @@ def _cloud(whole: _Whole, rows: Tensor | slice, smallest: float) -> Cloud:
     own = whole.gaussians
     kept = own.opacities[rows] >= smallest
     axes = quat.to_matrix(quat.normalized(own.quaternions[rows][kept])) * own.scales[rows][kept][:, None, :]
-    numbers = (own.means[rows][kept], axes @ axes.mT, whole.colors[rows][kept], own.opacities[rows][kept])
+    covariances = axes @ axes.mT
+    check_finite({"the square of scales": covariances}, DAMAGED)
+    numbers = (own.means[rows][kept], covariances, whole.colors[rows][kept], own.opacities[rows][kept])
     centers, covariances, colors, opacities = (value.float().cpu().numpy() for value in numbers)
     return Cloud(centers, covariances, colors, opacities)
 

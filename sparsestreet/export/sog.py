@@ -22,6 +22,7 @@ from sparsestreet.atomic import atomic_file
 from sparsestreet.codec.limits import Budget
 from sparsestreet.codec.positions import curve_order
 from sparsestreet.export.codebooks import nearest_numbers, number_book, vector_book
+from sparsestreet.export.ply import check_gaussians
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Gaussians
 
@@ -49,13 +50,12 @@ def write_sog(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     fewer colors, whose numbers are of 256. Raises ValueError for more than ``LARGEST_COUNT`` Gaussians or numbers that
     are not finite.
     """
+    check_gaussians(gaussians)
     if len(gaussians) > LARGEST_COUNT:
         raise ValueError(
             f"a .sog holds at most {LARGEST_COUNT:,} Gaussians, got {len(gaussians):,}: prune, or choose nodes"
         )
     means, sh = gaussians.means.double().numpy(), gaussians.sh.double().numpy()
-    if not (np.isfinite(means).all() and np.isfinite(sh).all()):
-        raise ValueError("all values of a .sog must be finite: the scene is damaged, train it again")
     logs = np.sign(means) * np.log1p(np.abs(means))
     order = curve_order(logs)
     scales = np.log(np.maximum(gaussians.scales.double().numpy()[order], 1e-30))

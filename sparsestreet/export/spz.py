@@ -6,6 +6,7 @@ scales, rotations as the smallest three parts, harmonics. Axes are right, up, ba
 
 import gzip
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float, UInt8
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.export.frame import turned
+from sparsestreet.export.ply import check_gaussians
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Gaussians
 
@@ -27,6 +29,8 @@ _RIGHT_UP_BACK = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 _FRACTION_BITS = 12
 _COLOR_SCALE = 0.15
 _ANTIALIASED = 1
+NOTED = 1e-3
+"""Meters of rounding that are worth a line."""
 _HALF = np.sqrt(0.5)
 """Largest value of the second largest part of a unit quaternion."""
 
@@ -38,14 +42,13 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     [-10, 5.9], opacities 1 / 510, parts of quaternions 0.0007, the first harmonic 1 / 77 in [-3.3, 3.3], the others
     1 / 256 in [-1, 1). Raises ValueError for more than ``LARGEST_COUNT`` Gaussians or numbers that are not finite.
     """
+    check_gaussians(gaussians)
     found = turned(gaussians, _RIGHT_UP_BACK)
     if len(found) > LARGEST_COUNT:
         raise ValueError(
             f"a .spz holds at most {LARGEST_COUNT:,} Gaussians, got {len(found):,}: prune, or choose nodes"
         )
     means, sh = found.means.double().numpy(), found.sh.double().numpy()
-    if not (np.isfinite(means).all() and np.isfinite(sh).all()):
-        raise ValueError("all values of a .spz must be finite: the scene is damaged, train it again")
     bits = _fraction_bits(float(np.abs(means).max(initial=0)))
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
     logs = np.log(np.maximum(found.scales.double().numpy(), 1e-30))
@@ -63,6 +66,24 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     return len(found)
 
 
+def spz_notes(gaussians: Gaussians) -> list[str]:
+    """Return, in a line each, what the format keeps less of than its usual rounding."""
+    notes, means = [], gaussians.means.double()
+    if len(gaussians):
+        row = int(means.abs().amax(1).argmax())
+        step = 0.5 ** (_fraction_bits(float(means[row].abs().max())) + 1)
+        if step > NOTED:
+            away = float(means[row].norm()) / 1000
+            notes.append(f"positions are kept to {1000 * step:.3g} mm, because row {row} lies {away:,.4g} km away")
+    logs, first, rest = gaussians.scales.double().log(), gaussians.sh[:, 0], gaussians.sh[:, 1:]
+    beyond = {
+        "scales are cut to 365 m": int((logs > 255 / 16 - 10 + 1 / 32).any(1).sum()),
+        "colors are cut to -3.3 to 3.3": int((first.abs() > 0.5 / _COLOR_SCALE + 0.01).any(1).sum()),
+        "harmonics are cut to -1 to 1": int((rest.abs() > 1 + 1 / 256).flatten(1).any(1).sum()),
+    }
+    return [*notes, *(f"of {count:,} Gaussians, {what}" for what, count in beyond.items() if count)]
+
+
 def read_spz(path: Path) -> Gaussians:
     """Returns the Gaussians of such a file, x right, y down, z ahead. Raises ValueError for one that is none."""
     # Above what the largest file unpacks to, zlib stops.
@@ -75,7 +96,7 @@ def read_spz(path: Path) -> Gaussians:
                 raise ValueError(f"{path} is no .spz of version {VERSION} with at most {LARGEST_COUNT:,} Gaussians")
             size = count * (20 + 3 * (terms - 1))
             content = stream.read(size + 1)
-        except (OSError, EOFError, struct.error) as error:
+        except (OSError, EOFError, struct.error, zlib.error) as error:
             raise ValueError(f"{path} is no .spz or is damaged ({error})") from error
     if len(content) != size:
         raise ValueError(f"{path} is damaged: {count} Gaussians take {size} bytes, got {len(content)}")

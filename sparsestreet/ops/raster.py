@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.types import DemandError
+
 LEAST_ALPHA = 1e-6
 """Depth is divided by alpha, or by this where a pixel is emptier."""
 
 
-class PairLimitError(RuntimeError):
+class PairLimitError(DemandError):
     """The splats of one view cover more (splat, tile) pairs than memory may hold.
 
     >>> raise PairLimitError.of(pairs=900, limit=800, worst=[(4, 600)])

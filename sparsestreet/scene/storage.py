@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from sparsestreet.atomic import atomic_file
+from sparsestreet.codec.container import MAGIC
 from sparsestreet.scene.stored import VERSION, StoredScene, description, scene_of, without_masks
 from sparsestreet.scene.street_file import SUFFIX, read_street
 
@@ -25,6 +26,25 @@ SMALL_FILE_NAME = f"scene{SUFFIX}"
 """Name of what may stand in its place there."""
 
 _KEY = "sparsestreet"
+_OURS = (".safetensors", SUFFIX)
+_MOMENT = "Gaussians of one moment for viewers, or points"
+_ARCHIVE, _PICTURE = "a zip archive", "a picture"
+_OF_ENDINGS = {
+    _MOMENT: (".ply", ".splat", ".ksplat", ".spz", ".sog"),
+    "what AlpaSim loads beside the pictures of a scene": (".usdz",),
+    "a page for browsers": (".html", ".htm"),
+    "a video": (".mp4", ".mov", ".avi", ".mkv", ".webm"),
+    "a checkpoint that a training goes on from": (".ckpt", ".pt", ".pth"),
+    _ARCHIVE: (".zip",),
+    _PICTURE: (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff"),
+    "text": (".json", ".yaml", ".yml", ".csv", ".txt", ".md"),
+}
+_OF_BYTES = (
+    (0, b"ply", _MOMENT), (0, b"PK\3\4", _ARCHIVE), (0, b"\x1f\x8b", "what gzip packed, such as a .spz"),
+    (0, b"\x89PNG", _PICTURE), (0, b"\xff\xd8\xff", _PICTURE), (0, b"RIFF", _PICTURE), (0, b"<", "a page for browsers"),
+    (4, b"ftyp", "a video"), (0, b"\x80\x02", "a pickle"), (0, b"{", "text"),
+)  # fmt: skip
+"""Place, bytes that stand there, and what begins so."""
 
 
 def save_scene(path: Path | str, stored: StoredScene) -> None:
@@ -57,15 +77,35 @@ def load_scene(path: Path | str, device: torch.device | str = "cpu") -> StoredSc
 def scene_path(path: Path) -> Path:
     """The scene file that a path names; in a run's folder, a .street where there is no other.
 
-    Raises FileNotFoundError where there is none.
+    Raises FileNotFoundError where there is none, ValueError for a file of another kind, which it names.
     """
     whole, small = path / FILE_NAME, path / SMALL_FILE_NAME
     found = path if not path.is_dir() else small if small.is_file() and not whole.is_file() else whole
     if not found.is_file():
+        runs = sorted(one.parent.name for one in path.glob(f"*/{FILE_NAME}"))[:3]
+        there = f" (such as {', '.join(runs)} in it)" if runs else ""
         raise FileNotFoundError(
-            f"there is no scene at {found}: give a {FILE_NAME}, or the folder of a run that has one"
+            f"there is no scene at {found}: give a {FILE_NAME}, or the folder of a run that has one{there}"
         )
+    _check_kind(found)
     return found
+
+
+def _check_kind(path: Path) -> None:
+    """Raise ValueError, saying what it is, for a file that is no scene by its ending and first bytes."""
+    with path.open("rb") as file:
+        head = file.read(9)
+    found = SUFFIX if head[:8] == MAGIC else ".safetensors" if head[8:] == b"{" and head[4:8] == bytes(4) else None
+    if found is not None and (found == path.suffix or (path.suffix not in _OURS and found != SUFFIX)):
+        return
+    if found is not None:
+        raise ValueError(f"{path} is a {found} by its first bytes: give it that ending")
+    what = next((what for what, endings in _OF_ENDINGS.items() if path.suffix.lower() in endings), None)
+    what = what or next((what for at, start, what in _OF_BYTES if head[at:].startswith(start)), None)
+    if what is None and path.suffix not in _OURS:
+        what = "bytes that are not known" if head else "nothing"
+    if what is not None:
+        raise ValueError(f"{path} holds {what}, not a scene: open the run's folder, its {FILE_NAME} or a {SUFFIX}")
 
 
 def _read_scene(path: Path) -> StoredScene:
@@ -74,7 +114,7 @@ def _read_scene(path: Path) -> StoredScene:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         if _KEY not in metadata:
-            raise ValueError(f"the file holds tensors but no scene: give the {FILE_NAME} that a run wrote")
+            raise ValueError(f"the file holds tensors but no scene of ours: give the {FILE_NAME} that a run wrote")
         return scene_of(json.loads(metadata[_KEY]), tensors)
     except (SafetensorError, json.JSONDecodeError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         # Whatever else is wrong: the header does not say what the tensors are.

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sparsestreet.finite import check_finite
 from sparsestreet.scene.effects.effect import Effect, EffectSettings
 from sparsestreet.scene.encoding import decode_as, encode
 from sparsestreet.scene.gaussians import Rows
@@ -22,6 +23,9 @@ VERSION = 3
 
 ROWS = "rows."
 """Begins the names of a node's tensors that are columns."""
+
+DAMAGED = "the scene is damaged, train it again"
+"""What is to be done where a number of a scene is none."""
 
 _HIGHER_HARMONICS = [(terms - 1, 3) for terms in (1, 4, 9, 16)]
 
@@ -86,6 +90,12 @@ def scene_of(header: Mapping[str, Any], tensors: dict[str, Tensor]) -> StoredSce
     scene.load_state_dict(tensors)
     options = decode_as(RenderOptions, header["options"])
     return StoredScene(scene.eval(), options, header["name"], header["num_frames"])
+
+
+def check_numbers(scene: SceneGraph) -> None:
+    """Raise ValueError where a number of a scene is NaN or infinite; it names node and field, row and value."""
+    tensors = {name: value.detach() for name, value in scene.state_dict().items() if value.is_floating_point()}
+    check_finite({name: value if value.dim() else value[None] for name, value in tensors.items()}, DAMAGED)
 
 
 def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:

@@ -26,7 +26,7 @@ from sparsestreet.codec.harmonics import packed_axes, principal_axes, unpacked_a
 from sparsestreet.codec.plain import TYPES, packed_column, unpacked_column
 from sparsestreet.codec.reading import Cursor
 from sparsestreet.scene import packing
-from sparsestreet.scene.stored import ROWS, StoredScene, description, scene_of, without_masks
+from sparsestreet.scene.stored import ROWS, StoredScene, check_numbers, description, scene_of, without_masks
 
 SUFFIX = ".street"
 
@@ -47,6 +47,7 @@ def save_street(path: Path | str, stored: StoredScene, attached: Mapping[str, by
     whose numbers are not finite, ModuleNotFoundError without zstandard.
     """
     scene = without_masks(stored.scene)
+    check_numbers(scene)
     moments = packing.second_moments(list(scene.nodes.values()))
     axes = {size: principal_axes(found) for size, found in sorted(moments.items())}
     forms = {name: packing.form_of(node, axes) for name, node in scene.nodes.items()}

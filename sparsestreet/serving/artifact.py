@@ -21,6 +21,7 @@ import sparsestreet
 from sparsestreet.atomic import atomic_file
 from sparsestreet.scene.edits import objects_of
 from sparsestreet.scene.nodes.tracked import Tracked
+from sparsestreet.scene.stored import check_numbers
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.cameras import Pose
 from sparsestreet.serving.renderer import frame_from_box
@@ -62,12 +63,13 @@ def write_artifact(
     Returns:
         How many ``poses``, ``cameras`` and ``objects`` there are.
 
-    Raises ValueError for a scene of less than two instants, or a car that is none.
+    Raises ValueError for a scene of less than two instants or with a number that is none, or a car that is none.
     """
     if len(car) != 3 or min(car) <= 0:
         raise ValueError(f"car= is length, width and height in meters, got {list(car)}")
     if len(served.rig.times) < 2:
         raise ValueError("a drive has two instants or more, got one: train on more frames")
+    check_numbers(served.stored.scene)
     tracks = _tracks(served)
     texts = {
         "metadata.yaml": yaml.safe_dump(_metadata(served, provenance), sort_keys=False),

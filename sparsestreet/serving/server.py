@@ -22,6 +22,7 @@ from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_messa
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
 from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
 from sparsestreet.serving.turns import Turns
+from sparsestreet.types import as_demand
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +41,9 @@ _CODES = {
     NotServedError: grpc.StatusCode.UNIMPLEMENTED,
     ValueError: grpc.StatusCode.INVALID_ARGUMENT,
     OSError: grpc.StatusCode.FAILED_PRECONDITION,
-    MemoryError: grpc.StatusCode.RESOURCE_EXHAUSTED,
 }
-"""The first that an error is one of; what is none of these is INTERNAL, and the server's log has its trace."""
+"""The first that an error is one of. Where memory does not do (``as_demand``), it is RESOURCE_EXHAUSTED; what is none
+of these is INTERNAL, and the server's log has its trace."""
 
 
 class GoneError(Exception):
@@ -88,15 +89,18 @@ class Sensorsim:
                 image, _ = self._rendered(one, context)
                 data = self._encoders.submit(encoded, image, one.image_format, one.image_quality)
                 started.append((item.camera_name, data))
-            except (ValueError, OSError, MemoryError) as error:
+            except GoneError:
+                raise
+            except Exception as error:
                 started.append((item.camera_name, error))
         answer = wire.kind("BatchRGBRenderReturn")()
         for name, outcome in started:
-            item = answer.items.add(camera_name=name, success=isinstance(outcome, Future))
-            if isinstance(outcome, Future):
+            failed = outcome.exception() if isinstance(outcome, Future) else outcome
+            item = answer.items.add(camera_name=name, success=failed is None)
+            if isinstance(outcome, Future) and failed is None:
                 item.result.image_bytes = outcome.result()
-            else:
-                item.error_message = str(outcome)
+            elif failed is not None:
+                item.error_message = _status_of(failed)[1]
         return answer
 
     def get_version(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -225,11 +229,19 @@ def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:
     except GoneError:
         _refuse(context, grpc.StatusCode.CANCELLED, "nobody waits for the answer any more")
     except Exception as error:
-        for kind, code in _CODES.items():
-            if isinstance(error, kind):
-                _refuse(context, code, str(error))
-        log.exception("a request failed")
-        _refuse(context, grpc.StatusCode.INTERNAL, f"{type(error).__name__}: {error}")
+        _refuse(context, *_status_of(error))
+
+
+def _status_of(error: BaseException) -> tuple[grpc.StatusCode, str]:
+    """The status of an error and what is said of it; the log has the trace of one that nobody expects."""
+    for kind, code in _CODES.items():
+        if isinstance(error, kind):
+            return code, str(error)
+    demand = as_demand(error)
+    if demand is not None:
+        return grpc.StatusCode.RESOURCE_EXHAUSTED, str(demand)
+    log.error("a request failed", exc_info=error)
+    return grpc.StatusCode.INTERNAL, f"{type(error).__name__}: {error}"
 
 
 def _refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> NoReturn:

@@ -1,15 +1,21 @@
 """``sparsestreet export`` on a hand-made scene."""
 
-from dataclasses import fields
+import math
+from dataclasses import fields, replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from plyfile import PlyData
 
 from sparsestreet.cli.export import USAGE, ExportRequest, export
 from sparsestreet.cli.render import render
+from sparsestreet.export.compressed_ply import read_compressed_ply
 from sparsestreet.export.ply import scene_gaussians
+from sparsestreet.scene.effects.lens import Lens, LensSettings
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
 from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street, street_views
@@ -70,6 +76,73 @@ def test_a_frame_for_viewers_and_what_it_lost(run, tmp_path, name, capsys):
     assert "30 Gaussians at time 0.25" in said
     assert "dB beside what was written" in said
     assert "lost: time, as this is the moment 0.25; the sky" in said
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz", "objects", "a.html"])
+@pytest.mark.parametrize("mip", [False, True])
+def test_what_a_file_loses_is_said(tmp_path, name, mip, capsys):
+    """Of the street at time 0.6 the tram is gone; its camera has an effect, and small Gaussians may have less blur."""
+    write_views(tmp_path / "views.json", street_views(), [], frame_rate=10.0)
+    stored = stored_street()
+    options = replace(stored.options, settings=replace(stored.options.settings, antialias=mip))
+    effects = dict(stored.scene.effects.items()) | {"lens": Lens(LensSettings())}
+    scene = SceneGraph(dict(stored.scene.nodes.items()), effects)
+    save_scene(tmp_path / "scene.safetensors", replace(stored, options=options, scene=scene))
+    moment = [] if name in ("objects", "a.html") else ["time=0.6"]
+    assert export([str(tmp_path), str(tmp_path / name), *moment]) == 0
+    said = capsys.readouterr().out
+    blurs = "trained with antialias: plain viewers show small Gaussians brighter"
+    assert (blurs in said) == (mip and name != "a.spz")
+    assert "effects of the cameras (lens)" in said
+    assert ("left out: 3 Gaussians" in said) == bool(moment)
+    files = [tmp_path / name] if moment else sorted((tmp_path / name).glob("*.ply")) if name == "objects" else []
+    for file in files:
+        if file.suffix == ".ply":
+            assert (b"\ncomment SplatRenderMode: mip\n" in file.read_bytes().partition(b"end_header")[0]) == mip
+            assert len(PlyData.read(file)["vertex"]) > 0
+    if name == "a.compressed.ply":
+        assert len(read_compressed_ply(tmp_path / name)) > 0
+
+
+FORMATS = ["a.ply", "a.spz", "a.compressed.ply", "a.sog", "a.html", "objects", "a.usdz", "a.street"]
+NUMBERS = [
+    (field, value)
+    for field in ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
+    for value in (math.nan, math.inf, -math.inf)
+]
+OVERFLOW = [("log_scales", 100.0), ("log_scales", 60.0)]
+"""Finite as they are learned: no scale in float32, and none whose square is one."""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_number_that_is_none_is_named_and_no_file_is_written(tmp_path, name, capsys):
+    """NaN opacities would be dropped by every comparison; a scale without end becomes one of 365 m in a .spz."""
+    write_views(tmp_path / "views.json", street_views(), [], frame_rate=10.0)
+    overflow = {"a.street": [], "a.usdz": [], "a.html": OVERFLOW}.get(name, OVERFLOW[:1])
+    for (field, value), (node, row) in zip([*NUMBERS, *overflow], cycle([("background", 17), ("rigid", 5)])):
+        stored = stored_street()
+        with torch.no_grad():
+            getattr(stored.scene.nodes[node].rows, field)[row].flatten()[-1:] = value
+        save_scene(tmp_path / "scene.safetensors", stored)
+        assert export([str(tmp_path), str(tmp_path / name)]) == 1, (node, field, value)
+        said = capsys.readouterr().err
+        assert len(said.strip().splitlines()) == 1
+        raw = f"nodes.{node}.rows.{field} must be finite, but row {row} has {value}: the scene is damaged"
+        assert (raw if (field, value) not in OVERFLOW else "scales") in said
+        assert "has inf" in said or not math.isfinite(value)
+        assert sorted(one.name for one in tmp_path.iterdir()) == ["scene.safetensors", "views.json"]
+
+
+@pytest.mark.parametrize("tensor", ["nodes.rigid.keyframe_translations", "effects.sky.texels"])
+@pytest.mark.parametrize("name", FORMATS)
+def test_so_is_one_of_a_pose_or_the_sky(tmp_path, name, tensor, capsys):
+    write_views(tmp_path / "views.json", street_views(), [], frame_rate=10.0)
+    stored = stored_street()
+    stored.scene.state_dict()[tensor][1].flatten()[-1:] = math.nan
+    save_scene(tmp_path / "scene.safetensors", stored)
+    assert export([str(tmp_path), str(tmp_path / name)]) == 1
+    assert f"{tensor} must be finite, but row 1 has nan" in capsys.readouterr().err
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["scene.safetensors", "views.json"]
 
 
 @pytest.mark.parametrize(

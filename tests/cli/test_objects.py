@@ -54,6 +54,23 @@ def test_names_that_a_terminal_would_obey_are_written_out(tmp_path, capsys):
     assert not {"\x1b", "\x07", "\u202e"} & {*said, *captured.out, *captured.err}
 
 
+def test_times_behind_the_end_of_the_log_are_said(run, tmp_path, capsys):
+    """The log lasts one second: 5 frames at 4 a second."""
+    edits = tmp_path / "edits.yaml"
+    edits.write_text(
+        "hide: {car: [5, 9]}\nmove: {tram: {hold: 99}}\ncopy: {a: {of: car, right: 3, during: [0.5, 2]},"
+        " b: {of: car, path: [[-3, 1, 1], [-2, 2, 2]]}, c: {of: car, right: 2, during: [0, 1], hide: [0.5, 1]}}"
+    )
+    assert render([str(run), str(tmp_path / "out"), "frames=0:1", "cameras=0", f"edits={edits}"]) == 0
+    said = capsys.readouterr().out
+    assert "car: hide 5 to 9 s: the log ends at 1 s, nothing of that is seen" in said
+    assert "tram: hold 99 s: the log ends at 1 s, it is as it is there" in said
+    assert "a: during 0.5 to 2 s: the log ends at 1 s, it is as it is there" in said
+    assert "b: path -3 to -2 s: the log begins at 0 s, nothing of that is seen" in said
+    assert "c: " not in said
+    assert "where tram stood" in said  # and not the car, which is never hidden
+
+
 def test_the_view_that_shows_an_object_largest_is_chosen():
     row = next(row for row in scene_objects(stored_street(), street_views()) if row.name == "car")
     areas = []

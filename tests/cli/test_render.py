@@ -3,11 +3,14 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hydra.utils import instantiate
 from PIL import Image
 
@@ -19,6 +22,7 @@ from sparsestreet.export.layers import LAYERS, layer_values
 from sparsestreet.export.path import recorded, resized, shifted
 from sparsestreet.export.seen import count_images
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.edits import REMOVED, Edits, edited
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import read_views, write_views
@@ -134,7 +138,11 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
         ({"height": 0}, 2, "height must be above 0"),
         ({"fps": 0}, 2, "fps must be above 0, got 0"),
         ({"quality": 11}, 2, "quality lies in 1 to 10, got 11"),
-        ({"out": "drive.avi"}, 1, "ends in .mp4"),
+        ({"fps": 1e5}, 2, "fps lies in 0.001 to 1000, got 100000"),
+        ({"log_fps": 1e-5}, 2, "log_fps lies in 0.001 to 1000, got 1e-05"),
+        ({"quality": "nan"}, 2, "quality must be a number, got 'nan'"),
+        ({"width": 6000}, 1, "at most 16,384 pixels a side, got 24,000 x 4,000: take a smaller width="),
+        ({"out": "drive.avi"}, 2, "ends in .mp4"),
         ({"scene": "nowhere"}, 1, "there is no scene at nowhere"),
         ({"views": "nowhere.json"}, 1, "there is no nowhere.json: training writes"),
         ({"cameras": 7}, 1, "no camera 7 in frame 0, only [0, 1, 2, 3]"),
@@ -150,6 +158,45 @@ def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, sa
     assert said in error
     assert len(error.strip().splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [None, MemoryError(), RuntimeError("CUDA out of memory.\nTried to"), torch.OutOfMemoryError("out of memory")],
+)
+def test_where_memory_does_not_do_it_is_one_line(run, tmp_path, error, capsys, monkeypatch):
+    def out_of_memory(*told):
+        raise error
+
+    if error is None:
+        monkeypatch.setattr(rasterizer, "PAIR_LIMIT", 5)
+    else:
+        monkeypatch.setattr(video, "side_by_side", out_of_memory)
+    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 1
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert ("more than the 5 that may be held" if error is None else "render: memory is out") in said
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_error_of_our_own_keeps_its_trace(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "side_by_side", lambda images: {}["of our own"])
+    with pytest.raises(KeyError, match="of our own"):
+        render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"])
+
+
+def test_without_a_file_the_usage_is_said(run, capsys):
+    assert render([str(run)]) == 2
+    assert "out=... is missing: sparsestreet render RUN FILE [key=value ...]" in capsys.readouterr().err
+
+
+def test_another_ending_is_refused_before_torch_is_there(run, tmp_path):
+    code = "import sys; from sparsestreet.cli.render import render; status = render(sys.argv[1:])"
+    code += "; sys.exit(99 if 'torch' in sys.modules else status)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(run), str(tmp_path / "out.avi")], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "a video ends in .mp4, a folder of PNGs has no ending, got 'out.avi'" in done.stderr
 
 
 @pytest.mark.lengthy

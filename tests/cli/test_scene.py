@@ -4,8 +4,50 @@ import pytest
 import torch
 
 from sparsestreet.cli import scene
+from sparsestreet.cli.evaluate import evaluate
+from sparsestreet.cli.export import export
+from sparsestreet.cli.objects import objects
+from sparsestreet.cli.render import render
 from sparsestreet.cli.scene import open_scene
-from tests.export.street import stored_street
+from sparsestreet.cli.serve import serve
+from sparsestreet.cli.view import view
+from sparsestreet.export.ply import scene_gaussians, write_ply
+from sparsestreet.scene.storage import save_scene
+from sparsestreet.scene.views import write_views
+from tests.export.street import stored_street, street_views
+
+
+@pytest.mark.parametrize(
+    ("command", "more"),
+    [
+        (render, ["out"]),
+        (view, ["port=0"]),
+        (export, ["a.spz"]),
+        (export, ["a.usdz"]),
+        (export, ["a.street"]),
+        (objects, []),
+        (serve, ["port=0"]),
+        (evaluate, []),
+    ],
+)
+def test_every_command_names_a_file_of_another_kind(command, more, tmp_path, monkeypatch, capsys):
+    """Our own .ply, which is for viewers, comes back to us."""
+    monkeypatch.chdir(tmp_path)
+    write_ply("car.ply", scene_gaussians(stored_street(), 0.0))
+    assert command(["car.ply", *more]) == 1
+    said = capsys.readouterr().err
+    assert "car.ply holds Gaussians of one moment for viewers, or points, not a scene: open the run's folder" in said
+    assert len(said.strip().splitlines()) == 1
+    assert [one.name for one in tmp_path.iterdir()] == ["car.ply"]
+
+
+def test_so_does_an_edit_that_inserts_it(tmp_path, capsys):
+    write_ply(tmp_path / "car.ply", scene_gaussians(stored_street(), 0.0))
+    save_scene(tmp_path / "scene.safetensors", stored_street())
+    write_views(tmp_path / "views.json", street_views(), [], frame_rate=10.0)
+    (tmp_path / "edits.yaml").write_text("insert: {new: {scene: car.ply, of: car, path: [[0, 1, 1]]}}")
+    assert render([str(tmp_path), str(tmp_path / "out"), f"edits={tmp_path / 'edits.yaml'}"]) == 1
+    assert "car.ply holds Gaussians of one moment for viewers" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("gpu", [False, True])

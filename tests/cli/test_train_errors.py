@@ -5,6 +5,7 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import pytest
+import torch
 from lightning.fabric.strategies.launchers.subprocess_script import _hydra_subprocess_cmd
 from omegaconf import DictConfig
 
@@ -43,6 +44,20 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys):
     assert "Traceback" not in written
     assert "Error in call" not in written
     assert not (tmp_path / "run").exists()
+
+
+def test_where_memory_does_not_do_it_is_one_line(tmp_path, capsys, monkeypatch):
+    def out_of_memory(*told):
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 2.00 GiB")
+
+    monkeypatch.setattr("sparsestreet.cli.run.run", out_of_memory)
+    with pytest.raises(SystemExit) as ended:
+        train([f"out={tmp_path / 'run'}"])
+    assert ended.value.code == 1
+    assert capsys.readouterr().err.splitlines() == [
+        "sparsestreet train: memory is out (CUDA out of memory. Tried to allocate 2.00 GiB): ask for smaller images or "
+        "fewer Gaussians"
+    ]
 
 
 def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):

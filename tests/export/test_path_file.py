@@ -12,6 +12,7 @@ import torch
 from sparsestreet.export.path_file import PathFile, read_path
 from sparsestreet.geometry.transforms import inverse
 from tests.export.street import street_views
+from tests.typed import there
 
 SECONDS = 4.0
 LIKE = street_views(cameras=(0,))[0]
@@ -99,6 +100,48 @@ def test_nerfstudios_axes_field_of_view_and_time(tmp_path):
     assert [rig[0].time for rig in found.path] == pytest.approx([0.0, 0.5 / SECONDS, 0.75])
 
 
+def nerfstudio(**said: Any) -> dict[str, Any]:
+    """A path of three poses in the form that nerfstudio's viewers write; ``said`` is what they differ in."""
+    flipped = (np.array(pose(3.0, 0.2)) @ np.diag([1.0, -1, -1, 1])).flatten().tolist()
+    entry = {"camera_to_world": flipped, "fov": 50.0, "aspect": 1.0}
+    rest = {"render_height": 24, "render_width": 33, "fps": 10, "seconds": 0.3, "is_cycle": False, "crop": None}
+    return {"camera_type": "perspective", "smoothness_value": 0.5, "camera_path": [entry] * 3} | rest | said
+
+
+KEY = {"fov": 50, "aspect": 1.5}
+COLUMNS = np.array(pose(3.0)).T.flatten().tolist()
+IN_JAVASCRIPT = {"keyframes": [KEY | {"matrix": json.dumps(COLUMNS), "properties": '[["FOV",50],["TIME",0]]'}] * 2}
+IN_VISER = {
+    "default_fov": 75.0, "default_transition_sec": 2.0, "render_height": 24.0, "render_width": 33.0, "fps": 10.0,
+    "keyframes": [
+        KEY | {"matrix": COLUMNS, "override_transition_enabled": False, "override_transition_sec": None}
+    ] * 2,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "own", [{}, IN_JAVASCRIPT, IN_VISER, {"keyframes": []}], ids=["alone", "three.js", "viser", "-"]
+)
+def test_files_of_nerfstudios_viewers_are_read_by_their_path(own, tmp_path):
+    """The viewer in three.js puts JSON into the JSON, that of viser whole floats for sizes; both add keyframes."""
+    found = read(nerfstudio(**own), tmp_path)
+    assert (len(found.path), found.fps, found.note) == (3, 10.0, None)
+    camera = found.path[0][0].camera
+    assert (camera.width, camera.height) == (33, 24)
+    assert type(camera.width) is int
+    np.testing.assert_allclose(inverse(camera.camera_from_world.double()).numpy(), pose(3.0, 0.2), atol=1e-6)
+
+
+def test_rows_of_a_pose_may_be_nested_and_a_crop_without_effect_is_said(tmp_path):
+    entry = nerfstudio()["camera_path"][0]
+    nested = entry | {"camera_to_world": np.reshape(entry["camera_to_world"], (4, 4)).tolist()}
+    found = read(nerfstudio(camera_path=[nested], crop={"crop_scale": [1, 1, 1]}), tmp_path)
+    assert torch.equal(
+        found.path[0][0].camera.camera_from_world, read(nerfstudio(), tmp_path).path[0][0].camera.camera_from_world
+    )
+    assert "crop" in there(found.note)
+
+
 ENTRY = {"seconds": 0.0, "world_from_camera": pose()}
 SCALED = (2 * np.array(pose())).tolist()
 
@@ -107,7 +150,7 @@ SCALED = (2 * np.array(pose())).tolist()
     ("said", "sentence"),
     [
         ("{", "is no JSON"),
-        ({"places": []}, "has a list of one of poses, keyframes, camera_path"),
+        ({"places": []}, "has a list of one of camera_path, poses, keyframes"),
         ({"poses": []}, "and something in it"),
         ({"poses": [{"seconds": 0}]}, r"poses\[0\] lacks world_from_camera"),
         ({"poses": [ENTRY | {"second": 0}]}, r"poses\[0\] has the keys height, intrinsics"),
@@ -125,6 +168,9 @@ SCALED = (2 * np.array(pose())).tolist()
         ({"keyframes": [ENTRY, ENTRY]}, "two or more at increasing seconds"),
         ({"camera_path": [{}], "render_width": 8, "render_height": 8}, r"camera_path\[0\] has camera_to_world and fov"),
         ({"camera_path": [{}]}, "render_width and height are pixels"),
+        (nerfstudio(render_width=32.5), "are pixels, 1 to 16384, got 32.5 and 24"),
+        (nerfstudio(render_width=True), "are pixels, 1 to 16384, got True"),
+        (nerfstudio(fps=1e9), "fps is above 0 and at most 1000, got 1e\\+09"),
         ({"camera_path": [{}], "camera_type": "equirectangular"}, "only perspective cameras"),
     ],
 )

@@ -103,7 +103,7 @@ def test_the_same_scene_gives_the_same_bytes(tmp_path: Path):
 def test_what_it_cannot_hold_is_refused(tmp_path: Path):
     one = gaussians(3)
     one.means[1, 2] = torch.nan
-    with pytest.raises(ValueError, match=r"all values of a \.sog must be finite"):
+    with pytest.raises(ValueError, match=r"must be finite, but row"):
         write_sog(tmp_path / "a.sog", one)
     assert list(tmp_path.iterdir()) == []
 

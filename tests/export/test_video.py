@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -123,6 +124,68 @@ def test_an_interrupted_film_leaves_nothing(tmp_path, name):
 
     with pytest.raises(KeyboardInterrupt):
         write_pictures(tmp_path / name, interrupted(), fps=10.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def profile(path) -> tuple[str, str]:
+    done = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-i", f"file:{path}"], capture_output=True, check=False)
+    found = re.search(r"Video: (\S+ \([^)]*\)).*?(yuv\w+)", done.stderr.decode())
+    return found[1], found[2]
+
+
+def test_the_best_quality_plays_as_the_others_do(tmp_path):
+    """crf 0 would be lossless, in a profile that browsers and phones do not show."""
+    write_pictures(tmp_path / "best.mp4", smooth_pictures(2), fps=10.0, quality=10.0)
+    assert profile(tmp_path / "best.mp4") == ("h264 (High)", "yuv420p")
+
+
+@pytest.mark.parametrize("name", ["12:30.mp4", "-y.mp4", "50%d%%.mp4", "concat:a|ü b.mp4", "http://a.mp4"])
+def test_any_name_is_a_name(tmp_path, monkeypatch, name):
+    """A colon is no protocol, a dash no option, a percent sign no number of a picture."""
+    monkeypatch.chdir(tmp_path)
+    assert write_pictures(name, smooth_pictures(2), fps=10.0) == 2
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.mp4")] == [str(Path(name))]
+    assert profile(tmp_path / name) == ("h264 (High)", "yuv420p")
+
+
+FFMPEGS = {
+    "fails behind the last picture": (
+        "cat > /dev/null; echo 'The moon is full' >&2; exit 3",
+        "status 3, .*The moon is",
+    ),
+    "ends at once": ("exec <&-; exit 4", "failed with status 4"),
+    "is killed": ("read -n 9 _; kill -9 $$", "was ended by signal 9"),
+    "says success and writes nothing": ("cat > /dev/null; exit 0", "took 30 pictures, and 0 of them are in its video"),
+    "says success behind the first picture": (
+        'case "$*" in *copy*) exec REAL "$@";; *) head -c 9216 | REAL "$@";; esac',
+        "failed with status 0",
+    ),
+    "says success and leaves one out": (
+        'case "$*" in *copy*) exec REAL "$@";; *) tail -c +9217 | REAL "$@";; esac',
+        "took 30 pictures, and 29 of them are in its video",
+    ),
+    "says success and stops taking pictures": ("head -c 99 > /dev/null; exec <&-; exit 0", "failed with status 0"),
+}
+
+
+@pytest.mark.parametrize("how", FFMPEGS)
+def test_when_ffmpeg_fails_the_old_video_stays_and_its_words_are_said(tmp_path, monkeypatch, how):
+    script, said = FFMPEGS[how]
+    program, path = tmp_path / "ffmpeg", tmp_path / "drive.mp4"
+    program.write_text("#!/bin/bash\n" + script.replace("REAL", imageio_ffmpeg.get_ffmpeg_exe()))
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    path.write_bytes(b"old")
+    with pytest.raises(OSError, match=said) as found:
+        write_pictures(path, smooth_pictures(30), fps=10.0)
+    assert len(str(found.value).splitlines()) == 1
+    assert path.read_bytes() == b"old"
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["drive.mp4", "ffmpeg"]
+
+
+def test_no_picture_of_a_video_is_wider_than_it_can_be(tmp_path):
+    with pytest.raises(ValueError, match=r"at most 16,384 pixels a side, got 16,386 x 2: take a smaller width="):
+        write_pictures(tmp_path / "a.mp4", [np.zeros((2, 16385, 3), np.uint8)], fps=10.0)
     assert list(tmp_path.iterdir()) == []
 
 

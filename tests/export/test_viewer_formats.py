@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sparsestreet.export.check import PROGRAM, check_file, read_plain_ply, turned_camera
-from sparsestreet.export.compressed_ply import read_compressed_ply, write_compressed_ply
+from sparsestreet.export.compressed_ply import compressed_ply_notes, read_compressed_ply, write_compressed_ply
 from sparsestreet.export.frame import VIEWER_FROM_WORLD, frame_gaussians, turned
 from sparsestreet.export.ply import write_ply
 from sparsestreet.export.sog import read_sog, write_sog
-from sparsestreet.export.spz import read_spz, write_spz
+from sparsestreet.export.spz import read_spz, spz_notes, write_spz
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Gaussians
 from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street, street_views
@@ -84,6 +84,32 @@ def test_compressed_ply_comes_back_within_its_rounding(tmp_path: Path, rows: int
     )
 
 
+@pytest.mark.parametrize(("name", "write", "read"), [("spz", write_spz, read_spz), ("ply", write_ply, read_plain_ply)])
+def test_a_damaged_file_is_a_value_error(name: str, write: Callable, read: Callable, tmp_path: Path):
+    """300 changed files each: bytes, cuts, and words of the header that are gone, twice or another."""
+    path, rng = tmp_path / f"a.{name}", np.random.default_rng(0)
+    write(path, gaussians(9, 4))
+    good = path.read_bytes()
+    words = good[: good.find(b"end_header")].split() if name == "ply" else [good[:4], good[4:10], good[10:14]]
+    refused = 0
+    for number in range(300):
+        content = bytearray(good)
+        if number % 3 == 0:
+            for place in rng.integers(0, len(good), rng.integers(1, 9)):
+                content[place] = rng.integers(256)
+        elif number % 3 == 1:
+            content = content[: rng.integers(len(good))]
+        else:
+            old, new = rng.choice(len(words), 2)
+            content = content.replace(words[old], words[new] if number % 2 else b"", 1 + number % 5)
+        path.write_bytes(content)
+        try:
+            read(path)
+        except ValueError:
+            refused += 1
+    assert refused > 100
+
+
 def test_a_spz_by_hand(tmp_path: Path):
     """From the description of the format: one Gaussian with x right, y down, z ahead becomes right, up, back."""
     one = Gaussians(
@@ -104,6 +130,39 @@ def test_a_spz_by_hand(tmp_path: Path):
     # The half turn about x that turns the axes: x is the largest part, the others are 0.
     assert int.from_bytes(content[32:36], "little") == 0
     assert len(content) == 36
+
+
+def with_a_far_row(meters: float) -> Gaussians:
+    one = gaussians(600)
+    one.means[417] = torch.tensor([0.0, meters, 0.0])
+    return one
+
+
+def test_one_far_row_that_coarsens_all_others_is_said(tmp_path: Path):
+    """What is said is what is measured, by the readers."""
+    for meters, written in ((1e6, "62.5 mm, because row 417 lies 1,000 km away"), (2e4, "1.95 mm, because row 417")):
+        one = with_a_far_row(meters)
+        (note,) = spz_notes(one)
+        assert f"positions are kept to {written}" in note
+        write_spz(tmp_path / "a.spz", one)
+        worst = float((read_spz(tmp_path / "a.spz").means - one.means)[:417].abs().max())
+        said = float(note.split()[4]) / 1000
+        assert 0.9 * said < worst <= 1.01 * said
+    assert spz_notes(with_a_far_row(5000.0)) == []  # still below a millimeter
+    (note,) = compressed_ply_notes(with_a_far_row(1e6))
+    assert "near row 417" in note
+    assert "because it lies 1e+06 m from its neighbors" in note
+    assert compressed_ply_notes(gaussians(600)) == [] or "mm" in compressed_ply_notes(gaussians(600))[0]
+
+
+def test_what_a_spz_cuts_is_counted():
+    one = gaussians(50)
+    one.scales[3, 1], one.sh[7, 2, 0], one.sh[8, 0, 1] = 1e20, 1.5, -4.0
+    assert spz_notes(one) == [
+        "of 1 Gaussians, scales are cut to 365 m",
+        "of 1 Gaussians, colors are cut to -3.3 to 3.3",
+        "of 1 Gaussians, harmonics are cut to -1 to 1",
+    ]
 
 
 def test_what_is_far_away_does_not_wrap_around(tmp_path: Path):

@@ -3,7 +3,9 @@
 import errno
 import json
 import os
+import re
 import resource
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +17,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from sparsestreet.codec.container import MAGIC
 from sparsestreet.scene import storage
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.storage import FILE_NAME, VERSION, load_scene, save_scene
@@ -51,16 +54,49 @@ def test_a_truncated_file(path: Path, length: int):
         load_scene(path)
 
 
-def test_a_file_of_another_kind(path: Path):
-    path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n" * 10)
-    with pytest.raises(ValueError, match=f"{path} is no scene file or is damaged"):
-        load_scene(path)
+FOREIGN = {
+    "a.ply": (b"ply\nformat ascii 1.0\n", "holds Gaussians of one moment for viewers, or points, not a scene"),
+    "a.splat": (bytes(32), "holds Gaussians of one moment for viewers"),
+    "A.KSPLAT": (bytes(4096), "holds Gaussians of one moment for viewers"),
+    "a.sog": (b"PK\3\4" + bytes(20), "holds Gaussians of one moment for viewers"),
+    "a.compressed.ply": (b"ply\nformat", "holds Gaussians of one moment for viewers"),
+    "a.usdz": (b"PK\3\4" + bytes(20), "holds what AlpaSim loads beside the pictures"),
+    "a.html": (b"<!doctype html>", "holds a page for browsers"),
+    "a.mp4": (bytes(4) + b"ftypisom", "holds a video"),
+    "last.ckpt": (b"PK\3\4" + bytes(20), "holds a checkpoint that a training goes on from"),
+    "views.json": (b"{}", "holds text"),
+    "a": (b"\x89PNG\r\n", "holds a picture"),
+    "scene.safetensors": (b"\x1f\x8b" + bytes(20), "holds what gzip packed, such as a .spz"),
+    "b.street": (b"PK\3\4" + bytes(20), "holds a zip archive"),
+    "a.blend": (b"BLENDER", "holds bytes that are not known"),
+    "a.npz": (b"", "holds nothing"),
+    "c.street": (bytes([90, *bytes(7), 123]) + bytes(90), "is a .safetensors by its first bytes: give it that ending"),
+    "d.safetensors": (MAGIC + bytes(20), "is a .street by its first bytes: give it that ending"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_files_of_other_programs_are_named_for_what_they_are(name: str, tmp_path: Path):
+    content, said = FOREIGN[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=re.escape(f"{tmp_path / name} {said}")) as found:
+        load_scene(tmp_path / name)
+    assert "damaged" not in str(found.value)
+    assert said.startswith("is a") or f"open the run's folder, its {FILE_NAME} or a .street" in str(found.value)
+
+
+def test_a_folder_of_runs_says_so(path: Path, tmp_path: Path):
+    shutil.copytree(path.parent, tmp_path / "more" / "run_3")
+    with pytest.raises(FileNotFoundError, match=r"the folder of a run that has one \(such as run_3 in it\)"):
+        load_scene(tmp_path / "more")
 
 
 def test_tensors_of_another_program(path: Path):
     for metadata in (None, {"format": "pt"}):
         save_file({"weight": torch.zeros(3)}, path, metadata=metadata)
-        with pytest.raises(ValueError, match=f"{path}: the file holds tensors but no scene: give the {FILE_NAME}"):
+        with pytest.raises(
+            ValueError, match=f"{path}: the file holds tensors but no scene of ours: give the {FILE_NAME}"
+        ):
             load_scene(path)
 
 

@@ -3,14 +3,18 @@
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import cv2
 import grpc
 import numpy as np
 import pytest
+import torch
 
+from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.serving import renderer, wire
+from sparsestreet.serving import server as server_module
 from sparsestreet.serving.scenes import Scenes, named_runs
 from sparsestreet.serving.server import start
 from tests.export.street import stored_street
@@ -69,6 +73,54 @@ def test_a_batch_is_its_singles_and_says_which_camera_failed(client):
     with pytest.raises(grpc.RpcError) as caught:
         client.batch_render_rgb(batch)
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+
+
+TOO_MUCH = [
+    MemoryError(),
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB"),
+    RuntimeError("[enforce fail] DefaultCPUAllocator: not enough memory: you tried to allocate 9 bytes"),
+]
+
+
+def batch_of(*sides: int) -> Any:
+    batch = pb2.BatchRGBRenderRequest()
+    for side in sides:
+        request = request_for(timed_views()[1], resolution_w=side, resolution_h=side)
+        batch.items.add(camera_name=f"camera {side}", request=theirs(request))
+    return batch
+
+
+def test_splats_beyond_the_limit_are_one_cameras_fault(client, monkeypatch):
+    monkeypatch.setattr(rasterizer, "PAIR_LIMIT", 300)
+    answer = client.batch_render_rgb(batch_of(8, 900, 9))
+    assert [item.success for item in answer.items] == [True, False, True]
+    assert "more than the 300 that may be held" in answer.items[1].error_message
+    with pytest.raises(grpc.RpcError) as caught:
+        picture(client, timed_views()[1], resolution_w=900, resolution_h=900)
+    assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+
+
+@pytest.mark.parametrize("error", [*TOO_MUCH, KeyError("of our own")], ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("place", ["picture", "encoded"])
+def test_any_error_belongs_to_its_camera(client, monkeypatch, error, place):
+    plain = getattr(server_module, place)
+
+    def fails(*told):
+        size = told[1].camera.width if place == "picture" else told[0].shape[1]
+        if size == 9:
+            raise error
+        return plain(*told)
+
+    monkeypatch.setattr(server_module, place, fails)
+    answer = client.batch_render_rgb(batch_of(8, 9, 10))
+    assert [item.success for item in answer.items] == [True, False, True]
+    said = "KeyError: 'of our own'" if isinstance(error, KeyError) else "memory is out"
+    assert said in answer.items[1].error_message
+    with pytest.raises(grpc.RpcError) as caught:
+        picture(client, timed_views()[1], resolution_w=9, resolution_h=9)
+    code = grpc.StatusCode.INTERNAL if isinstance(error, KeyError) else grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert caught.value.code() == code
+    assert said in caught.value.details()
 
 
 def test_full_hd_passes_alpasims_channel(client):
