@@ -3,7 +3,7 @@
 ``benchmarks/numbers.yaml`` binds them. Under ``rows`` it names lines of records: a file in ``benchmarks`` and the
 fields by which one line is found (``*`` stands for any text, ``a.b`` for a field within a field). A file that ends in
 .md is a page: its table rows are found by ``row``, the first cell, and ``table``, counted from 1. Their columns' heads
-are fields, such as ``full`` or ``of_all_nodes``. Such a number only agrees with that page.
+are fields, such as ``full``, and ``people_2`` for a second one of a name. Such a number only agrees with that page.
 
 Under ``numbers`` each entry has a ``page``, a piece of its ``text`` with ``{}`` where a number stands, and one of the
 ``values`` for each ``{}``: a row's field, such as ``street.step.median``, or arithmetic of several; ``total(...)`` adds
@@ -76,7 +76,9 @@ def records(root: Path, file: str) -> list[dict[str, Any]]:
         if not line.startswith("|"):
             head = []
         elif not head:
-            head, table = [re.sub(r"\W+", "_", cell).strip("_") for cell in cells], table + 1
+            names = [re.sub(r"\W+", "_", cell).strip("_") for cell in cells]
+            head = [name + f"_{names[: i + 1].count(name)}" * (name in names[:i]) for i, name in enumerate(names)]
+            table += 1
         elif set(line) - set("|-: "):
             numbers = {name: value_of(NUMBER.search(cell)) for name, cell in zip(head, cells, strict=False) if name}
             rows.append({**numbers, "row": cells[0], "table": table})
@@ -126,8 +128,11 @@ def _compare(root: Path, entry: Any, words: Any, rows: Any, kinds: Any, found: C
 
 def pattern_of(text: str) -> re.Pattern[str]:
     """Return what finds the text: ``{}`` is a number, a space any white space, and bold marks may stand anywhere."""
-    parts = [r"\s+".join(re.escape(word) for word in re.split(r"\s+", part)) for part in text.split("{}")]
-    return re.compile(r"\*{0,2}([-+]?\d[\d,]*(?:\.\d+)?)\*{0,2}".join(parts))
+    bold = r"(?:\*\*)?"
+    letters = {" ": bold + r"\s+" + bold}
+    parts = re.sub(r"\s+", " ", text.replace("**", "")).split("{}")
+    literal = ["".join(letters.get(one, bold + re.escape(one)) for one in part) for part in parts]
+    return re.compile((bold + r"([-+]?\d[\d,]*(?:\.\d+)?)").join(literal))
 
 
 def evaluate(node: ast.expr, rows: Any, words: Any) -> Any:
