@@ -11,7 +11,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help quick elsewhere test test-all stress lint style types docs demo bench tables claims figure clean FORCE
+.PHONY: help quick elsewhere test test-all stress lint style types docs numbers demo bench tables claims figure clean FORCE
 
 help: ## this list
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -72,6 +72,9 @@ types: $(VENV)/.ok
 
 docs: $(VENV)/.ok ## these pages as a site, without a network: outputs/site/index.html; a broken link is an error
 	$(BIN)/python -m sphinx -q -E -a -W --keep-going -n -d .cache/doctrees docs outputs/site
+
+numbers: $(VENV)/.ok ## numbers of the pages beside their records: what differs, and what has no record
+	$(BIN)/python scripts/check_numbers.py
 
 demo: $(VENV)/.ok ## a synthetic street, trained plain and pruned: one table, pictures in outputs/demo
 	$(BIN)/sparsestreet demo

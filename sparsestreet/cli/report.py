@@ -11,18 +11,21 @@ from sparsestreet.cli.options import run_command
 from sparsestreet.metrics.protocols import PROTOCOLS, Protocol
 from sparsestreet.report import collect, figure, markdown, sections, tables
 from sparsestreet.report.arms import arms
+from sparsestreet.report.collect import keep_records
 from sparsestreet.report.figures_readme import time_figure
 from sparsestreet.report.sweep import sweep_records, write_report
 from sparsestreet.safe_yaml import read_yaml
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
-                            [markdown=FILE] [figure=FILE.png]
+                            [markdown=FILE] [figure=FILE.png] [records=FILE.jsonl]
 sparsestreet report sweep=DIR [protocol=drivestudio|strict] [figure=FILE.png]
 
 Tables of all runs below the folders: one per scene, then the mean over scenes. Runs of one label and one configuration
 are repeats and share a column; a label's other configurations have columns named by the options that differ. With a
 baseline (label or name of a column), differences to it, paired by scene and seed. The figure shows PSNR against size.
+records=FILE writes a line of JSON for each run or job: what made it, and what was measured. scripts/check_numbers.py
+compares a page's numbers with such a file.
 
 Of a sweep (sparsestreet train +sweep=NAME) DIR/report is written: tables.md, tables.tex and tables.csv in the layout of
 the paper, with its published figures in columns of their own, paired differences with intervals, the best arm at one
@@ -45,12 +48,15 @@ class ReportRequest:
     protocol: Literal["drivestudio", "strict"] = "drivestudio"
     markdown: Path | None = None
     figure: Path | None = None
+    records: Path | None = None
 
     def __post_init__(self) -> None:
         if bool(self.folders) == (self.sweep is not None):
             raise ValueError("name folders of runs, or sweep=DIR: one of both")
         if self.sweep is not None and (self.baseline or self.markdown or self.sections != "all"):
-            raise ValueError("the report of a sweep has all of its sections: sweep=DIR goes with protocol and figure")
+            raise ValueError(
+                "the report of a sweep has all of its sections: sweep=DIR goes with protocol, figure and records"
+            )
 
 
 def report(arguments: list[str]) -> int:
@@ -60,6 +66,9 @@ def report(arguments: list[str]) -> int:
 
 def _report(request: ReportRequest) -> None:
     protocol = PROTOCOLS[request.protocol]
+    if request.records is not None:
+        keep_records(collect(request.folders or [request.sweep or Path()]), request.records)
+        print(f"{request.records}: a line for each run")
     if request.sweep is not None:
         _report_sweep(request.sweep, protocol, request.figure)
         return

@@ -1,10 +1,13 @@
-"""Finds the records of finished runs."""
+"""Finds the records of finished runs, and writes what of them a repository can keep."""
 
+import json
+import re
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.records.same_as import SAME_AS
+from sparsestreet.records.strict_json import significant, write_atomically
 from sparsestreet.records.summary import SUMMARY, RunSummary
 
 
@@ -39,6 +42,47 @@ def _stands_for_another(record: RunRecord, folders: Set[Path]) -> bool:
     if same is None or same.label != record.summary.run.label:
         return False
     return (record.folder / same.run).resolve() in folders
+
+
+def keep_records(records: Sequence[RunRecord], path: Path) -> None:
+    """Write a line of JSON for each run, some kilobytes, so that a page's numbers can be checked without its scenes.
+
+    A line has what identifies the run (label, log, seed, hashes, command without folders, commit, machine). It has the
+    means of each split in the metrics' units, Gaussians and bytes by part, milliseconds of a frame and seconds of
+    training.
+
+    Raises OSError where the file cannot be written.
+    """
+    lines = [json.dumps(_kept(record.summary), sort_keys=True) for record in records]
+    write_atomically(path, "".join(f"{line}\n" for line in lines))
+
+
+def _kept(summary: RunSummary) -> dict[str, object]:
+    run = summary.run
+    means = {
+        split: {name: significant(one.mean, name) for name, one in metrics.items() if one.mean is not None}
+        for split, metrics in summary.quality.items()
+    }
+    return {
+        **{name: getattr(run, name) for name in ("label", "method", "sparsify", "scene", "seed", "split", "steps")},
+        "config_hash": run.config_hash,
+        "data_hash": run.data_hash,
+        # A repository is no place for the folders of a machine.
+        "command": re.sub(r"(?<![^=\s,\[])(?:~|\.{0,2})/[^\s,\]]*/", "", run.command),
+        "source": vars(run.source),
+        "machine": {**vars(run.machine), "device": run.device, "threads": run.threads},
+        "sizes": summary.resolutions,
+        "images": summary.images,
+        "quality": means,
+        "gaussians": summary.gaussians,
+        "gaussians_total": summary.gaussians_total,
+        "caps": run.caps,
+        "bytes": summary.bytes_by_part,
+        "bytes_total": summary.bytes_total,
+        "frame_ms": significant(summary.latency.p50, "frame_ms"),
+        "quiet": summary.latency.noise.quiet and (run.noise is None or run.noise.quiet),
+        "training_seconds": run.training_seconds,
+    }
 
 
 def check_definitions(records: Sequence[RunRecord]) -> None:

@@ -67,6 +67,23 @@ class Recipe:
             found.append(f"a node and an effect are both named {', '.join(sorted(shared))}: rename one of them")
         return found
 
+    def left_whole(self, counts: Mapping[str, int]) -> list[str]:
+        """Return a line on the nodes from which masks and pruning can take nothing, because they have no more Gaussians
+        than their K_min; an empty list where there is none.
+
+        Args:
+            counts: Gaussians of each node (``SceneGraph.counts``).
+        """
+        rules = [callback.rule for callback in self.callbacks.values() if isinstance(callback, Pruning)]
+        said = [
+            f"{name} ({counts[name]:,} Gaussians, K_min {settings.min_gaussians:,})"
+            for name, settings in self.nodes.items()
+            if 0 < counts.get(name, 0) <= settings.min_gaussians
+            and (settings.mask_settings is not None or any(rule.touches(name, settings) for rule in rules))
+        ]
+        remedy = "node.NAME.min_gaussians sets it"
+        return [f"at or below K_min, where masks and pruning take nothing: {', '.join(said)}; {remedy}"] if said else []
+
     def check(self) -> None:
         """Raises ValueError where there are ``problems``."""
         if found := self.problems():

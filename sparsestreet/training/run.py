@@ -160,7 +160,7 @@ def train(
             system.scene, system.options, data, out, device=device, command=identity.command, extra=extra, ranks=ranks
         )
         record_costs(out, stages, device)  # the last file: a run with costs is a whole one
-    for line in result_lines(summary, out):
+    for line in (*result_lines(summary, out), *recipe.left_whole(summary.gaussians)):
         log.info(line)
     return summary
 

@@ -1,5 +1,6 @@
 """The table on the command line."""
 
+import json
 import typing
 
 import pytest
@@ -40,6 +41,23 @@ def test_sections_are_chosen(runs, tmp_path, wanted, titles):
     assert report([str(runs), f"sections={wanted}", f"markdown={table}"]) == 0
     found = [line.split()[1] for line in table.read_text().splitlines() if line.startswith("###")]
     assert found == titles
+
+
+def test_records_of_runs_are_kept_in_a_line_each(tmp_path, capsys):
+    """All that a table shows, without a folder of the machine, whose runs may lie anywhere."""
+    away = "sparsestreet train data.root=/home/me/drive out=~/x/run seed=3 data.a=[/k/l,/m/n] b=1/2"
+    SUMMARY.write(tmp_path / "a/b", make_summary("plain", seed=3, training_psnr=28.25, milliseconds=41.5, command=away))
+    SUMMARY.write(tmp_path / "c", make_summary("ours", gaussians={"background": 7}, psnr=24.125, vehicle_psnr=None))
+    kept = tmp_path / "kept.jsonl"
+    assert report([str(tmp_path), f"records={kept}"]) == 0
+    assert f"{kept}: a line for each run" in capsys.readouterr().out
+    assert len(kept.read_bytes()) < 2 * 4096
+    first, second = (json.loads(line) for line in kept.read_text().splitlines())
+    assert first["command"] == "sparsestreet train data.root=drive out=run seed=3 data.a=[l,n] b=1/2"
+    assert (first["label"], first["seed"], first["frame_ms"]) == ("plain", 3, 41.5)
+    assert (first["quality"]["training"]["psnr_full"], first["quality"]["held_out"]["psnr_vehicle"]) == (28.25, 22.0)
+    assert (second["gaussians"], second["bytes_total"]) == ({"background": 7}, 4 * 59 * 7)
+    assert second["quality"]["held_out"]["psnr_full"] == 24.125
 
 
 def test_a_folder_may_have_an_equals_sign(runs, capsys):

@@ -337,7 +337,9 @@ def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path):
     )
     summary = SUMMARY.read(out)
     assert summary.gaussians == {"background": 200, "rigid": 60}
-    assert "K_min" in (out / "train.log").read_text()
+    said = (out / "train.log").read_text()
+    assert "(K_min) of node 'background' held" in said
+    assert "take nothing: background (200 Gaussians, K_min 200), rigid (60 Gaussians, K_min 60)" in said
 
 
 def test_masks_end_with_their_stage(finished):

@@ -105,6 +105,22 @@ def test_each_part_that_lacks_its_counterpart_is_named(settings, kinds, said):
         recipe(settings, *kinds).check()
 
 
+def test_nodes_whose_k_min_keeps_all_are_said():
+    """Those that masks or a rule could touch, at or below it: never a node above it, without rows or untouched."""
+    nodes = {
+        "kept": replace(MASKED, min_gaussians=4000),
+        "at": replace(PLAIN, min_gaussians=7, prunable=True),
+        "above": replace(MASKED, min_gaussians=7),
+        "none": replace(MASKED, min_gaussians=7),
+        "plain": replace(PLAIN, min_gaussians=7),
+    }
+    counts = {"kept": 3999, "at": 7, "above": 8, "none": 0, "plain": 3}
+    several = replace(recipe(MASKED, "loss", "masks", "pruning"), nodes=nodes)
+    (line,) = several.left_whole(counts)
+    assert "take nothing: kept (3,999 Gaussians, K_min 4,000), at (7 Gaussians, K_min 7); node.NAME" in line
+    assert replace(several, callbacks={}, nodes={"at": nodes["at"]}).left_whole(counts) == []
+
+
 def test_a_node_and_an_effect_of_one_name():
     parts = Recipe({"sky": PLAIN, "b": PLAIN}, effects={"sky": SkySettings(), "b": SkySettings()}, losses={})
     assert parts.problems() == ["a node and an effect are both named b, sky: rename one of them"]

@@ -141,14 +141,13 @@ def test_rows_of_no_object():
 
 
 @pytest.mark.parametrize("make", [background_settings, rigid_settings])
-def test_limits_that_contradict_each_other_are_refused(make: type[NodeSettings]):
+def test_limits_below_zero_or_one_are_refused(make: type[NodeSettings]):
     with pytest.raises(ValueError, match="min_gaussians must be >= 0, got -1"):
         make(min_gaussians=-1)
-    with pytest.raises(ValueError, match="max_gaussians must be at least min_gaussians, got 4 and 5"):
-        make(min_gaussians=5, max_gaussians=4)
-    with pytest.raises(ValueError, match="max_gaussians must be at least min_gaussians, got 0 and 0"):
+    with pytest.raises(ValueError, match="max_gaussians must be >= 1 or null, got 0"):
         make(max_gaussians=0)
-    assert make(min_gaussians=5, max_gaussians=5).max_gaussians == 5
+    # The paper's K_min of moving objects is above the limit of a small run: then nothing is removed (training/floors).
+    assert make(min_gaussians=5, max_gaussians=4).max_gaussians == 4
 
 
 def test_a_node_is_said_by_its_fields_only():
