@@ -53,7 +53,7 @@ def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protoco
     dashes, end = _DASHES.get(arm.sparsify, "-."), [len(mean.seconds) - 1]
     paint = _paint(arm, shown)
     axes.plot(
-        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=marker(arm), markevery=end, label=arm.title
+        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=marker(arm), markevery=end, label=_label(arm)
     )
 
 
@@ -73,7 +73,11 @@ def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: P
     axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
     scenes = (by_scene({unit: values[unit] for unit in units}) for values in (costs, qualities))
     x, y = (statistics.fmean(means.values()) for means in scenes)
-    axes.scatter(x, y, s=44, color=paint, marker=marker(arm), label=arm.title, zorder=3)
+    axes.scatter(x, y, s=44, color=paint, marker=marker(arm), label=_label(arm), zorder=3)
+
+
+def _label(arm: Arm) -> str:
+    return f"{arm.title} (machine not quiet)" if arm.busy("frames") or arm.busy("training") else arm.title
 
 
 def _seconds(run: RunSummary) -> float | None:
