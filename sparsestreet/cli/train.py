@@ -23,7 +23,17 @@ from sparsestreet.cli.process import follows_another, name_beside_first, speak_a
 from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
-from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
+from sparsestreet.cli.sweep import (
+    SweepFolder,
+    as_sweep,
+    job_problem,
+    note_of_sweep,
+    run_job,
+    sentence,
+    sweep_problem,
+    sweep_status,
+    with_fixed_keys,
+)
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -45,7 +55,8 @@ def train(arguments: list[str]) -> int:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
                 arguments = as_sweep(arguments)
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
-                arguments = _shown(arguments)
+                problem = problem or job_problem(arguments)
+                arguments = _shown(with_fixed_keys(arguments))
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter
 
 # Okabe and Ito's palette: distinguishable with any color vision.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-_MARKERS = "osD^vP*X"
+_MARKERS = "osD^vP*"  # one fewer than colors, so that pairs of both repeat late
 _DASHES = ("--", ":", "-.")
 
 
