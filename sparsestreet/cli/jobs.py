@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sparsestreet.cli.branch import first_pruning, identity_of_trunk, moments_to_keep
-from sparsestreet.cli.compose import configuration, override_problem, resolved
+from sparsestreet.cli.compose import as_typed, configuration, override_problem, resolved
 from sparsestreet.cli.flags import SWEEPS, flags_of
 from sparsestreet.cli.folder import identity_of_run
 from sparsestreet.cli.sweep import finished, jobs_of, with_fixed_keys
@@ -68,6 +68,7 @@ class SweepCount:
 
 def jobs(arguments: list[str]) -> int:
     """Print the counts; 2 on wrong usage."""
+    arguments = as_typed(arguments)
     named = [name for text in arguments if text.startswith("+sweep=") for name in text[7:].split(",")]
     names = named or [COMMAND_LINE]
     if "--help" in arguments or not (named or SWEEPS & flags_of(arguments)):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from sparsestreet.cli.compose import load_run_config
+from sparsestreet.cli.compose import load_run_config, quoted, value_of
 from sparsestreet.records.branch_of import moment_of
 from sparsestreet.safe_yaml import read_yaml
 
@@ -17,8 +17,8 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
     ``resume=`` they are as given.
     Raises FileNotFoundError where no run is at that place, ValueError in a sweep.
     """
-    given = next((text.partition("=")[2] for text in arguments if text.startswith("resume=")), "null")
-    if given in ("null", ""):
+    given = next((value_of(text) for text in arguments if text.startswith("resume=")), "null")
+    if given in ("null", "None", ""):
         return arguments
     if {"-m", "--multirun"} & set(arguments):
         raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
@@ -35,7 +35,7 @@ def resumed_overrides(arguments: list[str]) -> list[str]:
     own = {"resume", "out", "overwrite", *(_key_of(text) for text in arguments)}
     kept = [text for text in map(str, overrides) if _key_of(text) not in own]
     branches = moment_of(Path(given)) is not None
-    folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={run}"]
+    folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={quoted(str(run))}"]
     return [*kept, *arguments, *folder]
 
 

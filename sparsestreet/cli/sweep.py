@@ -17,7 +17,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.compose import configuration, resolved, without_flags
+from sparsestreet.cli.compose import configuration, resolved, value_of, without_flags
 from sparsestreet.cli.flags import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.folder import folder_problem, holds_same_run, is_whole, same_run
 from sparsestreet.cli.locks import FolderTakenError
@@ -131,12 +131,12 @@ def sweep_problem(arguments: list[str]) -> str | None:
     name = _named(arguments)
     if name is None or not name.startswith(OF_DRIVES):
         return None
-    roots = next((text.partition("=")[2] for text in arguments if text.startswith("data.root=")), None)
+    roots = next((value_of(text) for text in arguments if text.startswith("data.root=")), None)
     if roots is None:
         return (
             f"+sweep={name} trains on recorded drives: give their folders, data.root=DIR,DIR (conf/sweep/{name}.yaml)"
         )
-    absent = [root for root in roots.split(",") if not Path(root).is_dir()]
+    absent = [root for root in ([roots] if Path(roots).is_dir() else roots.split(",")) if not Path(root).is_dir()]
     if absent:
         return f"data.root names {', '.join(absent)}, which is no folder here: give drives in DriveStudio's layout"
     return None

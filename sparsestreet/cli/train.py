@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.branch import check_resumed
-from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
+from sparsestreet.cli.compose import CONF, as_typed, composed, override_problem, resolved, without_flags
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
@@ -50,6 +50,7 @@ def train(arguments: list[str]) -> int:
         try:
             problem = flag_problem(arguments)
             if problem is None:
+                arguments = as_typed(arguments)
                 arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments)))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
